@@ -1,0 +1,1 @@
+"""What every part agrees on: the values that flow, the interfaces, and their composition."""

@@ -1,0 +1,97 @@
+"""Pinhole camera with OpenCV axes: x right, y down, z forward; pixel centres at +0.5."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One pinhole view.
+
+    Attributes:
+        K: intrinsics [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels; the centre of the top-left
+            pixel is at (0.5, 0.5).
+        world_to_camera: rigid transform x_cam = R x_world + t, metres ("viewmat").
+        width, height: image size, pixels.
+    """
+
+    K: Float[Tensor, "3 3"]
+    world_to_camera: Float[Tensor, "4 4"]
+    width: int
+    height: int
+
+    @property
+    def center(self) -> Float[Tensor, "3"]:
+        """Camera centre in the world, metres."""
+        rotation, shift = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return -rotation.mT @ shift
+
+    def to(self, *args: Any, **kwargs: Any) -> Camera:
+        return replace(
+            self,
+            K=self.K.to(*args, **kwargs),
+            world_to_camera=self.world_to_camera.to(*args, **kwargs),
+        )
+
+    def to_camera(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """World points in camera coordinates, metres."""
+        return points @ self.world_to_camera[:3, :3].mT + self.world_to_camera[:3, 3]
+
+    def project(
+        self, points: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
+        """Pixels (x, y) and depth in metres of world points; depth may be negative (behind)."""
+        cam = self.to_camera(points)
+        depth = cam[..., 2]
+        safe = torch.where(depth.abs() < 1e-8, torch.full_like(depth, 1e-8), depth)
+        xy = cam[..., :2] / safe[..., None]
+        focal = torch.stack((self.K[0, 0], self.K[1, 1]))
+        return xy * focal + self.K[:2, 2], depth
+
+    def unproject(
+        self, pixels: Float[Tensor, "*batch 2"], depth: Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch 3"]:
+        """World points at pixels (x, y) and depths along z, metres."""
+        focal = torch.stack((self.K[0, 0], self.K[1, 1]))
+        xy = (pixels - self.K[:2, 2]) / focal * depth[..., None]
+        cam = torch.cat((xy, depth[..., None]), -1)
+        return (cam - self.world_to_camera[:3, 3]) @ self.world_to_camera[:3, :3]
+
+    def pixel_grid(self) -> Float[Tensor, "H W 2"]:
+        """Centres (x, y) of all pixels."""
+        y = torch.arange(self.height, device=self.K.device, dtype=self.K.dtype) + 0.5
+        x = torch.arange(self.width, device=self.K.device, dtype=self.K.dtype) + 0.5
+        return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view at another image size."""
+        scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
+        return replace(self, K=self.K * scale, width=width, height=height)
+
+    @staticmethod
+    def look_at(
+        eye: Float[Tensor, "3"],
+        target: Float[Tensor, "3"],
+        *,
+        width: int,
+        height: int,
+        fov_y: float,
+        up: tuple[float, float, float] = (0.0, 1.0, 0.0),
+    ) -> Camera:
+        """A camera at `eye` that looks at `target`; `fov_y` is the vertical angle in radians."""
+        forward = torch.nn.functional.normalize(target - eye, dim=0)
+        down = -torch.tensor(up, dtype=eye.dtype, device=eye.device)
+        right = torch.nn.functional.normalize(torch.linalg.cross(down, forward), dim=0)
+        rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
+        viewmat = torch.eye(4, dtype=eye.dtype, device=eye.device)
+        viewmat[:3, :3] = rotation
+        viewmat[:3, 3] = -rotation @ eye
+        focal = 0.5 * height / float(torch.tan(torch.tensor(fov_y / 2)))
+        K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        return Camera(K.to(viewmat), viewmat, width, height)

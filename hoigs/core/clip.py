@@ -1,0 +1,203 @@
+"""Clip: the frames, cameras, masks, bodies and objects that a reconstruction starts from."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from hoigs.core.camera import Camera
+from hoigs.core.interaction import EntityKind
+from hoigs.core.moment import BodyPose, Moment
+
+
+class FrameStore(ABC):
+    """Pixels on demand; implementations decode lazily and may cache. Positions, not names."""
+
+    @abstractmethod
+    def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
+        """RGB."""
+
+    @abstractmethod
+    def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
+        """Visible pixels of an entity; all False where it is not seen."""
+
+    @abstractmethod
+    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
+        """Depth along z, metres; 0 where unknown (NaN and infinity are cleaned by the reader)."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One view of a clip, decoded.
+
+    Attributes:
+        position: its place in the clip's frame list. moment.index is the frame number.
+        masks: by entity, visible pixels. depth: metres, 0 = unknown, or None.
+    """
+
+    position: int
+    moment: Moment
+    camera: Camera
+    image: UInt8[Tensor, "H W 3"]
+    masks: dict[str, Bool[Tensor, "H W"]]
+    depth: Float[Tensor, "H W"] | None
+
+    @property
+    def rgb(self) -> Float[Tensor, "H W 3"]:
+        """RGB in [0, 1]."""
+        return self.image.float() / 255.0
+
+
+@dataclass(frozen=True)
+class BodyTrack:
+    """A body over the clip: which body model, and a BodyPose batched over the frames."""
+
+    model: str  # registry key, for example "body:anny"
+    poses: BodyPose
+    provenance: str = "unknown"
+
+
+@dataclass(frozen=True)
+class ObjectTrack:
+    """What is known of an object before training.
+
+    Attributes:
+        points: canonical points about the object's centre, metres, at world scale.
+        colors: RGB in [0, 1].
+        rotations: object to world, per frame. translations: object centre in the world, metres.
+        observed: frames in which the object was seen; the others are interpolated.
+        provenance: who made the track, for reports.
+    """
+
+    points: Float[Tensor, "P 3"]
+    colors: Float[Tensor, "P 3"]
+    rotations: Float[Tensor, "F 3 3"]
+    translations: Float[Tensor, "F 3"]
+    observed: Bool[Tensor, " F"]
+    provenance: str = "unknown"
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Everything that training and evaluation read; frames are lazy and uint8.
+
+    Attributes:
+        name: for reports.
+        store: pixels. cameras, moments: one a frame, in order.
+        kinds: entity name to kind; "scene" is implicit.
+        bodies: by human entity. objects: by object entity.
+        points, point_colors: scene points (COLMAP, or back-projected depth), metres, RGB [0, 1].
+        split: "train" and "test" positions.
+        held_out: the same moments from cameras never trained on, or None.
+        fps: frames a second.
+        depth_kind: "metric", "affine-disparity" or "none".
+        provenance: where each part came from.
+    """
+
+    name: str
+    store: FrameStore
+    cameras: Sequence[Camera]
+    moments: Sequence[Moment]
+    kinds: Mapping[str, EntityKind]
+    bodies: Mapping[str, BodyTrack]
+    objects: Mapping[str, ObjectTrack]
+    points: Float[Tensor, "P 3"]
+    point_colors: Float[Tensor, "P 3"]
+    split: Mapping[str, Sequence[int]]
+    held_out: Clip | None = None
+    fps: float = 30.0
+    depth_kind: str = "none"
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __getitem__(self, position: int) -> Frame:
+        if not -len(self) <= position < len(self):
+            raise IndexError(f"frame {position} of a clip with {len(self)} frames")
+        position %= len(self)
+        return Frame(
+            position=position,
+            moment=self.moments[position],
+            camera=self.cameras[position],
+            image=self.store.image(position),
+            masks={name: self.store.mask(name, position) for name in self.kinds},
+            depth=self.store.depth(position),
+        )
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[i] for i in range(len(self)))
+
+    @property
+    def num_frames(self) -> int:
+        """N_f of the paper: frames of the whole video, held-out views not counted."""
+        return max(m.index for m in self.moments) + 1
+
+    def frame(self, position: int) -> Frame:
+        return self[position]
+
+    def resized(self, width: int) -> Clip:
+        """This clip at another width, aspect kept; pixels are resampled on demand."""
+        if width == self.cameras[0].width:
+            return self
+        sizes = [(width, max(1, round(c.height * width / c.width))) for c in self.cameras]
+        return replace(
+            self,
+            store=ResizedStore(self.store, sizes),
+            cameras=[c.resized(*s) for c, s in zip(self.cameras, sizes, strict=True)],
+            held_out=self.held_out.resized(width) if self.held_out else None,
+        )
+
+    def extent(self) -> float:
+        """Scene extent, metres: 1.1 x camera spread (3DGS), but at least half the median depth
+        of the points, so that a static camera does not give zero (methods D.1, F13, F14)."""
+        centers = torch.stack([c.center for c in self.cameras])
+        spread = 1.1 * float((centers - centers.mean(0)).norm(dim=-1).max())
+        if len(self.points) == 0:
+            return max(spread, 1.0)
+        depth = self.cameras[0].to_camera(self.points)[:, 2]
+        ahead = depth[depth > 0]
+        return max(spread, 0.5 * float(ahead.median()) if len(ahead) else 1.0)
+
+
+class ResizedStore(FrameStore):
+    """Another store at another size: images by area, masks and depth by nearest pixel."""
+
+    def __init__(self, base: FrameStore, sizes: Sequence[tuple[int, int]]) -> None:
+        self.base, self.sizes = base, sizes
+        self._images: dict[int, Tensor] = {}
+
+    def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
+        if position not in self._images:
+            width, height = self.sizes[position]
+            image = self.base.image(position).permute(2, 0, 1)[None].float()
+            small = torch.nn.functional.interpolate(image, (height, width), mode="area")
+            self._images[position] = small[0].permute(1, 2, 0).round().to(torch.uint8)
+        return self._images[position]
+
+    def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
+        return self._nearest(self.base.mask(entity, position).float(), position) > 0.5
+
+    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
+        depth = self.base.depth(position)
+        return None if depth is None else self._nearest(depth, position)
+
+    def _nearest(self, image: Tensor, position: int) -> Tensor:
+        width, height = self.sizes[position]
+        resize = torch.nn.functional.interpolate
+        return resize(image[None, None], (height, width), mode="nearest-exact")[0, 0]
+
+
+def uniform_test_split(count: int, tests: int = 16) -> dict[str, list[int]]:
+    """`tests` uniformly chosen test frames, never the first or last (HOSNeRF's rule: 16)."""
+    tests = min(tests, max(1, count // 4))
+    chosen = sorted({round((i + 0.5) * count / tests) for i in range(tests)})
+    chosen = [min(max(1, c), count - 2) for c in chosen] if count > 2 else []
+    test = sorted(set(chosen))
+    return {"train": [i for i in range(count) if i not in set(test)], "test": test}

@@ -1,0 +1,29 @@
+"""BuildContext: what a component may need, besides its config, when a spec is composed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hoigs.core.body import BodyModel
+    from hoigs.core.clip import BodyTrack, Clip, ObjectTrack
+
+
+@dataclass(frozen=True)
+class BuildContext:
+    """Given to `from_config`; fields that do not apply are None.
+
+    Attributes:
+        entity: name of the entity being built ("" for scene-wide parts).
+        clip: the clip being reconstructed.
+        body, body_track: for a human. object_track: for an object.
+        seed: for anything random.
+    """
+
+    entity: str = ""
+    clip: Clip | None = None
+    body: BodyModel | None = None
+    body_track: BodyTrack | None = None
+    object_track: ObjectTrack | None = None
+    seed: int = 0

@@ -1,0 +1,107 @@
+"""DeformationModel: rest Gaussians and a moment in, Gaussians at that moment out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.moment import BodyPose, Moment
+from hoigs.core.topology import TopologyChange, reindex
+
+if TYPE_CHECKING:
+    from hoigs.core.context import BuildContext
+    from hoigs.core.interaction import Residual
+
+
+class DeformationModel(nn.Module, ABC):
+    """How one entity moves.
+
+    Attributes:
+        provides: what features may ask of it: "velocity" (ProvidesVelocity), "field"
+            (ProvidesField), "skeleton" (ProvidesSkeleton).
+        owns: names of Gaussians fields that this model computes from parameters of its own; the
+            entity does not train its rest values of those fields.
+        per_gaussian: names of this module's parameters whose first axis is the Gaussian.
+    """
+
+    provides: frozenset[str] = frozenset()
+    owns: frozenset[str] = frozenset()
+    per_gaussian: tuple[str, ...] = ()
+
+    @classmethod
+    def from_config(cls, config: Any, context: BuildContext) -> Self:
+        """Build from a validated config; override to take a body, a track … from the context."""
+        return cls(**config.model_dump())
+
+    def bind(self, rest: Gaussians) -> None:
+        """Called once by the Entity: allocate what depends on the number of Gaussians."""
+        del rest
+
+    @abstractmethod
+    def forward(
+        self, rest: Gaussians, moment: Moment, residual: Residual | None = None
+    ) -> Gaussians:
+        """The entity at `moment`, in world coordinates.
+
+        Args:
+            rest: its canonical Gaussians, raw.
+            moment: time, and the body pose of this entity if it has one.
+            residual: correction from the interaction module; None is no correction.
+        """
+
+    def on_topology(self, change: TopologyChange) -> None:
+        """Follow a change of Gaussian count; the default reindexes `per_gaussian` parameters."""
+        reindex((self.get_parameter(name) for name in self.per_gaussian), change)
+
+    def regularizers(self) -> dict[str, Tensor]:
+        """Named scalar penalties, unweighted, of the current parameters."""
+        return {}
+
+
+@runtime_checkable
+class ProvidesVelocity(Protocol):
+    """Deformations with "velocity" in `provides`."""
+
+    def velocity(self, rest: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
+        """Time derivative of the means, metres per keyframe interval or per unit time."""
+        ...
+
+
+@runtime_checkable
+class ProvidesField(Protocol):
+    """Deformations with "field" in `provides`: a space-time feature field phi(x, y, z, t)."""
+
+    field_width: int
+
+    def posed_field(
+        self, rest: Gaussians, moment: Moment
+    ) -> tuple[Float[Tensor, "V D"], Float[Tensor, "V 3"]]:
+        """Features of the body's points at `moment` and their world positions, metres."""
+        ...
+
+
+@runtime_checkable
+class ProvidesSkeleton(Protocol):
+    """Deformations with "skeleton" in `provides`: a posed body."""
+
+    entity: str
+
+    def point_parts(self) -> Tensor:
+        """Body part (0..15) of each Gaussian, int64 [N]."""
+        ...
+
+    def pose(self, moment: Moment) -> BodyPose:
+        """The pose used at `moment`, refinements included."""
+        ...
+
+    def anchors(self, moment: Moment) -> Float[Tensor, "A 3"]:
+        """World positions, metres: pelvis, left wrist, right wrist, left foot, right foot."""
+        ...
+
+    def arm_length(self) -> Float[Tensor, ""]:
+        """Shoulder to middle fingertip in world units (the learnable alpha included)."""
+        ...

@@ -1,0 +1,40 @@
+"""Errors that say what was expected, what came, where, and what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class HoigsError(Exception):
+    """A mistake in the input that a user can mend; the CLI prints it and exits with 2."""
+
+
+class SpecError(HoigsError):
+    """A spec file that cannot be used; the message starts with file:line:column and the key."""
+
+
+class PluginError(HoigsError):
+    """A component that is unknown, broken, conflicting or lacks an extra."""
+
+
+class ClipError(HoigsError):
+    """A clip folder that is absent, partial or inconsistent."""
+
+
+class CheckpointError(HoigsError):
+    """A checkpoint that is damaged or belongs to another spec."""
+
+
+class RenderError(HoigsError):
+    """Gaussians, a camera or a request that a rasterizer cannot draw."""
+
+
+class NotFiniteError(HoigsError):
+    """A tensor holds NaN or infinity; the message names it."""
+
+
+def did_you_mean(name: str, valid: Iterable[str], count: int = 1) -> str:
+    """`; did you mean "x"?` with the nearest of `valid`, or "" when nothing is near."""
+    near = difflib.get_close_matches(name, list(valid), n=count, cutoff=0.5)
+    return "; did you mean " + " or ".join(f'"{n}"' for n in near) + "?" if near else ""

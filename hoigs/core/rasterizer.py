@@ -1,0 +1,153 @@
+"""Rasterizer: Gaussians and a camera in, an image with alpha, depth and features out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.core.camera import Camera
+from hoigs.core.errors import RenderError
+from hoigs.core.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What a backend can do; conformance tests and `hoigs doctor` read it.
+
+    Attributes:
+        devices: torch device types. dtypes: names of the floating types it computes in.
+        camera_gradients: whether gradients reach `Camera.world_to_camera`.
+        deterministic: whether two runs agree bit for bit.
+    """
+
+    devices: frozenset[str]
+    dtypes: frozenset[str]
+    camera_gradients: bool
+    deterministic: bool
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """What to draw, and by which rules.
+
+    Attributes:
+        features: extra channels composited like colour, any F.
+        subset: rows to draw (boolean mask); others neither show nor occlude.
+        background: colour behind everything, RGB in [0, 1] (a colour or an image); black when None.
+        sh_degree: highest SH band to use, 0..3; None is all that are stored.
+        screen_offsets: added to the projected means, pixels. A zero tensor that requires grad
+            receives the screen-space gradient that density control needs, on every backend alike.
+        near: Gaussians whose centre is nearer than this are culled, metres.
+        low_pass: variance added to the screen covariance, square pixels (3DGS: 0.3).
+        max_alpha: alpha of one Gaussian at one pixel is clamped to this (no gradient above).
+        min_alpha: contributions below are skipped (3DGS: 1/255).
+        min_transmittance: compositing stops before transmittance falls to this (3DGS: 1e-4).
+    """
+
+    features: Float[Tensor, "N F"] | None = None
+    subset: Tensor | None = None
+    background: Tensor | None = None
+    sh_degree: int | None = None
+    screen_offsets: Float[Tensor, "N 2"] | None = None
+    near: float = 0.05
+    low_pass: float = 0.3
+    max_alpha: float = 0.999
+    min_alpha: float = 1.0 / 255.0
+    min_transmittance: float = 1e-4
+
+    def replace(self, **changes: Any) -> RenderRequest:
+        return replace(self, **changes)
+
+
+@dataclass(frozen=True)
+class RenderOutput:
+    """One drawn view.
+
+    Attributes:
+        color: RGB over the background, not clamped.
+        alpha: accumulated opacity.
+        depth: accumulated depth sum(w z), metres; see `expected_depth`.
+        features: accumulated features sum(w f), or None if none were asked for.
+        info: `radii` [N] (pixels, 0 when culled) and whatever a backend adds.
+    """
+
+    color: Float[Tensor, "H W 3"]
+    alpha: Float[Tensor, "H W"]
+    depth: Float[Tensor, "H W"]
+    features: Float[Tensor, "H W F"] | None = None
+    info: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def expected_depth(self) -> Float[Tensor, "H W"]:
+        """depth / alpha, metres: the mean depth of what is seen; 0 where nothing is."""
+        return self.depth / self.alpha.clamp_min(1e-6)
+
+
+class Rasterizer(ABC):
+    """A splatting backend. Stateless as far as a caller can tell; never falls back to another."""
+
+    capabilities: Capabilities
+
+    @classmethod
+    def from_config(cls, config: Any, context: Any = None) -> Self:
+        return cls(**config.model_dump())
+
+    @abstractmethod
+    def render(
+        self, gaussians: Gaussians, camera: Camera, request: RenderRequest | None = None
+    ) -> RenderOutput:
+        """Draw. Gradients reach every raw field, `features`, `screen_offsets` and `background`.
+
+        Gaussians that are culled (behind `near`, off screen, not finite, zero quaternion, outside
+        `subset`) contribute nothing and get zero gradients; they never disturb a neighbour.
+
+        Raises:
+            RenderError: shapes, dtypes or devices that this backend cannot draw.
+        """
+
+    def check_inputs(self, gaussians: Gaussians, camera: Camera, request: RenderRequest) -> None:
+        """The checks that every backend shares; call first in `render`."""
+        count, device = len(gaussians), gaussians.means.device
+        name = type(self).__name__
+        if device.type not in self.capabilities.devices:
+            raise RenderError(
+                f"{name}: Gaussians are on {device}, expected one of "
+                f"{sorted(self.capabilities.devices)}; move them with gaussians.to(...)"
+            )
+        dtype = str(gaussians.means.dtype).removeprefix("torch.")
+        if dtype not in self.capabilities.dtypes:
+            raise RenderError(
+                f"{name}: computes in {sorted(self.capabilities.dtypes)}, means are {dtype}"
+            )
+        if camera.world_to_camera.device != device:
+            raise RenderError(
+                f"{name}: camera is on {camera.world_to_camera.device}, Gaussians on {device}; "
+                "use camera.to(gaussians.means.device)"
+            )
+        if camera.width < 1 or camera.height < 1:
+            raise RenderError(f"{name}: image size {camera.width}x{camera.height} is empty")
+        expected = {
+            "features": (request.features, 2),
+            "subset": (request.subset, 1),
+            "screen_offsets": (request.screen_offsets, 2),
+        }
+        for key, (value, dims) in expected.items():
+            if value is not None and (value.shape[0] != count or value.dim() != dims):
+                raise RenderError(
+                    f"{name}: request.{key} has shape {tuple(value.shape)}, expected {count} rows "
+                    f"and {dims} dimensions to match the Gaussians"
+                )
+        if request.subset is not None and request.subset.dtype != torch.bool:
+            raise RenderError(f"{name}: request.subset must be a boolean mask")
+        degree = request.sh_degree
+        if gaussians.sh.shape[1] not in (1, 4, 9, 16):
+            raise RenderError(
+                f"{name}: sh has {gaussians.sh.shape[1]} bands, expected 1, 4, 9 or 16"
+            )
+        if degree is not None and not 0 <= degree <= 3:
+            raise RenderError(f"{name}: sh_degree {degree} is outside 0..3")

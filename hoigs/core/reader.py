@@ -1,0 +1,32 @@
+"""ClipReader: a folder on disk, in some layout, to a Clip."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from hoigs.core.clip import Clip
+
+if TYPE_CHECKING:
+    from hoigs.core.context import BuildContext
+
+
+class ClipReader(ABC):
+    """One dataset layout."""
+
+    @classmethod
+    def from_config(cls, config: Any, context: BuildContext) -> Self:
+        return cls(**config.model_dump())
+
+    @abstractmethod
+    def matches(self, folder: Path) -> bool:
+        """Whether `folder` looks like this layout, complete or not."""
+
+    @abstractmethod
+    def read(self, folder: Path) -> Clip:
+        """The clip, lazily.
+
+        Raises:
+            ClipError: naming every absent or inconsistent file and who makes it.
+        """

@@ -1,0 +1,124 @@
+"""SceneModel: the only place where a forward pass is composed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from hoigs.core.camera import Camera
+from hoigs.core.entity import Entity
+from hoigs.core.features import Tokens
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.interaction import InteractionModule, Residual
+from hoigs.core.moment import Moment
+from hoigs.core.rasterizer import Rasterizer, RenderOutput, RenderRequest
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """All entities at one moment.
+
+    Attributes:
+        gaussians: by entity, world, in the scene's order. residuals, tokens: by entity.
+    """
+
+    gaussians: Mapping[str, Gaussians]
+    residuals: Mapping[str, Residual]
+    tokens: Mapping[str, Tokens]
+
+    def joined(self, only: Iterable[str] | None = None) -> Gaussians:
+        """The Gaussians of all entities, or of some, in the scene's order."""
+        names = set(self.gaussians if only is None else only)
+        return Gaussians.cat([g for name, g in self.gaussians.items() if name in names])
+
+    def slices(self, only: Iterable[str] | None = None) -> dict[str, slice]:
+        """Rows of each entity in `joined(only)`."""
+        names = set(self.gaussians if only is None else only)
+        rows, start = {}, 0
+        for name, gaussians in self.gaussians.items():
+            if name in names:
+                rows[name] = slice(start, start + len(gaussians))
+                start += len(gaussians)
+        return rows
+
+
+class SceneModel(nn.Module):
+    """Entities, what passes between them, and how they are drawn.
+
+    moment -> features -> interaction -> deformation -> Gaussians(t) -> rasterizer -> image
+
+    Args:
+        entities: by name, in drawing order (the order has no visible effect).
+        interaction: couples entities that have features; None couples nothing.
+        rasterizer: any backend; it can be exchanged at any time.
+    """
+
+    def __init__(
+        self,
+        entities: Mapping[str, Entity],
+        *,
+        interaction: InteractionModule | None = None,
+        rasterizer: Rasterizer,
+    ) -> None:
+        super().__init__()
+        if not entities:
+            raise ValueError("SceneModel needs at least one entity")
+        self.entities = nn.ModuleDict(entities)
+        self.interaction = interaction
+        self.interaction_enabled = True
+        self.rasterizer = rasterizer
+        if interaction is not None:
+            described = {n: e for n, e in entities.items() if e.features is not None}
+            interaction.bind(
+                {n: e.features.width for n, e in described.items() if e.features is not None},
+                {n: e.kind for n, e in entities.items()},
+            )
+
+    def entity(self, name: str) -> Entity:
+        entity = self.entities[name]
+        assert isinstance(entity, Entity)
+        return entity
+
+    def names(self, kind: str | None = None) -> list[str]:
+        return [n for n in self.entities if kind is None or self.entity(n).kind == kind]
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.parameters()).device
+
+    def forward(self, moment: Moment, only: Iterable[str] | None = None) -> SceneState:
+        """Gaussians of every entity at `moment`, interaction included."""
+        names = list(self.entities if only is None else only)
+        tokens: dict[str, Tokens] = {}
+        residuals: Mapping[str, Residual] = {}
+        if self.interaction is not None and self.interaction_enabled:
+            for name in self.entities:
+                described = self.entity(name).tokens(moment)
+                if described is not None:
+                    tokens[name] = described
+            roles = {name: self.entity(name).role(moment) for name in self.entities}
+            residuals = self.interaction(tokens, roles)
+        gaussians = {n: self.entity(n)(moment, residuals.get(n)) for n in names}
+        return SceneState(gaussians, residuals, tokens)
+
+    def render(
+        self,
+        moment: Moment,
+        camera: Camera,
+        *,
+        only: Iterable[str] | None = None,
+        background: Tensor | None = None,
+        request: RenderRequest | None = None,
+    ) -> RenderOutput:
+        """Draw the scene, or some of its entities, at any moment from any camera."""
+        state = self(moment, only)
+        request = request or RenderRequest()
+        if background is not None:
+            request = request.replace(background=background)
+        return self.rasterizer.render(state.joined(), camera, request)
+
+    def count(self) -> dict[str, int]:
+        return {name: len(self.entity(name)) for name in self.entities}

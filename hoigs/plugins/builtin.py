@@ -1,0 +1,1 @@
+"""Names of the built-in parts; filled by the plugin machinery."""
