@@ -74,6 +74,11 @@ class Camera:
         scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
         return replace(self, K=self.K * scale, width=width, height=height)
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The part of the image that starts at pixel (left, top)."""
+        shift = self.K.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+        return replace(self, K=self.K - shift, width=width, height=height)
+
     @staticmethod
     def look_at(
         eye: Float[Tensor, "3"],

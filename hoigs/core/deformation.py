@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
 from jaxtyping import Float
@@ -26,11 +27,14 @@ class DeformationModel(nn.Module, ABC):
         owns: names of Gaussians fields that this model computes from parameters of its own; the
             entity does not train its rest values of those fields.
         per_gaussian: names of this module's parameters whose first axis is the Gaussian.
+        rates: parameter-name prefix to the learning rate it takes (a key of the spec's
+            `train.rates`, for example "planes" or "keyframes"); the others take "networks".
     """
 
     provides: frozenset[str] = frozenset()
     owns: frozenset[str] = frozenset()
     per_gaussian: tuple[str, ...] = ()
+    rates: Mapping[str, str] = {}
 
     @classmethod
     def from_config(cls, config: Any, context: BuildContext) -> Self:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -37,11 +38,13 @@ class FeatureExtractor(nn.Module, ABC):
     Attributes:
         requires: what the entity's deformation must list in `provides`.
         per_gaussian: names of this module's parameters whose first axis is the Gaussian.
+        rates: as DeformationModel.rates.
         width: D, the width of the tokens.
     """
 
     requires: frozenset[str] = frozenset()
     per_gaussian: tuple[str, ...] = ()
+    rates: Mapping[str, str] = {}
     width: int
 
     @classmethod
