@@ -1,0 +1,114 @@
+"""TrainSpec: how a model is optimised. No torch here: a spec is checked without it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", validate_assignment=True)
+
+
+class WarmupSpec(_Strict):
+    """When parts join in, as fractions of all steps (the paper gives no order: methods A.10).
+
+    Attributes:
+        motion: the object follows its initial track before this; then its keyframes are free.
+        interaction: the interaction module is off before this (methods A.7: 10-20 %).
+        poses: body poses stay as given before this, when they are optimised at all.
+    """
+
+    motion: float = Field(0.1, ge=0, le=1)
+    interaction: float = Field(0.2, ge=0, le=1)
+    poses: float = Field(0.1, ge=0, le=1)
+
+
+class LossSpec(_Strict):
+    """The joint objective (paper Sec. "Optimization"; supplement "Objective Function Details").
+
+    Attributes:
+        weights: "supp" = 0.5 human + 1.0 object + 0.25 scene + 1.0 depth; "main" = all ones.
+        human, object, scene, depth: override one weight of the preset.
+        lambda_dssim: (1 - l) L1 + l (1 - SSIM) in every image term.
+        lpips: weight of LPIPS (AlexNet) on the human crop; above 0 it needs weights on disk.
+        scene_loss: "full" compares the composite with the whole image (the supplement's formula),
+            "masked" draws the scene alone and leaves out the dilated masks (its text), "both".
+        background: colour behind masked terms. "random" is drawn anew at each step.
+        dilate: pixels by which masks grow before they cut a hole into the scene term.
+        regularizers: weight by name of the penalties that components offer, over their defaults.
+    """
+
+    weights: Literal["supp", "main"] = "supp"
+    human: float | None = Field(None, ge=0)
+    object: float | None = Field(None, ge=0)
+    scene: float | None = Field(None, ge=0)
+    depth: float | None = Field(None, ge=0)
+    lambda_dssim: float = Field(0.2, ge=0, le=1)
+    lpips: float = Field(0.0, ge=0)
+    scene_loss: Literal["full", "masked", "both"] = "full"
+    background: Literal["random", "black"] = "random"
+    dilate: int = Field(3, ge=0, le=64)
+    regularizers: dict[str, float] = Field(default_factory=dict)
+
+
+class RatesSpec(_Strict):
+    """Adam's learning rates at the start; those marked * are multiplied by the scene's extent.
+
+    Sources: 3DGS (Kerbl 2023) for the Gaussian fields, ExAvatar (Moon 2024) for networks and
+    poses, 4DGS (Wu 2024) for planes, E-D3DGS (Bae 2024) for embeddings; methods A.10, D.4.
+    `*_final` rates are reached log-linearly at the last step.
+    """
+
+    means: float = Field(1.6e-4, ge=0)  # *
+    means_final: float = Field(1.6e-6, ge=0)  # *
+    sh: float = Field(5e-3, ge=0)
+    opacity: float = Field(0.05, ge=0)
+    scale: float = Field(5e-3, ge=0)
+    rotation: float = Field(1e-3, ge=0)
+    planes: float = Field(5e-3, ge=0)
+    planes_final: float = Field(5e-4, ge=0)
+    networks: float = Field(1e-3, ge=0)
+    networks_final: float = Field(1e-4, ge=0)
+    keyframes: float = Field(1e-3, ge=0)  # metres a step, of positions and tangents
+    keyframes_final: float = Field(1e-5, ge=0)
+    keyframe_rotation: float = Field(1e-3, ge=0)
+    embedding: float = Field(2.5e-3, ge=0)
+    pose: float = Field(1e-4, ge=0)
+    shape: float = Field(1e-4, ge=0)
+
+
+class TrainSpec(_Strict):
+    """One training run.
+
+    Attributes:
+        steps: optimizer steps, one frame each.
+        seed: of everything random.
+        width: train and score at this image width; None is the clip's own.
+        checkpoint_every, log_every, preview_every: steps; the last step always writes both.
+            preview_every scores a few test frames for the curve in the report (0 = never).
+    """
+
+    steps: int = Field(3000, ge=1)
+    seed: int = Field(0, ge=0)
+    width: int | None = Field(None, ge=16)
+    warmup: WarmupSpec = WarmupSpec()
+    loss: LossSpec = LossSpec()
+    rates: RatesSpec = RatesSpec()
+    checkpoint_every: int = Field(1000, ge=1)
+    log_every: int = Field(25, ge=1)
+    preview_every: int = Field(250, ge=0)
+
+
+class EvaluationSpec(_Strict):
+    """How a run is judged.
+
+    Attributes:
+        test_pose: "given" uses the clip's poses on test frames as they stand, refined by what the
+            neighbouring training frames learned. Recorded with every score (methods A.9).
+        held_out: also score cameras that were never trained on, where the clip has them.
+    """
+
+    test_pose: Literal["given"] = "given"
+    held_out: bool = True
