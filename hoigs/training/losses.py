@@ -1,0 +1,113 @@
+"""The terms of the joint objective, each a small function (HOIGS, Sec. "Optimization")."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hoigs.core.train_spec import LossSpec
+from hoigs.evaluation.metrics import ssim
+from hoigs.training.regions import Crop
+
+# Supplement, "Objective Function Details"; the main text sums without weights
+PRESETS = {
+    "supp": {"human": 0.5, "object": 1.0, "scene": 0.25, "depth": 1.0},
+    "main": {"human": 1.0, "object": 1.0, "scene": 1.0, "depth": 1.0},
+}
+
+
+def term_weights(spec: LossSpec) -> dict[str, float]:
+    """Weight of each term: the preset with the overrides of the spec."""
+    weights = dict(PRESETS[spec.weights])
+    for name in weights:
+        override = getattr(spec, name)
+        if override is not None:
+            weights[name] = override
+    return weights
+
+
+def image_loss(
+    render: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], lambda_dssim: float
+) -> Float[Tensor, ""]:
+    """(1 - l) L1 + l (1 - SSIM), means over the image (3DGS Eq. 7)."""
+    l1 = (render - target).abs().mean()
+    if lambda_dssim == 0:
+        return l1
+    return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim(render, target))
+
+
+def masked_loss(
+    render: Float[Tensor, "h w 3"],
+    crop: Crop,
+    background: Float[Tensor, "3"],
+    lambda_dssim: float,
+) -> Float[Tensor, ""]:
+    """An entity drawn alone over `background` against the video composed over the same colour.
+
+    Composing the target, rather than multiplying an SSIM map by a hard-edged mask, teaches the
+    silhouette too: what sticks out shows against a colour that is new at every step. L1 is
+    normalised by the mask's area; hidden pixels count for nothing (methods A.8).
+    """
+    target = torch.where(crop.mask[..., None], crop.image, background)
+    render = torch.where(crop.ignore[..., None], target, render)
+    l1 = (render - target).abs().sum() / (3.0 * crop.mask.sum())
+    if lambda_dssim == 0:
+        return l1
+    return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim(render, target))
+
+
+def scene_only_loss(
+    render: Float[Tensor, "H W 3"],
+    target: Float[Tensor, "H W 3"],
+    dynamic: Bool[Tensor, "H W"] | None,
+    lambda_dssim: float,
+) -> Float[Tensor, ""]:
+    """The static scene alone, with the pixels of everything that moves left out."""
+    if dynamic is not None:
+        render = torch.where(dynamic[..., None], target, render)
+    return image_loss(render, target, lambda_dssim)
+
+
+def align_depth(
+    depth: Float[Tensor, " P"], prior: Float[Tensor, " P"], kind: str
+) -> Float[Tensor, " P"]:
+    """A prior brought to the units of the render, robustly.
+
+    "metric" is taken as it stands; "affine-disparity" is fitted by scale and shift in disparity
+    (iteratively reweighted least squares), which "scaled via COLMAP points" alone could not do.
+    """
+    if kind == "metric":
+        return prior
+    inverse = 1.0 / depth.detach().clamp_min(1e-3)
+    weights = torch.ones_like(prior)
+    fit = torch.zeros_like(prior)
+    ones = torch.ones_like(prior)
+    for _ in range(3):
+        A = torch.stack((prior, ones), 1) * weights[:, None]
+        solution = torch.linalg.lstsq(A, (inverse * weights)[:, None]).solution
+        fit = prior * solution[0] + solution[1]
+        residual = (fit - inverse).abs()
+        weights = 1.0 / (residual + residual.median().clamp_min(1e-6)).sqrt()
+    return 1.0 / fit.clamp_min(1e-3)
+
+
+def depth_loss(
+    depth: Float[Tensor, "H W"],
+    alpha: Float[Tensor, "H W"],
+    prior: Float[Tensor, "H W"],
+    kind: str,
+) -> Float[Tensor, ""] | None:
+    """|D_render - D|_1 of the composite, alpha-normalised, over the scene's median depth.
+
+    Pixels count where the prior is known and the render is more than half opaque. None when
+    fewer than 16 do, or when the clip has no depth.
+    """
+    if kind == "none":
+        return None
+    valid = (prior > 0) & (alpha.detach() > 0.5)
+    if int(valid.sum()) < 16:
+        return None
+    expected = depth[valid] / alpha[valid].clamp_min(1e-6)
+    target = align_depth(expected, prior[valid], kind)
+    return (expected - target).abs().mean() / target.median()

@@ -1,0 +1,139 @@
+"""Adam groups by what a parameter is, and the surgery that a change of Gaussian count needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from hoigs.core.entity import Entity
+from hoigs.core.scene import SceneModel
+from hoigs.core.topology import TopologyChange
+from hoigs.core.train_spec import RatesSpec, WarmupSpec
+
+FIELD_RATES = {
+    "means": "means",
+    "quats": "rotation",
+    "log_scales": "scale",
+    "opacity_logits": "opacity",
+    "sh": "sh",
+}
+
+# Rates that wait for a warm-up: rate -> field of WarmupSpec
+WAITING = {"keyframes": "motion", "keyframe_rotation": "motion", "pose": "poses", "shape": "poses"}
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Learning rate of one group: zero before `begin`, then log-linear from `start` to `final`."""
+
+    start: float
+    final: float
+    begin: float = 0.0
+
+    def at(self, progress: float) -> float:
+        """Rate at `progress` in [0, 1] of the run."""
+        if progress < self.begin or self.start == 0:
+            return 0.0
+        return float(self.start * (max(self.final, 1e-12) / self.start) ** progress)
+
+
+def entity_extent(entity: Entity, scene_extent: float) -> float:
+    """Metres by which an entity's position rates are scaled: the scene's for the scene itself,
+    the entity's own radius for a person or an object."""
+    if entity.kind == "scene" or len(entity) == 0:
+        return scene_extent
+    means = entity.means.detach()
+    return 1.1 * float((means - means.mean(0)).norm(dim=-1).max().clamp_min(1e-3))
+
+
+def named_rates(model: SceneModel) -> Iterator[tuple[str, nn.Parameter, str, Entity | None]]:
+    """Every trainable parameter with its dotted name, its rate's name and its entity."""
+    for name in model.entities:
+        entity = model.entity(name)
+        for path, parameter in entity.named_parameters():
+            head, _, tail = path.partition(".")
+            module = getattr(entity, head) if tail else None
+            if module is None:
+                rate = FIELD_RATES[path]
+            else:
+                prefixes = [p for p in module.rates if tail.startswith(p)]
+                rate = module.rates[max(prefixes, key=len)] if prefixes else "networks"
+            if parameter.requires_grad:
+                yield f"entities.{name}.{path}", parameter, rate, entity
+    if model.interaction is not None:
+        for path, parameter in model.interaction.named_parameters():
+            if parameter.requires_grad:
+                yield f"interaction.{path}", parameter, "networks", None
+
+
+class GroupedAdam:
+    """Adam with one group a parameter, so that each has its own schedule and name."""
+
+    def __init__(
+        self, model: SceneModel, rates: RatesSpec, warmup: WarmupSpec, scene_extent: float
+    ) -> None:
+        self.names: dict[str, nn.Parameter] = {}
+        self.schedules: list[Schedule] = []
+        groups = []
+        for name, parameter, rate, entity in named_rates(model):
+            start = getattr(rates, rate, None)
+            if start is None:
+                known = sorted(RatesSpec.model_fields)
+                raise ValueError(f"{name} asks for the rate {rate!r}; train.rates has {known}")
+            final = getattr(rates, f"{rate}_final", start)
+            if rate == "means" and entity is not None:
+                extent = entity_extent(entity, scene_extent)
+                start, final = start * extent, final * extent
+            begin = getattr(warmup, WAITING[rate]) if rate in WAITING else 0.0
+            self.names[name] = parameter
+            self.schedules.append(Schedule(start, final, begin))
+            groups.append({"params": [parameter], "lr": start})
+        # eps as in 3DGS: gradients of single Gaussians are tiny, the default would damp them
+        self.adam = torch.optim.Adam(groups, lr=1e-3, eps=1e-15, fused=True)
+
+    def set_progress(self, progress: float) -> None:
+        for group, schedule in zip(self.adam.param_groups, self.schedules, strict=True):
+            group["lr"] = schedule.at(progress)
+
+    def step(self) -> None:
+        self.adam.step()
+
+    def zero_grad(self) -> None:
+        self.adam.zero_grad(set_to_none=True)
+
+    @torch.no_grad()
+    def follow(self, parameter: nn.Parameter, change: TopologyChange) -> None:
+        """Rows of the moments follow a topology change; fresh rows start from zero."""
+        state = self.adam.state.get(parameter, {})
+        for key in ("exp_avg", "exp_avg_sq"):
+            if key in state:
+                state[key] = state[key][change.source].contiguous()
+                state[key][change.fresh] = 0.0
+
+    @torch.no_grad()
+    def forget(self, parameter: nn.Parameter) -> None:
+        """Zero the moments of a parameter whose values were reset."""
+        for key in ("exp_avg", "exp_avg_sq"):
+            if key in self.adam.state.get(parameter, {}):
+                self.adam.state[parameter][key].zero_()
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Moments and step counts by parameter name, for a checkpoint."""
+        return {
+            f"{name}.{key}": value
+            for name, parameter in self.names.items()
+            for key, value in self.adam.state.get(parameter, {}).items()
+        }
+
+    def load_tensors(self, tensors: dict[str, torch.Tensor]) -> None:
+        for name, parameter in self.names.items():
+            state = {
+                key: tensors[f"{name}.{key}"].clone()
+                for key in ("step", "exp_avg", "exp_avg_sq")
+                if f"{name}.{key}" in tensors
+            }
+            if state:
+                self.adam.state[parameter] = state
