@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -29,12 +29,14 @@ class DeformationModel(nn.Module, ABC):
         per_gaussian: names of this module's parameters whose first axis is the Gaussian.
         rates: parameter-name prefix to the learning rate it takes (a key of the spec's
             `train.rates`, for example "planes" or "keyframes"); the others take "networks".
+        regularizer_weights: default weight of each penalty of `regularizers`; 0 where absent.
     """
 
     provides: frozenset[str] = frozenset()
     owns: frozenset[str] = frozenset()
     per_gaussian: tuple[str, ...] = ()
-    rates: Mapping[str, str] = {}
+    rates: ClassVar[Mapping[str, str]] = {}
+    regularizer_weights: ClassVar[Mapping[str, float]] = {}
 
     @classmethod
     def from_config(cls, config: Any, context: BuildContext) -> Self:

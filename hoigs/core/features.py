@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -44,7 +44,7 @@ class FeatureExtractor(nn.Module, ABC):
 
     requires: frozenset[str] = frozenset()
     per_gaussian: tuple[str, ...] = ()
-    rates: Mapping[str, str] = {}
+    rates: ClassVar[Mapping[str, str]] = {}
     width: int
 
     @classmethod

@@ -1,0 +1,145 @@
+"""One step of the joint objective: what is drawn, what it is compared with, and the sum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.core.camera import Camera
+from hoigs.core.clip import Frame
+from hoigs.core.rasterizer import RenderOutput, RenderRequest
+from hoigs.core.scene import SceneModel, SceneState
+from hoigs.core.train_spec import LossSpec
+from hoigs.evaluation.lpips import Lpips
+from hoigs.training.losses import (
+    depth_loss,
+    image_loss,
+    masked_loss,
+    scene_only_loss,
+    term_weights,
+)
+from hoigs.training.regions import crop_around, dilate, union
+
+
+@dataclass(frozen=True)
+class ObjectiveResult:
+    """What one step produced.
+
+    Attributes:
+        terms: unweighted losses by name. total: their weighted sum.
+        state: the Gaussians that were drawn. composite: the full render.
+        screen_offsets: receives the screen-space gradient of `state.joined()`, pixels.
+    """
+
+    terms: dict[str, Tensor]
+    total: Float[Tensor, ""]
+    state: SceneState
+    composite: RenderOutput
+    screen_offsets: Float[Tensor, "N 2"]
+    weights: dict[str, float] = field(default_factory=dict)
+
+
+class JointObjective:
+    """L = w_h L_human + w_o L_object + w_s L_scene + w_d L_depth + regularisers.
+
+    L_human and L_object draw the entity alone over a random background, on the crop of its mask;
+    L_scene compares the composite (or the scene alone); L_depth compares the composite's depth.
+    """
+
+    def __init__(
+        self, model: SceneModel, spec: LossSpec, depth_kind: str, lpips: Lpips | None = None
+    ) -> None:
+        self.model, self.spec, self.depth_kind, self.lpips = model, spec, depth_kind, lpips
+        self.weights = term_weights(spec)
+
+    def __call__(
+        self, frame: Frame, camera: Camera, generator: torch.Generator
+    ) -> ObjectiveResult:
+        device = camera.K.device
+        state = self.model(frame.moment.to(device))
+        offsets = torch.zeros(
+            sum(len(g) for g in state.gaussians.values()), 2, device=device, requires_grad=True
+        )
+        composite = self.model.rasterizer.render(
+            state.joined(), camera, RenderRequest(screen_offsets=offsets)
+        )
+        image = frame.image.to(device).float() / 255.0
+        terms: dict[str, Tensor] = {}
+        terms.update(self._scene(frame, camera, image, state, composite))
+        if frame.depth is not None and self.weights["depth"] > 0:
+            depth = depth_loss(
+                composite.depth, composite.alpha, frame.depth.to(device), self.depth_kind
+            )
+            if depth is not None:
+                terms["depth"] = depth
+        for kind in ("human", "object"):
+            for name in self.model.names(kind):
+                terms.update(self._entity(name, kind, frame, camera, state, generator))
+        weights = {name: self.weights[name.partition("/")[0]] for name in terms}
+        for name in self.model.entities:
+            self._regularize(name, terms, weights)
+        total = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
+        return ObjectiveResult(terms, total, state, composite, offsets, weights)
+
+    def _scene(
+        self,
+        frame: Frame,
+        camera: Camera,
+        image: Tensor,
+        state: SceneState,
+        composite: RenderOutput,
+    ) -> dict[str, Tensor]:
+        terms = {}
+        l_dssim = self.spec.lambda_dssim
+        if self.spec.scene_loss in ("full", "both"):
+            terms["scene"] = image_loss(composite.color, image, l_dssim)
+        scenes = self.model.names("scene")
+        if self.spec.scene_loss in ("masked", "both") and scenes:
+            alone = self.model.rasterizer.render(state.joined(scenes), camera)
+            modelled = [m for n, m in frame.masks.items() if n in self.model.entities]
+            dynamic = union(modelled)
+            if dynamic is not None:
+                dynamic = dilate(dynamic, self.spec.dilate).to(image.device)
+            terms["scene/masked"] = scene_only_loss(alone.color, image, dynamic, l_dssim)
+        return terms
+
+    def _entity(
+        self,
+        name: str,
+        kind: str,
+        frame: Frame,
+        camera: Camera,
+        state: SceneState,
+        generator: torch.Generator,
+    ) -> dict[str, Tensor]:
+        crop = crop_around(frame, camera, name, camera.K.device) if name in frame.masks else None
+        if crop is None:  # not seen in this frame: the term is skipped, not zero
+            return {}
+        background = torch.zeros(3)
+        if self.spec.background == "random":
+            background = torch.rand(3, generator=generator)
+        background = background.to(crop.image)
+        output = self.model.rasterizer.render(
+            state.gaussians[name], crop.camera, RenderRequest(background=background)
+        )
+        terms = {
+            f"{kind}/{name}": masked_loss(output.color, crop, background, self.spec.lambda_dssim)
+        }
+        if kind == "human" and self.lpips is not None and self.spec.lpips > 0:
+            target = torch.where(crop.mask[..., None], crop.image, background)
+            render = torch.where(crop.ignore[..., None], target, output.color)
+            terms[f"{kind}/{name}/lpips"] = self.spec.lpips * self.lpips(render, target)
+        return terms
+
+    def _regularize(
+        self, name: str, terms: dict[str, Tensor], weights: dict[str, float]
+    ) -> None:
+        defaults = self.model.entity(name).deformation.regularizer_weights
+        for key, value in self.model.entity(name).regularizers().items():
+            weight = self.spec.regularizers.get(key, defaults.get(key, 0.0))
+            if weight > 0:
+                terms[f"regularizer/{name}/{key}"] = value
+                weights[f"regularizer/{name}/{key}"] = weight
