@@ -1,0 +1,204 @@
+"""Trainer: fits a SceneModel to the training frames of a Clip and keeps the run folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from hoigs.core.clip import Clip
+from hoigs.core.density import DensityControl
+from hoigs.core.scene import SceneModel
+from hoigs.core.train_spec import TrainSpec
+from hoigs.evaluation.lpips import Lpips
+from hoigs.evaluation.metrics import psnr
+from hoigs.training.checkpoint import Checkpoint, restore_model
+from hoigs.training.guard import NanGuard, first_not_finite, gradients_finite
+from hoigs.training.objective import JointObjective, ObjectiveResult
+from hoigs.training.optimizer import GroupedAdam, entity_extent
+from hoigs.training.refinement import EntityDensity
+from hoigs.training.run_folder import RunFolder
+from hoigs.training.sampler import EpochSampler
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What a step did, as it goes to `metrics.jsonl` and the progress bar."""
+
+    step: int
+    time_s: float
+    loss: float
+    losses: dict[str, float]
+    counts: dict[str, int]
+    psnr: dict[str, float] = field(default_factory=dict)
+
+    def record(self) -> dict[str, Any]:
+        record = dict(vars(self))
+        if not self.psnr:
+            del record["psnr"]
+        return record
+
+
+class Trainer:
+    """The loop.
+
+    Args:
+        model: composed, on its device. clip: at training width.
+        spec: numbers of the optimisation.
+        density: controller by entity; entities without one keep their count.
+        run: where metrics and checkpoints go, or None to keep everything in memory.
+        identity: what goes into checkpoints to recognise the spec (spec_name, model_hash).
+        lpips: the perceptual term, needed when spec.loss.lpips > 0.
+    """
+
+    def __init__(
+        self,
+        model: SceneModel,
+        clip: Clip,
+        spec: TrainSpec,
+        *,
+        density: Mapping[str, DensityControl] | None = None,
+        run: RunFolder | None = None,
+        identity: Mapping[str, str] | None = None,
+        lpips: Lpips | None = None,
+    ) -> None:
+        if spec.loss.lpips > 0 and lpips is None:
+            raise ValueError("train.loss.lpips > 0 needs LPIPS weights: give lpips=")
+        self.model, self.clip, self.spec, self.run = model, clip, spec, run
+        self.identity = dict(identity or {"spec_name": "", "model_hash": ""})
+        self.generator = torch.Generator().manual_seed(spec.seed)
+        self.sampler = EpochSampler(clip.split["train"], self.generator)
+        self.objective = JointObjective(model, spec.loss, clip.depth_kind, lpips)
+        scene_extent = clip.extent()
+        self.optimizer = GroupedAdam(model, spec.rates, spec.warmup, scene_extent)
+        self.density = {
+            name: EntityDensity(
+                model.entity(name), control, entity_extent(model.entity(name), scene_extent)
+            )
+            for name, control in (density or {}).items()
+        }
+        self.guard = NanGuard()
+        self.step = 0
+        self.elapsed = 0.0
+
+    def train(self, on_step: Callable[[StepReport], None] | None = None) -> None:
+        """Run to `spec.steps`, logging and saving on the way."""
+        self.model.train()
+        started = time.perf_counter() - self.elapsed
+        while self.step < self.spec.steps:
+            result = self._step()
+            self.elapsed = time.perf_counter() - started
+            report = self._report(result)
+            if report is not None:
+                if self.run is not None:
+                    self.run.log(report.record())
+                if on_step is not None:
+                    on_step(report)
+            last = self.step == self.spec.steps
+            if self.run is not None and (last or self.step % self.spec.checkpoint_every == 0):
+                self.checkpoint().save(self.run.checkpoints)
+        self.model.eval()
+
+    def _step(self) -> ObjectiveResult | None:
+        """One optimizer step; None when the guard skipped it."""
+        progress = self.step / self.spec.steps
+        self.step += 1
+        self.model.interaction_enabled = progress >= self.spec.warmup.interaction
+        self.optimizer.set_progress(progress)
+        frame = self.clip[self.sampler.next()]
+        camera = frame.camera.to(self.model.device)
+        result = self.objective(frame, camera, self.generator)
+        self.optimizer.zero_grad()
+        result.total.backward()
+        if not gradients_finite(self.optimizer.names):
+            culprit = first_not_finite(
+                result.terms, result.state.gaussians, self.optimizer.names
+            )
+            self.guard.failed(self.step, culprit or "a gradient")
+            self.optimizer.zero_grad()
+            return None
+        self.guard.passed()
+        self.optimizer.step()
+        self._refine(result, camera.width, camera.height)
+        return result
+
+    def _refine(self, result: ObjectiveResult, width: int, height: int) -> None:
+        gradient = result.screen_offsets.grad
+        radii = result.composite.info["radii"]
+        rows = result.state.slices()
+        for name, density in self.density.items():
+            if gradient is not None:
+                density.gather(gradient[rows[name]], radii[rows[name]], width, height)
+            density.refine(
+                result.state.gaussians[name], self.optimizer, self.step, self.spec.steps
+            )
+
+    def _report(self, result: ObjectiveResult | None) -> StepReport | None:
+        last = self.step == self.spec.steps
+        preview = self.spec.preview_every
+        scored = preview > 0 and (last or self.step % preview == 0 or self.step == 1)
+        if result is None or not (scored or last or self.step % self.spec.log_every == 0):
+            return None
+        return StepReport(
+            step=self.step,
+            time_s=round(self.elapsed, 3),
+            loss=float(result.total.detach()),
+            losses={name: float(term.detach()) for name, term in result.terms.items()},
+            counts=self.model.count(),
+            psnr=self._preview() if scored else {},
+        )
+
+    @torch.no_grad()
+    def _preview(self, frames: int = 4) -> dict[str, float]:
+        """PSNR on a few frames of each split, for the curves; the real score is `hoigs eval`."""
+        scores = {}
+        for split, positions in self.clip.split.items():
+            stride = max(1, len(positions) // frames)
+            values = []
+            for position in list(positions)[::stride][:frames]:
+                frame = self.clip[position]
+                moment = frame.moment.to(self.model.device)
+                color = self.model.render(moment, frame.camera.to(self.model.device)).color
+                values.append(float(psnr(color.cpu().clamp(0, 1), frame.rgb)))
+            if values:
+                scores[split] = sum(values) / len(values)
+        return scores
+
+    def checkpoint(self) -> Checkpoint:
+        """Everything needed to go on: see Checkpoint."""
+        tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
+        tensors |= {f"optimizer.{k}": v for k, v in self.optimizer.tensors().items()}
+        for name, density in self.density.items():
+            tensors |= {f"density.{name}.{k}": v for k, v in vars(density.statistics).items()}
+        tensors["rng.generator"] = self.generator.get_state()
+        tensors["rng.torch"] = torch.get_rng_state()
+        meta = {
+            "format": "hoigs-checkpoint",
+            "version": 1,
+            "step": self.step,
+            "time_s": self.elapsed,
+            "counts": self.model.count(),
+            "sampler": self.sampler.state(),
+            "skipped": self.guard.skipped,
+            **self.identity,
+        }
+        return Checkpoint(tensors, meta)
+
+    def resume(self, checkpoint: Checkpoint) -> None:
+        """Continue from a checkpoint; the rest of the run equals an unbroken one."""
+        restore_model(self.model, checkpoint, self.identity["model_hash"])
+        self.optimizer.load_tensors(checkpoint.part("optimizer"))
+        for name, density in self.density.items():
+            stored = checkpoint.part(f"density.{name}")
+            for key, value in stored.items():
+                setattr(density.statistics, key, value.clone())
+        self.generator.set_state(checkpoint.tensors["rng.generator"])
+        torch.set_rng_state(checkpoint.tensors["rng.torch"])
+        self.sampler.load(checkpoint.meta["sampler"])
+        self.step = checkpoint.meta["step"]
+        self.elapsed = checkpoint.meta["time_s"]
+        if self.run is not None:
+            self.run.cut_metrics(self.step)
