@@ -1,0 +1,85 @@
+"""Real spherical harmonics of degree 0 to 3 for view-dependent colour."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (
+    0.5900435899266435,
+    2.890611442640554,
+    0.4570457994644658,
+    0.3731763325901154,
+    1.445305721320277,
+)
+
+
+def sh_basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch K"]:
+    """The first K = (degree + 1)^2 basis functions at unit directions.
+
+    Order and signs are those of 3DGS and gsplat (Kerbl et al. 2023; Sloan 2008), so that their
+    checkpoints can be read: degree 1 is (-y, z, -x).
+
+    Args:
+        directions: unit vectors (x, y, z).
+        degree: 0 to 3.
+
+    Raises:
+        ValueError: another degree.
+    """
+    if not 0 <= degree <= 3:
+        raise ValueError(f"spherical harmonics of degree {degree}: expected 0, 1, 2 or 3")
+    x, y, z = directions.unbind(-1)
+    bands = [torch.full_like(x, C0)]
+    if degree >= 1:
+        bands += [-C1 * y, C1 * z, -C1 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        bands += [
+            C2[0] * x * y,
+            -C2[0] * y * z,
+            C2[1] * (2 * zz - xx - yy),
+            -C2[0] * x * z,
+            C2[2] * (xx - yy),
+        ]
+    if degree >= 3:
+        bands += [
+            -C3[0] * y * (3 * xx - yy),
+            C3[1] * x * y * z,
+            -C3[2] * y * (4 * zz - xx - yy),
+            C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            -C3[2] * x * (4 * zz - xx - yy),
+            C3[4] * z * (xx - yy),
+            -C3[0] * x * (xx - 3 * yy),
+        ]
+    return torch.stack(bands, dim=-1)
+
+
+def sh_to_colors(
+    sh: Float[Tensor, "N K 3"],
+    means: Float[Tensor, "N 3"],
+    camera_center: Float[Tensor, " 3"],
+    degree: int | None = None,
+) -> Float[Tensor, "N 3"]:
+    """Colours of Gaussians seen from a point: max(0.5 + sum_k sh_k Y_k(d), 0).
+
+    d = normalise(mean - camera_center). Gradients reach the coefficients and, through d, the means
+    and the camera. Where the sum is below zero the gradient is zero, as clamp's.
+
+    Args:
+        sh: raw coefficients, K = (stored degree + 1)^2.
+        means: centres, world, metres.
+        camera_center: metres, world.
+        degree: highest band to use; None, or more than is stored, is all that are stored.
+    """
+    stored = int(sh.shape[1] ** 0.5 + 0.5) - 1
+    active = stored if degree is None else min(degree, stored)
+    if active == 0:  # constant colour: no direction, so no gradient to means or camera
+        return (0.5 + C0 * sh[:, 0]).clamp_min(0.0)
+    directions = torch.nn.functional.normalize(means - camera_center, dim=-1)
+    basis = sh_basis(directions, active)
+    return (0.5 + torch.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]])).clamp_min(0.0)
