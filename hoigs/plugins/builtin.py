@@ -1,1 +1,56 @@
-"""Names of the built-in parts; filled by the plugin machinery."""
+"""The built-in parts: names and where each stands. They enter through the hook that all use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from hoigs.core.component import Component
+from hoigs.core.hookspecs import hookimpl
+
+DEFORMATION = "hoigs.plugins.deformation"
+FEATURES = "hoigs.plugins.features"
+INTERACTION = "hoigs.plugins.interaction"
+
+# key, module, class, config class, summary
+PARTS = (
+    ("rasterizer:torch", "hoigs.rasterizers.torch_tiles", "TorchRasterizer", "TorchConfig",
+     "readable and tiled, in plain torch; any device"),
+    ("rasterizer:warp", "hoigs.rasterizers.warp", "WarpRasterizer", "WarpConfig",
+     "Warp kernels for CPU and CUDA with a hand-written backward pass"),
+    ("rasterizer:oracle", "hoigs.rasterizers.oracle", "OracleRasterizer", "OracleConfig",
+     "the yardstick: float64, every Gaussian at every pixel"),
+    ("deformation:static", f"{DEFORMATION}.static", "Static", "StaticConfig",
+     "does not move"),
+    ("deformation:mlp", f"{DEFORMATION}.mlp", "MlpDeformation", "MlpConfig",
+     "an MLP of position and time, as in Deformable 3D Gaussians"),
+    ("deformation:chs", f"{DEFORMATION}.chs", "CubicHermite", "CubicHermiteConfig",
+     "a cubic Hermite spline per Gaussian, tangents learned or finite differences"),
+    ("deformation:hexplane-skinning", f"{DEFORMATION}.hexplane_skinning", "HexPlaneSkinning",
+     "HexPlaneSkinningConfig", "a skinned body whose looks come from space-time planes"),
+    ("features:body-parts", f"{FEATURES}.body_parts", "BodyPartFeatures", "BodyPartConfig",
+     "16 tokens, one a body part, from the body's feature field"),
+    ("features:spline-motion", f"{FEATURES}.spline_motion", "SplineMotionFeatures",
+     "SplineMotionConfig", "velocity, keyed embedding and time of each Gaussian"),
+    ("features:embedding", f"{FEATURES}.embedding", "EmbeddingFeatures", "EmbeddingConfig",
+     "learned tokens that see neither space nor time (an ablation)"),
+    ("interaction:cross-attention", f"{INTERACTION}.cross_attention", "CrossAttention",
+     "CrossAttentionConfig", "humans and objects in reach attend to each other"),
+    ("interaction:none", f"{INTERACTION}.none", "NoInteraction", "NoInteractionConfig",
+     "entities ignore each other (an ablation)"),
+    ("body:anny", "hoigs.plugins.bodies.anny", "AnnyBody", "AnnyConfig",
+     "the body that comes with hoigs, made from Anny"),
+    ("body:smplx", "hoigs.plugins.bodies.smplx", "SmplxBody", "SmplxConfig",
+     "SMPL-X, from your own SMPLX_*.npz"),
+    ("reader:clip", "hoigs.plugins.readers.clip", "ClipFolderReader", "ClipFolderConfig",
+     "the clip folder that `hoigs prepare` writes"),
+    ("density:adc", "hoigs.plugins.density.adc", "AdaptiveDensity", "AdaptiveDensityConfig",
+     "clone, split and prune as 3DGS does, under a hard cap"),
+    ("density:none", "hoigs.plugins.density.none", "NoDensity", "NoDensityConfig",
+     "the number of Gaussians stays"),
+)  # fmt: skip
+
+
+@hookimpl
+def hoigs_components() -> Iterator[Component]:
+    for key, module, name, config, summary in PARTS:
+        yield Component(key, f"{module}:{name}", config=f"{module}:{config}", summary=summary)

@@ -1,0 +1,130 @@
+"""Component: what a plugin offers, as strings, so that listing it imports nothing heavy."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from hoigs.core.errors import PluginError, did_you_mean
+
+API = 1  # number of the plugin interface; raised when an existing plugin would no longer work
+
+# kind -> the interface that its classes derive from; None where there is no interface yet
+INTERFACES: dict[str, str | None] = {
+    "deformation": "hoigs.core.deformation:DeformationModel",
+    "features": "hoigs.core.features:FeatureExtractor",
+    "interaction": "hoigs.core.interaction:InteractionModule",
+    "rasterizer": "hoigs.core.rasterizer:Rasterizer",
+    "body": "hoigs.core.body:BodyModel",
+    "reader": "hoigs.core.reader:ClipReader",
+    "density": "hoigs.core.density:DensityControl",
+    "prior": None,
+    "exporter": None,
+}
+KINDS = tuple(INTERFACES)
+
+_KEY = re.compile(r"[a-z]+:[a-z0-9]+(?:[-_.][a-z0-9]+)*")
+_TARGET = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
+
+
+@dataclass(frozen=True)
+class Component:
+    """One class that a spec can name.
+
+    Attributes:
+        key: "kind:name", kind one of KINDS, name in lower case with dashes.
+        target: "package.module:Class", imported on first use.
+        config: "package.module:Config", a ComponentConfig; None when there is nothing to set.
+        api: number of the plugin interface that it was written for.
+        summary: one line for listings.
+        extra: name of the distribution's extra that it needs, for example "viewer".
+    """
+
+    key: str
+    target: str
+    config: str | None = None
+    api: int = API
+    summary: str = ""
+    extra: str | None = None
+
+    @property
+    def kind(self) -> str:
+        return self.key.partition(":")[0]
+
+    def check(self) -> None:
+        """Raise PluginError when a field cannot be right."""
+        kind = self.kind
+        if not _KEY.fullmatch(self.key):
+            raise PluginError(
+                f'component key "{self.key}": expected "kind:name" in lower case, for example '
+                '"deformation:b-spline"'
+            )
+        if kind not in INTERFACES:
+            raise PluginError(
+                f'component key "{self.key}": unknown kind "{kind}"{did_you_mean(kind, KINDS)} '
+                f"(kinds: {', '.join(KINDS)})"
+            )
+        for field in ("target", "config"):
+            value = getattr(self, field)
+            if value is not None and not _TARGET.fullmatch(value):
+                raise PluginError(
+                    f'{self.key}: {field} is "{value}", expected "package.module:Class"'
+                )
+
+
+def missing_target(target: str) -> str | None:
+    """Why `target` cannot be there, or None; reads source files but imports nothing.
+
+    Modules that are not plain source, and names that a module makes in ways that its text does
+    not show, are given the benefit of the doubt.
+    """
+    module, _, name = target.partition(":")
+    path = _source_of(module)
+    if isinstance(path, str):
+        return path
+    if path is None:
+        return None
+    try:
+        tree = ast.parse(path.read_bytes(), filename=str(path))
+    except SyntaxError as error:
+        return f"SyntaxError in {path.name}, line {error.lineno}: {error.msg}"
+    names = _top_level_names(tree)
+    if names is None or name in names:
+        return None
+    return f'module "{module}" has no "{name}"{did_you_mean(name, names)}'
+
+
+def _source_of(module: str) -> Path | str | None:
+    """The module's source file; a str says why there is none, None that it cannot be read."""
+    top, *rest = module.split(".")
+    spec = importlib.util.find_spec(top)  # a top-level name: found without being imported
+    if spec is None:
+        return f'no module "{module}"'
+    if not rest:
+        return Path(spec.origin) if spec.origin and spec.origin.endswith(".py") else None
+    folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
+    for part in rest[:-1]:
+        folders = [folder / part for folder in folders if (folder / part).is_dir()]
+    for folder in folders:
+        for path in (folder / rest[-1] / "__init__.py", folder / f"{rest[-1]}.py"):
+            if path.is_file():
+                return path
+        if next(folder.glob(f"{rest[-1]}.*"), None):
+            return None  # an extension module
+    return f'no module "{module}"'
+
+
+def _top_level_names(tree: ast.Module) -> set[str] | None:
+    """Names that a module binds, or None when its text does not tell."""
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.add(node.id)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            names.update(alias.asname or alias.name for alias in node.names)
+    return None if names & {"*", "__getattr__"} else names
