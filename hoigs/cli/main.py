@@ -1,0 +1,58 @@
+"""The `hoigs` command. Nothing here imports torch, so that `hoigs --help` answers at once."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from hoigs import __version__
+from hoigs.cli import demo, doctor, evaluate, plugins, prepare, render, spec, train
+from hoigs.core.errors import HoigsError
+
+app = typer.Typer(
+    name="hoigs",
+    help="People handling things, reconstructed from one video as moving 3D Gaussians.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+app.command("demo")(demo.demo)
+app.command("prepare")(prepare.prepare)
+app.command("train")(train.train)
+app.command("eval")(evaluate.evaluate)
+app.command("render")(render.render)
+app.command("plugins")(plugins.plugins)
+app.add_typer(spec.app, name="spec")
+app.command("doctor")(doctor.doctor)
+
+
+def _version(show: bool) -> None:
+    if show:
+        typer.echo(f"hoigs {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Print the version and stop."
+    ),
+) -> None:
+    del version
+
+
+def main() -> None:
+    """Entry point: user errors become one message on stderr and exit code 2."""
+    try:
+        app()
+    except HoigsError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

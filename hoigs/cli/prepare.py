@@ -1,0 +1,42 @@
+"""`hoigs prepare`: a video with what is known of it in, a clip folder out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hoigs.cli.common import print_table, progress_bar
+
+
+def prepare(
+    source: Annotated[
+        Path, typer.Argument(help="Folder with video.mp4, masks, landmarks …, or a clip to check.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Clip folder to make.")],
+    width: Annotated[
+        int | None, typer.Option("--width", help="Resize frames; default: the video's own.")
+    ] = None,
+    max_frames: Annotated[
+        int | None, typer.Option("--max-frames", help="Use only the first frames.")
+    ] = None,
+    every: Annotated[int, typer.Option("--every", help="Use every n-th frame.")] = 1,
+    focal: Annotated[
+        float | None, typer.Option("--focal", help="Focal length in pixels of the video, if known.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the clip.")] = False,
+) -> None:
+    """Turn a video and its priors into a clip folder, with a written report."""
+    from hoigs.core.registry import default_registry
+    from hoigs.preparation.prepare import PrepareOptions
+    from hoigs.preparation.prepare import prepare as run
+
+    options = PrepareOptions(
+        width=width, max_frames=max_frames, every=every, focal=focal, overwrite=overwrite
+    )
+    body = default_registry().get("body:anny")()
+    with progress_bar("preparing", 1.0) as bar:
+        report = run(source, out, options=options, body=body, progress=bar.update)
+    print_table(f"prepared {out}", ("what", "value", "note"), report.rows())
+    typer.echo(f"clip: {out}")

@@ -1,0 +1,87 @@
+"""`hoigs train`: a clip and a spec in, a run folder out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hoigs.cli.common import (
+    DeviceOption,
+    PluginOption,
+    RasterizerOption,
+    SetOption,
+    overrides,
+    pick_device,
+    progress_bar,
+)
+
+
+def train(
+    clip: Annotated[Path, typer.Argument(help="Clip folder, as `hoigs prepare` makes it.")],
+    spec: Annotated[str, typer.Option("--spec", help="A built-in spec's name or a file.")] = "hoigs",
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Run folder; default runs/CLIP-SPEC.")
+    ] = None,
+    settings: SetOption = None,
+    rasterizer: RasterizerOption = None,
+    device: DeviceOption = "auto",
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out.")] = False,
+    evaluate: Annotated[
+        bool, typer.Option("--eval/--no-eval", help="Score the run and write its report.")
+    ] = True,
+    plugin: PluginOption = None,
+) -> None:
+    """Fit a model to a clip; then score it and write report.html."""
+    from hoigs.cli.evaluate import score_run
+    from hoigs.training.session import Session
+
+    where = pick_device(device)
+    session = Session.open(
+        clip,
+        spec,
+        out=out,
+        overrides=overrides(settings, rasterizer),
+        device=where,
+        resume=resume,
+        overwrite=overwrite,
+        plugins=plugin or (),
+    )
+    run_session(session)
+    if evaluate:
+        score_run(session.run.path, device=where)
+
+
+def run_session(session: object) -> None:
+    """Train with a progress bar; a line a thousand steps where stderr is not a terminal."""
+    from hoigs.training.session import Session
+    from hoigs.training.trainer import StepReport
+
+    assert isinstance(session, Session)
+    steps = session.spec.train.steps
+    typer.echo(
+        f"training {session.spec.name} on {session.clip.name}: {steps} steps, "
+        f"{len(session.clip.split['train'])} frames of "
+        f"{session.clip.cameras[0].width}x{session.clip.cameras[0].height}"
+    )
+    latest: dict[str, float] = {}
+    with progress_bar("training", steps) as bar:
+
+        def on_step(report: StepReport) -> None:
+            latest.update(report.psnr)
+            score = f" test {latest['test']:.2f} dB" if "test" in latest else ""
+            splats = sum(report.counts.values())
+            bar.update(report.step, f"loss {report.loss:.4f}{score} {splats} splats")
+            if report.psnr:
+                rest = (steps - report.step) * report.time_s / report.step
+                typer.echo(
+                    f"step {report.step:>6}  {report.time_s:7.1f} s  ETA {rest:6.0f} s  "
+                    f"loss {report.loss:.4f} {score}  {splats} splats"
+                )
+
+        session.train(on_step)
+    for step, culprit in session.trainer.guard.skipped[:5]:
+        typer.echo(f"skipped step {step}: {culprit} was not finite")
+    typer.echo(f"run: {session.run.path}")

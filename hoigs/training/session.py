@@ -1,0 +1,159 @@
+"""Session: everything between a command line and a Trainer, all input checked before a file is made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hoigs.core.clip import Clip
+from hoigs.core.compose import compose, compose_density
+from hoigs.core.errors import HoigsError
+from hoigs.core.registry import Registry, default_registry
+from hoigs.core.scene import SceneModel
+from hoigs.core.spec import Spec
+from hoigs.evaluation.lpips import Lpips, find_weights
+from hoigs.training.checkpoint import latest_checkpoint, load_checkpoint, restore_model
+from hoigs.training.run_folder import RunFolder, versions
+from hoigs.training.trainer import StepReport, Trainer
+
+
+def read_clip(folder: Path, registry: Registry, width: int | None = None) -> Clip:
+    """The clip in `folder`, by the first reader that knows its layout, at a training width.
+
+    Raises:
+        ClipError: no reader knows it, or the reader found it incomplete.
+    """
+    from hoigs.core.errors import ClipError
+
+    if not folder.is_dir():
+        raise ClipError(f"{folder}: no such folder; `hoigs prepare VIDEO --out {folder}` makes one")
+    for key in registry.keys("reader"):
+        reader = registry.get(key)()
+        if reader.matches(folder):
+            clip = reader.read(folder)
+            return clip if width is None else clip.resized(width)
+    raise ClipError(
+        f"{folder}: not a layout that {', '.join(registry.keys('reader'))} knows; a clip folder has "
+        "clip.json (docs/reference/clip.md); `hoigs prepare` makes one from a video"
+    )
+
+
+@dataclass
+class Session:
+    """One training run, ready to start."""
+
+    spec: Spec
+    clip: Clip
+    run: RunFolder
+    trainer: Trainer
+
+    @classmethod
+    def open(
+        cls,
+        clip_folder: Path,
+        spec: str | Path | Spec,
+        *,
+        out: Path | None = None,
+        overrides: Sequence[str] = (),
+        device: str = "cpu",
+        resume: bool = False,
+        overwrite: bool = False,
+        plugins: Sequence[Path] = (),
+        lpips_weights: Path | None = None,
+    ) -> Session:
+        """Check the spec, the clip and the output folder, compose the model, then make the run.
+
+        Raises:
+            HoigsError: anything wrong with the input; no folder has been made by then.
+        """
+        registry = default_registry(plugin_files=plugins)
+        if not isinstance(spec, Spec):
+            spec = Spec.load(spec, overrides=overrides, registry=registry)
+        torch.manual_seed(spec.train.seed)
+        clip = read_clip(clip_folder, registry, spec.train.width)
+        run = RunFolder(out or Path("runs") / f"{clip_folder.resolve().name}-{spec.name}")
+        if resume:
+            run.require()
+        else:
+            run.refuse_existing(overwrite)
+        model = compose(spec, clip, registry).to(device)
+        trainer = Trainer(
+            model,
+            clip,
+            spec.train,
+            density=compose_density(spec, clip, registry),
+            run=run,
+            identity={"spec_name": spec.name, "model_hash": spec.model_hash()},
+            lpips=_perceptual(spec, lpips_weights, device),
+        )
+        if resume:
+            trainer.resume(load_checkpoint(latest_checkpoint(run.checkpoints)))
+        else:
+            provenance = {
+                "versions": versions(),
+                "components": registry.provenance(spec),
+                "spec_hash": spec.hash(),
+                "clip": {"name": clip.name, "path": run.relative(clip_folder)},
+                "clip_provenance": dict(clip.provenance),
+                "device": device,
+            }
+            run.create(spec.dump(), provenance, overwrite)
+        return cls(spec, clip, run, trainer)
+
+    def train(self, on_step: Callable[[StepReport], None] | None = None) -> None:
+        self.trainer.train(on_step)
+
+
+def _perceptual(spec: Spec, weights: Path | None, device: str) -> Lpips | None:
+    """The LPIPS term if the spec asks for it; asking without weights is an error, not a skip."""
+    if spec.train.loss.lpips == 0:
+        return None
+    found = find_weights(weights)
+    if found.location is None:
+        raise HoigsError(f"train.loss.lpips is {spec.train.loss.lpips}, but {found.reason}")
+    return Lpips.load(found).to(device)
+
+
+@dataclass(frozen=True)
+class LoadedRun:
+    """A finished run, read back: spec, clip at training width, and the trained model."""
+
+    spec: Spec
+    clip: Clip
+    model: SceneModel
+    step: int
+    provenance: dict[str, Any]
+
+    @classmethod
+    def open(
+        cls,
+        path: Path,
+        *,
+        clip: Path | None = None,
+        rasterizer: str | None = None,
+        device: str = "cpu",
+    ) -> LoadedRun:
+        """Read a run folder; `clip` and `rasterizer` replace what it was trained with."""
+        run = RunFolder(path)
+        run.require()
+        registry = default_registry()
+        changes = []
+        if rasterizer is not None:
+            key = rasterizer if ":" in rasterizer else f"rasterizer:{rasterizer}"
+            changes.append(f"rasterizer.use={key}")
+        spec = Spec.load(run.spec, overrides=changes, registry=registry)
+        provenance = run.read_provenance()
+        folder = clip or path / provenance["clip"]["path"]
+        if not folder.is_dir():
+            raise HoigsError(f"{folder}: the clip of this run is not there; give --clip FOLDER")
+        torch.manual_seed(spec.train.seed)
+        source = read_clip(folder, registry, spec.train.width)
+        model = compose(spec, source, registry).to(device)
+        checkpoint = load_checkpoint(latest_checkpoint(run.checkpoints))
+        restore_model(model, checkpoint, spec.model_hash())
+        model.eval()
+        return cls(spec, source, model, checkpoint.meta["step"], provenance)

@@ -1,0 +1,72 @@
+"""Loss terms against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from hoigs.core.camera import Camera
+from hoigs.core.train_spec import LossSpec
+from hoigs.training.losses import align_depth, depth_loss, image_loss, masked_loss, term_weights
+from hoigs.training.regions import Crop, dilate
+
+
+def crop(mask: torch.Tensor, ignore: torch.Tensor | None = None) -> Crop:
+    height, width = mask.shape
+    camera = Camera(torch.eye(3), torch.eye(4), width, height)
+    image = torch.full((height, width, 3), 0.5)
+    return Crop(camera, image, mask, torch.zeros_like(mask) if ignore is None else ignore)
+
+
+def test_supplement_weights_and_overrides():
+    assert term_weights(LossSpec()) == {"human": 0.5, "object": 1.0, "scene": 0.25, "depth": 1.0}
+    assert set(term_weights(LossSpec(weights="main")).values()) == {1.0}
+    assert term_weights(LossSpec(depth=0.1))["depth"] == 0.1
+
+
+def test_image_loss_mixes_l1_and_dssim():
+    a, b = torch.zeros(16, 16, 3), torch.full((16, 16, 3), 0.25)
+    assert float(image_loss(a, b, 0.0)) == pytest.approx(0.25)
+    assert float(image_loss(a, a, 0.2)) == pytest.approx(0.0, abs=1e-6)
+    assert float(image_loss(a, b, 0.2)) > 0.8 * 0.25
+
+
+def test_masked_loss_is_normalised_by_the_mask_and_blind_to_hidden_pixels():
+    mask = torch.zeros(12, 12, dtype=torch.bool)
+    mask[:3, :4] = True
+    background = torch.tensor([1.0, 0.0, 0.0])
+    target = torch.where(mask[..., None], torch.tensor(0.5), background)
+    render = target.clone()
+    render[5, 5] += 0.6  # sticks out of the mask by one pixel, 0.6 in three channels
+    assert float(masked_loss(render, crop(mask), background, 0.0)) == pytest.approx(0.6 / 12)
+    ignore = torch.zeros_like(mask)
+    ignore[5, 5] = True
+    assert float(masked_loss(render, crop(mask, ignore), background, 0.0)) == pytest.approx(0.0)
+
+
+def test_depth_loss_skips_what_is_unknown():
+    depth = torch.full((8, 8), 2.0)
+    prior = torch.full((8, 8), 4.0)
+    alpha = torch.ones(8, 8)
+    prior[0] = 0.0  # unknown
+    loss = depth_loss(depth, alpha, prior, "metric")
+    assert loss is not None and float(loss) == pytest.approx(0.5)
+    assert depth_loss(depth, alpha, torch.zeros(8, 8), "metric") is None
+    assert depth_loss(depth, alpha, prior, "none") is None
+    assert depth_loss(depth, 0.4 * alpha, prior, "metric") is None
+
+
+def test_affine_disparity_is_recovered_through_outliers():
+    torch.manual_seed(0)
+    depth = 1.0 + 3.0 * torch.rand(400)
+    prior = (1.0 / depth - 0.1) / 0.7
+    prior[:20] += 3.0
+    aligned = align_depth(depth, prior, "affine-disparity")
+    assert float((aligned[20:] - depth[20:]).abs().median()) < 0.02
+
+
+def test_dilate_grows_by_a_square():
+    mask = torch.zeros(9, 9, dtype=torch.bool)
+    mask[4, 4] = True
+    assert int(dilate(mask, 2).sum()) == 25
+    assert torch.equal(dilate(mask, 0), mask)

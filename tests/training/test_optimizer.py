@@ -1,0 +1,83 @@
+"""Rates by role, schedules, and moments that follow a change of Gaussian count."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from hoigs.core.entity import Entity
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.scene import SceneModel
+from hoigs.core.topology import TopologyChange
+from hoigs.core.train_spec import RatesSpec, WarmupSpec
+from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.plugins.deformation.static import Static
+from hoigs.rasterizers.torch_tiles import TorchRasterizer
+from hoigs.training.optimizer import GroupedAdam, Schedule, named_rates
+
+
+def make_model() -> SceneModel:
+    torch.manual_seed(0)
+    rest = Gaussians.from_points(torch.randn(12, 3) * 0.3 + torch.tensor([0.0, 0.0, 3.0]))
+    thing = Gaussians.from_points(torch.randn(5, 3) * 0.1 + torch.tensor([0.0, 0.0, 2.0]))
+    entities = {
+        "scene": Entity(rest, Static(), kind="scene"),
+        "object": Entity(thing, CubicHermite(keyframes=4), kind="object"),
+    }
+    return SceneModel(entities, rasterizer=TorchRasterizer())
+
+
+def test_schedule_waits_then_decays_log_linearly():
+    schedule = Schedule(start=1e-2, final=1e-4, begin=0.25)
+    assert schedule.at(0.2) == 0.0
+    assert schedule.at(0.5) == pytest.approx(1e-3)
+    assert schedule.at(1.0) == pytest.approx(1e-4)
+
+
+def test_every_trainable_parameter_has_a_known_rate():
+    model = make_model()
+    found = {name: rate for name, _, rate, _ in named_rates(model)}
+    trainable = {name for name, p in model.named_parameters() if p.requires_grad}
+    assert set(found) == trainable
+    assert set(found.values()) <= set(RatesSpec.model_fields)
+    assert found["entities.scene.opacity_logits"] == "opacity"
+
+
+def test_position_rate_of_the_scene_scales_with_its_extent():
+    model = make_model()
+    rates = RatesSpec(means=1e-3)
+    adam = GroupedAdam(model, rates, WarmupSpec(), scene_extent=5.0)
+    adam.set_progress(0.0)
+    index = list(adam.names).index("entities.scene.means")
+    assert adam.adam.param_groups[index]["lr"] == pytest.approx(5e-3)
+
+
+def test_motion_does_not_move_before_its_warmup():
+    model = make_model()
+    adam = GroupedAdam(model, RatesSpec(), WarmupSpec(motion=0.5), scene_extent=1.0)
+    waiting = [n for n, _, rate, _ in named_rates(model) if rate == "keyframes"]
+    assert waiting, "the spline declares keyframes"
+    before = {n: adam.names[n].detach().clone() for n in waiting}
+    adam.set_progress(0.1)
+    for parameter in adam.names.values():
+        parameter.grad = torch.ones_like(parameter)
+    adam.step()
+    assert all(torch.equal(adam.names[n], before[n]) for n in waiting)
+
+
+def test_moments_follow_rows_and_fresh_rows_start_at_zero():
+    model = make_model()
+    adam = GroupedAdam(model, RatesSpec(), WarmupSpec(), scene_extent=1.0)
+    parameter = adam.names["entities.scene.means"]
+    for p in adam.names.values():
+        p.grad = torch.randn_like(p)
+    adam.step()
+    old = adam.adam.state[parameter]["exp_avg"].clone()
+    change = TopologyChange(
+        torch.tensor([3, 1, 1]), torch.tensor([False, False, True]), torch.zeros(3, 3)
+    )
+    adam.follow(parameter, change)
+    new = adam.adam.state[parameter]["exp_avg"]
+    assert torch.equal(new[:2], old[[3, 1]])
+    assert torch.equal(new[2], torch.zeros(3))
+    assert float(old[1].abs().min()) > 0
