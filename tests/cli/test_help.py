@@ -1,0 +1,41 @@
+"""`hoigs`, `hoigs --help` and `hoigs plugins` are light."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+PROBE = """
+import sys
+sys.argv = ["hoigs", *{args!r}]
+from hoigs.cli.main import main
+try:
+    main()
+except SystemExit as stop:
+    assert not stop.code, stop.code
+heavy = [m for m in ("torch", "warp", "kornia", "pycolmap", "scipy", "matplotlib") if m in sys.modules]
+assert not heavy, heavy
+"""
+
+
+@pytest.mark.parametrize("args", [["--help"], ["plugins"], ["--version"], ["spec", "list"]])
+def test_verbs_that_load_neither_torch_nor_warp(args):
+    done = subprocess.run(
+        [sys.executable, "-c", PROBE.format(args=args)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip()
+
+
+def test_importing_the_package_loads_neither():
+    code = "import hoigs, sys; assert not {'torch', 'warp', 'numpy'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_every_public_name_exists():
+    import hoigs
+
+    for name in hoigs.__all__:
+        assert getattr(hoigs, name) is not None
