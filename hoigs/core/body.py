@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from hoigs.core.gaussians import Gaussians
 from hoigs.core.moment import BodyPose
 
 if TYPE_CHECKING:
@@ -106,6 +107,13 @@ class BodyModel(nn.Module, ABC):
         self, count: int | None = None, betas: Float[Tensor, " B"] | None = None, seed: int = 0
     ) -> BodySurface:
         """Points on the zero-pose surface: one a vertex, or `count` spread evenly by area."""
+
+    def rest(
+        self, count: int | None = None, betas: Float[Tensor, " B"] | None = None, seed: int = 0
+    ) -> Gaussians:
+        """Grey Gaussians on `surface(count, betas, seed)`, as wide as their spacing."""
+        surface = self.surface(count, betas, seed)
+        return Gaussians.from_points(surface.points, scales=surface.spacing, opacity=0.9)
 
     def joint_rotations(self, pose: BodyPose) -> Float[Tensor, "*batch J 3"]:
         """Axis-angle of each of this model's joints (identity for jaw and eyes)."""
