@@ -1,0 +1,369 @@
+"""The clip folder's checker: every absent or inconsistent file, and who makes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from hoigs.core.clip_format import (
+    BODY,
+    CAMERAS,
+    DEPTH,
+    HEADER,
+    IMAGE,
+    MASK,
+    OBJECT,
+    POINTS,
+    VIEWS,
+    ClipHeader,
+    FileSpec,
+    ViewsHeader,
+    depth_path,
+    image_path,
+    load_arrays,
+    mask_path,
+    parse_header,
+)
+from hoigs.core.errors import ClipError
+
+ROTATION_TOLERANCE = 1e-3  # of R R^T - I, generous to float16 and text files
+_HEADER_FROM = "clip.json comes from `hoigs prepare VIDEO --out FOLDER` or ClipWriter"
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing wrong with a clip folder.
+
+    Attributes:
+        path: the file, relative to the folder.
+        message: what is wrong and what to do; for an absent file, who makes it.
+        absent: the file is not there.
+    """
+
+    path: str
+    message: str
+    absent: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.path} is absent: {self.message}" if self.absent else _joined(self)
+
+
+def _joined(problem: Problem) -> str:
+    return f"{problem.path}: {problem.message}"
+
+
+def check_clip(folder: Path) -> list[Problem]:
+    """Everything wrong with a clip folder, in reading order; empty when it can be used.
+
+    Reads every header and depth map, and masks until one is not empty; images by header only.
+    """
+    folder = Path(folder)
+    if not (folder / HEADER).is_file():
+        return [Problem(HEADER, _HEADER_FROM, absent=True)]
+    header, messages = parse_header(folder / HEADER, ClipHeader)
+    if header is None:
+        return [Problem(HEADER, message) for message in messages]
+    problems = list(_check_split(header))
+    view = _View("", header.width, header.height, header.frames)
+    problems += _check_views(folder, view, header)
+    sizes = {"F": header.frames}
+    for name, entity in header.entities.items():
+        spec, room = (BODY, "bodies") if entity.kind == "human" else (OBJECT, "objects")
+        path = f"{room}/{name}.npz"
+        found, arrays = _check_arrays(folder, path, spec, dict(sizes))
+        problems += found
+        problems += _check_track(path, arrays, entity.body)
+    found, arrays = _check_arrays(folder, POINTS.pattern, POINTS, dict(sizes))
+    problems += [*found, *_check_colors(POINTS.pattern, arrays)]
+    if (folder / "held_out").exists():
+        problems += _check_held_out(folder, header)
+    return problems
+
+
+def require_clip(folder: Path) -> ClipHeader:
+    """The header of a clip folder that can be used.
+
+    Raises:
+        ClipError: naming every absent or inconsistent file and who makes it.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ClipError(f"{folder} is not a folder; make a clip with `hoigs prepare VIDEO --out …`")
+    problems = check_clip(folder)
+    if problems:
+        lines = "\n".join(f"  {line}" for line in summarize(problems))
+        raise ClipError(f"{folder} cannot be used as a clip:\n{lines}")
+    header, _ = parse_header(folder / HEADER, ClipHeader)
+    assert header is not None  # check_clip has just read it
+    return header
+
+
+def summarize(problems: Iterable[Problem]) -> list[str]:
+    """One line a problem; numbered files of one folder with one message share a line."""
+    groups: dict[tuple[str, str, str, bool], list[str]] = {}
+    for p in problems:
+        path = Path(p.path)
+        numbered = path.stem.isdigit()
+        room = str(path.parent) if numbered else p.path
+        key = (room, path.suffix if numbered else "", p.message, p.absent)
+        groups.setdefault(key, []).append(path.stem)
+    lines = []
+    for (room, suffix, message, absent), stems in groups.items():
+        if len(stems) == 1:
+            path_name = f"{room}/{stems[0]}{suffix}" if suffix else room
+            lines.append(str(Problem(path_name, message, absent)))
+        else:
+            names = f"{room}/{_ranges(stems)}{suffix} ({len(stems)} files)"
+            lines.append(f"{names} are absent: {message}" if absent else f"{names}: {message}")
+    return lines
+
+
+def _ranges(stems: list[str]) -> str:
+    numbers = sorted({int(s) for s in stems})
+    runs: list[list[int]] = []
+    for n in numbers:
+        if runs and n == runs[-1][1] + 1:
+            runs[-1][1] = n
+        else:
+            runs.append([n, n])
+    text = [f"{a:05d}" if a == b else f"{a:05d}-{b:05d}" for a, b in runs]
+    return text[0] if len(text) == 1 else "{" + ",".join(text) + "}"
+
+
+@dataclass(frozen=True)
+class _View:
+    """The main frames (room "") or the held-out ones (room "held_out/")."""
+
+    room: str
+    width: int
+    height: int
+    count: int
+
+
+def _check_split(header: ClipHeader) -> Iterator[Problem]:
+    train, test = header.split.train, header.split.test
+    if not train:
+        yield Problem(HEADER, "split.train is empty: nothing to train on")
+    if not test and header.frames > 2:
+        yield Problem(HEADER, "split.test is empty: nothing to score on")
+    outside = sorted({i for i in (*train, *test) if not 0 <= i < header.frames})
+    if outside:
+        yield Problem(HEADER, f"split names frames {outside}; the clip has 0..{header.frames - 1}")
+    both = sorted(set(train) & set(test))
+    if both:
+        yield Problem(HEADER, f"split has frames {both} in both train and test")
+
+
+def _check_views(folder: Path, view: _View, header: ClipHeader) -> list[Problem]:
+    """Cameras, images, masks and depth of the main frames or of the held-out ones."""
+    root, path = folder / view.room, view.room + CAMERAS.pattern
+    problems, arrays = _check_arrays(folder, path, CAMERAS, {"F": view.count})
+    problems += _check_cameras(path, arrays)
+    problems += _each_frame(root, view, image_path, IMAGE, _image_problem)
+    for name in header.entities:
+        found = _each_frame(
+            root, view, lambda r, i, n=name: mask_path(r, n, i), MASK, _mask_problem
+        )
+        problems += found or _check_mask_content(root, view, name)
+    if header.depth_kind != "none":
+        problems += _each_frame(root, view, depth_path, DEPTH, _depth_problem)
+    return problems
+
+
+def _each_frame(
+    root: Path,
+    view: _View,
+    path_of: Callable[[Path, int], Path],
+    spec: FileSpec,
+    check: Callable[[Path, _View], str | None],
+) -> list[Problem]:
+    def one(frame: int) -> Problem | None:
+        path = path_of(root, frame)
+        name = view.room + path.relative_to(root).as_posix()
+        if not path.is_file():
+            return Problem(name, spec.maker, absent=True)
+        message = check(path, view)
+        return Problem(name, message) if message else None
+
+    with ThreadPoolExecutor(4) as pool:  # decompression releases the interpreter lock
+        return [p for p in pool.map(one, range(view.count)) if p]
+
+
+def _image_problem(path: Path, view: _View) -> str | None:
+    try:
+        with Image.open(path) as image:
+            size, mode = image.size, image.mode
+    except (OSError, ValueError) as error:
+        return f"not a readable image ({error})"
+    if size != (view.width, view.height):
+        return f"is {size[0]}x{size[1]}, expected {view.width}x{view.height}"
+    return None if mode in ("RGB", "L", "1", "P", "RGBA") else f"has mode {mode}, expected 8 bit"
+
+
+def _mask_problem(path: Path, view: _View) -> str | None:
+    message = _image_problem(path, view)
+    if message:
+        return message
+    with Image.open(path) as image:
+        mode = image.mode
+    return None if mode in ("L", "1") else f"has mode {mode}, expected one grey channel, 0 or 255"
+
+
+def _check_mask_content(root: Path, view: _View, entity: str) -> list[Problem]:
+    brightest = 0
+    for frame in range(view.count):
+        try:
+            with Image.open(mask_path(root, entity, frame)) as image:
+                brightest = max(brightest, int(np.asarray(image.convert("L")).max()))
+        except OSError as error:
+            name = f"{view.room}masks/{entity}/{frame:05d}.png"
+            return [Problem(name, f"cannot be decoded ({error})")]
+        if brightest > 127:
+            return []
+    hint = f" (the brightest pixel is {brightest}: write 255)" if brightest else ""
+    message = f'"{entity}" is seen in no frame: every mask is empty{hint}'
+    # an entity may well be out of the held-out cameras' sight
+    return [] if view.room else [Problem(f"masks/{entity}", message)]
+
+
+def _depth_problem(path: Path, view: _View) -> str | None:
+    try:
+        arrays = load_arrays(path)
+    except ValueError as error:
+        return str(error)
+    if "depth" not in arrays:
+        return f'has no array "depth"; it has {sorted(arrays)}'
+    depth = arrays["depth"]
+    if depth.shape != (view.height, view.width):
+        return f"depth has shape {list(depth.shape)}, expected [{view.height}, {view.width}]"
+    if depth.dtype.kind != "f":
+        return f"depth is {depth.dtype}, expected float32 or float16 in metres"
+    for name, count in (
+        ("NaN", int(np.isnan(depth).sum())),
+        ("infinite", int(np.isinf(depth).sum())),
+        ("negative", int((depth < 0).sum())),
+    ):
+        if count:
+            return f"{count} {name} pixels; write 0 where depth is unknown"
+    return None
+
+
+def _check_arrays(
+    folder: Path, path: str, spec: FileSpec, sizes: dict[str, int]
+) -> tuple[list[Problem], dict[str, np.ndarray]]:
+    """Problems, and the arrays that are as they should be."""
+    if not (folder / path).is_file():
+        return [Problem(path, spec.maker, absent=True)], {}
+    try:
+        arrays = load_arrays(folder / path)
+    except ValueError as error:
+        return [Problem(path, str(error))], {}
+    problems, good = [], {}
+    for want in spec.arrays:
+        if want.name not in arrays:
+            if not want.optional:
+                message = f"has no array {want.name!r} ({want.meaning}); {spec.maker}"
+                problems.append(Problem(path, message))
+            continue
+        got = arrays[want.name]
+        message = _array_problem(got, want.shape, want.kind, sizes)
+        if message:
+            problems.append(Problem(path, f"{want.name} {message}"))
+        else:
+            good[want.name] = got
+    return problems, good
+
+
+def _array_problem(
+    got: np.ndarray, shape: tuple[int | str, ...], kind: str, sizes: dict[str, int]
+) -> str | None:
+    kinds = {"float": "f", "bool": "b", "str": "U"}
+    if got.dtype.kind != kinds[kind]:
+        return f"is {got.dtype}, expected {kind}"
+    expected = [
+        sizes.setdefault(s, n) if isinstance(s, str) else s for s, n in zip(shape, got.shape)
+    ]
+    if len(got.shape) != len(shape) or list(got.shape) != expected:
+        named = ", ".join(f"{s}={sizes[s]}" if s in sizes else str(s) for s in shape)
+        frames = bool(shape) and shape[0] == "F" and len(got.shape) == len(shape)
+        count = f": {got.shape[0]} entries for {sizes['F']} frames" if frames else ""
+        return f"has shape {list(got.shape)}, expected [{named}]{count}"
+    if kind == "float" and not np.isfinite(got).all():
+        return f"has {int((~np.isfinite(got)).sum())} values that are NaN or infinite"
+    return None
+
+
+def _check_cameras(path: str, arrays: dict[str, np.ndarray]) -> Iterator[Problem]:
+    if "K" in arrays:
+        K = arrays["K"]
+        bad = (K[:, 0, 0] <= 0) | (K[:, 1, 1] <= 0) | (np.abs(K[:, 2] - [0, 0, 1]).max(-1) > 1e-5)
+        bad |= (np.abs(K[:, 0, 1]) > 1e-3) | (np.abs(K[:, 1, 0]) > 1e-3)
+        if bad.any():
+            form = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0"
+            yield Problem(path, f"K of {_frames(bad)} is not {form}")
+    if "world_to_camera" in arrays:
+        w2c = arrays["world_to_camera"]
+        yield from _check_rotations(path, "world_to_camera", w2c[:, :3, :3])
+        bad = np.abs(w2c[:, 3] - [0, 0, 0, 1]).max(-1) > 1e-5
+        if bad.any():
+            yield Problem(path, f"world_to_camera of {_frames(bad)}: last row is not 0 0 0 1")
+
+
+def _check_rotations(path: str, name: str, rotations: np.ndarray) -> Iterator[Problem]:
+    R = rotations.astype(np.float64)
+    off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
+    bad = (off > ROTATION_TOLERANCE) | (np.linalg.det(R) < 0)
+    if bad.any():
+        message = f"{name} of {_frames(bad)} is not a rotation (orthonormal, determinant +1)"
+        yield Problem(path, f"{message}; largest |R R^T - I| is {off.max():.3g}")
+
+
+def _frames(bad: np.ndarray) -> str:
+    numbers = np.flatnonzero(bad)
+    if len(numbers) == 1:
+        return f"frame {numbers[0]}"
+    shown = ", ".join(map(str, numbers[:8]))
+    return f"{len(numbers)} frames ({shown}{', …' if len(numbers) > 8 else ''})"
+
+
+def _check_colors(path: str, arrays: dict[str, np.ndarray]) -> Iterator[Problem]:
+    if "points" in arrays and len(arrays["points"]) == 0:
+        yield Problem(path, "points is empty; at least one point is needed to start from")
+    colors = arrays.get("colors")
+    if colors is not None and len(colors) and (colors.min() < 0 or colors.max() > 1):
+        spread = f"{colors.min():.3g}..{colors.max():.3g}"
+        yield Problem(path, f"colors span {spread}, expected RGB in [0, 1]; divide bytes by 255")
+
+
+def _check_track(path: str, arrays: dict[str, np.ndarray], body: str | None) -> Iterator[Problem]:
+    if "rotations" in arrays:
+        yield from _check_rotations(path, "rotations", arrays["rotations"])
+    yield from _check_colors(path, arrays)
+    if "observed" in arrays and not arrays["observed"].any():
+        yield Problem(path, "observed is False in every frame: the object was never seen")
+    convention = str(arrays.get("hand_pose_convention", "flat"))
+    if convention not in ("flat", "mean"):
+        yield Problem(path, f'hand_pose_convention is {convention!r}, expected "flat" or "mean"')
+    if body and "model" in arrays and str(arrays["model"]) != body:
+        yield Problem(path, f"model is {arrays['model']!s}, but clip.json says {body}")
+
+
+def _check_held_out(folder: Path, header: ClipHeader) -> list[Problem]:
+    if not (folder / VIEWS).is_file():
+        maker = "it comes from ClipWriter.add_held_out; or delete the folder held_out"
+        return [Problem(VIEWS, maker, absent=True)]
+    views, messages = parse_header(folder / VIEWS, ViewsHeader)
+    if views is None:
+        return [Problem(VIEWS, message) for message in messages]
+    problems = []
+    outside = sorted({i for i in views.frames if not 0 <= i < header.frames})
+    if outside:
+        message = f"frames names {outside}; the clip has 0..{header.frames - 1}"
+        problems.append(Problem(VIEWS, message))
+    view = _View("held_out/", views.width, views.height, len(views.frames))
+    return problems + _check_views(folder, view, header)
