@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -30,6 +30,9 @@ class DeformationModel(nn.Module, ABC):
         rates: parameter-name prefix to the learning rate it takes (a key of the spec's
             `train.rates`, for example "planes" or "keyframes"); the others take "networks".
         regularizer_weights: default weight of each penalty of `regularizers`; 0 where absent.
+        rest_space: where it expects the rest Gaussians: "canonical" (a body in its zero pose, an
+            object about its centre), when it knows the body or the track that places them; else
+            "world". May be set on the instance.
     """
 
     provides: frozenset[str] = frozenset()
@@ -37,6 +40,7 @@ class DeformationModel(nn.Module, ABC):
     per_gaussian: tuple[str, ...] = ()
     rates: ClassVar[Mapping[str, str]] = {}
     regularizer_weights: ClassVar[Mapping[str, float]] = {}
+    rest_space: Literal["canonical", "world"] = "canonical"
 
     @classmethod
     def from_config(cls, config: Any, context: BuildContext) -> Self:

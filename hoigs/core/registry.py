@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterable, Mapping
 from functools import cache
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 from hoigs.core.component import INTERFACES, KINDS, Component, missing_target
 from hoigs.core.errors import PluginError, did_you_mean
 from hoigs.core.manager import Offer, PluginManager, Status, describe, normal_name
+
+
+class UsesComponents(Protocol):
+    """A spec, as far as the registry is concerned: the keys that it names, by place."""
+
+    def components(self) -> Mapping[str, str]: ...
 
 
 class Registry:
@@ -75,8 +83,8 @@ class Registry:
             self._break(offer, f'{offer.component.config} has a field "use", which specs reserve')
         return loaded
 
-    def provenance(self, key: str) -> dict[str, str]:
-        """Who a component came from: its exact key, distribution, version and target."""
+    def origin(self, key: str) -> dict[str, str]:
+        """Where a component comes from: its exact key, distribution, version and target."""
         offer = self._offer(key)
         return {
             "key": offer.exact,
@@ -84,6 +92,10 @@ class Registry:
             "version": offer.plugin.version,
             "target": offer.component.target,
         }
+
+    def provenance(self, spec: UsesComponents) -> dict[str, dict[str, str]]:
+        """The origin of each component that a spec uses, by its place in the spec."""
+        return {place: self.origin(key) for place, key in spec.components().items()}
 
     def check(self, offer: Offer) -> None:
         """Look for an offer's targets on disk, importing nothing, and mark it when absent."""
@@ -165,8 +177,19 @@ def _what(value: Any) -> str:
 
 
 @cache
-def default_registry() -> Registry:
-    """The registry of this process, made on first use from what is installed."""
+def _installed() -> Registry:
     manager = PluginManager()
     manager.load_installed()
     return Registry(manager)
+
+
+def default_registry(plugin_files: Iterable[str | Path] = ()) -> Registry:
+    """The registry of this process, made on first use from what is installed.
+
+    Args:
+        plugin_files: plugins that the user named (`--plugin FILE`); they stay loaded.
+    """
+    registry = _installed()
+    for path in plugin_files:
+        registry.manager.load_file(path)
+    return registry

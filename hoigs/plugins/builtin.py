@@ -41,7 +41,7 @@ PARTS = (
      "the body that comes with hoigs, made from Anny"),
     ("body:smplx", "hoigs.plugins.bodies.smplx", "SmplxBody", "SmplxConfig",
      "SMPL-X, from your own SMPLX_*.npz"),
-    ("reader:clip", "hoigs.plugins.readers.clip", "ClipFolderReader", "ClipFolderConfig",
+    ("reader:clip", "hoigs.plugins.readers.clip", "ClipFolderReader", "ClipFolderReaderConfig",
      "the clip folder that `hoigs prepare` writes"),
     ("density:adc", "hoigs.plugins.density.adc", "AdaptiveDensity", "AdaptiveDensityConfig",
      "clone, split and prune as 3DGS does, under a hard cap"),

@@ -1,0 +1,197 @@
+"""compose: a spec and a clip to a SceneModel. The registry maps names to classes, no more."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hoigs.core.clip import Clip
+from hoigs.core.context import BuildContext
+from hoigs.core.deformation import DeformationModel
+from hoigs.core.density import DensityControl
+from hoigs.core.entity import Entity
+from hoigs.core.errors import HoigsError, SpecError, did_you_mean
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.interaction import EntityKind
+from hoigs.core.registry import Registry, default_registry
+from hoigs.core.scene import SceneModel
+from hoigs.core.spec import ComponentSpec, EntitySpec, Spec
+
+SCENE = "scene"
+
+
+def compose(spec: Spec, clip: Clip, registry: Registry | None = None) -> SceneModel:
+    """The model that `spec` describes, initialised from `clip`, on the CPU.
+
+    The same spec and clip give the same parameters; torch's global random state is left as it was.
+
+    Raises:
+        SpecError: an entity without a block, or a component that cannot be built; with position.
+        PluginError: a component that cannot be loaded.
+    """
+    builder = _Builder(spec, clip, registry or default_registry())
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(spec.train.seed)
+        context = BuildContext(clip=clip, seed=spec.train.seed)
+        entities = {
+            name: builder.entity(name, kind, place, block)
+            for name, kind, place, block in builder.chosen()
+        }
+        interaction = builder.part(("interaction",), spec.interaction, context)
+        rasterizer = builder.part(("rasterizer",), spec.rasterizer, context)
+        with _blaming(spec, "interaction"):
+            return SceneModel(entities, interaction=interaction, rasterizer=rasterizer)
+
+
+def compose_density(
+    spec: Spec, clip: Clip, registry: Registry | None = None
+) -> dict[str, DensityControl]:
+    """The density control of each entity that `compose` builds, by name.
+
+    Raises:
+        SpecError, PluginError: as `compose`.
+    """
+    builder = _Builder(spec, clip, registry or default_registry())
+    return {
+        name: builder.part(
+            ("model", place, "density"),
+            block.density,
+            BuildContext(entity=name, clip=clip, seed=spec.train.seed),
+        )
+        for name, _, place, block in builder.chosen()
+    }
+
+
+@dataclass(frozen=True)
+class _Builder:
+    spec: Spec
+    clip: Clip
+    registry: Registry
+
+    def chosen(self) -> list[tuple[str, EntityKind, str, EntitySpec]]:
+        """Name, kind, key of the block, and block of every entity to be modelled."""
+        kinds: dict[str, EntityKind] = {SCENE: "scene", **self.clip.kinds}
+        found = []
+        for name, kind in kinds.items():
+            if not self.spec.selects(name, kind):
+                continue
+            block = self.spec.block(name, kind)
+            if block is None:
+                raise SpecError(
+                    f"{self.spec.at('model')}: no block for the clip's {kind} "
+                    f'"{name}"{did_you_mean(name, self.spec.model)}; add model.{kind}, or leave '
+                    "it out with `entities`"
+                )
+            found.append((name, kind, *block))
+        if not found:
+            raise SpecError(
+                f"{self.spec.at('entities')}: none of {list(self.spec.entities or ())} is in the "
+                f"clip, which has {', '.join(f'{n} ({k})' for n, k in kinds.items())}"
+            )
+        return found
+
+    def part(self, place: tuple[str, ...], part: ComponentSpec, context: BuildContext) -> Any:
+        """One component, built from its settings."""
+        config = self.registry.config_class(part.use).model_validate(part.settings)
+        with _blaming(self.spec, *place):
+            return self.registry.get(part.use).from_config(config, context)
+
+    def entity(self, name: str, kind: EntityKind, place: str, block: EntitySpec) -> Entity:
+        context = BuildContext(entity=name, clip=self.clip, seed=self.spec.train.seed)
+        if kind == "human":
+            context = self._with_body(context, place, block)
+        elif kind == "object":
+            context = replace(context, object_track=self.clip.objects[name])
+        deformation = self.part(("model", place, "deformation"), block.deformation, context)
+        features = None
+        if block.features is not None:
+            features = self.part(("model", place, "features"), block.features, context)
+        with _blaming(self.spec, "model", place):
+            rest = initial_gaussians(kind, deformation, block, context)
+            return Entity(rest, deformation, features, kind=kind)
+
+    def _with_body(self, context: BuildContext, place: str, block: EntitySpec) -> BuildContext:
+        track = self.clip.bodies[context.entity]
+        part = block.body or ComponentSpec(use=track.model)
+        if part.use.partition("@")[0] != track.model.partition("@")[0]:
+            raise SpecError(
+                f"{self.spec.at('model', place, 'body')}: the clip's {context.entity} was fitted "
+                f"with {track.model}; shape coefficients of {part.use} mean something else"
+            )
+        where = ("model", place, "body") if block.body else ("model", place)
+        body = self.part(where, part, replace(context, body_track=track))
+        return replace(context, body=body, body_track=track)
+
+
+def initial_gaussians(
+    kind: EntityKind, deformation: DeformationModel, block: EntitySpec, context: BuildContext
+) -> Gaussians:
+    """Rest Gaussians of an entity, in the space that its deformation expects.
+
+    The scene starts from the clip's points; a human from points spread evenly over its body; an
+    object from the points of its track. Scales follow the spacing of the points (3DGS's rule).
+    """
+    looks: dict[str, Any] = {"opacity": block.opacity, "sh_degree": block.sh_degree}
+    clip = context.clip
+    assert clip is not None
+    if kind == "human":
+        return _human(context, deformation, block.points, looks)
+    if kind == "object":
+        return _object(context, deformation, block.points, looks)
+    if len(clip.points) == 0:
+        raise ValueError("the clip has no scene points to start from (points.npz is empty)")
+    rows = _subset(len(clip.points), block.points, context.seed)
+    return Gaussians.from_points(clip.points[rows], clip.point_colors[rows], **looks)
+
+
+def _human(
+    context: BuildContext, deformation: DeformationModel, count: int, looks: dict[str, Any]
+) -> Gaussians:
+    body, track = context.body, context.body_track
+    assert body is not None and track is not None
+    betas = track.poses.betas
+    betas = betas if betas.dim() == 1 else betas.mean(0)
+    surface = body.surface(count, betas, context.seed)
+    points = surface.points
+    if deformation.rest_space == "world":
+        pose = track.poses.frame(len(track.poses.transl) // 2)
+        corners = body(pose).vertices[body.faces[surface.faces]]
+        points = (corners * surface.barycentric[..., None]).sum(1)
+    return Gaussians.from_points(points.detach(), scales=surface.spacing.detach(), **looks)
+
+
+def _object(
+    context: BuildContext, deformation: DeformationModel, count: int, looks: dict[str, Any]
+) -> Gaussians:
+    track = context.object_track
+    assert track is not None
+    rows = _subset(len(track.points), count, context.seed)
+    points = track.points[rows]
+    if deformation.rest_space == "world":
+        first = int(track.observed.nonzero()[0]) if track.observed.any() else 0
+        points = points @ track.rotations[first].mT + track.translations[first]
+    return Gaussians.from_points(points, track.colors[rows], **looks)
+
+
+def _subset(available: int, wanted: int, seed: int) -> Tensor:
+    """`wanted` rows at random but in order, or all when there are not so many."""
+    if available <= wanted:
+        return torch.arange(available)
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randperm(available, generator=generator)[:wanted].sort().values
+
+
+@contextmanager
+def _blaming(spec: Spec, *place: str) -> Iterator[None]:
+    """Errors of a component name its place in the spec."""
+    try:
+        yield
+    except SpecError:
+        raise
+    except (HoigsError, ValueError) as error:
+        raise SpecError(f"{spec.at(*place)}: {error}") from error

@@ -1,0 +1,288 @@
+"""Spec: a method as a file of words. Which component does what, with which settings; no torch.
+
+A file is YAML or TOML. Each component is a block of `use: "kind:name"` beside that component's own
+settings, which its own config class checks. `extends: NAME_OR_FILE` starts from another spec.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+)
+
+import hoigs
+from hoigs.core.errors import PluginError, SpecError, did_you_mean
+from hoigs.core.registry import Registry, default_registry
+from hoigs.core.spec_errors import explain
+from hoigs.core.spec_loader import (
+    Document,
+    Place,
+    dump_yaml,
+    load_overrides,
+    load_yaml,
+    read_document,
+)
+from hoigs.core.train_spec import EvaluationSpec, TrainSpec
+
+BUILTIN_SPECS = Path(hoigs.__file__).parent / "plugins" / "specs"
+SUFFIXES = (".yaml", ".yml", ".toml")
+
+# sections that decide which tensors a model has; a checkpoint belongs to these
+MODEL_SECTIONS = ("interaction", "entities", "model")
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ComponentSpec(BaseModel):
+    """One component and, beside `use`, its settings; once resolved all of them, defaults included.
+
+    Attributes:
+        use: "kind:name", or "kind:name@distribution".
+    """
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    use: str
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return dict(self.model_extra or {})
+
+
+class EntitySpec(_Strict):
+    """How one entity, or every entity of a kind, is modelled.
+
+    Attributes:
+        deformation: how it moves. features: how others see it; None leaves it out of interaction.
+        density: when it gains and loses Gaussians.
+        body: settings of a human's body model; by default those of the one that the clip names.
+        sh_degree: spherical-harmonics degree of its colours.
+        points: Gaussians at the start; scene and objects have fewer where the clip has fewer
+            points for them.
+        opacity: of every Gaussian at the start.
+    """
+
+    deformation: ComponentSpec
+    features: ComponentSpec | None = None
+    density: ComponentSpec = ComponentSpec(use="density:none")
+    body: ComponentSpec | None = None
+    sh_degree: int = Field(0, ge=0, le=3)
+    points: int = Field(10_000, ge=1)
+    opacity: float = Field(0.1, gt=0, lt=1)
+
+
+class Spec(_Strict):
+    """A whole method.
+
+    Attributes:
+        name, summary: for listings and reports.
+        rasterizer, interaction: scene-wide components.
+        entities: names or kinds of the clip's entities to model; None models all. The others are
+            ignored: their pixels count as scene.
+        model: by exact entity name or by kind (scene, human, object); the name wins. Blocks that
+            the clip has no entity for are not used.
+        train, evaluation: how it is optimised and judged.
+    """
+
+    name: str
+    summary: str = ""
+    rasterizer: ComponentSpec = ComponentSpec(use="rasterizer:warp")
+    interaction: ComponentSpec = ComponentSpec(use="interaction:none")
+    entities: tuple[str, ...] | None = None
+    model: dict[str, EntitySpec]
+    train: TrainSpec = TrainSpec()
+    evaluation: EvaluationSpec = EvaluationSpec()
+
+    _document: Document = PrivateAttr(default_factory=lambda: Document("spec"))
+
+    @staticmethod
+    def load(
+        source: str | Path,
+        *,
+        overrides: Sequence[str] = (),
+        registry: Registry | None = None,
+    ) -> Spec:
+        """Read, check and resolve a spec.
+
+        Args:
+            source: a built-in spec's name, or a .yaml, .yml or .toml file.
+            overrides: "a.b=value", laid over the file.
+            registry: where components are looked up; by default what is installed.
+
+        Raises:
+            SpecError: everything that is wrong, a line each, with its position.
+        """
+        document = _read(source, ())
+        if overrides:
+            document = document.merged(load_overrides(list(overrides)))
+        return _resolve(document, registry or default_registry())
+
+    @staticmethod
+    def parse(text: str, *, source: str = "spec", registry: Registry | None = None) -> Spec:
+        """A spec from YAML text; `extends` may name built-in specs only.
+
+        Raises:
+            SpecError: as `load`.
+        """
+        document = _extended(load_yaml(text, source), None, ())
+        return _resolve(document, registry or default_registry())
+
+    def block(self, name: str, kind: str) -> tuple[str, EntitySpec] | None:
+        """The model block for an entity, and the key that it stands under."""
+        for key in (name, kind):
+            if key in self.model:
+                return key, self.model[key]
+        return None
+
+    def selects(self, name: str, kind: str) -> bool:
+        """Whether an entity of the clip is to be modelled."""
+        return self.entities is None or name in self.entities or kind in self.entities
+
+    def component_specs(self) -> Iterator[tuple[Place, ComponentSpec]]:
+        """Every component with its place in the tree."""
+        yield ("rasterizer",), self.rasterizer
+        yield ("interaction",), self.interaction
+        for name, block in self.model.items():
+            for field in ("deformation", "features", "density", "body"):
+                part = getattr(block, field)
+                if part is not None:
+                    yield ("model", name, field), part
+
+    def components(self) -> dict[str, str]:
+        """The key of every component by its dotted place."""
+        return {".".join(map(str, place)): part.use for place, part in self.component_specs()}
+
+    def at(self, *place: str) -> str:
+        """`file:line:column dotted.place`, for messages about a part of this spec."""
+        return f"{self._document.where(place)} {'.'.join(place)}"
+
+    def dump(self) -> str:
+        """Canonical YAML, every default filled in; it is itself a spec and equal to this one."""
+        return dump_yaml(self.model_dump(mode="json"))
+
+    def hash(self) -> str:
+        """SHA-256 of the whole spec, names and summary left out."""
+        return self._digest([f for f in type(self).model_fields if f not in ("name", "summary")])
+
+    def model_hash(self) -> str:
+        """SHA-256 of what decides which tensors the model has; checkpoints carry it."""
+        return self._digest(MODEL_SECTIONS)
+
+    def _digest(self, sections: Sequence[str]) -> str:
+        data = self.model_dump(mode="json", include=set(sections))
+        return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Spec) and self.model_dump() == other.model_dump()
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.hash()))
+
+
+def builtin_specs() -> list[str]:
+    """Names of the specs that come with hoigs."""
+    return sorted(path.stem for path in BUILTIN_SPECS.glob("*.yaml"))
+
+
+def builtin_summary(name: str) -> str:
+    """The summary line of a built-in spec, which is read but not checked."""
+    return str(read_document(BUILTIN_SPECS / f"{name}.yaml").data.get("summary", ""))
+
+
+def _find(source: str | Path, folder: Path | None) -> Path:
+    """The file that `source` means; relative ones start from `folder`, None allows names only."""
+    text = str(source)
+    if isinstance(source, str) and "/" not in text and not text.endswith(SUFFIXES):
+        if text in builtin_specs():
+            return BUILTIN_SPECS / f"{text}.yaml"
+        raise SpecError(
+            f'no spec "{text}"{did_you_mean(text, builtin_specs())} (built in: '
+            f"{', '.join(builtin_specs())}; a file ends in {', '.join(SUFFIXES)})"
+        )
+    if folder is None:
+        raise SpecError(f'"{text}": only the names of built-in specs can be extended here')
+    if not text.endswith(SUFFIXES):
+        raise SpecError(f"{text}: a spec file ends in {', '.join(SUFFIXES)}")
+    return folder / text
+
+
+def _read(source: str | Path, chain: tuple[Path, ...]) -> Document:
+    path = _find(source, Path())
+    resolved = path.resolve()
+    if resolved in chain:
+        names = " -> ".join(p.name for p in (*chain, resolved))
+        raise SpecError(f"{path}: extends itself: {names}")
+    document = read_document(path)
+    document.data.setdefault("name", path.stem)
+    return _extended(document, path.parent, (*chain, resolved))
+
+
+def _extended(document: Document, folder: Path | None, chain: tuple[Path, ...]) -> Document:
+    """`document` over what it extends; name and summary are never inherited."""
+    base_name = document.data.pop("extends", None)
+    if base_name is None:
+        return document
+    at = document.where(("extends",))
+    if not isinstance(base_name, str):
+        raise SpecError(f"{at} extends: expected a spec's name or file, got {base_name!r}")
+    try:
+        base = _read(_find(base_name, folder), chain)
+    except SpecError as error:
+        raise SpecError(f"{at} extends: {error}") from error
+    base.data = {k: v for k, v in base.data.items() if k not in ("name", "summary")}
+    return base.merged(document)
+
+
+def _resolve(document: Document, registry: Registry) -> Spec:
+    """Check the tree, then each component's settings with its own config class."""
+    try:
+        spec = Spec.model_validate(document.data)
+    except ValidationError as error:
+        raise SpecError("\n".join(explain(error, Spec, document, ()))) from error
+    problems: list[str] = []
+    data = spec.model_dump()
+    for place, part in spec.component_specs():
+        settings, trouble = _settings(part, place, document, registry)
+        problems += trouble
+        node = data
+        for step in place[:-1]:
+            node = node[step]
+        node[place[-1]] = {"use": part.use, **settings}
+    if problems:
+        raise SpecError("\n".join(problems))
+    resolved = Spec.model_validate(data)
+    resolved._document = document
+    return resolved
+
+
+def _settings(
+    part: ComponentSpec, place: Place, document: Document, registry: Registry
+) -> tuple[dict[str, Any], list[str]]:
+    """Complete settings of one component, and what is wrong with it."""
+    path = ".".join(map(str, place))
+    at = document.where((*place, "use"))
+    kind = str(place[-1])
+    try:
+        found = registry.component(part.use)
+        if found.kind != kind:
+            known = ", ".join(registry.keys(kind))
+            return {}, [f'{at} {path}.use: "{part.use}" is no {kind} (known: {known})']
+        config_class = registry.config_class(part.use)
+    except PluginError as error:
+        return {}, [f"{at} {path}.use: {error}"]
+    try:
+        return config_class.model_validate(part.settings).model_dump(mode="json"), []
+    except ValidationError as error:
+        return {}, explain(error, config_class, document, place)
