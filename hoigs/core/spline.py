@@ -1,0 +1,110 @@
+"""Cubic Hermite splines over uniform keyframes (HOIGS, Sec. "Spline-based Motion Modeling").
+
+Knots are uniform over the clip's time [0, 1]: keyframe k stands at k / (K - 1), in general between
+two frames. Tangents are displacements per keyframe interval. Every function gathers only the
+knots that it needs, never all K of them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def keyframe_count(num_frames: int, step: int) -> int:
+    """K = max(2, round((N_f - 1) / step) + 1): the count nearest to one keyframe every `step`
+    frames (the paper's interval is 4; N_f - 1 is rarely a multiple of it)."""
+    if num_frames < 1 or step < 1:
+        raise ValueError(
+            f"keyframe_count needs at least one frame and a step of 1, got {num_frames}, {step}"
+        )
+    return max(2, math.floor((num_frames - 1) / step + 0.5) + 1)
+
+
+def keyframe_position(time: float, keyframes: int) -> tuple[int, float]:
+    """First knot k and position r in [0, 1] of `time` within the interval [k, k + 1].
+
+    t_s = t_n (K - 1), as in the paper, but k = min(floor(t_s), K - 2): its formula asks for the
+    missing knot K at the last frame. Times outside [0, 1] are held at the ends.
+    """
+    if keyframes < 2:
+        raise ValueError(f"a spline needs at least 2 keyframes, got {keyframes}")
+    scaled = min(max(time, 0.0), 1.0) * (keyframes - 1)
+    k = min(math.floor(scaled), keyframes - 2)
+    return k, scaled - k
+
+
+def hermite_basis(r: float) -> tuple[float, float, float, float]:
+    """Weights of m_k, tau_k, m_{k+1}, tau_{k+1} at r in [0, 1] (HOIGS, equation of CHS)."""
+    return (
+        2 * r**3 - 3 * r**2 + 1,
+        r**3 - 2 * r**2 + r,
+        -2 * r**3 + 3 * r**2,
+        r**3 - r**2,
+    )
+
+
+def hermite_basis_derivative(r: float) -> tuple[float, float, float, float]:
+    """Derivative of `hermite_basis` in r: per keyframe interval."""
+    return 6 * r**2 - 6 * r, 3 * r**2 - 4 * r + 1, -6 * r**2 + 6 * r, 3 * r**2 - 2 * r
+
+
+def cubic_hermite(
+    values: Float[Tensor, "N K D"],
+    tangents: Float[Tensor, "N K D"],
+    time: float,
+    *,
+    derivative: bool = False,
+) -> Float[Tensor, "N D"]:
+    """CHS(t, m) with explicit tangents, or its derivative per keyframe interval.
+
+    Args:
+        values: at each knot. tangents: per keyframe interval.
+        time: in [0, 1]; held at the ends outside.
+    """
+    k, r = keyframe_position(time, values.shape[1])
+    weights = hermite_basis_derivative(r) if derivative else hermite_basis(r)
+    m, tau = values[:, k : k + 2], tangents[:, k : k + 2]
+    return (
+        weights[0] * m[:, 0]
+        + weights[1] * tau[:, 0]
+        + weights[2] * m[:, 1]
+        + (weights[3] * tau[:, 1])
+    )
+
+
+def catmull_rom_tangents(values: Float[Tensor, "N K D"]) -> Float[Tensor, "N K D"]:
+    """tau_k = (m_{k+1} - m_{k-1}) / 2, one-sided at both ends: the finite differences that the
+    paper sets against learned tangents, and the start of the learned ones."""
+    steps = values[:, 1:] - values[:, :-1]
+    inner = 0.5 * (steps[:, 1:] + steps[:, :-1])
+    return torch.cat((steps[:, :1], inner, steps[:, -1:]), dim=1)
+
+
+def catmull_rom(
+    values: Float[Tensor, "N K D"], time: float, *, derivative: bool = False
+) -> Float[Tensor, "N D"]:
+    """`cubic_hermite` with `catmull_rom_tangents`, from the four knots about `time` alone."""
+    k, _ = keyframe_position(time, values.shape[1])
+    first, last = max(k - 1, 0), min(k + 2, values.shape[1] - 1)
+    window = values[:, first : last + 1]
+    count = window.shape[1]
+    # the time within the window at which its knots stand where they stood in the whole
+    scaled = min(max(time, 0.0), 1.0) * (values.shape[1] - 1) - first
+    tangents = catmull_rom_tangents(window)
+    return cubic_hermite(window, tangents, scaled / (count - 1), derivative=derivative)
+
+
+def linear(values: Float[Tensor, "N K ..."], time: float) -> Float[Tensor, "N ..."]:
+    """Piecewise linear interpolation over the knots."""
+    k, r = keyframe_position(time, values.shape[1])
+    pair = values[:, k : k + 2]
+    return torch.lerp(pair[:, 0], pair[:, 1], r)
+
+
+def accelerations(values: Float[Tensor, "N K D"]) -> Float[Tensor, "N K2 D"]:
+    """Second differences of the knots, m_{k+1} - 2 m_k + m_{k-1}; empty for two knots."""
+    return values[:, 2:] - 2 * values[:, 1:-1] + values[:, :-2]

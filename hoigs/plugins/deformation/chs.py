@@ -1,0 +1,214 @@
+"""deformation:chs: per-Gaussian cubic Hermite splines (HOIGS, Sec. "Object Deformation")."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar, Literal, Self
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from hoigs.core import spline
+from hoigs.core.clip import ObjectTrack
+from hoigs.core.config import ComponentConfig
+from hoigs.core.context import BuildContext
+from hoigs.core.deformation import DeformationModel
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.interaction import Residual
+from hoigs.core.moment import Moment
+from hoigs.core.rotation import multiply_quats, normalize_quats, quats_to_matrices, slerp
+from hoigs.core.topology import TopologyChange, reindex
+from hoigs.plugins.deformation.rigid_track import RigidTrack
+
+Tangents = Literal["learned", "finite-difference"]
+Opacity = Literal["keyed", "constant"]
+
+LARGE_STEP = math.radians(120)
+
+
+class CubicHermiteConfig(ComponentConfig):
+    """The paper's object motion and its ablations.
+
+    Attributes:
+        keyframes: number of knots; None derives it from `keyframe_step` and the clip's length.
+        keyframe_step: frames between knots (the paper's 4).
+        tangents: "learned" velocities (the paper) or "finite-difference" of neighbouring knots.
+        opacity: "keyed" over time, linear between knots (the paper), or "constant".
+        track: start from the object's rigid track, where it has one, else at rest.
+    """
+
+    keyframes: int | None = Field(None, ge=2)
+    keyframe_step: int = Field(4, ge=1)
+    tangents: Tangents = "learned"
+    opacity: Opacity = "keyed"
+    track: bool = True
+
+
+class CubicHermite(DeformationModel):
+    """M(t) = CHS(t, m) for each Gaussian, plus the interaction's displacement.
+
+    Rotations are slerped between knots, opacity logits are linear, scales and colours constant
+    (keep SH degree 0 on an object that turns: higher bands do not turn with it). Tangents and
+    `velocity` are in metres per keyframe interval. Times outside [0, 1] are held at the ends.
+
+    Parameters, allocated in `bind` for N Gaussians and K knots: `keyframe_means` [N, K, 3] and
+    `tangents` [N, K, 3] in the world, metres; `keyframe_quats` [N, K, 4]; `opacity_logits`
+    [N, K]. That is 11 floats a Gaussian and knot.
+
+    Args:
+        keyframes: K; or None with `num_frames`, for one every `keyframe_step` frames.
+        num_frames: frames of the clip; by default those of the track.
+        track: rest is then the canonical object, and knot k starts at R_k p + t_k, the track
+            taken at the knot's real-valued time. Without one every knot starts at rest.
+    """
+
+    provides = frozenset({"velocity"})
+    rates: ClassVar[Mapping[str, str]] = {
+        "keyframe_means": "keyframes",
+        "tangents": "keyframes",
+        "keyframe_quats": "keyframe_rotation",
+        "opacity_logits": "opacity",
+    }
+
+    regularizer_weights: ClassVar[Mapping[str, float]] = {"tangent": 0.1, "acceleration": 0.01}
+
+    rest_quats: Tensor
+
+    def __init__(
+        self,
+        keyframes: int | None = None,
+        *,
+        keyframe_step: int = 4,
+        num_frames: int | None = None,
+        tangents: Tangents = "learned",
+        opacity: Opacity = "keyed",
+        track: ObjectTrack | None = None,
+    ) -> None:
+        super().__init__()
+        if keyframes is None:
+            if num_frames is None and track is None:
+                raise ValueError(
+                    "CubicHermite needs `keyframes`, or `num_frames` or a `track` to derive them"
+                )
+            frames = num_frames if num_frames is not None else len(track.rotations)  # type: ignore[union-attr]
+            keyframes = spline.keyframe_count(frames, keyframe_step)
+        if keyframes < 2:
+            raise ValueError(f"CubicHermite needs at least 2 keyframes, got {keyframes}")
+        self.keyframes, self.learned, self.keyed = (
+            keyframes,
+            tangents == "learned",
+            opacity == "keyed",
+        )
+        names = ["keyframe_means", "keyframe_quats"]
+        names += ["tangents"] if self.learned else []
+        names += ["opacity_logits"] if self.keyed else []
+        self.per_gaussian = tuple(names)
+        self.owns = frozenset({"means", "quats"} | ({"opacity_logits"} if self.keyed else set()))
+        self.rest_space = "canonical" if track is not None else "world"
+        self._track = track
+
+    @classmethod
+    def from_config(cls, config: CubicHermiteConfig, context: BuildContext) -> Self:
+        return cls(
+            config.keyframes,
+            keyframe_step=config.keyframe_step,
+            num_frames=context.clip.num_frames if context.clip is not None else None,
+            tangents=config.tangents,
+            opacity=config.opacity,
+            track=context.object_track if config.track else None,
+        )
+
+    def bind(self, rest: Gaussians) -> None:
+        rest = rest.detach()
+        means, quats = self._initial_knots(rest.means, normalize_quats(rest.quats))
+        self.keyframe_means = nn.Parameter(means)
+        self.keyframe_quats = nn.Parameter(quats)
+        if self.learned:
+            self.tangents = nn.Parameter(spline.catmull_rom_tangents(means))
+        if self.keyed:
+            logits = rest.opacity_logits[:, None].repeat(1, self.keyframes)
+            self.opacity_logits = nn.Parameter(logits)
+        # kept because offsets of new Gaussians come in rest coordinates
+        self.register_buffer("rest_quats", normalize_quats(rest.quats).clone())
+        self._track = None
+
+    def _initial_knots(
+        self, means: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]
+    ) -> tuple[Float[Tensor, "N K 3"], Float[Tensor, "N K 4"]]:
+        count = self.keyframes
+        if self._track is None:
+            return means[:, None].repeat(1, count, 1), quats[:, None].repeat(1, count, 1)
+        track = RigidTrack(self._track).to(means)
+        if track.largest_step(count) > LARGE_STEP:
+            warnings.warn(
+                f"the object turns {math.degrees(track.largest_step(count)):.0f} degrees between "
+                "two keyframes: splines cut such corners and slerp may turn the wrong way; use "
+                "more keyframes (a smaller keyframe_step)",
+                stacklevel=3,
+            )
+        placed = [track.place(means, quats, k / (count - 1)) for k in range(count)]
+        return torch.stack([m for m, _ in placed], 1), torch.stack([q for _, q in placed], 1)
+
+    def forward(
+        self, rest: Gaussians, moment: Moment, residual: Residual | None = None
+    ) -> Gaussians:
+        means = self._means(moment.time)
+        if residual is not None and residual.means is not None:
+            means = means + residual.means
+        k, r = spline.keyframe_position(moment.time, self.keyframes)
+        pair = self.keyframe_quats[:, k : k + 2]
+        moved = replace(rest, means=means, quats=slerp(pair[:, 0], pair[:, 1], r))
+        if self.keyed:
+            moved = replace(moved, opacity_logits=spline.linear(self.opacity_logits, moment.time))
+        return moved
+
+    def _means(self, time: float, *, derivative: bool = False) -> Float[Tensor, "N 3"]:
+        if self.learned:
+            return spline.cubic_hermite(
+                self.keyframe_means, self.tangents, time, derivative=derivative
+            )
+        return spline.catmull_rom(self.keyframe_means, time, derivative=derivative)
+
+    def velocity(self, rest: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
+        """tau(t): exact derivative of the spline, metres per keyframe interval."""
+        del rest
+        return self._means(moment.time, derivative=True)
+
+    def on_topology(self, change: TopologyChange) -> None:
+        """Rows follow; new Gaussians are displaced in every knot.
+
+        Offsets come in rest coordinates, and knot k turns a Gaussian by R(q_k) R(q_rest)^-1, so
+        each is turned into its knot before it is added, and the tangents gain the finite
+        differences of the turned offsets: a child keeps its place on a turning object.
+        """
+        reindex((self.get_parameter(name) for name in self.per_gaussian), change)
+        self.rest_quats = self.rest_quats[change.source].contiguous()
+        if not change.offsets.any():
+            return
+        conjugate = self.rest_quats * self.rest_quats.new_tensor((1.0, -1.0, -1.0, -1.0))
+        quats = self.keyframe_quats.data
+        turns = multiply_quats(quats, conjugate[:, None].expand_as(quats))
+        offsets = torch.einsum("nkij,nj->nki", quats_to_matrices(turns), change.offsets.to(quats))
+        self.keyframe_means.data += offsets
+        if self.learned:
+            self.tangents.data += spline.catmull_rom_tangents(offsets)
+
+    def regularizers(self) -> dict[str, Tensor]:
+        """Squared, per Gaussian and knot, in metres per interval.
+
+        "acceleration": second difference of the knots. "tangent": learned tangents against the
+        finite differences, which an interval's few frames cannot pin down alone (methods A.3).
+        """
+        penalties: dict[str, Tensor] = {}
+        if self.keyframes > 2:
+            jerks = spline.accelerations(self.keyframe_means)
+            penalties["acceleration"] = jerks.square().sum(-1).mean()
+        if self.learned:
+            difference = self.tangents - spline.catmull_rom_tangents(self.keyframe_means)
+            penalties["tangent"] = difference.square().sum(-1).mean()
+        return penalties

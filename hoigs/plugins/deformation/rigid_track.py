@@ -1,0 +1,53 @@
+"""The rigid motion that an object starts from, at any time."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hoigs.core.clip import ObjectTrack
+from hoigs.core.rotation import matrices_to_quats, multiply_quats, quats_to_matrices, slerp
+from hoigs.core.spline import catmull_rom, keyframe_position
+
+
+class RigidTrack(nn.Module):
+    """Poses of an ObjectTrack between its frames: slerp of rotations, CHS of translations.
+
+    Its frames are taken as uniform over [0, 1]; a track of a single frame stands still.
+    """
+
+    quats: Tensor
+    translations: Tensor
+
+    def __init__(self, track: ObjectTrack) -> None:
+        super().__init__()
+        quats, translations = matrices_to_quats(track.rotations), track.translations
+        if len(quats) == 1:
+            quats, translations = quats.repeat(2, 1), translations.repeat(2, 1)
+        self.register_buffer("quats", quats.detach().clone())
+        self.register_buffer("translations", translations.detach().clone())
+
+    def at(self, time: float) -> tuple[Float[Tensor, " 4"], Float[Tensor, " 3"]]:
+        """Rotation (wxyz) and translation, object to world, at `time` in [0, 1]."""
+        k, r = keyframe_position(time, len(self.quats))
+        return slerp(self.quats[k], self.quats[k + 1], r), catmull_rom(
+            self.translations[None], time
+        )[0]
+
+    def place(
+        self,
+        means: Float[Tensor, "N 3"],
+        quats: Float[Tensor, "N 4"],
+        time: float,
+    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
+        """Canonical centres and rotations in the world at `time`."""
+        rotation, translation = self.at(time)
+        turned = multiply_quats(rotation.expand_as(quats), quats)
+        return means @ quats_to_matrices(rotation).mT + translation, turned
+
+    def largest_step(self, keyframes: int) -> float:
+        """Largest rotation between neighbouring keyframes of a uniform spline, radians."""
+        knots = torch.stack([self.at(k / (keyframes - 1))[0] for k in range(keyframes)])
+        dot = (knots[1:] * knots[:-1]).sum(-1).abs().clamp(max=1.0)
+        return float(2 * torch.acos(dot).max())
