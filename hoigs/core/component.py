@@ -91,6 +91,9 @@ def missing_target(target: str) -> str | None:
         tree = ast.parse(path.read_bytes(), filename=str(path))
     except SyntaxError as error:
         return f"SyntaxError in {path.name}, line {error.lineno}: {error.msg}"
+    for package in _top_level_imports(tree):
+        if importlib.util.find_spec(package) is None:
+            return f'{path.name} imports "{package}", which is not installed'
     names = _top_level_names(tree)
     if names is None or name in names:
         return None
@@ -115,6 +118,17 @@ def _source_of(module: str) -> Path | str | None:
         if next(folder.glob(f"{rest[-1]}.*"), None):
             return None  # an extension module
     return f'no module "{module}"'
+
+
+def _top_level_imports(tree: ast.Module) -> set[str]:
+    """Packages that importing the module needs for certain: those not in an `if` or a `try`."""
+    packages: set[str] = set()
+    for node in tree.body:
+        if isinstance(node, ast.Import):
+            packages.update(alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            packages.add(node.module.partition(".")[0])
+    return packages
 
 
 def _top_level_names(tree: ast.Module) -> set[str] | None:

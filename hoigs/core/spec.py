@@ -256,7 +256,7 @@ def _resolve(document: Document, registry: Registry) -> Spec:
     for place, part in spec.component_specs():
         settings, trouble = _settings(part, place, document, registry)
         problems += trouble
-        node = data
+        node: Any = data
         for step in place[:-1]:
             node = node[step]
         node[place[-1]] = {"use": part.use, **settings}

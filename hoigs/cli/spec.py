@@ -1,0 +1,51 @@
+"""`hoigs spec list|check|show`: the methods that come with hoigs, and one's own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hoigs.cli.common import PluginOption, SetOption
+
+if TYPE_CHECKING:
+    from hoigs.core.spec import Spec
+
+app = typer.Typer(help="List, check and show specs.", no_args_is_help=True)
+
+NameOrFile = Annotated[
+    str, typer.Argument(help="A built-in spec's name, or a .yaml or .toml file.")
+]
+
+
+@app.command("list")
+def list_specs() -> None:
+    """Names and summaries of the built-in specs."""
+    from hoigs.core.spec import builtin_specs, builtin_summary
+
+    for name in builtin_specs():
+        typer.echo(f"{name:<24} {builtin_summary(name)}")
+
+
+@app.command()
+def check(spec: NameOrFile, settings: SetOption = None, plugin: PluginOption = None) -> None:
+    """Say whether a spec can be used, and what its components are."""
+    loaded = _load(spec, settings, plugin)
+    typer.echo(f"{loaded.name}: ok")
+    for place, key in loaded.components().items():
+        typer.echo(f"  {place:<28} {key}")
+
+
+@app.command()
+def show(spec: NameOrFile, settings: SetOption = None, plugin: PluginOption = None) -> None:
+    """Print a spec with every default filled in; the output is itself a spec."""
+    typer.echo(_load(spec, settings, plugin).dump(), nl=False)
+
+
+def _load(spec: str, settings: Sequence[str] | None, plugin: Sequence[Path] | None) -> Spec:
+    from hoigs.core.registry import default_registry
+    from hoigs.core.spec import Spec
+
+    return Spec.load(spec, overrides=settings or (), registry=default_registry(plugin or ()))
