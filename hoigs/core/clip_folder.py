@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -133,7 +133,7 @@ class ClipWriter:
         self,
         folder: str | Path,
         *,
-        fps: float,
+        fps: float | int,
         entities: Mapping[str, Literal["human", "object"]],
         name: str | None = None,
         depth_kind: DepthKind = "none",
@@ -154,7 +154,7 @@ class ClipWriter:
         self._held_out_frames: list[int] = []
         refuse_to_overwrite(self.folder)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> ClipWriter:
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         self._root = Path(tempfile.mkdtemp(prefix=f".{self.folder.name}.", dir=self.folder.parent))
         self._root.chmod(0o755)
@@ -225,8 +225,8 @@ class ClipWriter:
         if not self.frames:
             raise ClipError(f"{self.folder}: no frame was added; a clip has at least one")
         self._main.save_cameras()
-        for name, track in self._bodies.items():
-            _save_body(self._root / "bodies" / f"{name}.npz", track)
+        for name, body in self._bodies.items():
+            _save_body(self._root / "bodies" / f"{name}.npz", body)
         for name, track in self._objects.items():
             _save_object(self._root / "objects" / f"{name}.npz", track)
         if self._points:
@@ -281,7 +281,7 @@ def write_clip(clip: Clip, folder: str | Path, **options: Any) -> None:
     # the scene is implied by the format
     entities = {n: k for n, k in clip.kinds.items() if k != "scene"}
     options = {"name": clip.name, "depth_kind": clip.depth_kind, **options}
-    with ClipWriter(folder, fps=clip.fps, entities=entities, **options) as writer:  # type: ignore[arg-type]
+    with ClipWriter(folder, fps=clip.fps, entities=entities, **options) as writer:
         for frame in clip:
             masks = {n: frame.masks[n] for n in entities}
             writer.add_frame(frame.image, frame.camera, masks, frame.depth)
