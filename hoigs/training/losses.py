@@ -75,20 +75,21 @@ def align_depth(
     """A prior brought to the units of the render, robustly.
 
     "metric" is taken as it stands; "affine-disparity" is fitted by scale and shift in disparity
-    (iteratively reweighted least squares), which "scaled via COLMAP points" alone could not do.
+    (medians first, then reweighted least squares), which scaling by COLMAP points could not do.
     """
     if kind == "metric":
         return prior
     inverse = 1.0 / depth.detach().clamp_min(1e-3)
-    weights = torch.ones_like(prior)
-    fit = torch.zeros_like(prior)
-    ones = torch.ones_like(prior)
-    for _ in range(3):
-        A = torch.stack((prior, ones), 1) * weights[:, None]
-        solution = torch.linalg.lstsq(A, (inverse * weights)[:, None]).solution
-        fit = prior * solution[0] + solution[1]
+    center, middle = prior.median(), inverse.median()
+    spread = (prior - center).abs().median().clamp_min(1e-9)
+    slope = (inverse - middle).abs().median() / spread  # median fit: outliers have no leverage
+    fit = (prior - center) * slope + middle
+    columns = torch.stack((prior, torch.ones_like(prior)), 1)
+    for _ in range(5):
         residual = (fit - inverse).abs()
-        weights = 1.0 / (residual + residual.median().clamp_min(1e-6)).sqrt()
+        weights = 1.0 / (1.0 + (residual / (2 * residual.median().clamp_min(1e-6))) ** 2)
+        A, b = columns * weights[:, None], (inverse * weights)[:, None]
+        fit = columns @ torch.linalg.lstsq(A, b).solution.squeeze(1)
     return 1.0 / fit.clamp_min(1e-3)
 
 
