@@ -112,7 +112,7 @@ class Rasterizer(ABC):
 
     def check_inputs(self, gaussians: Gaussians, camera: Camera, request: RenderRequest) -> None:
         """The checks that every backend shares; call first in `render`."""
-        count, device = len(gaussians), gaussians.means.device
+        device = gaussians.means.device
         name = type(self).__name__
         if device.type not in self.capabilities.devices:
             raise RenderError(
@@ -124,30 +124,58 @@ class Rasterizer(ABC):
             raise RenderError(
                 f"{name}: computes in {sorted(self.capabilities.dtypes)}, means are {dtype}"
             )
-        if camera.world_to_camera.device != device:
-            raise RenderError(
-                f"{name}: camera is on {camera.world_to_camera.device}, Gaussians on {device}; "
-                "use camera.to(gaussians.means.device)"
-            )
         if camera.width < 1 or camera.height < 1:
             raise RenderError(f"{name}: image size {camera.width}x{camera.height} is empty")
-        expected = {
-            "features": (request.features, 2),
-            "subset": (request.subset, 1),
-            "screen_offsets": (request.screen_offsets, 2),
-        }
-        for key, (value, dims) in expected.items():
-            if value is not None and (value.shape[0] != count or value.dim() != dims):
+        for key, (value, shapes) in _expected_shapes(gaussians, camera, request).items():
+            if value is None:
+                continue
+            if not any(_matches(value.shape, shape) for shape in shapes):
+                wanted = " or ".join(_shape_text(shape) for shape in shapes)
                 raise RenderError(
-                    f"{name}: request.{key} has shape {tuple(value.shape)}, expected {count} rows "
-                    f"and {dims} dimensions to match the Gaussians"
+                    f"{name}: {key} has shape {_shape_text(tuple(value.shape))}, expected {wanted}"
                 )
+            if value.device != device:
+                raise RenderError(
+                    f"{name}: {key} is on {value.device}, gaussians.means on {device}; "
+                    "move one with .to(...)"
+                )
+            if key.startswith("gaussians.") and value.dtype != gaussians.means.dtype:
+                raise RenderError(f"{name}: {key} is {value.dtype}, gaussians.means are {dtype}")
         if request.subset is not None and request.subset.dtype != torch.bool:
             raise RenderError(f"{name}: request.subset must be a boolean mask")
         degree = request.sh_degree
-        if gaussians.sh.shape[1] not in (1, 4, 9, 16):
-            raise RenderError(
-                f"{name}: sh has {gaussians.sh.shape[1]} bands, expected 1, 4, 9 or 16"
-            )
         if degree is not None and not 0 <= degree <= 3:
             raise RenderError(f"{name}: sh_degree {degree} is outside 0..3")
+
+
+Shape = tuple[int | None, ...]  # None is any number
+
+
+def _expected_shapes(
+    gaussians: Gaussians, camera: Camera, request: RenderRequest
+) -> dict[str, tuple[Tensor | None, list[Shape]]]:
+    count = gaussians.means.shape[0] if gaussians.means.dim() else 0
+    image = (camera.height, camera.width, 3)
+    return {
+        "gaussians.means": (gaussians.means, [(count, 3)]),
+        "gaussians.quats": (gaussians.quats, [(count, 4)]),
+        "gaussians.log_scales": (gaussians.log_scales, [(count, 3)]),
+        "gaussians.opacity_logits": (gaussians.opacity_logits, [(count,)]),
+        "gaussians.sh": (gaussians.sh, [(count, bands, 3) for bands in (1, 4, 9, 16)]),
+        "camera.K": (camera.K, [(3, 3)]),
+        "camera.world_to_camera": (camera.world_to_camera, [(4, 4)]),
+        "request.features": (request.features, [(count, None)]),
+        "request.subset": (request.subset, [(count,)]),
+        "request.screen_offsets": (request.screen_offsets, [(count, 2)]),
+        "request.background": (request.background, [(3,), image]),
+    }
+
+
+def _matches(actual: torch.Size, expected: Shape) -> bool:
+    return len(actual) == len(expected) and all(
+        wanted is None or size == wanted for size, wanted in zip(actual, expected)
+    )
+
+
+def _shape_text(shape: Shape) -> str:
+    return "[" + ", ".join("any" if size is None else str(size) for size in shape) + "]"
