@@ -1,0 +1,8 @@
+"""Splatting with NVIDIA Warp: one package for CPUs and CUDA, compiled on first use.
+
+Importing this loads no Warp; constructing a WarpRasterizer does.
+"""
+
+from hoigs.rasterizers.warp.rasterizer import WarpConfig, WarpRasterizer
+
+__all__ = ["WarpConfig", "WarpRasterizer"]

@@ -1,0 +1,95 @@
+"""Frame: one render's settings and tensors, as the two device paths share them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hoigs.rasterizers.warp.runtime import wp
+
+_TYPES = {torch.float32: wp.float32, torch.int32: wp.int32, torch.uint8: wp.uint8}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is no tensor in one render; see `RenderRequest` for most of it."""
+
+    width: int
+    height: int
+    bands: int
+    near: float
+    low_pass: float
+    max_alpha: float
+    min_alpha: float
+    min_transmittance: float
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Contiguous float32 tensors of one render on one device; absent ones are empty.
+
+    Attributes:
+        means [N, 3], quats [N, 4], log_scales [N, 3], opacity_logits [N], sh [N, K, 3]: raw space.
+        features [N, F]; offsets [N, 2] pixels; subset [N] uint8.
+        background: [3] or [H, W, 3].
+        K [3, 3], view [4, 4]: of the camera.
+    """
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    sh: Tensor
+    features: Tensor
+    offsets: Tensor
+    background: Tensor
+    view: Tensor
+    K: Tensor
+    subset: Tensor
+
+    @property
+    def count(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def channels(self) -> int:
+        return self.features.shape[1]
+
+
+@dataclass(frozen=True)
+class Lists:
+    """The Gaussians of each tile, nearest first. See `records` for pair and slot."""
+
+    tile_rows: int
+    across: int
+    down: int
+    pairs: Tensor  # [M, 2] int32
+    offsets: Tensor  # [tiles + 1] int32
+    first: Tensor  # [N] int32
+    slots: Tensor  # [N] int32
+
+
+@dataclass(frozen=True)
+class Images:
+    """color [H, W, 3] over the background, alpha [H, W], depth [H, W], extra [H, W, F]."""
+
+    color: Tensor
+    alpha: Tensor
+    depth: Tensor
+    extra: Tensor
+
+
+def flat(tensor: Tensor) -> Any:
+    """A contiguous tensor as a flat array for a kernel."""
+    return wp.from_torch(
+        tensor.view(-1), dtype=_TYPES[tensor.dtype], requires_grad=False, return_ctype=True
+    )
+
+
+def vectors(tensor: Tensor, dtype: Any) -> Any:
+    """A contiguous tensor whose last dimension is a vector, as a flat array of vectors."""
+    size = tensor.shape[-1]
+    return wp.from_torch(tensor.view(-1, size), dtype=dtype, requires_grad=False, return_ctype=True)

@@ -1,0 +1,122 @@
+"""Calls of the kernels in `projection`; shared by every path."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hoigs.rasterizers.warp.frame import Inputs, Lists, Settings, flat, vectors
+from hoigs.rasterizers.warp.records import POSE, RECORD, SMALLEST_ALPHA
+from hoigs.rasterizers.warp.runtime import wp
+
+
+class Projected:
+    """What `projection.project` writes: records [N, 16], means2d [N, 2], depths [N], radii [N]."""
+
+    def __init__(self, like: Tensor, count: int) -> None:
+        self.records = like.new_empty(count, RECORD)
+        self.means2d = like.new_empty(count, 2)
+        self.depths = like.new_empty(count)
+        self.radii = like.new_empty(count)
+
+
+def project_arguments(inputs: Inputs, settings: Settings, out: Projected) -> list[Any]:
+    """Arguments of `projection.project` but for its last two, the range of rows."""
+    return [
+        vectors(inputs.means, wp.vec3),
+        vectors(inputs.quats, wp.vec4),
+        vectors(inputs.log_scales, wp.vec3),
+        flat(inputs.opacity_logits),
+        vectors(inputs.sh, wp.vec3),
+        inputs.sh.shape[1],
+        settings.bands,
+        flat(inputs.features),
+        inputs.channels,
+        flat(inputs.offsets),
+        int(inputs.offsets.numel() > 0),
+        flat(inputs.subset),
+        int(inputs.subset.numel() > 0),
+        flat(inputs.K),
+        flat(inputs.view),
+        settings.width,
+        settings.height,
+        settings.near,
+        settings.low_pass,
+        settings.min_alpha,
+        max(settings.min_alpha, SMALLEST_ALPHA),
+        flat(out.records),
+        flat(out.means2d),
+        flat(out.depths),
+        flat(out.radii),
+    ]
+
+
+class Gradients:
+    """What `projection.project_adjoint` writes, in the shapes of the inputs."""
+
+    def __init__(self, inputs: Inputs, pose: bool) -> None:
+        self.means = torch.empty_like(inputs.means)
+        self.quats = torch.empty_like(inputs.quats)
+        self.log_scales = torch.empty_like(inputs.log_scales)
+        self.opacity_logits = torch.empty_like(inputs.opacity_logits)
+        self.sh = torch.empty_like(inputs.sh)
+        self.features = torch.empty_like(inputs.features)
+        self.offsets = inputs.means.new_empty(inputs.count, 2)
+        self.pose = inputs.means.new_empty(inputs.count if pose else 0, POSE)
+
+    def view(self, inputs: Inputs) -> Tensor:
+        """Gradient of world_to_camera [4, 4] from the rows of `pose`.
+
+        The camera centre is -R^T t, so its gradient v adds -t v^T to that of R and -R v to that
+        of t.
+        """
+        total = self.pose.sum(0)
+        result = torch.zeros_like(inputs.view)
+        rotation, shift = inputs.view[:3, :3], inputs.view[:3, 3]
+        center = total[12:]
+        result[:3, :3] = total[:9].view(3, 3) - torch.outer(shift, center)
+        result[:3, 3] = total[9:12] - rotation @ center
+        return result
+
+
+def adjoint_arguments(
+    inputs: Inputs,
+    settings: Settings,
+    records: Tensor,
+    lists: Lists,
+    partials: Tensor,
+    out: Gradients,
+) -> list[Any]:
+    """Arguments of `projection.project_adjoint` but for its last two, the range of rows."""
+    return [
+        vectors(inputs.means, wp.vec3),
+        vectors(inputs.quats, wp.vec4),
+        vectors(inputs.log_scales, wp.vec3),
+        flat(inputs.opacity_logits),
+        vectors(inputs.sh, wp.vec3),
+        inputs.sh.shape[1],
+        settings.bands,
+        inputs.channels,
+        flat(inputs.offsets),
+        int(inputs.offsets.numel() > 0),
+        flat(inputs.K),
+        flat(inputs.view),
+        settings.width,
+        settings.height,
+        settings.low_pass,
+        flat(records),
+        flat(lists.first),
+        flat(lists.slots),
+        flat(partials),
+        vectors(out.means, wp.vec3),
+        vectors(out.quats, wp.vec4),
+        vectors(out.log_scales, wp.vec3),
+        flat(out.opacity_logits),
+        vectors(out.sh, wp.vec3),
+        flat(out.offsets),
+        flat(out.features),
+        flat(out.pose),
+        int(out.pose.numel() > 0),
+    ]
