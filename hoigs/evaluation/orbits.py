@@ -1,0 +1,83 @@
+"""Camera paths that look around a scene without leaving what the video has seen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.core.camera import Camera
+from hoigs.core.clip import Clip
+from hoigs.core.moment import Moment
+from hoigs.core.rotation import axis_angle_to_matrices
+from hoigs.core.scene import SceneModel
+
+
+def orbit_cameras(
+    clip: Clip,
+    model: SceneModel,
+    count: int,
+    *,
+    amplitude: float = 20.0,
+    position: int | None = None,
+) -> list[Camera]:
+    """A closed path of `count` cameras that swings about the human's pelvis.
+
+    The camera of a training frame is turned rigidly about the pivot by a lying figure of eight:
+    `amplitude` degrees to each side and a quarter of it up and down. A small swing keeps the
+    view within what the video has seen; the pivot stays at its pixel.
+
+    Args:
+        model: tells where the human is. amplitude: degrees.
+        position: frame whose camera and moment the path starts from; the middle one when None.
+    """
+    position = len(clip) // 2 if position is None else position
+    camera = clip.cameras[position]
+    center = pivot(model, clip, clip.moments[position], camera)
+    up = world_up(clip)
+    right = torch.nn.functional.normalize(camera.world_to_camera[0, :3], dim=0)
+    path = []
+    for i in range(count):
+        phase = 2 * math.pi * i / max(1, count)
+        yaw = math.radians(amplitude) * math.sin(phase)
+        pitch = math.radians(amplitude) / 4 * math.sin(2 * phase)
+        turn = axis_angle_to_matrices(up * yaw) @ axis_angle_to_matrices(right * pitch)
+        path.append(turned(camera, center, turn))
+    return path
+
+
+def turned(camera: Camera, center: Float[Tensor, " 3"], turn: Float[Tensor, "3 3"]) -> Camera:
+    """The camera, carried by a rotation of the world about `center`."""
+    # the view of the turned camera is the old view of the world turned back
+    back = torch.eye(4).to(camera.world_to_camera)
+    back[:3, :3] = turn.mT
+    back[:3, 3] = center - turn.mT @ center
+    return replace(camera, world_to_camera=camera.world_to_camera @ back)
+
+
+@torch.no_grad()
+def pivot(model: SceneModel, clip: Clip, moment: Moment, camera: Camera) -> Float[Tensor, " 3"]:
+    """What to look at, world metres: the pelvis, else the moving Gaussians, else the scene."""
+    moment = moment.to(model.device)
+    for name in model.names("human"):
+        anchors = model.entity(name).role(moment).anchors
+        if anchors is not None:
+            return anchors[0].to(camera.world_to_camera)
+    moving = model.names("human") + model.names("object")
+    if moving:
+        means = model(moment, moving).joined().means
+        return means.mean(0).to(camera.world_to_camera)
+    depth = camera.to_camera(clip.points.to(camera.world_to_camera))[:, 2]
+    ahead = depth[depth > 0]
+    distance = ahead.median() if len(ahead) else torch.tensor(2.0)
+    middle = torch.tensor([camera.width / 2, camera.height / 2]).to(camera.world_to_camera)
+    return camera.unproject(middle, distance)
+
+
+def world_up(clip: Clip) -> Float[Tensor, " 3"]:
+    """The mean upward direction of the cameras: COLMAP's worlds have no up of their own."""
+    ups = torch.stack([-camera.world_to_camera[1, :3] for camera in clip.cameras])
+    return torch.nn.functional.normalize(ups.mean(0), dim=0)

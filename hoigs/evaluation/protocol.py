@@ -1,0 +1,83 @@
+"""Protocol: how a score came about. A number without one is not a result (methods D.6)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+TestPose = Literal["given", "interpolated", "fitted"]
+Pixels = Literal["float", "8-bit"]
+
+
+@dataclass(frozen=True)
+class NotComputed:
+    """In the place of a number: why there is none."""
+
+    reason: str
+
+    def __str__(self) -> str:
+        return f"not computed: {self.reason}"
+
+
+Value = float | NotComputed
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Everything that decides what a score means.
+
+    Attributes:
+        views: "training cameras" (held-out times on the training path) or "held-out cameras".
+        split: name of the clip's split whose frames were scored. frames: how many.
+        unseen_times: how many of these frames are at times that were not trained on.
+        region: one of regions.REGIONS. band: pixels of the interaction band.
+        test_pose: where body poses on scored frames come from: "given" with the clip,
+            "interpolated" from training frames, or "fitted" to the test images themselves.
+        pixels: "float" renders, or rounded to "8-bit"; clamped to [0, 1] either way.
+        background: behind all Gaussians.
+        width, height: of the scored images, pixels.
+        lpips_net: "alex", "vgg", or None when LPIPS was not computed. lpips_range: of its input.
+        device, rasterizer: what drew.
+    """
+
+    views: str
+    split: str
+    frames: int
+    unseen_times: int
+    region: str
+    band: int
+    test_pose: TestPose
+    pixels: Pixels
+    width: int
+    height: int
+    lpips_net: str | None
+    device: str
+    rasterizer: str
+    background: str = "black"
+    lpips_range: str = "[-1, 1]"
+    averages: str = "mean over frames of the metric of each frame"
+    ssim: str = "11x11 Gaussian, sigma 1.5, zero padding; of regions: mean of the map over them"
+    lpips_regions: str = "mean over the region of the spatial map, layers upsampled bilinearly"
+    depth: str = "mean |rendered - true| along z where truth is known and alpha > 0.5, metres"
+
+    def of(self, region: str) -> Protocol:
+        return replace(self, region=region)
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def footnotes(self) -> list[str]:
+        """The protocol in sentences, for the foot of a table."""
+        lpips = (
+            f"LPIPS v0.1 {self.lpips_net} on {self.lpips_range}, of regions: {self.lpips_regions}"
+            if self.lpips_net
+            else "LPIPS not computed"
+        )
+        return [
+            f"{self.frames} frames of split {self.split!r} from {self.views}, "
+            f"{self.unseen_times} of them at times that were not trained on; "
+            f"body poses: {self.test_pose}.",
+            f"{self.width}x{self.height}, {self.pixels} pixels clamped to [0, 1] over "
+            f"{self.background}; {self.averages}; drawn by {self.rasterizer} on {self.device}.",
+            f"SSIM: {self.ssim}. {lpips}. Interaction: within {self.band} px of human and object.",
+        ]
