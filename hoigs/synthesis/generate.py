@@ -1,0 +1,161 @@
+"""generate(knobs, body): a clip with known truth, one frame at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+
+from hoigs.core.body import BodyModel
+from hoigs.core.camera import Camera
+from hoigs.core.moment import BodyPose
+from hoigs.synthesis.clothes import DressedBody, dress
+from hoigs.synthesis.knobs import SceneKnobs
+from hoigs.synthesis.meshes import TexturedMesh, box, smooth_normals
+from hoigs.synthesis.objects import MOTIONS, ObjectScript, bent_mesh
+from hoigs.synthesis.paths import camera_path, held_out_views
+from hoigs.synthesis.person import Choreographer
+from hoigs.synthesis.raycast import Layer, RayCaster, fine_array
+from hoigs.synthesis.room import HIGH, LOW, Palette, build_room
+from hoigs.synthesis.textures import TextureAtlas, crate_faces, to_srgb
+
+Array = np.ndarray
+ENTITIES = ("human", "object")  # numbers 1 and 2 in entity images; 0 is the scene
+
+
+@dataclass(frozen=True)
+class TrueView:
+    """What a camera sees at a moment, exactly.
+
+    Attributes:
+        frame: of the clip. depth: along z, metres. entity: 0 scene, 1 human, 2 object at each
+            pixel's centre.
+    """
+
+    frame: int
+    camera: Camera
+    image: UInt8[Array, "H W 3"]
+    depth: Float[Array, "H W"]
+    entity: Float[Array, "H W"] | Array
+
+    def mask(self, name: str) -> Bool[Array, "H W"]:
+        """Visible pixels of "human" or "object"."""
+        return self.entity == 1 + ENTITIES.index(name)
+
+
+@dataclass(frozen=True)
+class SyntheticScene:
+    """A scripted scene; views are rendered on demand.
+
+    Attributes:
+        poses: batched over the frames. script: of the object. object_mesh: about its own centre,
+            unbent. cameras: one a frame. held_out: (frame, camera) pairs.
+    """
+
+    knobs: SceneKnobs
+    poses: BodyPose
+    script: ObjectScript
+    dressed: DressedBody
+    object_mesh: TexturedMesh
+    shell: TexturedMesh
+    props: TexturedMesh
+    atlas: TextureAtlas
+    cameras: list[Camera]
+    held_out: list[tuple[int, Camera]]
+
+    @cached_property
+    def body_vertices(self) -> Float[Array, "T V 3"]:
+        """The dressed body at every frame, world, metres."""
+        return self.dressed.posed(self.poses)
+
+    @cached_property
+    def _caster(self) -> RayCaster:
+        k = self.knobs
+        layers = [Layer.build(m, np.zeros(len(m.faces))) for m in (self.shell, self.props)]
+        room = (LOW, HIGH)
+        return RayCaster(layers[0], layers[1], self.atlas, k.light, room, k.samples, k.edge_samples)
+
+    @cached_property
+    def _fine(self):  # type: ignore[no-untyped-def]
+        return fine_array(self.dressed.colors)
+
+    def object_at(self, frame: int) -> TexturedMesh:
+        """The object's mesh in the world."""
+        angle = float(self.script.bend[frame]) / self.knobs.object.size[0]
+        track = self.script.track
+        return bent_mesh(self.object_mesh, angle).moved(
+            track.rotations[frame], track.translations[frame]
+        )
+
+    def moving_layer(self, frame: int) -> Layer:
+        """Person and object of a frame, ready for rays."""
+        vertices, faces = self.body_vertices[frame].astype(float), self.dressed.faces
+        person = TexturedMesh(
+            vertices,
+            faces,
+            smooth_normals(vertices, faces)[faces],
+            np.zeros((len(faces), 3, 2)),
+            np.full(len(faces), -1),
+        )
+        thing = self.object_at(frame)
+        numbers = np.repeat([1, 2], [len(faces), len(thing.faces)])
+        return Layer.build(TexturedMesh.join([person, thing]), numbers, self._fine)
+
+    def render(self, frame: int, camera: Camera, layer: Layer | None = None) -> TrueView:
+        """The moment `frame` from any camera."""
+        picture = self._caster.render(camera, layer or self.moving_layer(frame))
+        gain = 1 + self.knobs.light.exposure_ramp * (frame / (self.knobs.frames - 1) - 0.5)
+        image = np.round(255 * to_srgb(gain * picture.color)).astype(np.uint8)
+        return TrueView(frame, camera, image, picture.depth, picture.entity)
+
+    def views(self) -> Iterator[tuple[TrueView, list[TrueView]]]:
+        """Every frame from the path's camera, with the held-out views of that moment."""
+        for frame, camera in enumerate(self.cameras):
+            layer = self.moving_layer(frame)
+            others = [self.render(f, c, layer) for f, c in self.held_out if f == frame]
+            yield self.render(frame, camera, layer), others
+
+
+def generate(knobs: SceneKnobs, body: BodyModel) -> SyntheticScene:
+    """Scripts a scene; deterministic in its arguments.
+
+    Raises:
+        HoigsError: the person cannot reach what the knobs ask for.
+    """
+    script = MOTIONS[knobs.object.motion](knobs).script()
+    person = Choreographer(body, knobs)
+    poses = person.perform(script, knobs)
+    palette = Palette()
+    room = build_room(palette, script.stands, knobs.seed)
+    faces = crate_faces(np.random.default_rng(knobs.seed + 1), 256, knobs.object.textured)
+    columns = 24 if knobs.object.motion == "bending" else 1
+    thing = box(knobs.object.size, [palette.add(face) for face in faces], columns)
+    return SyntheticScene(
+        knobs=knobs,
+        poses=poses,
+        script=script,
+        dressed=dress(body, person.betas, knobs.cloth_thickness, knobs.seed + 2),
+        object_mesh=thing,
+        shell=room.shell,
+        props=room.props,
+        atlas=TextureAtlas.pack(palette.images),
+        cameras=camera_path(knobs),
+        held_out=held_out_views(knobs),
+    )
+
+
+def canonical(scene: SyntheticScene, points: Float[Array, "P 3"], frame: int) -> Array:
+    """World points in the object's own frame at a moment (rigid part of its motion)."""
+    track = scene.script.track
+    return (points - track.translations[frame]) @ track.rotations[frame]
+
+
+def unproject(view: TrueView, where: Bool[Array, "H W"]) -> tuple[Array, Array]:
+    """World points [P, 3] and sRGB [P, 3] of some pixels of a view."""
+    grid = view.camera.pixel_grid()[torch.from_numpy(where)]
+    points = view.camera.unproject(grid, torch.from_numpy(view.depth[where]))
+    return points.double().numpy(), view.image[where] / 255.0

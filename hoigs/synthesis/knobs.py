@@ -1,0 +1,139 @@
+"""SceneKnobs: every number of a synthetic clip in one checked place."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from hoigs.core.config import ComponentConfig
+
+CameraPathName = Literal["orbit", "pan", "static"]
+ObjectMotionName = Literal["held", "thrown", "pushed", "bending", "static"]
+
+
+class CameraKnobs(ComponentConfig):
+    """The camera that films the clip.
+
+    orbit: an arc about the person with a change of height; pan: a sideways dolly with a fixed
+    viewing direction; static: one place.
+    """
+
+    path: CameraPathName = "orbit"
+    azimuth_degrees: float = Field(8.0, description="middle of the path; 0 faces the person")
+    arc_degrees: float = Field(44.0, ge=0, le=180, description="whole arc of an orbit")
+    pan_metres: float = Field(1.2, ge=0, description="whole way of a pan")
+    distance: float = Field(3.7, gt=0.5, description="to the target, metres, along the floor")
+    height: float = Field(1.45, gt=0, description="of the camera's centre, metres")
+    height_change: float = Field(0.5, ge=0, description="between the ends of the path, metres")
+    target: tuple[float, float, float] = (0.0, 0.88, 0.15)
+    fov_y_degrees: float = Field(40.0, gt=5, lt=120)
+    principal_point_shift: tuple[float, float] = Field(
+        (0.0, 0.0), description="of (cx, cy) from the middle, as fractions of width and height"
+    )
+
+
+class ObjectKnobs(ComponentConfig):
+    """The thing that is handled, and how it moves."""
+
+    motion: ObjectMotionName = "held"
+    size: tuple[float, float, float] = Field(
+        (0.34, 0.25, 0.26), description="between the hands, height, depth; metres"
+    )
+    textured: bool = Field(True, description="False paints it in one colour")
+    swing_degrees: float = Field(45.0, ge=0, le=60, description="yaw of the swing to either side")
+    tilt_degrees: float = Field(20.0, ge=0, le=45, description="roll and pitch while it swings")
+    lift_height: float = Field(1.22, gt=0, description="of the centre at the top of the swing")
+    stand_height: float = Field(0.56, gt=0.1, description="of what it stands on, metres")
+    throw_height: float = Field(0.45, gt=0, description="rise of a throw, metres")
+    bend_degrees: float = Field(70.0, ge=0, le=150, description="of a bending bar, end to end")
+
+
+class LightKnobs(ComponentConfig):
+    """Sun and sky; both fixed in the world, so that every view agrees."""
+
+    sun: float = Field(1.15, ge=0)
+    ambient: float = Field(0.78, ge=0)
+    sun_direction: tuple[float, float, float] = Field(
+        (0.45, 1.0, 0.65), description="towards the sun"
+    )
+    sun_radius_degrees: float = Field(7.0, ge=0, description="half-angle; wide gives soft shadows")
+    shadows: float = Field(0.75, ge=0, le=1, description="0 casts none")
+    occlusion: float = Field(0.8, ge=0, le=1, description="ambient occlusion; 0 is none")
+    exposure_ramp: float = Field(0.0, gt=-1, lt=1, description="relative gain, first to last frame")
+
+
+class NoiseKnobs(ComponentConfig):
+    """Errors put on what is written, as a real pipeline would make them; the truth stays exact."""
+
+    mask_boundary: float = Field(0.0, ge=0, le=1, description="share of boundary pixels flipped")
+    mask_missing: float = Field(0.0, ge=0, le=1, description="share of frames without a mask")
+    depth_relative: float = Field(0.0, ge=0, description="std as a share of the depth")
+    depth_scale: float = Field(1.0, gt=0)
+    depth_holes: float = Field(0.0, ge=0, le=1, description="share of pixels without a depth")
+    pose_degrees: float = Field(0.0, ge=0, description="std of each joint's rotation")
+    pose_metres: float = Field(0.0, ge=0, description="std of the body's place")
+    object_degrees: float = Field(0.0, ge=0, description="std of the object's rotation")
+    object_metres: float = Field(0.0, ge=0, description="std of the object's place")
+    camera_degrees: float = Field(0.0, ge=0, description="std of each camera's rotation")
+    camera_metres: float = Field(0.0, ge=0, description="std of each camera's place")
+    points_metres: float = Field(0.004, ge=0, description="std of the initial points")
+
+
+class SceneKnobs(ComponentConfig):
+    """A synthetic clip: one person, one object, one room, one moving camera, known truth.
+
+    Attributes:
+        frames: of the whole clip. fps: so that frames / fps is its length in seconds.
+        width, height: pixels.
+        seed: of textures, points and noise.
+        samples, edge_samples: rays a pixel, and at edges (colour only; masks and depth are the
+            pixel centre's).
+        held_out_views: frames from cameras that are never trained on.
+        test_frames: uniformly chosen (HOSNeRF's rule: 16).
+        scene_points, object_points: initial points written to the clip.
+        betas: shape of the body; coefficients that the body has and this lacks are zero.
+        cloth_thickness: how far clothes stand off the skin, metres.
+    """
+
+    frames: int = Field(64, ge=2)
+    width: int = Field(256, ge=16)
+    height: int = Field(256, ge=16)
+    fps: float = Field(16.0, gt=0)
+    seed: int = 0
+    samples: int = Field(4, ge=1, le=64)
+    edge_samples: int = Field(16, ge=1, le=64)
+    held_out_views: int = Field(8, ge=0)
+    test_frames: int = Field(16, ge=1)
+    scene_points: int = Field(10_000, ge=100)
+    object_points: int = Field(1_500, ge=50)
+    betas: tuple[float, ...] = ()
+    cloth_thickness: float = Field(0.010, ge=0, le=0.05)
+    camera: CameraKnobs = CameraKnobs()
+    object: ObjectKnobs = ObjectKnobs()
+    light: LightKnobs = LightKnobs()
+    noise: NoiseKnobs = NoiseKnobs()
+
+    @model_validator(mode="after")
+    def _edges_take_more(self) -> SceneKnobs:
+        if self.edge_samples < self.samples:
+            raise ValueError(
+                f"edge_samples ({self.edge_samples}) is below samples ({self.samples}): edges "
+                "take the plain samples first and then more; give at least as many"
+            )
+        return self
+
+    @staticmethod
+    def tiny(**changes: object) -> SceneKnobs:
+        """A clip for tests: 12 frames at 64x64, a few held-out views, about a second."""
+        small: dict[str, object] = {
+            "frames": 12, "width": 64, "height": 64, "fps": 3.0, "edge_samples": 4,
+            "held_out_views": 3, "test_frames": 3, "scene_points": 2_000, "object_points": 300,
+        }  # fmt: skip
+        return SceneKnobs.model_validate({**small, **changes})
+
+    def digest(self, *more: str) -> str:
+        """A hash of every knob and of `more` (generator version, body), 16 hex digits."""
+        text = "\n".join((self.model_dump_json(), *more))
+        return hashlib.sha256(text.encode()).hexdigest()[:16]

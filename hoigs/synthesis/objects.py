@@ -1,0 +1,240 @@
+"""How the object moves: one small class a way of moving, each a script over the clip's time."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import gaussian_filter1d
+
+from hoigs.synthesis.ik import about
+from hoigs.synthesis.knobs import SceneKnobs
+from hoigs.synthesis.meshes import TexturedMesh
+from hoigs.synthesis.room import Stand
+
+Array = np.ndarray
+GRAVITY = 9.81
+STAND_RADIUS = 0.60  # from the person's axis to the middle of what the object stands on, metres
+RELEASED = 0.14  # how far a waiting hand is off the surface, metres
+
+
+@dataclass(frozen=True)
+class Track:
+    """A rigid path: object to world."""
+
+    rotations: Float[Array, "F 3 3"]
+    translations: Float[Array, "F 3"]
+
+
+@dataclass(frozen=True)
+class ObjectScript:
+    """Everything that the person and the renderer need to know of the object.
+
+    Attributes:
+        track: of the object. hold: of the frame that the hands keep to (where the object is, or
+            would be, while they have it).
+        grip: 1 where the hands touch, 0 where they are away, smooth between.
+        bend: end-to-end angle, radians; 0 for a rigid object.
+        stands: furniture that it needs.
+    """
+
+    track: Track
+    hold: Track
+    grip: Float[Array, " F"]
+    bend: Float[Array, " F"]
+    stands: tuple[Stand, ...]
+
+
+class ObjectMotion(ABC):
+    """Scripts the object over a clip."""
+
+    def __init__(self, knobs: SceneKnobs):
+        self.knobs, self.object = knobs, knobs.object
+        self.u = np.linspace(0, 1, knobs.frames)
+        self.rest_height = self.object.stand_height + self.object.size[1] / 2
+
+    @abstractmethod
+    def script(self) -> ObjectScript: ...
+
+    def follow(self, keys: Array) -> Array:
+        """Monotone cubic through rows (u, yaw, radius, height, pitch, roll), slightly smoothed.
+
+        Sampled finely first, so that the path does not depend on the number of frames.
+        """
+        fine = np.linspace(0, 1, 1025)
+        values = PchipInterpolator(keys[:, 0], keys[:, 1:])(fine)
+        values = gaussian_filter1d(values, 14.0, axis=0, mode="nearest")
+        return np.stack([np.interp(self.u, fine, v) for v in values.T], -1)
+
+    def path(self, keys: Array) -> Track:
+        """Keys in degrees and metres about the person's axis, as poses."""
+        yaw, radius, height, pitch, roll = self.follow(keys).T
+        yaw, pitch, roll = np.radians(yaw), np.radians(pitch), np.radians(roll)
+        turned = about(np.array([0, 1, 0]), yaw)
+        rotations = turned @ about(np.array([1, 0, 0]), pitch) @ about(np.array([0, 0, 1]), roll)
+        place = np.stack((radius * np.sin(yaw), height, radius * np.cos(yaw)), -1)
+        return Track(rotations, place)
+
+    def ramp(self, *points: tuple[float, float]) -> Array:
+        """Smooth interpolation of (u, value) pairs."""
+        u, value = np.asarray(points, float).T
+        return PchipInterpolator(u, value)(self.u)
+
+    def stand(self, yaw_degrees: float, width: float = 0.42) -> Stand:
+        yaw = np.radians(yaw_degrees)
+        return Stand(
+            STAND_RADIUS * np.sin(yaw), STAND_RADIUS * np.cos(yaw), self.object.stand_height,
+            width=width, yaw=yaw,
+        )  # fmt: skip
+
+    def swing_keys(self, side: float) -> Array:
+        """Lift at one side, swing across and back, put down at the other."""
+        s, t, low, top = self.object.swing_degrees, self.object.tilt_degrees, self.rest_height, \
+            self.object.lift_height  # fmt: skip
+        middle = low + 0.80 * (top - low)
+        keys = np.array(
+            [
+                # u,  yaw,      radius,       height,             pitch,    roll
+                [0.00, -s, STAND_RADIUS, low, 0, 0],
+                [0.11, -s, STAND_RADIUS, low, 0, 0],
+                [0.29, -0.6 * s, 0.52, middle, -0.4 * t, -0.5 * t],
+                [0.46, 0.75 * s, 0.50, 0.5 * (middle + top), -0.6 * t, t],
+                [0.63, -0.45 * s, 0.50, top, -0.9 * t, -0.9 * t],
+                [0.76, 0.45 * s, 0.52, 0.65 * middle + 0.35 * low, -0.3 * t, 0.35 * t],
+                [0.88, s, STAND_RADIUS, low, 0, 0],
+                [1.00, s, STAND_RADIUS, low, 0, 0],
+            ]
+        )
+        keys[:, [1, 5]] *= side
+        return keys
+
+    def lift_grip(self) -> Array:
+        return self.ramp((0, 0), (0.085, 1), (0.905, 1), (1, 0))
+
+    def rigid(self) -> Array:
+        return np.zeros(len(self.u))
+
+
+class Held(ObjectMotion):
+    """Lifted from one stool, swung from side to side, put down on another."""
+
+    def script(self) -> ObjectScript:
+        track = self.path(self.swing_keys(1.0))
+        s = self.object.swing_degrees
+        stands = (self.stand(-s), self.stand(s))
+        return ObjectScript(track, track, self.lift_grip(), self.rigid(), stands)
+
+
+class Thrown(ObjectMotion):
+    """Lifted, thrown up with one turn about x in true free fall, caught and put down."""
+
+    def script(self) -> ObjectScript:
+        low, chest = self.rest_height, 0.5 * (self.rest_height + self.object.lift_height)
+        flight = 2 * np.sqrt(2 * self.object.throw_height / GRAVITY)
+        seconds = self.knobs.frames / self.knobs.fps
+        share = min(0.5, flight / seconds)
+        up, down = 0.5 - share / 2, 0.5 + share / 2
+        keys = np.array(
+            [
+                [0.00, 0, STAND_RADIUS, low, 0, 0],
+                [0.11, 0, STAND_RADIUS, low, 0, 0],
+                [0.5 * (0.11 + up), 0, 0.50, chest - 0.12, 0, 0],
+                [up, 0, 0.52, chest, 0, 0],
+                [down, 0, 0.52, chest, 0, 0],
+                [0.5 * (0.88 + down), 0, 0.50, chest - 0.12, 0, 0],
+                [0.88, 0, STAND_RADIUS, low, 0, 0],
+                [1.00, 0, STAND_RADIUS, low, 0, 0],
+            ]
+        )
+        hold = self.path(keys)
+        r = np.clip((self.u - up) / share, 0, 1)
+        rise = 4 * self.object.throw_height * r * (1 - r)
+        turned = hold.rotations @ about(np.array([1, 0, 0]), -2 * np.pi * r)
+        track = Track(turned, hold.translations + rise[:, None] * np.array([0, 1.0, 0]))
+        free = self.ramp((0, 1), (up, 1), (0.5 * (up + down), 0.25), (down, 1), (1, 1))
+        return ObjectScript(track, hold, self.lift_grip() * free, self.rigid(), (self.stand(0),))
+
+
+class Pushed(ObjectMotion):
+    """Slid along a table between both hands."""
+
+    def script(self) -> ObjectScript:
+        reach, low = 0.55 * self.object.swing_degrees, self.rest_height
+        columns = [(0.0, -1), (0.13, -1), (0.42, 0.9), (0.62, -0.5), (0.87, 1), (1.0, 1)]
+        # along a straight table edge: radius grows as 1 / cos(yaw)
+        keys = np.array(
+            [
+                [u, reach * k, STAND_RADIUS / np.cos(np.radians(reach * k)), low, 0, 0]
+                for u, k in columns
+            ]
+        )
+        track = self.path(keys)
+        track.translations[:, 2] = STAND_RADIUS
+        return ObjectScript(
+            track, track, self.lift_grip(), self.rigid(), (self.stand(0, width=1.15),)
+        )
+
+
+class Bending(ObjectMotion):
+    """A bar held at both ends that is lifted and bent to and fro (not rigid)."""
+
+    def script(self) -> ObjectScript:
+        held = self.path(self.swing_keys(1.0))
+        wave = np.sin(2 * np.pi * 2.0 * np.clip((self.u - 0.16) / 0.64, 0, 1))
+        bend = np.radians(self.object.bend_degrees) * wave * self.ramp(
+            (0, 0), (0.16, 0), (0.3, 1), (0.66, 1), (0.80, 0), (1, 0)
+        )  # fmt: skip
+        s = self.object.swing_degrees
+        return ObjectScript(held, held, self.lift_grip(), bend, (self.stand(-s), self.stand(s)))
+
+
+class Static(ObjectMotion):
+    """Stands there while the person moves the hands as if to take it."""
+
+    def script(self) -> ObjectScript:
+        keys = self.swing_keys(1.0)
+        keys[:, 1] = np.minimum(keys[:, 1], -0.1 * self.object.swing_degrees)
+        hold = self.path(keys)
+        stand = self.stand(self.object.swing_degrees)
+        count = len(self.u)
+        place = np.array([stand.x, self.rest_height, stand.z])
+        rotation = about(np.array([0, 1, 0]), np.full(1, stand.yaw))
+        track = Track(np.repeat(rotation, count, 0), np.repeat(place[None], count, 0))
+        return ObjectScript(track, hold, np.zeros(count), self.rigid(), (stand,))
+
+
+MOTIONS: dict[str, type[ObjectMotion]] = {
+    "held": Held, "thrown": Thrown, "pushed": Pushed, "bending": Bending, "static": Static,
+}  # fmt: skip
+
+
+def bend_points(
+    points: Float[Array, "*batch 3"], angle: float
+) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 3 3"]]:
+    """Bends along x into an arc of unit stretch on the middle line.
+
+    Args:
+        angle: radians a metre of x (end-to-end angle over length).
+
+    Returns:
+        bent points, and the local rotation at each.
+    """
+    phase = points[..., 0] * angle
+    rotation = about(np.array([0, 1, 0]), phase.ravel()).reshape(*phase.shape, 3, 3)
+    x = points[..., 0] * np.sinc(phase / np.pi)
+    z = points[..., 0] * np.sinc(phase / (2 * np.pi)) * np.sin(phase / 2) * -1.0
+    middle = np.stack((x, np.zeros_like(x), z), -1)
+    offset = points * np.array([0, 1.0, 1.0])
+    return middle + np.einsum("...ij,...j->...i", rotation, offset), rotation
+
+
+def bent_mesh(mesh: TexturedMesh, angle: float) -> TexturedMesh:
+    """`mesh` after `bend_points`."""
+    if angle == 0:
+        return mesh
+    vertices, rotations = bend_points(mesh.vertices, angle)
+    turned = np.einsum("fcij,fcj->fci", rotations[mesh.faces], mesh.normals)
+    return replace(mesh, vertices=vertices, normals=turned)
