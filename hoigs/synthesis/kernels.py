@@ -6,6 +6,8 @@ same ones at every pixel, so that soft shadows carry no noise.
 """
 
 # No `from __future__ import annotations` here: Warp reads kernel annotations as objects.
+# float(1.0) declares a variable that a loop may change; a bare literal would be a constant.
+# ruff: noqa: UP018
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
@@ -192,7 +194,7 @@ def blocked(props: Surface, moving: Surface, origin: wp.vec3, ray: wp.vec3, reac
 @wp.func
 def corner_dimming(lights: Lights, point: wp.vec3, normal: wp.vec3):
     """Sky that the room's own walls hide near an edge; smooth, known in closed form."""
-    dim = 1.0
+    dim = float(1.0)
     for axis in range(3):
         away = 1.0 - wp.abs(normal[axis])
         dim *= 1.0 - 0.38 * away * wp.exp((lights.room_low[axis] - point[axis]) / 0.35)
@@ -227,14 +229,14 @@ def shade(
     start = point + flat * 2.0e-3
     tangent = wp.normalize(wp.cross(smooth, wp.vec3(0.31, 0.17, 0.93)))
     bitangent = wp.cross(smooth, tangent)
-    sun = 0.0
-    hidden = 0.0
+    sun = float(0.0)
+    hidden = float(0.0)
     for k in range(2):
         index = (2 * sample + k) % DIRECTIONS
         towards = lights.suns[index]
         facing = wp.dot(smooth, towards)
         if facing > 0.0:
-            seen = 1.0
+            seen = float(1.0)
             if lights.shadows > 0.0:
                 seen = 1.0 - lights.shadows * blocked(props, moving, start, towards, FAR)
             sun += 0.5 * facing * seen
@@ -306,9 +308,9 @@ def render_rows(
     if centre.layer == 2:
         entity[pixel] = moving.entity[centre.face]
 
-    darkest = 1.0e6
-    brightest = 0.0
-    edge = False
+    darkest = float(1.0e6)
+    brightest = float(0.0)
+    edge = bool(False)
     total = wp.vec3(0.0, 0.0, 0.0)
     for s in range(offsets.shape[0]):
         ray = direction(view, column + offsets[s][0], row + offsets[s][1])
