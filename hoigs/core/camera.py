@@ -27,7 +27,7 @@ class Camera:
     height: int
 
     @property
-    def center(self) -> Float[Tensor, "3"]:
+    def center(self) -> Float[Tensor, " 3"]:
         """Camera centre in the world, metres."""
         rotation, shift = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return -rotation.mT @ shift
@@ -81,8 +81,8 @@ class Camera:
 
     @staticmethod
     def look_at(
-        eye: Float[Tensor, "3"],
-        target: Float[Tensor, "3"],
+        eye: Float[Tensor, " 3"],
+        target: Float[Tensor, " 3"],
         *,
         width: int,
         height: int,

@@ -1,0 +1,46 @@
+"""Shared by all tests: shape checking at run time, two threads, the optional shared data."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from jaxtyping import install_import_hook
+
+# Annotations are promises: every call in these modules is checked against its shapes and types.
+# hoigs.rasterizers.warp is left out, because Warp reads the source of its kernels; the modules
+# that pydantic and pluggy read are free of tensors.
+CHECKED = (
+    "hoigs.core",
+    "hoigs.plugins",
+    "hoigs.rasterizers.compositing",
+    "hoigs.rasterizers.oracle",
+    "hoigs.rasterizers.torch_tiles",
+    "hoigs.evaluation",
+    "hoigs.training",
+)
+install_import_hook(list(CHECKED), "shapecheck.check")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    torch.set_num_threads(2)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of recorded clips and weights beside the repository; the test skips without it."""
+    beside = Path(__file__).resolve().parents[2] / "shared"
+    folder = Path(os.environ.get("HOIGS_SHARED", beside)) / "data"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}: set HOIGS_SHARED to the folder that holds data/")
+    return folder
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> torch.device:
+    """The CPU, then a CUDA device where there is one."""
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    return torch.device(request.param)
