@@ -53,17 +53,17 @@ class Render(torch.autograd.Function):
             background = v.color * (1.0 - images.alpha)[..., None]
             if inputs.background.dim() == 1:
                 background = background.sum((0, 1))
-        gradients = dict(
-            means=out.means,
-            quats=out.quats,
-            log_scales=out.log_scales,
-            opacity_logits=out.opacity_logits,
-            sh=out.sh,
-            features=out.features,
-            offsets=out.offsets if needs.offsets else None,
-            background=background,
-            view=out.view(inputs) if needs.view else None,
-            K=None,
-            subset=None,
-        )
+        gradients = {
+            "means": out.means,
+            "quats": out.quats,
+            "log_scales": out.log_scales,
+            "opacity_logits": out.opacity_logits,
+            "sh": out.sh,
+            "features": out.features,
+            "offsets": out.offsets if needs.offsets else None,
+            "background": background,
+            "view": out.view(inputs) if needs.view else None,
+            "K": None,
+            "subset": None,
+        }
         return (None, None, *(gradients[f.name] for f in fields(Inputs)))

@@ -1,4 +1,5 @@
 # mypy: ignore-errors
+# ruff: noqa: UP018
 # Warp's arrays annotate as values, and float(0.0) declares a variable that a loop may change.
 """Kernels of the fast CPU path: depth order, tile lists, and the tile loops of `cpu_source`.
 
@@ -58,7 +59,7 @@ def sort_by_depth(
     counters: I32,
 ):
     """Rows that are drawn, nearest first, ties by index; one thread (0.2 ms for 20,000)."""
-    visible = 0
+    visible = int(0)
     for row in range(count):
         if records[row * RECORD_C + HALF_WIDTH] > 0.0:
             key = wp.cast(depths[row], wp.int32)
@@ -68,10 +69,10 @@ def sort_by_depth(
             for digit in range(3):
                 slot = digit * DIGIT + ((key >> (11 * digit)) & (DIGIT - 1))
                 histogram[slot] = histogram[slot] + 1
-    source = 0
+    source = int(0)
     for digit in range(3):
-        total = 0
-        distinct = 0
+        total = int(0)
+        distinct = int(0)
         for j in range(digit * DIGIT, (digit + 1) * DIGIT):
             here = histogram[j]
             histogram[j] = total
@@ -93,7 +94,7 @@ def sort_by_depth(
             order[j] = order[source + j]
     counters[N_VISIBLE_C] = visible
     # room for the spans of each chunk: a span is the tiles of one row of tiles under one splat
-    total_spans = 0
+    total_spans = int(0)
     for chunk in range(chunks):
         spans_before[chunk] = total_spans
         for j in range(visible * chunk // chunks, visible * (chunk + 1) // chunks):
@@ -188,11 +189,11 @@ def place_pairs(
 ):
     """Running sums, one thread."""
     for chunk in range(chunks):
-        total = 0
+        total = int(0)
         for tile in range(tiles):
             total += tile_counts[chunk * tiles + tile]
         slots_before[chunk + 1] = slots_before[chunk] + total
-    place = 0
+    place = int(0)
     for tile in range(tiles):
         offsets[tile] = place
         for chunk in range(chunks):
