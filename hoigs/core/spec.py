@@ -280,6 +280,7 @@ def _settings(
             known = ", ".join(registry.keys(kind))
             return {}, [f'{at} {path}.use: "{part.use}" is no {kind} (known: {known})']
         config_class = registry.config_class(part.use)
+        registry.get(part.use)
     except PluginError as error:
         return {}, [f"{at} {path}.use: {error}"]
     try:

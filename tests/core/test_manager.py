@@ -219,7 +219,7 @@ def test_strict(plugins):
     plugins.offer("good", GOOD)
     plugins.manager({"HOIGS_STRICT": "1"})
     plugins.add("bad", "raise RuntimeError('no luck')")
-    with pytest.raises(PluginError, match="bad-plugin.*no luck"):
+    with pytest.raises(PluginError, match=r"bad-plugin.*no luck"):
         plugins.manager({"HOIGS_STRICT": "1"})
     plugins.manager({"HOIGS_STRICT": "0"})
 
