@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-# ruff: noqa: UP018
+# ruff: noqa: UP018, RUF046
 # Warp's arrays annotate as values, and float(0.0) declares a variable that a loop may change.
 """Kernels of the fast CPU path: depth order, tile lists, and the tile loops of `cpu_source`.
 
