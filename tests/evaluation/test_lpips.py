@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,6 @@ from torch import Tensor, nn
 from hoigs.core.errors import HoigsError
 from hoigs.evaluation.lpips import STACKS, VARIABLE, Lpips, find_weights
 
-SHARED = Path(os.environ.get("HOIGS_SHARED", "../shared"))
-WEIGHTS = SHARED / "data" / "lpips" / "alex_fp16.npz"
 VGG_WIDTHS = (64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512)
 ALEX_SHAPES = ((64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3))
 
@@ -164,10 +161,8 @@ def test_small_images_are_grown_not_refused() -> None:
     assert lpips.map(x, y).shape == (9, 20)
 
 
-def test_real_weights_rank_damage(monkeypatch: pytest.MonkeyPatch) -> None:
-    if not WEIGHTS.is_file():
-        pytest.skip(f"{WEIGHTS} is absent")
-    monkeypatch.setenv(VARIABLE, str(WEIGHTS))
+def test_real_weights_rank_damage(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, str(shared_data / "lpips" / "alex_fp16.npz"))
     lpips = Lpips.load(find_weights())
     assert lpips.net == "alex"
     ramp = torch.linspace(0, 1, 64)

@@ -66,7 +66,7 @@ def test_ssim_agrees_with_kornia_away_from_the_border() -> None:
 
 
 def test_ssim_gradients_by_finite_differences() -> None:
-    x, y = pair(7, 8, 2, dtype=torch.float64)
+    x, y = pair(5, 6, 1, dtype=torch.float64)
     x.requires_grad_(True)
     y.requires_grad_(True)
     assert torch.autograd.gradcheck(ssim, (x, y))

@@ -1,0 +1,201 @@
+"""A model judged on a clip: every score with its protocol, or the reason why there is none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from hoigs.core.clip import Clip, Frame
+from hoigs.core.errors import did_you_mean
+from hoigs.core.interaction import EntityKind
+from hoigs.core.rasterizer import RenderOutput
+from hoigs.core.scene import SceneModel
+from hoigs.evaluation.lpips import Lpips, find_weights
+from hoigs.evaluation.measure import device_name, model_size, render_time
+from hoigs.evaluation.metrics import region_psnr, ssim_map
+from hoigs.evaluation.protocol import NotComputed, Pixels, Protocol, TestPose, Value
+from hoigs.evaluation.regions import default_band, region_masks
+from hoigs.evaluation.scores import METRICS, Evaluation, FrameScores, ViewScores
+
+Progress = Callable[[float, str], None]
+TIMING_SHARE = 0.3  # of the progress bar
+
+
+def evaluate(
+    model: SceneModel,
+    clip: Clip,
+    *,
+    split: str = "test",
+    lpips_weights: Path | str | None = None,
+    held_out: bool = True,
+    test_pose: TestPose = "given",
+    pixels: Pixels = "float",
+    band: int | None = None,
+    timing_frames: int = 100,
+    timing_warmup: int = 10,
+    timing_budget_s: float = 60.0,
+    device: str | torch.device | None = None,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Score a model on a split of a clip and on its held-out cameras, and measure it.
+
+    Args:
+        lpips_weights: see `lpips.find_weights`; without any, LPIPS is "not computed" and says why.
+        held_out: also score the clip's held-out cameras, where it has them.
+        test_pose: how the clip came by the body poses of its test frames: recorded, not changed.
+        pixels: score float renders, or round them to 8 bits first. Clamped to [0, 1] either way.
+        band: pixels of the interaction band; 2 % of the longer side when None.
+        timing_frames, timing_warmup, timing_budget_s: see `measure.render_time`; 0 frames skip it.
+        device: where to move the model; None leaves it where it is.
+        progress: called with the done fraction and a word.
+
+    Raises:
+        ValueError: the clip has no such split, or no frames in it.
+        HoigsError: `lpips_weights` names no file, or a damaged one.
+    """
+    if split not in clip.split or len(clip.split[split]) == 0:
+        known = [name for name, positions in clip.split.items() if len(positions)]
+        raise ValueError(
+            f"clip has no frames in split {split!r}: {known}{did_you_mean(split, known)}"
+        )
+    if device is not None:
+        model.to(device)
+    found = find_weights(lpips_weights)
+    lpips: Lpips | NotComputed = NotComputed(found.reason)
+    if found.location is not None:
+        lpips = Lpips.load(found).to(model.device)
+    chosen = [("test frames" if split == "test" else f"{split} frames", clip, split)]
+    if held_out and clip.held_out is not None and len(clip.held_out):
+        chosen.append(("held-out cameras", clip.held_out, "test"))
+    work = sum(len(source.split[name]) for _, source, name in chosen)
+    report = progress or (lambda done, text: None)
+    trained = {clip.moments[p].index for p in clip.split.get("train", ())}
+    was_training = model.training
+    model.eval()
+    views, done = [], 0
+    for title, source, name in chosen:
+        protocol = _protocol(model, source, title, name, trained, test_pose, pixels, band, lpips)
+        frames = []
+        for position in source.split[name]:
+            frames.append(score_frame(model, source[position], source, protocol, lpips))
+            done += 1
+            report((1 - TIMING_SHARE) * done / work, title)
+        views.append(ViewScores(title, protocol, frames))
+    report(1 - TIMING_SHARE, "render time")
+    timing = NotComputed("timing_frames is 0") if timing_frames == 0 else render_time(
+        model, clip, list(clip.split[split]), frames=timing_frames, warmup=timing_warmup,
+        budget_s=timing_budget_s,
+    )  # fmt: skip
+    report(1.0, "")
+    model.train(was_training)
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    return Evaluation(clip.name, views, timing, model_size(model), created)
+
+
+def _protocol(
+    model: SceneModel,
+    clip: Clip,
+    title: str,
+    split: str,
+    trained: set[int],
+    test_pose: TestPose,
+    pixels: Pixels,
+    band: int | None,
+    lpips: Lpips | NotComputed,
+) -> Protocol:
+    positions = clip.split[split]
+    camera = clip.cameras[positions[0]]
+    first = camera.world_to_camera
+    fixed = all(torch.equal(c.world_to_camera, first) for c in clip.cameras)
+    views = title if title == "held-out cameras" else "training cameras"
+    return Protocol(
+        views="the one fixed training camera" if fixed and views != title else views,
+        split=split,
+        frames=len(positions),
+        unseen_times=sum(clip.moments[p].index not in trained for p in positions),
+        region="full",
+        band=default_band(camera.width, camera.height) if band is None else band,
+        test_pose=test_pose,
+        pixels=pixels,
+        width=camera.width,
+        height=camera.height,
+        lpips_net=None if isinstance(lpips, NotComputed) else lpips.net,
+        device=device_name(model.device),
+        rasterizer=type(model.rasterizer).__name__,
+    )
+
+
+@torch.no_grad()
+def score_frame(
+    model: SceneModel,
+    frame: Frame,
+    clip: Clip,
+    protocol: Protocol,
+    lpips: Lpips | NotComputed,
+) -> FrameScores:
+    """Draw one frame and score every region of it."""
+    device = model.device
+    output = model.render(frame.moment.to(device), frame.camera.to(device))
+    target = frame.rgb.to(device)
+    color = output.color.clamp(0, 1)
+    if protocol.pixels == "8-bit":
+        color = (color * 255).round() / 255
+    regions = region_masks(frame, clip.kinds, protocol.band)
+    if not torch.isfinite(color).all():
+        broken = dict.fromkeys(METRICS, NotComputed("the render is not finite"))
+        return FrameScores(frame.position, frame.moment.index, dict.fromkeys(regions, broken))
+    similarity = ssim_map(color, target).mean(-1)
+    perceptual = lpips if isinstance(lpips, NotComputed) else lpips.map(color, target)
+    depth = _depth_error(output, frame, clip)
+    values: dict[str, Mapping[str, Value]] = {}
+    for region, mask in regions.items():
+        mask = mask.to(device)
+        if not mask.any():
+            values[region] = dict.fromkeys(METRICS, NotComputed(_absence(region, clip.kinds)))
+            continue
+        values[region] = {
+            "psnr": float(region_psnr(color, target, mask)),
+            "ssim": float(similarity[mask].mean()),
+            "lpips": perceptual
+            if isinstance(perceptual, NotComputed)
+            else float(perceptual[mask].mean()),
+            "depth": _mean_depth(depth, mask),
+        }
+    if not isinstance(lpips, NotComputed):
+        # of whole images the published definition, which averages each layer before upsampling
+        values["full"] = {**values["full"], "lpips": float(lpips(color, target))}
+    return FrameScores(frame.position, frame.moment.index, values)
+
+
+def _depth_error(
+    output: RenderOutput, frame: Frame, clip: Clip
+) -> tuple[Tensor, Tensor] | NotComputed:
+    """|rendered - true| at each pixel, metres, and where both are known."""
+    if clip.depth_kind != "metric" or frame.depth is None:
+        return NotComputed(f"the clip's depth is {clip.depth_kind!r}, not metric")
+    truth = frame.depth.to(output.depth)
+    return (output.expected_depth - truth).abs(), (truth > 0) & (output.alpha > 0.5)
+
+
+def _mean_depth(errors: tuple[Tensor, Tensor] | NotComputed, mask: Tensor) -> Value:
+    if isinstance(errors, NotComputed):
+        return errors
+    error, known = errors
+    if not (known & mask).any():
+        return NotComputed("no pixel of the region has both true and rendered depth")
+    mean = float(error[known & mask].mean())
+    return mean if math.isfinite(mean) else NotComputed("the rendered depth is not finite")
+
+
+def _absence(region: str, kinds: Mapping[str, EntityKind]) -> str:
+    present = set(kinds.values())
+    wanted = {"human": {"human"}, "object": {"object"}, "interaction": {"human", "object"}}
+    missing = wanted.get(region, set()) - present
+    if missing:
+        return f"the clip has no {' and no '.join(sorted(missing))}"
+    return "human and object are not close" if region == "interaction" else "no visible pixels"

@@ -1,0 +1,223 @@
+"""What an evaluation says: scores by view, region and metric, times and sizes; tables and JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from hoigs.core.errors import did_you_mean
+from hoigs.evaluation.protocol import NotComputed, Protocol, Value
+from hoigs.evaluation.regions import REGIONS
+
+METRICS = ("psnr", "ssim", "lpips", "depth")
+TITLES = {"psnr": "PSNR dB ↑", "ssim": "SSIM ↑", "lpips": "LPIPS ↓", "depth": "depth error m ↓"}
+DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "depth": 4}
+
+
+@dataclass(frozen=True)
+class Table:
+    """Plain cells; whoever prints them chooses how."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+    notes: Sequence[str]
+
+
+@dataclass(frozen=True)
+class FrameScores:
+    """One frame: values by region, then by metric.
+
+    Attributes:
+        position: in the scored clip. index: frame number in the video.
+    """
+
+    position: int
+    index: int
+    values: Mapping[str, Mapping[str, Value]]
+
+
+@dataclass(frozen=True)
+class ViewScores:
+    """All scored frames of one kind of view, under one protocol.
+
+    Attributes:
+        name: "test frames" or "held-out cameras".
+    """
+
+    name: str
+    protocol: Protocol
+    frames: list[FrameScores]
+
+    def mean(self, region: str, metric: str) -> tuple[Value, int]:
+        """Mean over the frames that have this score, and how many have."""
+        values = [frame.values[region][metric] for frame in self.frames]
+        numbers = [v for v in values if not isinstance(v, NotComputed)]
+        if numbers:
+            return sum(numbers) / len(numbers), len(numbers)
+        reasons = sorted({v.reason for v in values if isinstance(v, NotComputed)})
+        return NotComputed("; ".join(reasons)), 0
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Medians over synchronised frames after a warm-up, milliseconds (methods D.7).
+
+    Attributes:
+        deform_ms: features, interaction and deformation: a moment in, Gaussians out.
+        raster_ms: Gaussians in, image out. total_ms: both, as one frame takes.
+        drawn: median number of Gaussians with a footprint on screen.
+    """
+
+    frames: int
+    warmup: int
+    deform_ms: float
+    raster_ms: float
+    total_ms: float
+    drawn: int
+    width: int
+    height: int
+    device: str
+    rasterizer: str
+    note: str = "nothing is cached between frames"
+
+    @property
+    def fps(self) -> float:
+        return 1000.0 / self.total_ms
+
+
+@dataclass(frozen=True)
+class PartSize:
+    """One entity, or the interaction module. megabytes: of its stored tensors, 10^6 bytes."""
+
+    name: str
+    kind: str
+    gaussians: int
+    parameters: int
+    megabytes: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A judged model."""
+
+    clip: str
+    views: list[ViewScores]
+    timing: Timing | NotComputed
+    sizes: list[PartSize]
+    created: str
+
+    def view(self, name: str) -> ViewScores:
+        for view in self.views:
+            if view.name == name:
+                return view
+        known = [view.name for view in self.views]
+        raise KeyError(f"no view {name!r} among {known}{did_you_mean(name, known)}")
+
+    def score(self, region: str, metric: str, view: str = "test frames") -> Value:
+        """The mean of one metric: `evaluation.score("human_object", "psnr")`."""
+        for value, valid in ((region, REGIONS), (metric, METRICS)):
+            if value not in valid:
+                raise KeyError(f"{value!r} is none of {valid}{did_you_mean(value, valid)}")
+        return self.view(view).mean(region, metric)[0]
+
+    def tables(self) -> list[Table]:
+        """One table a view, then times and sizes."""
+        tables = [score_table(view) for view in self.views]
+        return [*tables, timing_table(self.timing), size_table(self.sizes)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values. Every score carries its protocol; an absent one its reason."""
+        scores, frames = [], []
+        for view in self.views:
+            for region in REGIONS:
+                for metric in METRICS:
+                    value, counted = view.mean(region, metric)
+                    scores.append(
+                        {
+                            "view": view.name,
+                            "region": region,
+                            "metric": metric,
+                            "value": _plain(value),
+                            "frames": counted,
+                            "protocol": view.protocol.of(region).to_dict(),
+                        }
+                    )
+            for frame in view.frames:
+                values = {
+                    region: {metric: _plain(v) for metric, v in of_region.items()}
+                    for region, of_region in frame.values.items()
+                }
+                record = {"position": frame.position, "index": frame.index, "values": values}
+                frames.append({"view": view.name, **record})
+        timing = self.timing
+        return {
+            "format": "hoigs-evaluation",
+            "version": 1,
+            "clip": self.clip,
+            "created": self.created,
+            "scores": scores,
+            "timing": _plain(timing) if isinstance(timing, NotComputed) else asdict(timing),
+            "size": [asdict(part) for part in self.sizes],
+            "frames": frames,
+        }
+
+    def save(self, path: Path | str) -> None:
+        """Write JSON under a temporary name, then rename."""
+        path = Path(path)
+        temporary = path.with_name(f".{path.name}.part")
+        temporary.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False))
+        temporary.replace(path)
+
+
+def score_table(view: ViewScores) -> Table:
+    """Regions down, metrics across; metrics that no region has are explained in a note."""
+    rows, notes = [], {}
+    shown = [m for m in METRICS if any(view.mean(r, m)[1] for r in REGIONS)]
+    for metric in METRICS:
+        if metric not in shown:
+            notes[metric] = f"{metric}: {view.mean('full', metric)[0]}"
+    for region in REGIONS:
+        cells = []
+        for metric in shown:
+            value, _ = view.mean(region, metric)
+            cells.append("–" if isinstance(value, NotComputed) else f"{value:.{DIGITS[metric]}f}")
+            if isinstance(value, NotComputed):
+                notes[region] = f"{region.replace('_', ' + ')}: {value}"
+        rows.append((region.replace("_", " + "), str(view.mean(region, "psnr")[1]), *cells))
+    columns = ("region", "frames", *(TITLES[m] for m in shown))
+    return Table(view.name, columns, rows, [*notes.values(), *view.protocol.footnotes()])
+
+
+def timing_table(timing: Timing | NotComputed) -> Table:
+    columns = ("deform ms", "raster ms", "total ms", "frames/s", "Gaussians drawn")
+    if isinstance(timing, NotComputed):
+        return Table("render time", columns, [], [str(timing)])
+    numbers = (timing.deform_ms, timing.raster_ms, timing.total_ms, timing.fps)
+    note = (
+        f"Median of {timing.frames} synchronised frames after {timing.warmup}, at "
+        f"{timing.width}x{timing.height}, by {timing.rasterizer} on {timing.device}; {timing.note}."
+    )
+    row = (*(f"{n:.2f}" for n in numbers), f"{timing.drawn:,}")
+    return Table("render time", columns, [row], [note])
+
+
+def size_table(parts: Sequence[PartSize]) -> Table:
+    rows = [(p.name, p.kind, p.gaussians, p.parameters, p.megabytes) for p in parts]
+    columns = zip(*rows, strict=True)
+    _, _, gaussians, parameters, megabytes = (list(c) for c in columns)
+    rows.append(("total", "", sum(gaussians), sum(parameters), sum(megabytes)))
+    cells = [
+        (name, kind, f"{count:,}" if kind != "interaction" else "–", f"{numbers:,}", f"{mb:.2f}")
+        for name, kind, count, numbers, mb in rows
+    ]
+    columns_ = ("part", "kind", "Gaussians", "parameters", "MB")
+    notes = ["Parameters are trained numbers; MB are 10^6 bytes of all stored tensors, unpacked."]
+    return Table("model size", columns_, cells, notes)
+
+
+def _plain(value: Value) -> float | dict[str, str]:
+    return {"not_computed": value.reason} if isinstance(value, NotComputed) else round(value, 6)
