@@ -93,6 +93,10 @@ class ProvidesField(Protocol):
         """Features of the body's points at `moment` and their world positions, metres."""
         ...
 
+    def field_parts(self) -> Tensor:
+        """Body part (0..15) of each point of `posed_field`, int64 [V]."""
+        ...
+
 
 @runtime_checkable
 class ProvidesSkeleton(Protocol):

@@ -1,0 +1,349 @@
+"""deformation:hexplane-skinning: HOIGS's human (Sec. "Human Deformation", methods A.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, Self
+
+import torch
+from jaxtyping import Float, Int
+from pydantic import Field
+from torch import Tensor, nn
+
+from hoigs.core.body import PART_NAMES, PELVIS, BodyModel, BodySurface
+from hoigs.core.config import ComponentConfig
+from hoigs.core.context import BuildContext
+from hoigs.core.gaussians import SH_C0, GaussianDelta, Gaussians
+from hoigs.core.interaction import Residual
+from hoigs.core.moment import BodyPose, Moment
+from hoigs.core.planes import PairedPlanes
+from hoigs.core.rotation import multiply_quats
+from hoigs.core.topology import TopologyChange
+from hoigs.plugins.deformation.canonical_head import CanonicalAttributes, CanonicalHead, HeadKind
+from hoigs.plugins.deformation.skinned_body import ScaleAbout, SkinnedBody
+from hoigs.plugins.deformation.skinning import skin_points, skin_quats
+
+OPAQUE = 4.6  # logit of 0.99
+
+
+class HexPlaneSkinningConfig(ComponentConfig):
+    """The paper's human; sizes that it leaves open are ExAvatar's (methods A.4).
+
+    Attributes:
+        resolution, channels: of the feature planes. time_resolution: None is half the frames.
+        box: side of the cube about the pelvis that the planes cover, metres.
+        width: of psi_h. head: what psi_h predicts, see CanonicalHead.
+        free_attributes: train each point's own colour, opacity and scale too, which psi_h then
+            adds to; they converge sooner. False is the paper: all comes from the planes.
+        refine_poses: learn per-frame corrections of pose and translation, and one of shape.
+        scale_about: the fixed point of alpha: the "pelvis", or the "camera", seen from which
+            alpha changes depth but not the image.
+        field_points: body points at which phi is read, spread over the 16 parts.
+    """
+
+    resolution: int = Field(128, ge=2)
+    channels: int = Field(32, ge=1)
+    time_resolution: int | None = Field(None, ge=1)
+    box: float = Field(2.5, gt=0)
+    width: int = Field(128, ge=8)
+    head: HeadKind = "full"
+    free_attributes: bool = True
+    refine_poses: bool = True
+    scale_about: ScaleAbout = "pelvis"
+    field_points: int = Field(1536, ge=16)
+
+
+class HexPlaneSkinning(SkinnedBody):
+    """G_human = alpha LBS(P_c, theta, W), with psi_h(f(T_c)) = (c, o, dP_c, R, S, W).
+
+    The canonical body is the zero pose. f and phi come from the same paired planes: f is read at
+    canonical points, phi at posed ones, both relative to the pelvis and before alpha. Everything
+    that is learned starts where it changes nothing: the human starts as its skinned template.
+
+    The rest Gaussians lie on `surface`, or, when none is given, on
+    `body.surface(len(rest), betas, seed)`: rest must have been made with the same call.
+
+    Args:
+        body, entity, betas, num_frames, trained_frames, camera_centers: as SkinnedBody;
+            num_frames also gives the default time resolution.
+        surface: the points of rest, where they are not those of `body.surface`.
+        seed: of that surface.
+        The others are HexPlaneSkinningConfig's.
+    """
+
+    provides = frozenset({"field", "skeleton"})
+    rates: ClassVar[Mapping[str, str]] = {
+        "planes": "planes",
+        "refinement": "pose",
+        "refinement.betas": "shape",
+        "log_alpha": "shape",
+    }
+    regularizer_weights: ClassVar[Mapping[str, float]] = {
+        "offset": 1.0,
+        "laplacian": 10.0,
+        "skinning": 1.0,
+        "time_smoothness": 0.01,
+        "time_sparsity": 1e-4,
+    }
+
+    field_vertices: Tensor
+    log_weights: Tensor
+    parts: Tensor
+    faces: Tensor
+    barycentric: Tensor
+    neighbours: Tensor | None
+
+    def __init__(
+        self,
+        body: BodyModel,
+        *,
+        entity: str = "human",
+        betas: Float[Tensor, " B"] | None = None,
+        surface: BodySurface | None = None,
+        seed: int = 0,
+        num_frames: int | None = None,
+        trained_frames: Sequence[int] | None = None,
+        camera_centers: Float[Tensor, "F 3"] | None = None,
+        resolution: int = 128,
+        channels: int = 32,
+        time_resolution: int | None = None,
+        box: float = 2.5,
+        width: int = 128,
+        head: HeadKind = "full",
+        free_attributes: bool = True,
+        refine_poses: bool = False,
+        scale_about: ScaleAbout = "pelvis",
+        field_points: int = 1536,
+    ) -> None:
+        super().__init__(
+            body,
+            entity=entity,
+            betas=betas,
+            num_frames=num_frames,
+            trained_frames=trained_frames,
+            camera_centers=camera_centers,
+            refine_poses=refine_poses,
+            scale_about=scale_about,
+        )
+        self._surface = surface
+        self.seed, self.half_box = seed, box / 2
+        self.opaque = head == "exavatar"
+        if time_resolution is None:
+            time_resolution = max(8, (num_frames or 64) // 2)
+        self.planes = PairedPlanes(channels, resolution, time_resolution)
+        self.head = CanonicalHead(self.planes.width, len(body.parents), width, head)
+        owned = {"means", "quats"} | ({"opacity_logits"} if self.opaque else set())
+        self.owns = frozenset(
+            owned if free_attributes else {"means", "quats", "log_scales", "opacity_logits", "sh"}
+        )
+        field = field_subset(body.vertex_parts, field_points)
+        self.register_buffer("field_vertices", field, persistent=False)
+        self._cached: tuple[object, CanonicalAttributes, Tensor] | None = None
+        self._last: tuple[CanonicalAttributes, Tensor] | None = None
+
+    @classmethod
+    def from_config(cls, config: HexPlaneSkinningConfig, context: BuildContext) -> Self:
+        if context.body is None:
+            raise ValueError(
+                "deformation:hexplane-skinning needs a body; it suits entities of kind human"
+            )
+        clip, track = context.clip, context.body_track
+        settings: dict[str, Any] = config.model_dump()
+        if track is not None:
+            betas = track.poses.betas
+            settings["betas"] = betas if betas.dim() == 1 else betas.mean(0)
+            settings["num_frames"] = len(track.poses.transl)
+        if clip is not None:
+            settings["num_frames"] = clip.num_frames
+            train = {clip.moments[i].index for i in clip.split.get("train", range(len(clip)))}
+            settings["trained_frames"] = sorted(train)
+            settings["camera_centers"] = torch.stack([c.center for c in clip.cameras])
+        return cls(context.body, entity=context.entity, seed=context.seed, **settings)
+
+    def bind(self, rest: Gaussians) -> None:
+        surface = self._surface or self.body.surface(len(rest), self.betas, self.seed)
+        if len(surface.points) != len(rest):
+            raise ValueError(
+                f"{len(rest)} rest Gaussians, but a surface of {len(surface.points)} points"
+            )
+        for name, value in {
+            "log_weights": (surface.weights + 1e-6).log(),
+            "parts": surface.parts,
+            "faces": surface.faces,
+            "barycentric": surface.barycentric,
+        }.items():
+            self.register_buffer(name, value.detach().clone())
+        self.register_buffer("neighbours", nearest(rest.means.detach()), persistent=False)
+        self._surface = None
+
+    def forward(
+        self, rest: Gaussians, moment: Moment, residual: Residual | None = None
+    ) -> Gaussians:
+        attributes, weights = self._attributes(rest)
+        pose = self.pose(moment)
+        if residual is not None and residual.pose is not None:
+            pose = pose.with_residual(residual.pose)
+        transforms = self.body.skinning_transforms(pose)
+        canonical = self._canonical(rest, attributes, pose)
+        means = skin_points(canonical.means, weights, transforms)
+        pelvis = self.posed_joints(pose, transforms, [PELVIS])[0]
+        means = self.scaled(means, pelvis, moment)
+        if residual is not None and residual.means is not None:
+            means = means + residual.means
+        turns = skin_quats(weights, transforms, self.body.parents, self.ancestors)
+        return replace(
+            canonical,
+            means=means,
+            quats=multiply_quats(turns, canonical.quats),
+            log_scales=canonical.log_scales + self.log_alpha,
+        )
+
+    def _attributes(self, rest: Gaussians) -> tuple[CanonicalAttributes, Float[Tensor, "N J"]]:
+        """psi_h of every canonical point, and its skinning weights. Neither depends on time, so
+        they are kept between frames in eval mode (fused optimizers change parameters without a
+        trace, hence not in training mode)."""
+        keep = not self.training and not torch.is_grad_enabled()
+        sources = (rest.means, self.planes.space, self.log_weights, *self.head.parameters())
+        state = [(x.data_ptr(), x._version) for x in sources] if keep else []
+        if keep and self._cached is not None and self._cached[0] == state:
+            return self._cached[1], self._cached[2]
+        points = (rest.means - self.rest_joints[PELVIS]) / self.half_box
+        attributes = self.head(self.planes(points))
+        logits = self.log_weights
+        if attributes.weights is not None:
+            logits = logits + attributes.weights
+        weights = logits.softmax(-1)
+        if torch.is_grad_enabled():
+            self._remember(attributes, weights)
+        elif keep:
+            self._cached = (state, attributes, weights)
+        return attributes, weights
+
+    def train(self, mode: bool = True) -> Self:
+        self._cached = None
+        return super().train(mode)
+
+    def _remember(self, attributes: CanonicalAttributes, weights: Tensor) -> None:
+        """Keep the last forward's outputs for `regularizers`, until their graph is used up."""
+        self._last = (attributes, weights)
+        if attributes.offsets.requires_grad:
+
+            def forget(gradient: Tensor) -> None:
+                del gradient
+                self._last = None
+
+            attributes.offsets.register_hook(forget)
+
+    def _canonical(
+        self, rest: Gaussians, attributes: CanonicalAttributes, pose: BodyPose
+    ) -> Gaussians:
+        """Gaussians of the zero pose, in the pose's shape."""
+        offsets = attributes.offsets
+        if pose.betas.requires_grad or not torch.equal(pose.betas, self.betas):
+            change = self.shaped(pose.betas)[0] - self.rest_vertices
+            corners = change[self.body.faces[self.faces]]
+            offsets = offsets + (corners * self.barycentric[..., None]).sum(1)
+        bands = rest.sh.shape[1]
+        canonical = rest.moved(
+            GaussianDelta(
+                means=offsets,
+                quats=attributes.quats,
+                log_scales=attributes.log_scales,
+                opacity_logits=attributes.opacity_logits,
+                sh=nn.functional.pad(attributes.colors[:, None] / SH_C0, (0, 0, 0, bands - 1)),
+            )
+        )
+        if self.opaque:
+            logits = torch.full_like(canonical.opacity_logits, OPAQUE)
+            canonical = replace(canonical, opacity_logits=logits)
+        return canonical
+
+    def posed_field(
+        self, rest: Gaussians, moment: Moment
+    ) -> tuple[Float[Tensor, "V F"], Float[Tensor, "V 3"]]:
+        """phi at the posed body, relative to its pelvis and before alpha, and its world places.
+
+        The body points are vertices of the template, so every part is described however few
+        Gaussians it has.
+        """
+        del rest
+        pose = self.pose(moment)
+        transforms = self.body.skinning_transforms(pose)
+        points = self.shaped(pose.betas)[0][self.field_vertices]
+        posed = skin_points(points, self.body.skinning_weights[self.field_vertices], transforms)
+        pelvis = self.posed_joints(pose, transforms, [PELVIS])[0]
+        features = self.planes((posed - pelvis) / self.half_box, moment.time)
+        return features, self.scaled(posed, pelvis, moment)
+
+    def field_parts(self) -> Int[Tensor, " V"]:
+        """Body part (0..15) of each point of `posed_field`."""
+        return self.body.vertex_parts[self.field_vertices]
+
+    @property
+    def field_width(self) -> int:
+        return self.planes.width
+
+    def point_parts(self) -> Int[Tensor, " N"]:
+        return self.parts
+
+    def on_topology(self, change: TopologyChange) -> None:
+        """Rows of the surface follow; a child keeps its parent's weights, part and face."""
+        for name in ("log_weights", "parts", "faces", "barycentric"):
+            setattr(self, name, getattr(self, name)[change.source].contiguous())
+        self.neighbours = self._cached = self._last = None
+
+    def regularizers(self) -> dict[str, Tensor]:
+        """Means over points (or cells) of squared quantities, but for the sparsity.
+
+        "offset": canonical offsets, m^2. "laplacian": offset against its neighbours' mean, m^2
+        (the paper's L_reg). "skinning": distance to the template's weights (HUGS). "scale": of
+        log-scales from the template's. "time_smoothness", "time_sparsity": see PairedPlanes.
+
+        Those of points are of the last forward pass, whose graph they share: add them to the
+        same loss.
+        """
+        penalties = {
+            "time_smoothness": self.planes.time_smoothness(),
+            "time_sparsity": self.planes.time_sparsity(),
+        }
+        if self._last is not None:
+            attributes, weights = self._last
+            offsets = attributes.offsets
+            penalties["offset"] = offsets.square().sum(-1).mean()
+            penalties["scale"] = attributes.log_scales.square().mean()
+            if attributes.weights is not None:
+                drift = weights - self.log_weights.softmax(-1)
+                penalties["skinning"] = drift.square().sum(-1).mean()
+            if self.neighbours is not None:
+                roughness = offsets - offsets[self.neighbours].mean(1)
+                penalties["laplacian"] = roughness.square().sum(-1).mean()
+        return penalties
+
+
+def nearest(points: Float[Tensor, "N 3"], count: int = 4) -> Int[Tensor, "N k"] | None:
+    """Indices of each point's nearest neighbours, or None when there are too few points."""
+    from scipy.spatial import cKDTree  # on use: scipy takes a while to import
+
+    if len(points) <= count:
+        return None
+    array = points.cpu().double().numpy()
+    _, indices = cKDTree(array).query(array, k=count + 1)
+    return torch.as_tensor(indices[:, 1:], dtype=torch.int64, device=points.device)
+
+
+def field_subset(vertex_parts: Int[Tensor, " V"], count: int) -> Int[Tensor, " S"]:
+    """About `count` vertices, equally many of each of the 16 parts, evenly over its indices.
+
+    Raises:
+        ValueError: a part without vertices; the human would lack a token.
+    """
+    chosen = []
+    for part, name in enumerate(PART_NAMES):
+        rows = (vertex_parts == part).nonzero().squeeze(1)
+        if len(rows) == 0:
+            raise ValueError(f"the body has no vertex of part {part} ({name})")
+        wanted = min(len(rows), -(-count // len(PART_NAMES)))
+        picks = torch.linspace(0, len(rows) - 1, wanted, device=rows.device).round().long()
+        chosen.append(rows[picks])
+    return torch.cat(chosen)

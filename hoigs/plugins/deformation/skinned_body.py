@@ -1,0 +1,145 @@
+"""A human that is posed by a body model: what every skinned deformation shares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal, Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hoigs.core.body import LEFT_FOOT, LEFT_WRIST, PELVIS, RIGHT_FOOT, RIGHT_WRIST, BodyModel
+from hoigs.core.deformation import DeformationModel
+from hoigs.core.moment import BodyPose, Moment
+from hoigs.plugins.deformation.pose_refinement import PoseRefinement
+from hoigs.plugins.deformation.skinning import ancestry
+
+ScaleAbout = Literal["pelvis", "camera"]
+
+ANCHORS = (PELVIS, LEFT_WRIST, RIGHT_WRIST, LEFT_FOOT, RIGHT_FOOT)
+
+
+class SkinnedBody(DeformationModel):
+    """Poses by entity name, their refinement, the learnable scale alpha, and the skeleton.
+
+    Args:
+        body: the skinned body; neither trained nor stored in checkpoints.
+        entity: name of the human, under which moments carry its pose.
+        betas: shape for which rest was made; zeros when absent.
+        num_frames: of the clip; needed to refine poses.
+        trained_frames: frames whose poses are refined; the others follow (PoseRefinement).
+        camera_centers: [F, 3], metres, needed to scale about the camera.
+        refine_poses: learn corrections of pose, translation and shape.
+        scale_about: the fixed point of alpha = exp(log_alpha): the "pelvis", or the "camera".
+    """
+
+    provides = frozenset({"skeleton"})
+    rest_space = "canonical"
+
+    betas: Tensor
+    rest_vertices: Tensor
+    rest_joints: Tensor
+    ancestors: Tensor
+    camera_centers: Tensor | None
+
+    def __init__(
+        self,
+        body: BodyModel,
+        *,
+        entity: str,
+        betas: Float[Tensor, " B"] | None,
+        num_frames: int | None,
+        trained_frames: Sequence[int] | None,
+        camera_centers: Float[Tensor, "F 3"] | None,
+        refine_poses: bool,
+        scale_about: ScaleAbout,
+    ) -> None:
+        super().__init__()
+        if scale_about == "camera" and camera_centers is None:
+            raise ValueError('scale_about "camera" needs camera_centers, one a frame')
+        # in a tuple, so that the body is no submodule: its data belongs to no checkpoint
+        self._body = (body,)
+        self.entity = entity
+        self.log_alpha = nn.Parameter(torch.zeros(()))
+        self.refinement: PoseRefinement | None = None
+        if refine_poses:
+            if num_frames is None:
+                raise ValueError("refine_poses needs num_frames, the length of the clip")
+            self.refinement = PoseRefinement(num_frames, body.num_betas, trained_frames)
+        betas = torch.zeros(body.num_betas) if betas is None else betas.detach().clone()
+        with torch.no_grad():
+            vertices, joints = body.shaped(betas)
+        for name, value in {
+            "betas": betas,
+            "rest_vertices": vertices,
+            "rest_joints": joints,
+            "ancestors": ancestry(body.parents),
+            "camera_centers": camera_centers if scale_about == "camera" else None,
+        }.items():
+            self.register_buffer(name, value, persistent=False)
+        self._shape: tuple[Tensor, Tensor, Tensor] | None = None
+        self._arm: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def body(self) -> BodyModel:
+        return self._body[0]
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        self.body._apply(fn, recurse)
+        self._shape = self._arm = None
+        return super()._apply(fn, recurse)
+
+    def set_trained_frames(self, indices: Sequence[int]) -> None:
+        """Frames whose poses are refined; the others are interpolated from these."""
+        if self.refinement is not None:
+            self.refinement.set_trained_frames(indices)
+
+    def pose(self, moment: Moment) -> BodyPose:
+        """The pose that `moment` brings for this human, refined; without the interaction."""
+        if self.entity not in moment.poses:
+            raise ValueError(
+                f'the moment has no body pose for "{self.entity}"; it has '
+                f"{sorted(moment.poses) or 'none'}"
+            )
+        pose = moment.poses[self.entity]
+        return pose if self.refinement is None else self.refinement(pose, moment.time)
+
+    def shaped(self, betas: Float[Tensor, " B"]) -> tuple[Tensor, Tensor]:
+        """Vertices and joints of the zero pose; the last shape without gradient is kept."""
+        if betas.requires_grad and torch.is_grad_enabled():
+            return self.body.shaped(betas)
+        if self._shape is None or not torch.equal(self._shape[0], betas):
+            self._shape = (betas.detach().clone(), *self.body.shaped(betas.detach()))
+        return self._shape[1], self._shape[2]
+
+    def posed_joints(
+        self, pose: BodyPose, transforms: Float[Tensor, "J 4 4"], joints: list[int]
+    ) -> Float[Tensor, "A 3"]:
+        """World positions of some joints, before alpha."""
+        places, turns = self.shaped(pose.betas)[1][joints], transforms[joints]
+        return (turns[:, :3, :3] @ places[..., None]).squeeze(-1) + turns[:, :3, 3]
+
+    def scaled(
+        self, points: Float[Tensor, "N 3"], pelvis: Float[Tensor, " 3"], moment: Moment
+    ) -> Float[Tensor, "N 3"]:
+        """alpha: points scaled about the pelvis, or along the rays of the camera."""
+        center = pelvis
+        if self.camera_centers is not None:
+            last = len(self.camera_centers) - 1
+            center = self.camera_centers[min(max(round(moment.time * last), 0), last)]
+        return center + self.log_alpha.exp() * (points - center)
+
+    def anchors(self, moment: Moment) -> Float[Tensor, "A 3"]:
+        pose = self.pose(moment)
+        transforms = self.body.skinning_transforms(pose)
+        joints = self.posed_joints(pose, transforms, list(ANCHORS))
+        return self.scaled(joints, joints[0], moment)
+
+    def arm_length(self) -> Float[Tensor, ""]:
+        betas = self.betas
+        if self.refinement is not None:
+            betas = betas + self.refinement.betas.detach()
+        if self._arm is None or not torch.equal(self._arm[0], betas):
+            self._arm = (betas.clone(), self.body.arm_length(betas))
+        return self._arm[1] * self.log_alpha.exp()
