@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from hoigs.core.context import BuildContext
 from hoigs.core.deformation import DeformationModel
 from hoigs.core.density import DensityControl
 from hoigs.core.entity import Entity
-from hoigs.core.errors import HoigsError, SpecError, did_you_mean
+from hoigs.core.errors import HoigsError, PluginError, SpecError, did_you_mean
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.interaction import EntityKind
 from hoigs.core.registry import Registry, default_registry
@@ -98,8 +98,9 @@ class _Builder:
     def part(self, place: tuple[str, ...], part: ComponentSpec, context: BuildContext) -> Any:
         """One component, built from its settings."""
         config = self.registry.config_class(part.use).model_validate(part.settings)
-        with _blaming(self.spec, *place):
-            return self.registry.get(part.use).from_config(config, context)
+        component = self.registry.get(part.use)
+        with _blaming(self.spec, *place) if place else nullcontext():
+            return component.from_config(config, context)
 
     def entity(self, name: str, kind: EntityKind, place: str, block: EntitySpec) -> Entity:
         context = BuildContext(entity=name, clip=self.clip, seed=self.spec.train.seed)
@@ -116,16 +117,28 @@ class _Builder:
             return Entity(rest, deformation, features, kind=kind)
 
     def _with_body(self, context: BuildContext, place: str, block: EntitySpec) -> BuildContext:
-        track = self.clip.bodies[context.entity]
-        part = block.body or ComponentSpec(use=track.model)
-        if part.use.partition("@")[0] != track.model.partition("@")[0]:
+        """`context` with the body model that the clip's poses were fitted with."""
+        name, track = context.entity, self.clip.bodies[context.entity]
+        context = replace(context, body_track=track)
+        if block.body is None:
+            with _blaming(self.spec, "model", place, why=f"the clip's {name} is a {track.model}: "):
+                body = self.part((), self._default_body(track.model), context)
+            return replace(context, body=body)
+        if block.body.use.partition("@")[0] != track.model.partition("@")[0]:
             raise SpecError(
-                f"{self.spec.at('model', place, 'body')}: the clip's {context.entity} was fitted "
-                f"with {track.model}; shape coefficients of {part.use} mean something else"
+                f"{self.spec.at('model', place, 'body')}: the clip's {name} was fitted with "
+                f"{track.model}; shape coefficients of {block.body.use} mean something else"
             )
-        where = ("model", place, "body") if block.body else ("model", place)
-        body = self.part(where, part, replace(context, body_track=track))
-        return replace(context, body=body, body_track=track)
+        return replace(context, body=self.part(("model", place, "body"), block.body, context))
+
+    def _default_body(self, key: str) -> ComponentSpec:
+        """The body without settings, if it can do without."""
+        fields = self.registry.config_class(key).model_fields.items()
+        needed = [name for name, field in fields if field.is_required()]
+        if needed:
+            example = ", ".join(f"{name}: …" for name in needed)
+            raise PluginError(f'add `body: {{use: "{key}", {example}}}` to this block')
+        return ComponentSpec(use=key)
 
 
 def initial_gaussians(
@@ -187,11 +200,11 @@ def _subset(available: int, wanted: int, seed: int) -> Tensor:
 
 
 @contextmanager
-def _blaming(spec: Spec, *place: str) -> Iterator[None]:
-    """Errors of a component name its place in the spec."""
+def _blaming(spec: Spec, *place: str, why: str = "") -> Iterator[None]:
+    """Errors of a component name its place in the spec, and what had been wanted of it."""
     try:
         yield
     except SpecError:
         raise
     except (HoigsError, ValueError) as error:
-        raise SpecError(f"{spec.at(*place)}: {error}") from error
+        raise SpecError(f"{spec.at(*place)}: {why}{error}") from error
