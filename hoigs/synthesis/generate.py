@@ -75,9 +75,8 @@ class SyntheticScene:
     @cached_property
     def _caster(self) -> RayCaster:
         k = self.knobs
-        layers = [Layer.build(m, np.zeros(len(m.faces))) for m in (self.shell, self.props)]
-        room = (LOW, HIGH)
-        return RayCaster(layers[0], layers[1], self.atlas, k.light, room, k.samples, k.edge_samples)
+        shell = Layer.build(self.shell, np.zeros(len(self.shell.faces)))
+        return RayCaster(shell, self.atlas, k.light, (LOW, HIGH), k.samples, k.edge_samples)
 
     @cached_property
     def _fine(self):  # type: ignore[no-untyped-def]
@@ -91,8 +90,8 @@ class SyntheticScene:
             track.rotations[frame], track.translations[frame]
         )
 
-    def moving_layer(self, frame: int) -> Layer:
-        """Person and object of a frame, ready for rays."""
+    def things(self, frame: int) -> Layer:
+        """Person, object and furniture of a frame, ready for rays."""
         vertices, faces = self.body_vertices[frame].astype(float), self.dressed.faces
         person = TexturedMesh(
             vertices,
@@ -102,12 +101,12 @@ class SyntheticScene:
             np.full(len(faces), -1),
         )
         thing = self.object_at(frame)
-        numbers = np.repeat([1, 2], [len(faces), len(thing.faces)])
-        return Layer.build(TexturedMesh.join([person, thing]), numbers, self._fine)
+        numbers = np.repeat([1, 2, 0], [len(faces), len(thing.faces), len(self.props.faces)])
+        return Layer.build(TexturedMesh.join([person, thing, self.props]), numbers, self._fine)
 
     def render(self, frame: int, camera: Camera, layer: Layer | None = None) -> TrueView:
         """The moment `frame` from any camera."""
-        picture = self._caster.render(camera, layer or self.moving_layer(frame))
+        picture = self._caster.render(camera, layer or self.things(frame))
         gain = 1 + self.knobs.light.exposure_ramp * (frame / (self.knobs.frames - 1) - 0.5)
         image = np.round(255 * to_srgb(gain * picture.color)).astype(np.uint8)
         return TrueView(frame, camera, image, picture.depth, picture.entity)
@@ -115,7 +114,7 @@ class SyntheticScene:
     def views(self) -> Iterator[tuple[TrueView, list[TrueView]]]:
         """Every frame from the path's camera, with the held-out views of that moment."""
         for frame, camera in enumerate(self.cameras):
-            layer = self.moving_layer(frame)
+            layer = self.things(frame)
             others = [self.render(f, c, layer) for f, c in self.held_out if f == frame]
             yield self.render(frame, camera, layer), others
 

@@ -1,8 +1,9 @@
 """Warp kernels of the ray caster: nearest hit, texture and mesh colours, Lambert shading.
 
 Directions have unit length along the camera's z, so a hit's parameter *is* the depth. A sample
-looks at 2 of the DIRECTIONS of the sun's disc and of the sky; four samples see all of them, the
-same ones at every pixel, so that soft shadows carry no noise.
+looks at one of the DIRECTIONS of the sun's disc and of the sky. Every pixel takes the same ones in
+the same order, so that soft shadows carry no noise, and a pixel whose first samples disagree goes
+on to see them all.
 """
 
 # No `from __future__ import annotations` here: Warp reads kernel annotations as objects.
@@ -55,35 +56,32 @@ class View:
 @wp.struct
 class Hit:
     t: wp.float32
-    layer: wp.int32  # 0 shell, 1 props, 2 moving; -1 none
+    layer: wp.int32  # 0 shell, 1 things; -1 none
     face: wp.int32
     u: wp.float32
     v: wp.float32
-    front: wp.float32
+
+
+@wp.struct
+class Shade:
+    value: wp.vec3
+    dark: wp.float32  # 1: the sun is hidden
+    hidden: wp.float32  # 1: the sky is hidden
 
 
 @wp.func
-def nearest(shell: Surface, props: Surface, moving: Surface, origin: wp.vec3, ray: wp.vec3):
+def nearest(shell: Surface, things: Surface, origin: wp.vec3, ray: wp.vec3):
     best = Hit()
     best.t = FAR
     best.layer = -1
     best.face = -1
-    q = wp.mesh_query_ray(moving.mesh, origin, ray, best.t)
-    if q.result:
-        best.t = q.t
-        best.layer = 2
-        best.face = q.face
-        best.u = q.u
-        best.v = q.v
-        best.front = q.sign
-    q = wp.mesh_query_ray(props.mesh, origin, ray, best.t)
+    q = wp.mesh_query_ray(things.mesh, origin, ray, best.t)
     if q.result:
         best.t = q.t
         best.layer = 1
         best.face = q.face
         best.u = q.u
         best.v = q.v
-        best.front = q.sign
     q = wp.mesh_query_ray(shell.mesh, origin, ray, best.t)
     if q.result:
         best.t = q.t
@@ -91,7 +89,6 @@ def nearest(shell: Surface, props: Surface, moving: Surface, origin: wp.vec3, ra
         best.face = q.face
         best.u = q.u
         best.v = q.v
-        best.front = q.sign
     return best
 
 
@@ -183,10 +180,8 @@ def albedo(
 
 
 @wp.func
-def blocked(props: Surface, moving: Surface, origin: wp.vec3, ray: wp.vec3, reach: float):
-    if wp.mesh_query_ray_anyhit(moving.mesh, origin, ray, reach):
-        return 1.0
-    if wp.mesh_query_ray_anyhit(props.mesh, origin, ray, reach):
+def blocked(things: wp.uint64, origin: wp.vec3, ray: wp.vec3, reach: float):
+    if wp.mesh_query_ray_anyhit(things, origin, ray, reach):
         return 1.0
     return 0.0
 
@@ -205,8 +200,7 @@ def corner_dimming(lights: Lights, point: wp.vec3, normal: wp.vec3):
 @wp.func
 def shade(
     surface: Surface,
-    props: Surface,
-    moving: Surface,
+    things: wp.uint64,
     texels: wp.array(dtype=wp.vec3),
     levels: wp.array(dtype=wp.vec3i, ndim=2),
     lights: Lights,
@@ -229,32 +223,29 @@ def shade(
     start = point + flat * 2.0e-3
     tangent = wp.normalize(wp.cross(smooth, wp.vec3(0.31, 0.17, 0.93)))
     bitangent = wp.cross(smooth, tangent)
-    sun = float(0.0)
-    hidden = float(0.0)
-    for k in range(2):
-        index = (2 * sample + k) % DIRECTIONS
-        towards = lights.suns[index]
-        facing = wp.dot(smooth, towards)
-        if facing > 0.0:
-            seen = float(1.0)
-            if lights.shadows > 0.0:
-                seen = 1.0 - lights.shadows * blocked(props, moving, start, towards, FAR)
-            sun += 0.5 * facing * seen
-        if lights.occlusion > 0.0:
-            local = lights.skies[index]
-            up = tangent * local[0] + bitangent * local[1] + smooth * local[2]
-            hidden += 0.5 * blocked(props, moving, start, up, 0.7)
+    out = Shade()
+    out.dark = 0.0
+    out.hidden = 0.0
+    towards = lights.suns[sample % DIRECTIONS]
+    facing = wp.dot(smooth, towards)
+    if facing > 0.0 and lights.shadows > 0.0:
+        out.dark = blocked(things, start, towards, FAR)
+    if lights.occlusion > 0.0:
+        local = lights.skies[sample % DIRECTIONS]
+        up = tangent * local[0] + bitangent * local[1] + smooth * local[2]
+        out.hidden = blocked(things, start, up, 0.7)
+    sun = wp.max(facing, 0.0) * (1.0 - lights.shadows * out.dark)
     sky = lights.sky * (0.5 + 0.5 * smooth[1]) + lights.ground * (0.5 - 0.5 * smooth[1])
-    open_share = 1.0 - lights.occlusion * hidden
+    open_share = 1.0 - lights.occlusion * out.hidden
     sky = sky * (open_share * corner_dimming(lights, point, smooth))
-    return wp.cw_mul(color, lights.sun * sun + sky)
+    out.value = wp.cw_mul(color, lights.sun * sun + sky)
+    return out
 
 
 @wp.func
 def radiance(
     shell: Surface,
-    props: Surface,
-    moving: Surface,
+    things: Surface,
     texels: wp.array(dtype=wp.vec3),
     levels: wp.array(dtype=wp.vec3i, ndim=2),
     lights: Lights,
@@ -264,12 +255,10 @@ def radiance(
     sample: int,
 ):
     if hit.layer == 0:
-        return shade(shell, props, moving, texels, levels, lights, view, ray, hit, sample)
+        return shade(shell, things.mesh, texels, levels, lights, view, ray, hit, sample)
     if hit.layer == 1:
-        return shade(props, props, moving, texels, levels, lights, view, ray, hit, sample)
-    if hit.layer == 2:
-        return shade(moving, props, moving, texels, levels, lights, view, ray, hit, sample)
-    return wp.vec3(0.0, 0.0, 0.0)
+        return shade(things, things.mesh, texels, levels, lights, view, ray, hit, sample)
+    return Shade()
 
 
 @wp.func
@@ -281,14 +270,14 @@ def direction(view: View, x: float, y: float):
 def render_rows(
     first: int,
     shell: Surface,
-    props: Surface,
-    moving: Surface,
+    things: Surface,
     texels: wp.array(dtype=wp.vec3),
     levels: wp.array(dtype=wp.vec3i, ndim=2),
     lights: Lights,
     view: View,
     offsets: wp.array(dtype=wp.vec2),
-    edge_offsets: wp.array(dtype=wp.vec2),
+    samples: int,
+    edge_samples: int,
     color: wp.array(dtype=wp.vec3),
     depth: wp.array(dtype=wp.float32),
     entity: wp.array(dtype=wp.int32),
@@ -296,7 +285,7 @@ def render_rows(
     pixel = first + wp.tid()
     column = float(pixel % view.width)
     row = float(pixel // view.width)
-    centre = nearest(shell, props, moving, view.eye, direction(view, column + 0.5, row + 0.5))
+    centre = nearest(shell, things, view.eye, direction(view, column + 0.5, row + 0.5))
     depth[pixel] = 0.0
     entity[pixel] = -1
     if centre.layer >= 0:
@@ -304,30 +293,36 @@ def render_rows(
     if centre.layer == 0:
         entity[pixel] = shell.entity[centre.face]
     if centre.layer == 1:
-        entity[pixel] = props.entity[centre.face]
-    if centre.layer == 2:
-        entity[pixel] = moving.entity[centre.face]
+        entity[pixel] = things.entity[centre.face]
 
+    total = wp.vec3(0.0, 0.0, 0.0)
     darkest = float(1.0e6)
     brightest = float(0.0)
-    edge = bool(False)
-    total = wp.vec3(0.0, 0.0, 0.0)
-    for s in range(offsets.shape[0]):
-        ray = direction(view, column + offsets[s][0], row + offsets[s][1])
-        hit = nearest(shell, props, moving, view.eye, ray)
-        value = radiance(shell, props, moving, texels, levels, lights, view, ray, hit, s)
-        if hit.layer != centre.layer or wp.abs(hit.t - centre.t) > 0.03 * centre.t:
-            edge = True
-        luminance = value[0] + value[1] + value[2]
-        darkest = wp.min(darkest, luminance)
-        brightest = wp.max(brightest, luminance)
-        total += value
-    count = offsets.shape[0]
-    if (edge or brightest - darkest > 0.3 * (brightest + 0.2)) and edge_offsets.shape[0] > count:
-        total = wp.vec3(0.0, 0.0, 0.0)
-        count = edge_offsets.shape[0]
-        for s in range(count):
-            ray = direction(view, column + edge_offsets[s][0], row + edge_offsets[s][1])
-            hit = nearest(shell, props, moving, view.eye, ray)
-            total += radiance(shell, props, moving, texels, levels, lights, view, ray, hit, s)
+    shadowed = float(0.0)
+    hidden = float(0.0)
+    varied = bool(False)
+    count = int(0)
+    wanted = int(samples)
+    while count < wanted:
+        ray = direction(view, column + offsets[count][0], row + offsets[count][1])
+        hit = nearest(shell, things, view.eye, ray)
+        shaded = radiance(shell, things, texels, levels, lights, view, ray, hit, count)
+        total += shaded.value
+        count += 1
+        if count <= samples:
+            if hit.layer != centre.layer or wp.abs(hit.t - centre.t) > 0.03 * centre.t:
+                varied = True
+            luminance = shaded.value[0] + shaded.value[1] + shaded.value[2]
+            darkest = wp.min(darkest, luminance)
+            brightest = wp.max(brightest, luminance)
+            shadowed += shaded.dark
+            hidden += shaded.hidden
+        if count == samples:
+            # a sample sees one direction of sun and sky: if they disagree, ask the others too
+            if shadowed > 0.0 and shadowed < float(samples):
+                varied = True
+            if hidden > 0.0 and hidden < float(samples):
+                varied = True
+            if varied or brightest - darkest > 0.6 * (brightest + 0.2):
+                wanted = edge_samples
     color[pixel] = total / float(count)

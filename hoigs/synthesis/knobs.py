@@ -88,8 +88,8 @@ class SceneKnobs(ComponentConfig):
         frames: of the whole clip. fps: so that frames / fps is its length in seconds.
         width, height: pixels.
         seed: of textures, points and noise.
-        samples, edge_samples: rays a pixel, and at edges (colour only; masks and depth are the
-            pixel centre's).
+        samples, edge_samples: rays a pixel, and where they disagree (edges, soft shadows); colour
+            only, masks and depth are the pixel centre's.
         held_out_views: frames from cameras that are never trained on.
         test_frames: uniformly chosen (HOSNeRF's rule: 16).
         scene_points, object_points: initial points written to the clip.
@@ -103,7 +103,7 @@ class SceneKnobs(ComponentConfig):
     fps: float = Field(16.0, gt=0)
     seed: int = 0
     samples: int = Field(4, ge=1, le=64)
-    edge_samples: int = Field(16, ge=1, le=64)
+    edge_samples: int = Field(8, ge=1, le=64)
     held_out_views: int = Field(8, ge=0)
     test_frames: int = Field(16, ge=1)
     scene_points: int = Field(10_000, ge=100)

@@ -6,6 +6,7 @@ depends on the view: two cameras that see one point see one colour.
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -75,12 +76,16 @@ class Picture:
 
 
 class RayCaster:
-    """Renders views of a fixed shell and props and of whatever moves."""
+    """Renders views of a room and the things in it.
+
+    Args:
+        shell: floor, walls and ceiling, which cast no shadow: the sun shines through them.
+        room: corners of the room, low and high; its edges are dimmed.
+    """
 
     def __init__(
         self,
         shell: Layer,
-        props: Layer,
         atlas: TextureAtlas,
         light: LightKnobs,
         room: tuple[Sequence[float], Sequence[float]],
@@ -88,17 +93,17 @@ class RayCaster:
         edge_samples: int = 16,
     ):
         wp.load_module(kernels, device="cpu")  # compile before threads ask for it
-        self.shell, self.props = shell, props
+        self.shell = shell
         self.texels = wp.array(atlas.texels, dtype=wp.vec3, device="cpu")
         self.levels = wp.array(atlas.levels, dtype=wp.vec3i, device="cpu")
         self.lights = _lights(light, room)
-        self.offsets, self.edge_offsets = (
-            wp.array(pixel_samples(n), dtype=wp.vec2, device="cpu") for n in (samples, edge_samples)
-        )
+        self.samples, self.edge_samples = samples, max(samples, edge_samples)
+        offsets = pixel_samples(samples, self.edge_samples)
+        self.offsets = wp.array(offsets, dtype=wp.vec2, device="cpu")
         self.threads = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity")
                            else os.cpu_count() or 1)  # fmt: skip
 
-    def render(self, camera: Camera, moving: Layer) -> Picture:
+    def render(self, camera: Camera, things: Layer) -> Picture:
         """Depth and entities at pixel centres, colour averaged over the pixel."""
         count = camera.width * camera.height
         color = wp.zeros(count, dtype=wp.vec3, device="cpu")
@@ -112,8 +117,8 @@ class RayCaster:
                 kernels.render_rows,
                 dim=last - first,
                 inputs=[
-                    first, self.shell.surface, self.props.surface, moving.surface, self.texels,
-                    self.levels, self.lights, view, self.offsets, self.edge_offsets, color, depth,
+                    first, self.shell.surface, things.surface, self.texels,
+                    self.levels, self.lights, view, self.offsets, self.samples, self.edge_samples, color, depth,
                     entity,
                 ],
                 device="cpu",
@@ -122,7 +127,7 @@ class RayCaster:
         # A launch is one loop on the calling thread and releases the GIL; short bands share out
         # the person, who costs more than the wall.
         edges = np.linspace(0, count, 8 * self.threads + 1).astype(int).tolist()
-        parts = list(zip(edges[:-1], edges[1:], strict=True))
+        parts = list(itertools.pairwise(edges))
         with ThreadPoolExecutor(self.threads) as pool:
             list(pool.map(rows, parts))
         shape = (camera.height, camera.width)
@@ -133,10 +138,14 @@ class RayCaster:
         )
 
 
-def pixel_samples(count: int) -> Float[Array, "S 2"]:
-    """Stratified places in a pixel (Sobol), centred, so that no sample set shifts the image."""
-    points = qmc.Sobol(2, scramble=False).random(count)
-    return (points - points.mean(0) + 0.5).astype(np.float32)
+def pixel_samples(plain: int, more: int) -> Float[Array, "S 2"]:
+    """Stratified places in a pixel (Sobol): first the plain ones, then those that edges add.
+
+    Each of the two sets is centred, so that neither shifts the image.
+    """
+    points = qmc.Sobol(2, scramble=False).random(more)
+    sets = (points[:plain], points[plain:])
+    return np.concatenate([p - p.mean(0) + 0.5 for p in sets if len(p)]).astype(np.float32)
 
 
 def _disc(count: int) -> Float[Array, "N 2"]:
