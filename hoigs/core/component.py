@@ -6,6 +6,7 @@ import ast
 import importlib.util
 import re
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from hoigs.core.errors import PluginError, did_you_mean
@@ -88,14 +89,13 @@ def missing_target(target: str) -> str | None:
     if path is None:
         return None
     try:
-        tree = ast.parse(path.read_bytes(), filename=str(path))
+        names, packages = _outline(path)
     except SyntaxError as error:
         return f"SyntaxError in {path.name}, line {error.lineno}: {error.msg}"
-    for package in _top_level_imports(tree):
+    for package in packages:
         if importlib.util.find_spec(package) is None:
             return f'{path.name} imports "{package}", which is not installed'
-    names = _top_level_names(tree)
-    if names is None or name in names:
+    if name in names or names & {"*", "__getattr__"}:
         return None
     return f'module "{module}" has no "{name}"{did_you_mean(name, names)}'
 
@@ -120,25 +120,25 @@ def _source_of(module: str) -> Path | str | None:
     return f'no module "{module}"'
 
 
-def _top_level_imports(tree: ast.Module) -> set[str]:
-    """Packages that importing the module needs for certain: those not in an `if` or a `try`."""
-    packages: set[str] = set()
-    for node in tree.body:
-        if isinstance(node, ast.Import):
-            packages.update(alias.name.partition(".")[0] for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            packages.add(node.module.partition(".")[0])
-    return packages
-
-
-def _top_level_names(tree: ast.Module) -> set[str] | None:
-    """Names that a module binds, or None when its text does not tell."""
+@cache
+def _outline(path: Path) -> tuple[set[str], set[str]]:
+    """Names that a module binds, and packages without which it cannot be imported: those that it
+    imports outside of any `if` or `try`."""
     names: set[str] = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            names.add(node.name)
-        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            names.add(node.id)
-        elif isinstance(node, ast.Import | ast.ImportFrom):
-            names.update(alias.asname or alias.name for alias in node.names)
-    return None if names & {"*", "__getattr__"} else names
+    packages: set[str] = set()
+    for statement in ast.parse(path.read_bytes(), filename=str(path)).body:
+        if isinstance(statement, ast.Import):
+            packages.update(alias.name.partition(".")[0] for alias in statement.names)
+        elif isinstance(statement, ast.ImportFrom) and statement.level == 0 and statement.module:
+            packages.add(statement.module.partition(".")[0])
+        if isinstance(statement, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            names.add(statement.name)
+            continue
+        for node in ast.walk(statement):
+            if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                names.add(node.name)
+            elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                names.add(node.id)
+            elif isinstance(node, ast.Import | ast.ImportFrom):
+                names.update(alias.asname or alias.name for alias in node.names)
+    return names, packages

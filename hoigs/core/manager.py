@@ -105,7 +105,7 @@ class PluginManager(pluggy.PluginManager):
         super().__init__(hookspecs.PROJECT)
         self.add_hookspecs(hookspecs)
         environ = os.environ if environ is None else environ
-        self.allowed = _names(environ["HOIGS_PLUGINS"]) if "HOIGS_PLUGINS" in environ else None
+        self.allowed = _names(environ.get("HOIGS_PLUGINS", "")) or None
         self.blocked = _names(environ.get("HOIGS_BLOCK", ""))
         self.strict = environ.get("HOIGS_STRICT", "0") not in ("", "0")
         self.plugins: list[Plugin] = []
@@ -184,6 +184,8 @@ class PluginManager(pluggy.PluginManager):
         """Register `module` and collect what it offers; all or nothing."""
         full_name = f"{plugin.dist}:{plugin.name}"
         try:
+            if self.is_registered(module):
+                raise PluginError(f"{plugin.module} is already the plugin {self.get_name(module)}")
             self.register(module, name=full_name)
             problem = self._hook_problem(module)
             if problem:

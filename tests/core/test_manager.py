@@ -173,6 +173,15 @@ def test_an_extra_that_is_not_installed(plugins):
     assert "needs not-there-at-all: pip install 'wants[gpu]'" in one.error
 
 
+def test_two_distributions_with_one_module(plugins):
+    module = plugins.offer("good", GOOD)
+    plugins.offer("other", GOOD, module=module)
+    manager = plugins.manager()
+    statuses = {p.dist: p.status for p in manager.plugins}
+    assert sorted(statuses[dist] for dist in ("good", "other")) == ["broken", "ok"]
+    assert f"{module} is already the plugin" in manager.failures()[0]
+
+
 def test_nothing_but_the_builtin_parts(plugins):
     module = plugins.offer("good", GOOD)
     manager = plugins.manager({"HOIGS_PLUGINS": "0"})
@@ -191,6 +200,11 @@ def test_the_allow_list_decides_before_the_import(plugins):
     assert plugin_of(manager, "bad-one").status is Status.BLOCKED
     assert module not in sys.modules
     assert plugin_of(plugins.manager({"HOIGS_PLUGINS": "bad_one"}), "bad-one").status == "broken"
+
+
+def test_an_empty_allow_list_is_none(plugins):
+    plugins.offer("good", GOOD)
+    assert offers_of(plugins.manager({"HOIGS_PLUGINS": ""}), "good")
 
 
 def test_blocking_a_plugin_and_a_component(plugins):
