@@ -1,0 +1,167 @@
+"""Training curves as inline SVG, from a run's metrics.jsonl."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from hoigs.core.errors import HoigsError
+from hoigs.evaluation.protocol import NotComputed
+from hoigs.evaluation.scores import ViewScores
+
+INK, QUIET, LINES = "#e9e6df", "#8d9097", "#2b2f37"
+HUES = ("#ffb26b", "#62c6b5", "#8fa8ff", "#f27d8b", "#c3d86a", "#c79bf2")
+STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",  # text stays text, in the page's own font
+    "svg.hashsalt": "hoigs",  # the same run gives the same bytes
+    "font.size": 9.5,
+    "text.color": INK,
+    "axes.labelcolor": QUIET,
+    "axes.edgecolor": LINES,
+    "xtick.color": QUIET,
+    "ytick.color": QUIET,
+    "axes.grid": True,
+    "grid.color": LINES,
+    "grid.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
+SHOWN_TERMS = 6
+
+
+def read_metrics(file: Path) -> list[dict[str, Any]]:
+    """The records of metrics.jsonl; none when the file is absent.
+
+    Raises:
+        HoigsError: a line is not JSON; the message has its number.
+    """
+    if not file.is_file():
+        return []
+    records = []
+    for number, line in enumerate(file.read_text().splitlines(), 1):
+        try:
+            records.append(json.loads(line))
+        except json.JSONDecodeError as error:
+            raise HoigsError(
+                f"{file}:{number}: not JSON ({error.msg}); if a crash cut the line short, delete it"
+            ) from error
+    return records
+
+
+def loss_curve(records: Sequence[dict[str, Any]]) -> str:
+    """Total loss and its largest terms, logarithmic."""
+    steps = [r["step"] for r in records]
+    last = records[-1].get("losses", {})
+    names = sorted(
+        (n for n in last if not n.startswith("regularizer/")), key=lambda n: -abs(last[n])
+    )
+
+    def paint(axes: Axes) -> None:
+        for name, hue in zip(names[:SHOWN_TERMS], HUES):
+            points = [(r["step"], r["losses"][name]) for r in records if name in r["losses"]]
+            positive = [(s, v) for s, v in points if v > 0]
+            if positive:
+                x, y = zip(*positive, strict=True)
+                axes.plot(x, smoothed(y), color=hue, linewidth=1.1, label=name)
+        total = [r["loss"] for r in records]
+        axes.plot(steps, smoothed(total), color=INK, linewidth=1.8, label="total, weighted")
+        axes.set_yscale("log")
+        axes.legend(frameon=False, fontsize=8, ncols=2, labelcolor="linecolor")
+
+    return _figure("loss", "step", paint)
+
+
+def psnr_curve(records: Sequence[dict[str, Any]]) -> str:
+    """PSNR of a few frames of each split, as training went."""
+    scored = [r for r in records if r.get("psnr")]
+    splits = sorted({split for r in scored for split in r["psnr"]}, reverse=True)
+
+    def paint(axes: Axes) -> None:
+        for split, hue in zip(splits, HUES):
+            points = [(r["step"], r["psnr"][split]) for r in scored if split in r["psnr"]]
+            x, y = zip(*points, strict=True)
+            axes.plot(x, y, color=hue, linewidth=1.8, marker="o", markersize=3, label=split)
+        axes.legend(frameon=False, fontsize=8.5, labelcolor="linecolor", loc="lower right")
+
+    return _figure("PSNR dB, a few frames of each split", "step", paint)
+
+
+def count_curve(records: Sequence[dict[str, Any]]) -> str:
+    """Gaussians of each entity."""
+    counted = [r for r in records if r.get("counts")]
+    names = list(counted[-1]["counts"]) if counted else []
+
+    def paint(axes: Axes) -> None:
+        for name, hue in zip(names, HUES):
+            points = [(r["step"], r["counts"][name]) for r in counted if name in r["counts"]]
+            x, y = zip(*points, strict=True)
+            axes.step(x, y, color=hue, linewidth=1.6, where="post", label=name)
+        axes.set_ylim(bottom=0)
+        axes.yaxis.set_major_formatter(FuncFormatter(_thousands))
+        axes.legend(frameon=False, fontsize=8.5, labelcolor="linecolor")
+
+    return _figure("Gaussians", "step", paint)
+
+
+def frame_bars(view: ViewScores) -> str:
+    """PSNR of each scored frame, full and human + object, so that no mean hides a bad one."""
+    regions = {"full": "full frame", "human_object": "human + object"}
+
+    def paint(axes: Axes) -> None:
+        for offset, (region, label), hue in zip((-0.2, 0.2), regions.items(), HUES):
+            bars = [
+                (i, value)
+                for i, frame in enumerate(view.frames)
+                if not isinstance(value := frame.values[region]["psnr"], NotComputed)
+            ]
+            if bars:
+                x, y = zip(*bars, strict=True)
+                axes.bar([i + offset for i in x], y, 0.36, color=hue, label=label)
+        axes.set_xticks(range(len(view.frames)), [str(f.index) for f in view.frames])
+        axes.grid(False, axis="x")
+        axes.legend(
+            frameon=False, fontsize=8.5, labelcolor="linecolor", ncols=2, loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+        )  # fmt: skip
+
+    return _figure(f"PSNR dB of each frame, {view.name}", "frame", paint)
+
+
+def smoothed(values: Sequence[float], keep: float = 0.8) -> list[float]:
+    """Exponential moving average without the pull of its start."""
+    out, mean, weight = [], 0.0, 0.0
+    for value in values:
+        mean, weight = keep * mean + (1 - keep) * value, keep * weight + (1 - keep)
+        out.append(mean / weight)
+    return out
+
+
+def _figure(title: str, xlabel: str, paint: Callable[[Axes], None]) -> str:
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(5.6, 3.1), layout="constrained")
+        axes = figure.add_subplot()
+        paint(axes)
+        axes.set_title(title, loc="left", fontsize=10.5)
+        axes.set_xlabel(xlabel)
+        axes.tick_params(length=0)
+        if axes.get_xscale() == "linear" and xlabel == "step":
+            axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        figure.patch.set_alpha(0)
+        axes.patch.set_alpha(0)
+        buffer = io.StringIO()
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
+    svg = buffer.getvalue()
+    return svg[svg.index("<svg") :]  # without the XML head, which has no place inside HTML
+
+
+def _thousands(value: float, _: int) -> str:
+    return f"{value / 1000:g}k" if value >= 1000 else f"{value:g}"

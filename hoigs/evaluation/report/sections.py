@@ -1,0 +1,151 @@
+"""The report's sections as HTML; every word from outside is escaped here."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+from hoigs.evaluation.protocol import NotComputed, Value
+from hoigs.evaluation.regions import MEANING
+from hoigs.evaluation.report.media import Comparison, Cutout
+from hoigs.evaluation.scores import Evaluation, Table, Timing
+
+
+def tiles(evaluation: Evaluation, records: Sequence[dict[str, Any]]) -> str:
+    """The headline numbers; what was not computed is left out here and explained below."""
+    shown: list[tuple[str, str, str]] = []
+    first = evaluation.views[0]
+    for region, label in (("full", "full frame"), ("human_object", "human + object")):
+        shown += _decibels(first.mean(region, "psnr")[0], f"{label}, {first.name}")
+    for view in evaluation.views[1:]:
+        shown += _decibels(view.mean("full", "psnr")[0], f"full frame, {view.name}")
+    count = sum(part.gaussians for part in evaluation.sizes)
+    megabytes = sum(part.megabytes for part in evaluation.sizes)
+    shown.append((short(count), "Gaussians", f"{megabytes:.1f} MB"))
+    if isinstance(evaluation.timing, Timing):
+        timing = evaluation.timing
+        shown.append((f"{timing.fps:.3g}", "frames a second", f"on {timing.device}"))
+    if records:
+        seconds = records[-1]["time_s"]
+        shown.append((clock(seconds), "training", f"{records[-1]['step']:,} steps"))
+    cells = (
+        f"<div class='tile'><b>{escape(number)}</b><span>{escape(what)}</span>"
+        f"<small>{escape(detail)}</small></div>"
+        for number, what, detail in shown
+    )
+    return f"<div class='tiles'>{''.join(cells)}</div>"
+
+
+def _decibels(value: Value, what: str) -> list[tuple[str, str, str]]:
+    return [] if isinstance(value, NotComputed) else [(f"{value:.2f}", "dB PSNR", what)]
+
+
+def pair(image: str, left: str, right: str, alt: str) -> str:
+    """One picture whose halves carry a caption each."""
+    return (
+        f"<figure class='pair'><img src='{image}' alt='{escape(alt, quote=True)}'>"
+        f"<figcaption><span>{escape(left)}</span><span>{escape(right)}</span></figcaption></figure>"
+    )
+
+
+def comparer(comparisons: Sequence[Comparison]) -> str:
+    """Video against render under a slider, the error beside it, and thumbnails to choose by."""
+    stages, thumbs = [], []
+    for i, c in enumerate(comparisons):
+        on = " on" if i == 0 else ""
+        stages.append(
+            f"<div class='stage{on}'><div class='slider'>"
+            f"<img src='{c.render}' alt='render'>"
+            f"<img class='top' src='{c.video}' alt='video'>"
+            "<i class='line'></i><span class='tag left'>video</span>"
+            "<span class='tag right'>reconstruction</span>"
+            "<input type='range' min='0' max='100' value='50' step='0.1' "
+            "aria-label='how much of the video to show'></div>"
+            f"<div class='error'><img src='{c.error}' alt='error'>"
+            "<span class='tag left'>absolute error, white at 0.25</span></div>"
+            f"<p class='caption'><b>{escape(c.label)}</b> {escape(c.score)}</p></div>"
+        )
+        thumbs.append(
+            f"<button class='{on.strip()}' aria-label='{escape(c.label, quote=True)}'>"
+            f"<img src='{c.thumb}' alt=''></button>"
+        )
+    return f"<div class='comparer'>{''.join(stages)}<nav>{''.join(thumbs)}</nav></div>"
+
+
+def apart(cutouts: Sequence[Cutout]) -> str:
+    """Each entity alone."""
+    cells = (
+        f"<figure class='{escape(c.kind, quote=True)}'><img src='{c.image}' "
+        f"alt='{escape(c.name, quote=True)} alone'><figcaption><b>{escape(c.name)}</b> "
+        f"{escape(c.kind)} · {c.gaussians:,} Gaussians</figcaption></figure>"
+        for c in cutouts
+    )
+    return f"<div class='apart'>{''.join(cells)}</div>"
+
+
+def table(source: Table) -> str:
+    """A table with its protocol at its foot."""
+    head = "".join(f"<th>{escape(c)}</th>" for c in source.columns)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>"
+        for row in source.rows
+    )
+    notes = "".join(f"<li>{escape(note)}</li>" for note in source.notes)
+    return (
+        f"<div class='table'><h3>{escape(source.title)}</h3><table><thead><tr>{head}</tr></thead>"
+        f"<tbody>{body}</tbody></table><ul class='notes'>{notes}</ul></div>"
+    )
+
+
+def legend() -> str:
+    """What the regions mean."""
+    words = "; ".join(f"<b>{n.replace('_', ' + ')}</b> {escape(m)}" for n, m in MEANING.items())
+    return f"<p class='legend'>{words}.</p>"
+
+
+def time_bar(timing: Timing | NotComputed) -> str:
+    """Where a frame's time goes."""
+    if isinstance(timing, NotComputed):
+        return ""
+    share = 100 * timing.deform_ms / (timing.deform_ms + timing.raster_ms)
+    return (
+        "<div class='bar' role='img' aria-label='share of deformation and rasterization'>"
+        f"<i class='deform' style='width:{share:.1f}%'></i><i class='raster'></i></div>"
+        f"<p class='barkey'><span class='deform'>deformation {timing.deform_ms:.1f} ms</span>"
+        f"<span class='raster'>rasterization {timing.raster_ms:.1f} ms</span></p>"
+    )
+
+
+def document(title: str, text: str) -> str:
+    """A file of the run, folded away."""
+    return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>"
+
+
+def provenance(record: dict[str, Any]) -> str:
+    """Versions as a list; the whole record folded away."""
+    versions = record.get("versions", {})
+    items = "".join(
+        f"<div><dt>{escape(str(k))}</dt><dd>{escape(str(v))}</dd></div>"
+        for k, v in versions.items()
+    )
+    whole = document("provenance.json", json.dumps(record, indent=1, ensure_ascii=False))
+    return f"<dl class='versions'>{items}</dl>{whole}"
+
+
+def short(count: int) -> str:
+    """12,345 as 12.3k."""
+    if count >= 1_000_000:
+        return f"{count / 1e6:.2f}M"
+    return f"{count / 1000:.1f}k" if count >= 1000 else str(count)
+
+
+def clock(seconds: float) -> str:
+    """Seconds as 48 s, 5:07 or 2:05:00."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(whole, 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

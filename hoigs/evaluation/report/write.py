@@ -1,0 +1,166 @@
+"""write_report: one HTML file that shows what a run made and how good it is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from html import escape
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import hoigs
+from hoigs.core.clip import Clip
+from hoigs.core.scene import SceneModel
+from hoigs.evaluation.report import curves, media, sections
+from hoigs.evaluation.scores import Evaluation, score_table, size_table, timing_table
+
+
+def write_report(
+    run_folder: Path | str,
+    model: SceneModel,
+    clip: Clip,
+    evaluation: Evaluation,
+    *,
+    progress: Callable[[float, str], None] | None = None,
+) -> Path:
+    """Draw, tabulate and write `report.html` into a run folder, and return its path.
+
+    The page is self-contained: pictures are inside it and it asks the network for nothing.
+    Reads the run's metrics.jsonl, spec.yaml and provenance.json, each if it is there.
+
+    Raises:
+        HoigsError: metrics.jsonl is damaged.
+    """
+    folder = Path(run_folder)
+    report = progress or (lambda done, text: None)
+    records = curves.read_metrics(folder / "metrics.jsonl")
+    was_training = model.training
+    model.eval()
+    body = []
+    steps: list[tuple[str, Callable[[], str]]] = [
+        ("playback", lambda: _hero(model, clip)),
+        ("comparisons", lambda: _compared(model, clip, evaluation)),
+        ("orbit", lambda: _space(model, clip)),
+        ("scores", lambda: _scores(evaluation)),
+        ("curves", lambda: _training(records)),
+        ("cost", lambda: _cost(evaluation)),
+        ("provenance", lambda: _origin(folder)),
+    ]
+    for i, (name, make) in enumerate(steps):
+        report(i / len(steps), name)
+        body.append(make())
+    model.train(was_training)
+    page = Template(_asset("page.html")).substitute(
+        title=escape(clip.name),
+        lead=escape(_lead(model, clip)),
+        style=_asset("style.css"),
+        script=_asset("script.js"),
+        tiles=sections.tiles(evaluation, records),
+        sections="\n".join(body),
+        version=escape(hoigs.__version__),
+        created=escape(evaluation.created),
+    )
+    path = folder / "report.html"
+    temporary = folder / ".report.html.part"
+    temporary.write_text(page, encoding="utf-8")
+    temporary.replace(path)
+    report(1.0, "")
+    return path
+
+
+def _lead(model: SceneModel, clip: Clip) -> str:
+    """What was reconstructed, in a sentence."""
+    cast = [f"{name} ({model.entity(name).kind})" for name in model.entities]
+    listed = " and ".join([", ".join(cast[:-1]), cast[-1]]) if len(cast) > 1 else cast[0]
+    camera = clip.cameras[0]
+    return (
+        f"{len(clip)} frames of video, {camera.width}×{camera.height} at {clip.fps:g} a second, "
+        f"as moving 3D Gaussians: {listed}."
+    )
+
+
+def _hero(model: SceneModel, clip: Clip) -> str:
+    image = media.playback(model, clip)
+    return "<div class='hero'>" + sections.pair(
+        image, "The video", "The reconstruction, from the same camera", "video beside render"
+    ) + "</div>"  # fmt: skip
+
+
+def _compared(model: SceneModel, clip: Clip, evaluation: Evaluation) -> str:
+    comparisons = media.comparisons(model, clip, evaluation)
+    return _section(
+        "Frames it never saw",
+        "These frames took no part in training. Drag the seam; choose a frame below.",
+        sections.comparer(comparisons),
+    )
+
+
+def _space(model: SceneModel, clip: Clip) -> str:
+    position = media.key_position(clip)
+    index = clip.moments[position].index
+    orbit = media.frozen_orbit(model, clip, position)
+    return _section(
+        "One moment, held still",
+        f"Frame {index} is stopped while the camera swings 20° to each side of where it was.",
+        sections.pair(orbit, "Colour", "Depth, near is bright", "orbit around a frozen moment"),
+    ) + _section(
+        "Taken apart",
+        "Every entity is a model of its own and can be drawn alone, moved or left out.",
+        sections.apart(media.cutouts(model, clip, position)),
+    )
+
+
+def _scores(evaluation: Evaluation) -> str:
+    tables = "".join(sections.table(score_table(view)) for view in evaluation.views)
+    bars = "".join(curves.frame_bars(view) for view in evaluation.views)
+    return _section(
+        "Scores",
+        "Each number stands with the protocol that it was measured by.",
+        sections.legend() + tables + f"<div class='curves'>{bars}</div>",
+    )
+
+
+def _training(records: Sequence[dict[str, Any]]) -> str:
+    if not records:
+        return _section("Training", "metrics.jsonl is absent or empty: no curves.", "")
+    plots = [curves.loss_curve(records)]
+    if any(r.get("psnr") for r in records):
+        plots.append(curves.psnr_curve(records))
+    if any(r.get("counts") for r in records):
+        plots.append(curves.count_curve(records))
+    return _section("Training", "", f"<div class='curves'>{''.join(plots)}</div>")
+
+
+def _cost(evaluation: Evaluation) -> str:
+    tables = (timing_table(evaluation.timing), size_table(evaluation.sizes))
+    return _section(
+        "What it costs",
+        "",
+        sections.time_bar(evaluation.timing) + "".join(sections.table(t) for t in tables),
+    )
+
+
+def _origin(folder: Path) -> str:
+    parts = []
+    provenance = folder / "provenance.json"
+    if provenance.is_file():
+        parts.append(sections.provenance(json.loads(provenance.read_text())))
+    spec = folder / "spec.yaml"
+    if spec.is_file():
+        parts.append(
+            sections.document("spec.yaml, resolved: it makes this run again", spec.read_text())
+        )
+    absent = [file.name for file in (provenance, spec) if not file.is_file()]
+    return _section("Where it comes from", f"Absent: {', '.join(absent)}." if absent else "",
+                    "".join(parts))  # fmt: skip
+
+
+def _section(title: str, say: str, content: str) -> str:
+    words = f"<p class='say'>{escape(say)}</p>" if say else ""
+    return f"<section><h2>{escape(title)}</h2>{words}{content}</section>"
+
+
+def _asset(name: str) -> str:
+    return (resources.files(__package__) / name).read_text(encoding="utf-8")
