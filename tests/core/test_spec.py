@@ -350,3 +350,29 @@ def test_reading_specs_needs_no_torch():
         "assert not {'torch', 'numpy', 'warp'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("name", builtin_specs())
+def test_builtin_specs_are_in_order_and_read_back_equal(name):
+    spec = Spec.load(name)
+    assert spec.name == name
+    assert Spec.parse(spec.dump()) == spec
+
+
+def test_ablations_change_what_their_names_say():
+    def changed(name: str) -> set[str]:
+        base, other = (flat(Spec.load(n).model_dump()) for n in ("hoigs", name))
+        keys = {k for k in base | other if base.get(k) != other.get(k)}
+        return {k.rpartition(".")[0] for k in keys - {"name", "summary"}}
+
+    assert changed("hoigs-no-interaction") == {"interaction"}
+    assert changed("hoigs-human-embedding") == {"model.human.features"}
+    assert changed("hoigs-chs-fd") == {"model.object.deformation"}
+    assert changed("hoigs-object-mlp") == {"model.object.deformation", "model.object.features"}
+    assert len({Spec.load(name).model_hash() for name in builtin_specs()}) == len(builtin_specs())
+
+
+def flat(tree, prefix=""):
+    if not isinstance(tree, dict):
+        return {prefix.rstrip("."): tree}
+    return {k: v for key, value in tree.items() for k, v in flat(value, f"{prefix}{key}.").items()}

@@ -142,10 +142,11 @@ def test_a_spec_uses_the_example_by_name(registry, clip):
     assert type(cup.deformation).__module__ == "hoigs_bspline.deformation"
     assert cup.deformation.control.shape == (6, 4 + 3, 3)
     frame = clip.moments[4]
-    # a B-spline passes near its control points, which follow the track: 2 cm on a 1 m path
+    # a B-spline misses its control points, which follow the track t^2 every 1/4, by a sixth of
+    # their second difference: 2 / 16 / 6 = 2.1 cm on a path of 1 m
     track = clip.objects["cup"]
     expected = cup.means @ track.rotations[4].T + track.translations[4]
-    assert (cup(frame).means - expected).norm(dim=-1).max() < 0.02
+    assert (cup(frame).means - expected).norm(dim=-1).max() < 0.021
     output = model.render(frame, clip.cameras[4])
     output.color.sum().backward()
     assert output.alpha.max() > 0.01
@@ -164,7 +165,7 @@ def test_its_settings_are_checked_as_ours_are(registry):
     with pytest.raises(SpecError) as caught:
         Spec.parse(SPEC.replace("step: 2", "stp: 2"), source="my.yaml", registry=registry)
     assert str(caught.value) == (
-        'my.yaml:7:59 model.object.deformation.stp: unknown key; did you mean "step"?'
+        'my.yaml:7:55 model.object.deformation.stp: unknown key; did you mean "step"?'
     )
 
 
