@@ -38,9 +38,10 @@ def shared_data() -> Path:
     return folder
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
+
+
+@pytest.fixture(params=DEVICES if torch.cuda.is_available() else DEVICES[:1])
 def device(request: pytest.FixtureRequest) -> torch.device:
-    """The CPU, then a CUDA device where there is one."""
-    if request.param == "cuda" and not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
+    """Every device of this machine: the CPU, and CUDA where there is one."""
     return torch.device(request.param)

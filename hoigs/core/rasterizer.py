@@ -107,7 +107,7 @@ class Rasterizer(ABC):
         `subset`) contribute nothing and get zero gradients; they never disturb a neighbour.
 
         Raises:
-            RenderError: shapes, dtypes or devices that this backend cannot draw.
+            RenderError: shapes, dtypes, devices or limits that this backend cannot draw.
         """
 
     def check_inputs(self, gaussians: Gaussians, camera: Camera, request: RenderRequest) -> None:
@@ -146,6 +146,18 @@ class Rasterizer(ABC):
         degree = request.sh_degree
         if degree is not None and not 0 <= degree <= 3:
             raise RenderError(f"{name}: sh_degree {degree} is outside 0..3")
+        limits = {
+            "near": (request.near >= 0, "0 or more metres"),
+            "low_pass": (request.low_pass >= 0, "0 or more square pixels"),
+            "max_alpha": (0 < request.max_alpha <= 1, "above 0 and at most 1"),
+            "min_alpha": (0 <= request.min_alpha <= request.max_alpha, "from 0 to max_alpha"),
+            "min_transmittance": (0 <= request.min_transmittance < 1, "at least 0 and below 1"),
+        }
+        for key, (good, wanted) in limits.items():
+            if not good:
+                raise RenderError(
+                    f"{name}: request.{key} is {getattr(request, key)}, expected {wanted}"
+                )
 
 
 Shape = tuple[int | None, ...]  # None is any number

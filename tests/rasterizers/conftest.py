@@ -1,0 +1,38 @@
+"""The backends that the conformance tests run on."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from raster_scenes import Backend
+
+from hoigs.core.rasterizer import Rasterizer
+
+
+def make(name: str) -> Rasterizer:
+    if name == "torch":
+        from hoigs.rasterizers.torch_tiles import TorchRasterizer
+
+        return TorchRasterizer()
+    from hoigs.rasterizers.warp import WarpRasterizer
+
+    return WarpRasterizer()
+
+
+DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+
+
+@pytest.fixture(
+    scope="session",
+    params=[
+        pytest.param(
+            (name, device), id=f"{name}-{device}", marks=[pytest.mark.gpu] * (device != "cpu")
+        )
+        for name in ("torch", "warp")
+        for device in DEVICES
+    ],
+)
+def backend(request: pytest.FixtureRequest) -> Backend:
+    """Every backend on every device of this machine."""
+    name, device = request.param
+    return Backend(make(name), torch.device(device))

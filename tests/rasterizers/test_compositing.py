@@ -1,0 +1,83 @@
+"""The shared pieces of the torch backends, against their literal definitions."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from raster_scenes import a_camera, images, random_scene
+
+from hoigs.core.rasterizer import RenderRequest
+from hoigs.rasterizers import compositing
+from hoigs.rasterizers.compositing import compositing_weights, prepare, splat_alphas
+from hoigs.rasterizers.oracle import OracleRasterizer
+from hoigs.rasterizers.torch_tiles import TorchRasterizer, list_by_tile
+
+
+@pytest.mark.parametrize("limit", [0.0, 1e-4, 0.03, 0.5])
+def test_weights_are_the_loop_front_to_back(limit: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    alphas = torch.rand(20, 9, generator=generator, dtype=torch.float64)
+    alphas[3, 4] = 0.0
+    alphas[5, 2] = 1.0
+    wanted = torch.zeros_like(alphas)
+    for row in range(20):
+        transmittance = 1.0
+        for i in range(9):
+            after = transmittance * (1 - float(alphas[row, i]))
+            if limit > 0 and after <= limit:
+                break
+            wanted[row, i] = transmittance * alphas[row, i]
+            transmittance = after
+    torch.testing.assert_close(compositing_weights(alphas, limit), wanted)
+    assert compositing_weights(alphas[:, :0], limit).shape == (20, 0)
+
+
+@pytest.mark.parametrize("min_alpha", [0.0, 1 / 255, 0.1])
+@pytest.mark.parametrize("tile_size", [1, 7, 16, 100])
+def test_tiles_list_every_splat_that_touches_a_pixel(tile_size: int, min_alpha: float) -> None:
+    camera = a_camera()
+    request = RenderRequest(min_alpha=min_alpha)
+    splats, _ = prepare(random_scene(80, degree=0), camera, request)
+    tiles, rows = list_by_tile(splats, camera, tile_size, min_alpha)
+    across = -(-camera.width // tile_size)
+    listed = {(int(t), int(r)) for t, r in zip(tiles, rows)}
+    assert len(listed) == len(tiles)
+    assert torch.equal(tiles, tiles.sort().values)
+    for tile in tiles.unique():
+        assert (rows[tiles == tile].diff() > 0).all(), "splats of a tile are out of depth order"
+    grid = camera.pixel_grid().flatten(0, 1)
+    pixel, row = torch.nonzero(splat_alphas(grid, splats, 0.999, min_alpha), as_tuple=True)
+    column, line = (grid[pixel] // tile_size).long().unbind(-1)
+    touching = {(int(t), int(r)) for t, r in zip(line * across + column, row)}
+    assert touching <= listed
+    # pixel-sized tiles leave no slack but the small margin for rounding
+    assert tile_size > 1 or not min_alpha or len(listed) <= 1.01 * len(touching)
+
+
+@pytest.mark.parametrize("rasterizer", [OracleRasterizer(), TorchRasterizer()])
+def test_chunks_change_nothing(
+    rasterizer: OracleRasterizer | TorchRasterizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gaussians, camera = random_scene(60).to(torch.float64), a_camera().to(torch.float64)
+    request = RenderRequest(features=torch.randn(60, 2, dtype=torch.float64))
+    whole = rasterizer.render(gaussians, camera, request)
+    monkeypatch.setattr(compositing, "CHUNK", 500)
+    for name, image in images(rasterizer.render(gaussians, camera, request)).items():
+        torch.testing.assert_close(image, images(whole)[name], atol=1e-12, rtol=0)
+
+
+def test_the_oracle_ignores_cutoffs_unless_asked() -> None:
+    gaussians, camera = random_scene(100, degree=0), a_camera()
+    free = RenderRequest(min_alpha=0.0, min_transmittance=0.0)
+    default = OracleRasterizer().render(gaussians, camera)
+    assert torch.equal(
+        default.color, OracleRasterizer(cutoffs=True).render(gaussians, camera, free).color
+    )
+    cut = OracleRasterizer(cutoffs=True).render(gaussians, camera)
+    assert default.color.dtype == torch.float64
+    assert 1e-4 < float((default.color - cut.color).abs().max()) < 0.1
+
+
+def test_tile_size_must_be_positive() -> None:
+    with pytest.raises(ValueError, match="tile_size 0"):
+        TorchRasterizer(tile_size=0)
