@@ -1,0 +1,47 @@
+"""What can be chosen when a video is prepared."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from hoigs.core.config import ComponentConfig
+
+
+class PrepareOptions(ComponentConfig):
+    """Settings of `prepare`; the defaults suit a phone's video of one person and one object."""
+
+    width: int | None = Field(
+        default=None, ge=16, description="of the stored frames, pixels; None keeps the video's"
+    )
+    every: int = Field(default=1, ge=1, description="take every n-th frame")
+    max_frames: int | None = Field(default=None, ge=1, description="stop after so many frames")
+    image_format: Literal["jpg", "png"] = Field(default="jpg", description="of the stored frames")
+    quality: int = Field(default=95, ge=1, le=100, description="of jpg frames")
+    focal: float | None = Field(
+        default=None,
+        gt=0,
+        description="focal length in pixels of the *video's* own size, for a static camera; "
+        "None assumes 0.8 x the longer side (64 degrees), which scales all depths",
+    )
+    body: str = Field(default="body:anny", description="key of the body model, for the clip")
+    human: str = Field(default="human", description="name of the person's entity")
+    object: str = Field(default="object", description="name of the object's entity")
+    ball_radius: float = Field(
+        default=0.11, gt=0, description="of a tracked ball, metres; a football's is 0.11"
+    )
+    object_points: int = Field(default=4000, ge=8, description="points that start the object")
+    scene_spacing: float = Field(
+        default=3.0,
+        gt=0,
+        description="of a static background's points, pixels at 640 wide: 3 gives about 26,000",
+    )
+    backdrop: float = Field(
+        default=3.0,
+        gt=1,
+        description="distance of a static background, in distances of the person",
+    )
+    overlay_width: int = Field(
+        default=640, ge=0, description="of overlay.mp4, pixels; 0 writes none"
+    )

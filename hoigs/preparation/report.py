@@ -1,0 +1,93 @@
+"""What was prepared, how well, and how far each part may be trusted."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class PrepareReport:
+    """Numbers to judge a prepared clip by; written as report.json and report.md beside it.
+
+    Attributes:
+        name, frames, width, height, fps: of the clip. video: the source's file name.
+        camera: "static" or "moving". parallax_degrees: largest angle between two views of the
+            scene's middle; under about 5 the geometry is weakly known.
+        coverage: by entity, part of the image that the mask covers in each frame, 0..1.
+        body_residual_px: median distance of fitted to given landmarks, in frame pixels.
+        body: whatever else the body fit reports.
+        scene_scale: metres a COLMAP unit; 1 for a static camera.
+        object_scale_spread: standard deviation over frames of the object's apparent over its
+            expected size: 0.05 means that its depth is uncertain by about 5 %.
+        object_observed: part of the frames in which the object was seen.
+        scene_points: number of points that start the background.
+        provenance: what each part was made from, and how weak it is.
+        warnings: what a reader should know before training.
+        seconds: time by stage.
+    """
+
+    name: str
+    video: str
+    frames: int
+    width: int
+    height: int
+    fps: float
+    camera: str
+    parallax_degrees: float
+    coverage: dict[str, list[float]]
+    body_residual_px: float
+    scene_scale: float
+    object_scale_spread: float
+    object_observed: float
+    scene_points: int
+    body: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, str] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self), indent=2, allow_nan=False)
+
+    def to_markdown(self) -> str:
+        rows = [
+            ("video", self.video),
+            ("frames", f"{self.frames} of {self.width}x{self.height} at {self.fps:g} fps"),
+            ("camera", f"{self.camera}, parallax {self.parallax_degrees:.1f} degrees"),
+            ("body", f"landmarks missed by {self.body_residual_px:.1f} px (median)"),
+            ("scene scale", f"{self.scene_scale:.4g} metres a unit"),
+            ("object seen", f"in {100 * self.object_observed:.0f} % of the frames"),
+            ("object scale spread", f"{100 * self.object_scale_spread:.1f} %"),
+            ("scene points", f"{self.scene_points}"),
+        ]
+        rows += [(f"mask of {n}", _coverage(c)) for n, c in self.coverage.items()]
+        rows.append(("time", ", ".join(f"{n} {s:.1f} s" for n, s in self.seconds.items())))
+        table = "\n".join(f"| {name} | {value} |" for name, value in rows)
+        made = "\n".join(f"- **{name}**: {text}" for name, text in self.provenance.items())
+        lines = [f"# {self.name}", "", "| | |", "|---|---|", table, "", "## Made from", "", made]
+        if self.warnings:
+            lines += ["", "## Beware", "", *(f"- {w}" for w in self.warnings)]
+        return "\n".join(lines) + "\n"
+
+    def save(self, folder: Path) -> None:
+        """report.json and report.md."""
+        (folder / "report.json").write_text(self.to_json(), encoding="utf-8")
+        (folder / "report.md").write_text(self.to_markdown(), encoding="utf-8")
+
+
+_BARS = "▁▂▃▄▅▆▇█"
+
+
+def _coverage(values: list[float]) -> str:
+    """Mean and extent, and a sparkline over time."""
+    if not values:
+        return "no frames"
+    top = max(values) or 1.0
+    chosen = [values[i * len(values) // 32] for i in range(32)] if len(values) > 32 else values
+    line = "".join(_BARS[min(7, int(8 * v / top))] if v else " " for v in chosen)
+    empty = sum(v == 0 for v in values)
+    note = f", empty in {empty} frames" if empty else ""
+    mean = sum(values) / len(values)
+    return f"{100 * mean:.1f} % of the image (`{line}`, up to {100 * top:.1f} %{note})"

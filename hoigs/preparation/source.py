@@ -1,0 +1,121 @@
+"""What a video's folder holds beside the video: cameras, masks, tracks, landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hoigs.core.errors import HoigsError
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+_COLMAP_FILES = ("cameras", "images", "points3D")
+_LAYOUT = """  FOLDER/
+    video.mp4            the video (any name; one file)
+    pose_mediapipe.npz   image_xyzv and world_xyzv [F, 33, 4], from MediaPipe Pose
+    hoi_mask/00000.png   person and object together, 0/255, one file a video frame,
+                         from a video segmenter; or masks/human/ and masks/object/ apart
+    sparse/              a COLMAP model, if the camera moves; absent: a static camera
+    ball_track.npz       xyr [F, 3] pixels, if the object is a ball: centre and radius"""
+
+
+class SourceError(HoigsError):
+    """A video or its priors that are absent, unreadable or do not fit together."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where each input of `prepare` lies.
+
+    Attributes:
+        video: the file. landmarks: pose_mediapipe.npz.
+        together: folder of masks that hold person and object at once, or None.
+        apart: folders of masks by entity name.
+        colmap: folder of a COLMAP model, or None for a static camera.
+        ball: ball_track.npz, or None.
+    """
+
+    video: Path
+    landmarks: Path
+    together: Path | None = None
+    apart: dict[str, Path] = field(default_factory=dict)
+    colmap: Path | None = None
+    ball: Path | None = None
+
+    @property
+    def static_camera(self) -> bool:
+        return self.colmap is None
+
+
+def find_source(path: Path, *, human: str = "human", object_name: str = "object") -> Source:
+    """The inputs in a folder, or beside a video file.
+
+    Raises:
+        SourceError: naming everything that is absent and who makes it.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise SourceError(f"{path} does not exist; expected a video, or a folder with one")
+    folder = path if path.is_dir() else path.parent
+    missing: list[str] = []
+    video = path if path.is_file() else _find_video(folder, missing)
+    landmarks = folder / "pose_mediapipe.npz"
+    if not landmarks.is_file():
+        missing.append(
+            "pose_mediapipe.npz: body landmarks, from MediaPipe Pose (`pip install mediapipe` in "
+            "an environment of its own), arrays image_xyzv and world_xyzv [F, 33, 4]"
+        )
+    together, apart = _find_masks(folder, human, object_name, missing)
+    ball = folder / "ball_track.npz"
+    colmap = _find_colmap(folder, missing)
+    if missing:
+        lines = "\n".join(f"  - {line}" for line in missing)
+        raise SourceError(
+            f"{path} cannot be prepared; absent:\n{lines}\n"
+            f"hoigs runs no estimator itself, it reads their files from one folder:\n{_LAYOUT}"
+        )
+    assert video is not None
+    return Source(video, landmarks, together, apart, colmap, ball if ball.is_file() else None)
+
+
+def _find_video(folder: Path, missing: list[str]) -> Path | None:
+    videos = sorted(p for p in folder.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
+    if len(videos) > 1:
+        names = ", ".join(p.name for p in videos)
+        raise SourceError(f"{folder} holds {len(videos)} videos ({names}): name the one to prepare")
+    if not videos:
+        missing.append(f"a video ({', '.join(VIDEO_SUFFIXES)}): from your camera")
+    return videos[0] if videos else None
+
+
+def _find_masks(
+    folder: Path, human: str, object_name: str, missing: list[str]
+) -> tuple[Path | None, dict[str, Path]]:
+    apart = {n: folder / "masks" / n for n in (human, object_name)}
+    apart = {n: p for n, p in apart.items() if p.is_dir()}
+    together = folder / "hoi_mask"
+    if together.is_dir() and any(together.glob("*.png")):
+        return together, apart
+    for name in (human, object_name):
+        # a tracked ball gives the object's mask, so the person's alone is enough
+        covered = name == object_name and (folder / "ball_track.npz").is_file()
+        if name not in apart and not covered:
+            missing.append(
+                f"masks/{name}/00000.png, …: from a video segmenter such as SAM 2, one file a "
+                "video frame, 0/255 (or hoi_mask/ with person and object together)"
+            )
+    return None, apart
+
+
+def _find_colmap(folder: Path, missing: list[str]) -> Path | None:
+    sparse = folder / "sparse"
+    if not sparse.is_dir():
+        return None
+    for model in (sparse / "0", sparse):
+        for suffix in (".bin", ".txt"):
+            if all((model / (name + suffix)).is_file() for name in _COLMAP_FILES):
+                return model
+    missing.append(
+        "sparse/{cameras,images,points3D}.bin: the folder is there but no COLMAP model is in it; "
+        "run `colmap mapper`, or delete the folder if the camera does not move"
+    )
+    return None

@@ -1,0 +1,65 @@
+"""The tiny scene of conftest.py, as functions of the frame number."""
+
+from __future__ import annotations
+
+import numpy as np
+
+FRAMES, WIDTH, HEIGHT = 12, 96, 64
+_Y, _X = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+
+
+def BALL(frame: int) -> tuple[float, float, float]:
+    """Centre x, y and radius, pixels."""
+    return 20.0 + 3.5 * frame, 36.0 - 0.8 * frame, 9.0 - 0.15 * frame
+
+
+def masks(frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """The person and the ball in front of it, bool [H, W]."""
+    x, y, r = BALL(frame)
+    ball = (_X - x) ** 2 + (_Y - y) ** 2 <= r * r
+    human = (np.abs(_X - 48) < 8) & (np.abs(_Y - 34) < 26)
+    return human & ~ball, ball
+
+
+def background() -> np.ndarray:
+    """RGB of the scene alone: a smooth ramp, so that compression keeps it."""
+    ramp = np.stack((_X / WIDTH * 120, _Y / HEIGHT * 90 + 40, 0 * _X + 60), -1)
+    return ramp.astype(np.uint8)
+
+
+def picture(frame: int) -> np.ndarray:
+    image = background()
+    human, ball = masks(frame)
+    image[human] = (90, 30, 110)
+    image[ball] = (235, 235, 225)
+    return image
+
+
+# MediaPipe's 33 landmarks of a standing person, hip-centred, metres, y down
+_BODY = np.zeros((33, 3))
+for _i, _xyz in {
+    0: (0, -0.62, -0.1), 7: (0.07, -0.64, 0), 8: (-0.07, -0.64, 0), 9: (0.02, -0.57, -0.1),
+    10: (-0.02, -0.57, -0.1), 11: (0.17, -0.48, 0), 12: (-0.17, -0.48, 0), 13: (0.22, -0.22, 0),
+    14: (-0.22, -0.22, 0), 15: (0.24, 0.02, 0), 16: (-0.24, 0.02, 0), 17: (0.25, 0.1, 0),
+    18: (-0.25, 0.1, 0), 19: (0.24, 0.11, 0), 20: (-0.24, 0.11, 0), 21: (0.22, 0.07, 0),
+    22: (-0.22, 0.07, 0), 23: (0.1, 0, 0), 24: (-0.1, 0, 0), 25: (0.11, 0.42, 0),
+    26: (-0.11, 0.42, 0), 27: (0.11, 0.82, 0.05), 28: (-0.11, 0.82, 0.05), 29: (0.11, 0.88, 0.08),
+    30: (-0.11, 0.88, 0.08), 31: (0.12, 0.88, -0.12), 32: (-0.12, 0.88, -0.12),
+}.items():  # fmt: skip
+    _BODY[_i] = _xyz
+for _i in (1, 2, 3):
+    _BODY[_i] = (0.03, -0.65, -0.09)
+for _i in (4, 5, 6):
+    _BODY[_i] = (-0.03, -0.65, -0.09)
+
+
+def landmarks(depth: float = 2.8) -> dict[str, np.ndarray]:
+    """pose_mediapipe.npz of that person standing still before a camera of focal 0.8 x width."""
+    focal = 0.8 * WIDTH
+    pixels = _BODY[:, :2] / (_BODY[:, 2:] + depth) * focal + (WIDTH / 2, 32)
+    image = np.concatenate((pixels, _BODY[:, 2:] * 30, np.full((33, 1), 0.99)), -1)
+    world = np.concatenate((_BODY, np.full((33, 1), 0.99)), -1)
+    return {
+        "image_xyzv": np.repeat(image[None], FRAMES, 0).astype(np.float32),
+        "world_xyzv": np.repeat(world[None], FRAMES, 0).astype(np.float32),
+    }
