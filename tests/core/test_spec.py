@@ -365,7 +365,11 @@ def test_ablations_change_what_their_names_say():
         keys = {k for k in base | other if base.get(k) != other.get(k)}
         return {k.rpartition(".")[0] for k in keys - {"name", "summary"}}
 
-    assert changed("hoigs-no-interaction") == {"interaction"}
+    assert changed("hoigs-no-interaction") == {
+        "interaction",
+        "model.human.features",
+        "model.object.features",
+    }
     assert changed("hoigs-human-embedding") == {"model.human.features"}
     assert changed("hoigs-chs-fd") == {"model.object.deformation"}
     assert changed("hoigs-object-mlp") == {"model.object.deformation", "model.object.features"}
