@@ -1,0 +1,40 @@
+"""`hoigs spec list|check|show`."""
+
+from __future__ import annotations
+
+import pytest
+
+from hoigs.core.spec import Spec, builtin_specs
+
+
+def test_list(hoigs):
+    lines = hoigs("spec", "list").out.splitlines()
+    assert [line.split()[0] for line in lines] == builtin_specs()
+    assert all(len(line.split()) > 4 for line in lines)
+
+
+def test_what_is_shown_is_the_spec(hoigs, tmp_path):
+    path = tmp_path / "copy.yaml"
+    path.write_text(hoigs("spec", "show", "hoigs", "--set", "train.steps=12").out)
+    spec = Spec.load("hoigs", overrides=["train.steps=12"])
+    assert spec.train.steps == 12 and Spec.load(path) == spec
+    assert hoigs("spec", "show", path).out == path.read_text()
+
+
+def test_check(hoigs, tmp_path):
+    outcome = hoigs("spec", "check", "static")
+    assert outcome.code == 0 and outcome.out.startswith("static: ok\n")
+    assert "model.scene.deformation" in outcome.out
+    path = tmp_path / "my.yaml"
+    path.write_text("extends: static\nmodel: {scene: {pionts: 3}}\n")
+    outcome = hoigs("spec", "check", path)
+    assert outcome.code == 2 and not outcome.out
+    assert outcome.err == (
+        f'error: {path}:2:17 model.scene.pionts: unknown key; did you mean "points"?\n'
+    )
+
+
+@pytest.mark.parametrize("verb", ["check", "show"])
+def test_an_unknown_name(hoigs, verb):
+    outcome = hoigs("spec", verb, "statik")
+    assert outcome.code == 2 and 'did you mean "static"?' in outcome.err
