@@ -1,4 +1,4 @@
-"""Clothes, shoes and hair put on any BodyModel by rules about its zero pose.
+"""Clothes, shoes and a cap put on any BodyModel by rules about its zero pose.
 
 Rules speak of joints, parts and distances, never of vertex numbers, so every body that follows the
 SMPL-X tree can be dressed. Cloth is the skin pushed out along its normals, painted by a function
@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import sparse
+from scipy.spatial import ConvexHull
 
 from hoigs.core.body import BodyModel
 from hoigs.core.moment import BodyPose
@@ -22,35 +23,40 @@ from hoigs.synthesis.textures import hex_color, to_linear
 
 Array = np.ndarray
 
-SKIN, SHIRT, TROUSERS, SHOES, HAIR, SOLES = range(6)
+SKIN, SHIRT, TROUSERS, SHOES, CAP, HAIR = range(6)
 HEAD_PART, HAND_PARTS, FOOT_PARTS = 3, (8, 9), (14, 15)
 LEG_PARTS = (0, 10, 11, 12, 13, 14, 15)
 
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Heights and places of the zero pose that hems and hairlines refer to, metres."""
+    """Heights and places of the zero pose that hems and rims refer to, metres."""
 
     sole: float
     ankle: float
+    toe: float  # z
+    heel: float  # z, a little before the end
     hip: float
     neck: float
     shoulder: float  # |x|
     elbow: float  # |x|
     chin: float
     crown: float
-    brow: float  # |y| of the eyes' upper edge
+    brow: float
     face: float  # z of the forehead
     ear: float  # z of the ears
 
     @staticmethod
     def of(vertices: Array, joints: Array, parts: Array) -> Landmarks:
         head = vertices[parts == HEAD_PART]
+        feet = vertices[np.isin(parts, FOOT_PARTS)]
         crown, base = float(head[:, 1].max()), float(joints[15, 1])
         above = head[head[:, 1] > base]
         return Landmarks(
             sole=float(vertices[:, 1].min()),
             ankle=float(joints[7, 1]),
+            toe=float(feet[:, 2].max()),
+            heel=float(feet[:, 2].min()) + 0.03,
             hip=float(joints[0, 1]),
             neck=float(joints[12, 1]),
             shoulder=float(abs(joints[16, 0])),
@@ -95,7 +101,7 @@ def dress(body: BodyModel, betas: torch.Tensor, thickness: float, seed: int) -> 
     """Clothes on a body of a given shape.
 
     Args:
-        thickness: how far cloth stands off the skin, metres; shoes and hair scale with it.
+        thickness: how far cloth stands off the skin, metres; shoes and cap scale with it.
     """
     with torch.no_grad():
         vertices, joints = (x.double().numpy() for x in body.shaped(betas))
@@ -103,11 +109,11 @@ def dress(body: BodyModel, betas: torch.Tensor, thickness: float, seed: int) -> 
     parts = body.vertex_parts.numpy()
     marks = Landmarks.of(vertices, joints, parts)
     garment = garments(vertices, parts, marks)
-    off = thickness * np.array([0.0, 1.0, 1.0, 0.9, 1.3, 0.9])[garment]
+    off = thickness * np.array([0.0, 1.0, 1.0, 1.1, 1.2, 0.5])[garment]
     neighbours = _adjacency(faces, len(vertices))
-    shod = np.isin(garment, (SHOES, SOLES))
-    outer = vertices.copy()
-    for _ in range(8):  # toes disappear in the shoe
+    shod = garment == SHOES
+    outer = _forefoot_hulls(vertices, shod, marks)
+    for _ in range(10):
         outer[shod] = (0.5 * outer + 0.5 * (neighbours @ outer))[shod]
     outer += off[:, None] * smooth_normals(outer, faces)
     outer[:, 1] = np.maximum(outer[:, 1], marks.sole)
@@ -125,7 +131,7 @@ def dress(body: BodyModel, betas: torch.Tensor, thickness: float, seed: int) -> 
 
 
 def garments(points: Float[Array, "N 3"], parts: Int[Array, " N"], marks: Landmarks) -> Array:
-    """What is worn at each zero-pose point: SKIN, SHIRT, TROUSERS, SHOES, HAIR or SOLES."""
+    """What is worn at each zero-pose point: SKIN, SHIRT, TROUSERS, SHOES, CAP or HAIR."""
     x, y, z = np.abs(points[:, 0]), points[:, 1], points[:, 2]
     worn = np.full(len(points), SKIN)
     head = parts == HEAD_PART
@@ -136,13 +142,11 @@ def garments(points: Float[Array, "N 3"], parts: Int[Array, " N"], marks: Landma
     hem = marks.hip - 0.015
     worn[torso | ((parts == 0) & (y > hem) & (x < arm))] = SHIRT
     worn[legs & (y <= hem) & (y > marks.ankle + 0.035)] = TROUSERS
-    feet = legs & (y <= marks.ankle + 0.035)
-    worn[feet] = SHOES
-    worn[feet & (y < marks.sole + 0.022)] = SOLES
-    hairline = marks.brow + 0.052 - 0.75 * np.clip(marks.face - z, 0, None)
-    cap = (y > hairline) & (z < marks.face)
-    back = (z < marks.ear - 0.022) & (y > marks.chin + 0.005)
-    worn[head & ((cap & (z > marks.ear - 0.03) & (y > marks.brow - 0.02)) | back)] = HAIR
+    worn[legs & (y <= marks.ankle + 0.035)] = SHOES
+    # a knitted cap down to the forehead and the ears; hair shows below it at the back
+    rim = marks.brow + 0.046 - 0.42 * np.clip(marks.face - z, 0, 0.15)
+    worn[head & (y > rim)] = CAP
+    worn[head & (y <= rim) & (z < marks.ear - 0.022) & (y > marks.chin + 0.005)] = HAIR
     return worn
 
 
@@ -156,28 +160,28 @@ def paint(
     color[:] = hex_color("#d39a74")
     _paint_face(color, points, parts, marks)
 
-    along = np.where(x > marks.shoulder + 0.02, x + 0.013, y)
+    torso = marks.shoulder + 0.02
     navy, cream, coral = (np.array(hex_color(c)) for c in ("#27497a", "#f3ead7", "#d8553f"))
-    phase = (along / 0.062) % 1
-    shirt = np.where((phase < 0.34)[:, None], cream, navy)
-    chest = np.abs(y - (marks.neck - 0.20)) < 0.032
-    shirt = np.where((chest & (x < marks.shoulder + 0.02))[:, None], coral, shirt)
+    along = np.where(x > torso, x + 0.013, y)
+    shirt = _blend(navy, cream, _stripe(along, 0.062, 0.34))
+    chest = _soft(0.032 - np.abs(y - (marks.neck - 0.20))) * (x < torso)
     collar = marks.neck - 0.012 - 0.35 * np.clip(z - 0.02, 0, 0.1)
-    shirt = np.where(((y > collar) & (x < 0.12))[:, None], coral, shirt)
+    shirt = _blend(shirt, coral, np.maximum(chest, _soft(y - collar) * (x < 0.12)))
 
-    denim = np.array(hex_color("#8a7b5c"))
-    check = 0.10 * (((y / 0.085) % 1) < 0.14) + 0.10 * (((points[:, 0] / 0.070) % 1) < 0.16)
-    trousers = denim * (1.0 - check)[:, None]
-    belt = y > marks.hip - 0.045
-    trousers = np.where(belt[:, None], np.array(hex_color("#3b2a1e")), trousers)
+    drill = np.array(hex_color("#8f8061"))
+    check = 0.13 * _stripe(y, 0.085, 0.14) + 0.13 * _stripe(points[:, 0], 0.070, 0.16)
+    trousers = drill * (1.0 - check)[:, None]
+    trousers = _blend(trousers, np.array(hex_color("#3b2a1e")), _soft(y - marks.hip + 0.045))
 
-    hair = (
-        np.array(hex_color("#3a2417")) * (1 + 0.35 * np.sin(points[:, 0] * 420 + z * 90))[:, None]
-    )
-    shoe = np.where((z < -0.01)[:, None], cream, np.array(hex_color("#b8342f")))
-    for kind, paint_of in ((SHIRT, shirt), (TROUSERS, trousers), (HAIR, hair), (SHOES, shoe)):
-        color[worn == kind] = paint_of[worn == kind]
-    color[worn == SOLES] = hex_color("#efe9dd")
+    ribs = np.arctan2(points[:, 0], z - marks.ear) * 16
+    mustard = np.array(hex_color("#dba23a")) * (0.90 + 0.10 * np.sin(ribs))[:, None]
+    rim = marks.brow + 0.046 - 0.42 * np.clip(marks.face - z, 0, 0.15)
+    cap = _blend(mustard, np.array(hex_color("#8c3b2e")), _soft(rim + 0.034 - y))
+    hair = np.broadcast_to(hex_color("#3a2417"), points.shape)
+    shoe = _blend(np.array(hex_color("#9c2f2c")), cream, _soft(marks.heel - z))
+    for kind, material in ((SHIRT, shirt), (TROUSERS, trousers), (SHOES, shoe), (CAP, cap),
+                           (HAIR, hair)):  # fmt: skip
+        color[worn == kind] = material[worn == kind]
     rng = np.random.default_rng(seed)
     mottle = 1 + 0.05 * _ripple(points, rng)
     return np.clip(color * mottle[:, None], 0, 1)
@@ -199,10 +203,39 @@ def _paint_face(color: Array, points: Array, parts: Array, marks: Landmarks) -> 
         color[front & inside] = hex_color(code)
 
 
+def _soft(signed: Float[Array, " N"], width: float = 0.005) -> Float[Array, " N"]:
+    """0 to 1 over `width` metres about zero: edges that mesh colours can carry."""
+    return np.clip(signed / width + 0.5, 0, 1)
+
+
+def _stripe(position: Float[Array, " N"], period: float, share: float) -> Float[Array, " N"]:
+    """1 within a stripe that takes a share of every period, soft-edged."""
+    offset = np.abs((position / period) % 1 - 0.5) * period
+    return _soft(share * period / 2 - offset)
+
+
+def _blend(first: Array, second: Array, weight: Float[Array, " N"]) -> Array:
+    return first * (1 - weight)[:, None] + second * weight[:, None]
+
+
 def _ripple(points: Array, rng: np.random.Generator) -> Array:
     """A few random plane waves, in about [-1, 1]: slight unevenness of every material."""
     waves = rng.normal(0, 55, (3, 6))
     return np.sin(points @ waves + rng.uniform(0, 6.3, 6)).mean(-1) * 1.5
+
+
+def _forefoot_hulls(vertices: Array, shod: Array, marks: Landmarks) -> Array:
+    """Vertices with both forefeet grown to their convex hulls, where toes disappear."""
+    outer = vertices.copy()
+    front = shod & (vertices[:, 2] > marks.toe - 0.115)
+    for side in (-1, 1):
+        rows = np.flatnonzero(front & (side * vertices[:, 0] > 0))
+        planes = ConvexHull(vertices[rows]).equations
+        gaps = vertices[rows] @ planes[:, :3].T + planes[:, 3]
+        nearest = gaps.argmax(1)
+        depth = gaps[np.arange(len(rows)), nearest]
+        outer[rows] -= depth[:, None] * planes[nearest, :3]
+    return outer
 
 
 def _adjacency(faces: Array, count: int) -> sparse.csr_matrix:

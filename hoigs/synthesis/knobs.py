@@ -24,7 +24,7 @@ class CameraKnobs(ComponentConfig):
     azimuth_degrees: float = Field(8.0, description="middle of the path; 0 faces the person")
     arc_degrees: float = Field(44.0, ge=0, le=180, description="whole arc of an orbit")
     pan_metres: float = Field(1.2, ge=0, description="whole way of a pan")
-    distance: float = Field(3.7, gt=0.5, description="to the target, metres, along the floor")
+    distance: float = Field(3.5, gt=0.5, description="to the target, metres, along the floor")
     height: float = Field(1.45, gt=0, description="of the camera's centre, metres")
     height_change: float = Field(0.5, ge=0, description="between the ends of the path, metres")
     target: tuple[float, float, float] = (0.0, 0.88, 0.15)
@@ -42,7 +42,7 @@ class ObjectKnobs(ComponentConfig):
         (0.34, 0.25, 0.26), description="between the hands, height, depth; metres"
     )
     textured: bool = Field(True, description="False paints it in one colour")
-    swing_degrees: float = Field(45.0, ge=0, le=60, description="yaw of the swing to either side")
+    swing_degrees: float = Field(52.0, ge=0, le=60, description="yaw of the swing to either side")
     tilt_degrees: float = Field(20.0, ge=0, le=45, description="roll and pitch while it swings")
     lift_height: float = Field(1.22, gt=0, description="of the centre at the top of the swing")
     stand_height: float = Field(0.56, gt=0.1, description="of what it stands on, metres")

@@ -18,7 +18,7 @@ from hoigs.synthesis.room import Stand
 Array = np.ndarray
 GRAVITY = 9.81
 STAND_RADIUS = 0.60  # from the person's axis to the middle of what the object stands on, metres
-RELEASED = 0.14  # how far a waiting hand is off the surface, metres
+RELEASED = 0.12  # how far a waiting hand is off the surface, metres
 
 
 @dataclass(frozen=True)
@@ -182,12 +182,14 @@ class Bending(ObjectMotion):
     """A bar held at both ends that is lifted and bent to and fro (not rigid)."""
 
     def script(self) -> ObjectScript:
-        held = self.path(self.swing_keys(1.0))
+        keys = self.swing_keys(1.0)
+        keys[:, 1] *= 0.6  # both ends of a long bar stay in reach
+        held = self.path(keys)
         wave = np.sin(2 * np.pi * 2.0 * np.clip((self.u - 0.16) / 0.64, 0, 1))
         bend = np.radians(self.object.bend_degrees) * wave * self.ramp(
             (0, 0), (0.16, 0), (0.3, 1), (0.66, 1), (0.80, 0), (1, 0)
         )  # fmt: skip
-        s = self.object.swing_degrees
+        s = 0.6 * self.object.swing_degrees
         return ObjectScript(held, held, self.lift_grip(), bend, (self.stand(-s), self.stand(s)))
 
 
@@ -196,7 +198,7 @@ class Static(ObjectMotion):
 
     def script(self) -> ObjectScript:
         keys = self.swing_keys(1.0)
-        keys[:, 1] = np.minimum(keys[:, 1], -0.1 * self.object.swing_degrees)
+        keys[:, 1] = np.minimum(keys[:, 1], -0.35 * self.object.swing_degrees)
         hold = self.path(keys)
         stand = self.stand(self.object.swing_degrees)
         count = len(self.u)

@@ -158,8 +158,8 @@ class Choreographer:
         yaw = np.arctan2(place[:, 0], place[:, 2])
         choices = np.radians(np.arange(2, 82, 2.0))
         short = np.stack([self._shortfall(yaw, np.full(len(yaw), c), wrists) for c in choices])
-        least = np.argmax(short <= 0, axis=0)
-        least[(short > 0).all(0)] = len(choices) - 1
+        # where no lean suffices the best one goes on, and `perform` measures what is missing
+        least = np.where((short <= 0).any(0), (short <= 0).argmax(0), short.argmin(0))
         lean = choices[least]
         width = max(1, round(0.05 * len(yaw)))
         lean = maximum_filter1d(lean, 2 * width + 1, mode="nearest")
@@ -179,13 +179,13 @@ class Choreographer:
         """Pelvis, spine and collars that turn and lean towards the object."""
         count = len(yaw)
         local = np.broadcast_to(np.eye(3), (count, len(self.rest), 3, 3)).copy()
-        hip_yaw, turn = 0.32 * yaw, 0.50 * yaw / 3
+        hip_yaw, turn = 0.36 * yaw, 0.56 * yaw / 3
         local[:, 0] = about(Y, hip_yaw) @ about(X, 0.55 * lean)
         for joint, share in zip(SPINE, (0.18, 0.17, 0.10), strict=True):
             local[:, joint] = about(Y, turn) @ about(X, share * lean)
         for joint, side in zip(COLLARS, SIDES, strict=True):
             local[:, joint] = about(Y, np.full(count, -side * 0.16))
-        drop = 0.035 + 0.15 * (1 - np.cos(np.minimum(lean, 1.2)))
+        drop = 0.035 + 0.21 * (1 - np.cos(np.minimum(lean, 1.2)))
         back = -0.16 * np.sin(lean)
         height = self.rest[0, 1] - self.sole - drop
         ahead = np.stack((np.sin(hip_yaw), np.zeros(count), np.cos(hip_yaw)), -1)
@@ -245,7 +245,7 @@ class Choreographer:
 
     def _fingers(self, local: Array, grip: Array) -> None:
         """Slightly curled when free, flat on the object when holding."""
-        curl = 0.26 - 0.20 * grip
+        curl = 0.26 - 0.26 * grip
         for first, side in ((22, 1.0), (37, -1.0)):
             bent = about(-side * Z, curl)
             for joint in range(first, first + 12):

@@ -298,15 +298,9 @@ def crate_faces(rng: np.random.Generator, size: int, textured: bool = True) -> l
         draw.rectangle((0, 0.40 * n, n, 0.60 * n), fill=sun)
         draw.ellipse((0.36 * n, 0.36 * n, 0.64 * n, 0.64 * n), fill=cream)
 
-    def chevrons(draw: ImageDraw.ImageDraw) -> None:
-        for k in range(-1, 5):
-            y = k * n / 4
-            draw.polygon([(0, y), (n / 2, y + n / 4), (n, y), (n, y + n / 8), (n / 2, y + 0.375 * n),
-                          (0, y + n / 8)], fill=sun)  # fmt: skip
-
     designs: list[tuple[str, Callable[[ImageDraw.ImageDraw], None]]] = [
         (cream, checks), (sun, stripes), (teal, ribbon), (navy, checks), (cream, star),
-        (navy, chevrons if size > 0 else dots),
+        (navy, dots),
     ]  # fmt: skip
     faces = []
     for ground, design in designs:
