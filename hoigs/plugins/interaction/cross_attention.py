@@ -1,0 +1,177 @@
+"""interaction:cross-attention: HOIGS's HOI module (Sec. "Cross-Attention Interaction Module")."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from hoigs.core.body import PART_NAMES
+from hoigs.core.config import ComponentConfig
+from hoigs.core.features import Tokens
+from hoigs.core.interaction import EntityKind, InteractionModule, Residual, Role
+from hoigs.core.rotation import axis_angle_to_matrices
+from hoigs.plugins.interaction.gates import DistanceGate, GateKind, Granularity, ReachFrom
+
+Values = Literal["gated", "swapped"]
+ObjectResidual = Literal["per-gaussian", "rigid", "both"]
+
+POSE_JOINTS = 51  # 21 of the body, 15 of each hand
+
+
+class CrossAttentionConfig(ComponentConfig):
+    """The paper's module and its readings (methods A.6, A.7).
+
+    Attributes:
+        width: d of queries, keys and values.
+        values: the printed products do not fit. "gated" is V_self + g A V_other, which keeps
+            the printed V_self; "swapped" is A V_other alone.
+        gate, granularity, reach_from, softness: see DistanceGate.
+        object_residual: "per-gaussian" (the paper), one "rigid" motion of the object, or "both".
+        hidden: of the two heads.
+        pose_bound: largest correction of a joint's axis-angle, radians an axis.
+        means_bound: largest displacement of an object's Gaussian, metres an axis.
+    """
+
+    width: int = Field(32, ge=1)
+    values: Values = "gated"
+    gate: GateKind = "soft"
+    granularity: Granularity = "object"
+    reach_from: ReachFrom = "nearest"
+    softness: float = Field(0.05, gt=0)
+    object_residual: ObjectResidual = "per-gaussian"
+    hidden: int = Field(128, ge=1)
+    pose_bound: float = Field(0.3, gt=0)
+    means_bound: float = Field(0.1, gt=0)
+
+
+class CrossAttention(InteractionModule):
+    """Humans attend to the tokens of all objects, and objects to the parts of all humans.
+
+    F'_H = V_h + g softmax(Q_h K_o^T / sqrt(d) + B) V_o, and the mirror image for objects; heads
+    turn F'_H into the pose correction of body and hands, F'_O into displacements of the object's
+    Gaussians. B is the logarithm of the distance gate; as a softmax ignores what all its entries
+    share, the gate g (the widest of a row) also multiplies every residual: what is out of reach
+    has a residual of zero, whose gradients are zero too. Gates carry no gradient.
+
+    Both heads start at zero. Entities of one kind with tokens of one width share their weights.
+    Object tokens are one a Gaussian, human tokens one a body part.
+    """
+
+    def __init__(
+        self,
+        width: int = 32,
+        values: Values = "gated",
+        gate: GateKind = "soft",
+        granularity: Granularity = "object",
+        reach_from: ReachFrom = "nearest",
+        softness: float = 0.05,
+        object_residual: ObjectResidual = "per-gaussian",
+        hidden: int = 128,
+        pose_bound: float = 0.3,
+        means_bound: float = 0.1,
+    ) -> None:
+        super().__init__()
+        self.width, self.gated = width, values == "gated"
+        self.gate = DistanceGate(gate, granularity, reach_from, softness)
+        self.per_gaussian = object_residual in ("per-gaussian", "both")
+        self.rigid = object_residual in ("rigid", "both")
+        self.pose_bound, self.means_bound = pose_bound, means_bound
+        self.projections = nn.ModuleDict()
+        self.pose_head = zero_headed(len(PART_NAMES) * width, hidden, 3 * POSE_JOINTS)
+        if self.per_gaussian:
+            self.means_head = zero_headed(width, hidden, 3)
+        if self.rigid:
+            self.twist_head = zero_headed(width, hidden, 6)
+
+    def bind(self, widths: Mapping[str, int], kinds: Mapping[str, EntityKind]) -> None:
+        for name, width in widths.items():
+            key = f"{kinds[name]}_{width}"
+            if kinds[name] != "scene" and key not in self.projections:
+                self.projections[key] = nn.Linear(width, 3 * self.width, bias=False)
+
+    def forward(
+        self, tokens: Mapping[str, Tokens], roles: Mapping[str, Role]
+    ) -> Mapping[str, Residual]:
+        humans = [name for name in tokens if roles[name].kind == "human"]
+        things = [name for name in tokens if roles[name].kind == "object"]
+        if not humans or not things:
+            return {}
+        for name in humans:
+            if len(tokens[name].features) != len(PART_NAMES):
+                raise ValueError(
+                    f'"{name}" has {len(tokens[name].features)} tokens; a human needs '
+                    f"{len(PART_NAMES)}, one a body part"
+                )
+        projected = {n: self._project(roles[n].kind, tokens[n]) for n in humans + things}
+        log_gates = {
+            (h, o): self.gate.log(h, roles[h], tokens[h], tokens[o]) for h in humans for o in things
+        }
+        residuals = {}
+        for h in humans:
+            bias = torch.cat([log_gates[h, o] for o in things], dim=1)
+            attended, gates = self._attend(projected[h], [projected[o] for o in things], bias)
+            residuals[h] = Residual(pose=self._pose(attended, gates))
+        for o in things:
+            bias = torch.cat([log_gates[h, o].mT for h in humans], dim=1)
+            attended, gates = self._attend(projected[o], [projected[h] for h in humans], bias)
+            means = self._means(attended, gates, tokens[o].positions.detach())
+            residuals[o] = Residual(means=means)
+        return residuals
+
+    def _project(self, kind: EntityKind, tokens: Tokens) -> Float[Tensor, "M QKV"]:
+        """Queries, keys and values of one entity, side by side."""
+        return self.projections[f"{kind}_{tokens.features.shape[1]}"](tokens.features)
+
+    def _attend(
+        self,
+        own: Float[Tensor, "M QKV"],
+        others: list[Tensor],
+        bias: Float[Tensor, "M N"],
+    ) -> tuple[Float[Tensor, "M d"], Float[Tensor, " M"]]:
+        """F' of one entity's tokens, and the gate of each."""
+        query, _, value = own.chunk(3, dim=-1)
+        _, keys, values = torch.cat(others).chunk(3, dim=-1)
+        gates = bias.amax(1).exp()
+        # a row that is shut everywhere would be NaN; its weights do not matter, its gate is zero
+        bias = torch.where(torch.isneginf(bias).all(1, keepdim=True), 0.0, bias)
+        weights = (query @ keys.mT / self.width**0.5 + bias).softmax(-1)
+        attended = gates[:, None] * (weights @ values)
+        return (value + attended if self.gated else attended), gates
+
+    def _pose(
+        self, attended: Float[Tensor, "M d"], gates: Float[Tensor, " M"]
+    ) -> Float[Tensor, "51 3"]:
+        """delta theta: the tokens flattened through one MLP, bounded, gated."""
+        raw = self.pose_head(attended.flatten()).unflatten(0, (POSE_JOINTS, 3))
+        return gates.max() * self.pose_bound * torch.tanh(raw)
+
+    def _means(
+        self,
+        attended: Float[Tensor, "N d"],
+        gates: Float[Tensor, " N"],
+        positions: Float[Tensor, "N 3"],
+    ) -> Float[Tensor, "N 3"]:
+        """delta G: free for each Gaussian, or one small motion about the object's centre."""
+        means = torch.zeros_like(positions)
+        if self.per_gaussian:
+            raw = self.means_head(attended)
+            means = means + gates[:, None] * self.means_bound * torch.tanh(raw)
+        if self.rigid:
+            twist = torch.tanh(self.twist_head(attended.mean(0))) * gates.max()
+            turn = axis_angle_to_matrices(self.pose_bound * twist[:3])
+            arms = positions - positions.mean(0)
+            means = means + arms @ turn.mT - arms + self.means_bound * twist[3:]
+        return means
+
+
+def zero_headed(entry: int, hidden: int, out: int) -> nn.Sequential:
+    """A two-layer MLP whose last layer starts at zero."""
+    last = nn.Linear(hidden, out)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(nn.Linear(entry, hidden), nn.ReLU(), last)

@@ -1,0 +1,141 @@
+"""features: body-parts, spline-motion, embedding."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from hoigs.core.context import BuildContext
+from hoigs.core.entity import Entity
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.moment import BodyPose, Moment
+from hoigs.core.spline import catmull_rom
+from hoigs.core.topology import TopologyChange
+from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
+from hoigs.plugins.deformation.mlp import MlpDeformation
+from hoigs.plugins.deformation.static import Static
+from hoigs.plugins.features.body_parts import BodyPartConfig, BodyPartFeatures, part_averages
+from hoigs.plugins.features.embedding import EmbeddingConfig, EmbeddingFeatures
+from hoigs.plugins.features.spline_motion import SplineMotionConfig, SplineMotionFeatures
+
+
+def human(body, features) -> Entity:
+    torch.manual_seed(0)
+    model = HexPlaneSkinning(body, resolution=16, time_resolution=4, field_points=320)
+    return Entity(body.rest(100), model, features)
+
+
+def thing(features, count: int = 12, **settings) -> Entity:
+    torch.manual_seed(0)
+    points = torch.randn(count, 3)
+    model = CubicHermite(keyframes=5, **settings)
+    entity = Entity(Gaussians.from_points(points, scales=0.1), model, features)
+    with torch.no_grad():
+        model.keyframe_means += 0.3 * torch.randn_like(model.keyframe_means)
+    return entity
+
+
+def test_body_parts_are_means_over_each_part(toy_body, toy_pose):
+    entity = human(toy_body, BodyPartFeatures.from_config(BodyPartConfig(), BuildContext()))
+    moment = Moment(0.3, poses={"human": toy_pose(0)})
+    with torch.no_grad():
+        entity.deformation.planes.time.normal_()
+    tokens = entity.tokens(moment)
+    assert tokens.features.shape == (16, 96) and entity.features.width == 96
+    features, places = entity.deformation.posed_field(entity.rest, moment)
+    parts = entity.deformation.field_parts()
+    for part in range(16):
+        torch.testing.assert_close(tokens.features[part], features[parts == part].mean(0))
+        torch.testing.assert_close(tokens.positions[part], places[parts == part].mean(0))
+    later = entity.tokens(Moment(0.9, poses=moment.poses))
+    assert (later.features - tokens.features).abs().max() > 1e-3
+    tokens.features.square().sum().backward()
+    for parameter in entity.deformation.planes.parameters():
+        assert parameter.grad.abs().max() > 0
+
+
+def test_an_empty_part_is_told():
+    with pytest.raises(ValueError, match="no points of right foot"):
+        part_averages(torch.arange(15))
+
+
+def test_body_parts_need_a_field():
+    with pytest.raises(ValueError, match=r"requires \['field'\], but Static provides nothing"):
+        Entity(Gaussians.from_points(torch.randn(4, 3)), Static(), BodyPartFeatures())
+
+
+@pytest.mark.parametrize("kind", ["per-gaussian", "shared", "low-rank"])
+def test_spline_motion(kind):
+    features = SplineMotionFeatures.from_config(SplineMotionConfig(embedding=kind), BuildContext())
+    entity = thing(features)
+    tokens = entity.tokens(Moment(0.6))
+    assert tokens.features.shape == (12, 32)
+    torch.testing.assert_close(tokens.positions, entity(Moment(0.6)).means)
+    assert not tokens.positions.requires_grad
+    velocity = entity.deformation.velocity(entity.rest, Moment(0.6))
+    code = features.embedded(12, 0.6)
+    if kind == "per-gaussian":
+        assert features.embedding.shape == (12, 5, 29)
+        torch.testing.assert_close(code, catmull_rom(features.embedding, 0.6))
+    entry = torch.cat((velocity, code, torch.full((12, 1), 0.6)), -1)
+    assert entry.shape == (12, 33)
+    torch.testing.assert_close(tokens.features, features.mlp(entry))
+    (tokens.features * torch.randn(12, 32)).sum().backward()
+    for name, parameter in features.named_parameters():
+        assert torch.isfinite(parameter.grad).all() and parameter.grad.abs().max() > 0, name
+    assert entity.deformation.tangents.grad.abs().max() > 0  # gradients reach the motion
+
+
+@pytest.mark.parametrize("kind", ["per-gaussian", "shared", "low-rank"])
+def test_rows_of_the_embedding_follow(kind):
+    entity = thing(SplineMotionFeatures(embedding=kind))
+    before = entity.tokens(Moment(0.4)).features.detach()
+    source = torch.tensor([4, 4, 0])
+    change = TopologyChange(source, torch.zeros(3, dtype=torch.bool), torch.zeros(3, 3))
+    entity.apply_topology(change, entity.rest.detach()[source])
+    torch.testing.assert_close(entity.tokens(Moment(0.4)).features, before[source])
+
+
+def test_spline_motion_needs_keyframes():
+    class Drifting(Static):
+        provides = frozenset({"velocity"})
+
+        def velocity(self, rest, moment):
+            return torch.ones_like(rest.means)
+
+    points = Gaussians.from_points(torch.randn(4, 3))
+    with pytest.raises(ValueError, match="Drifting has no keyframes"):
+        Entity(points, Drifting(), SplineMotionFeatures())
+    entity = Entity(points, Drifting(), SplineMotionFeatures(keyframes=3, width=7))
+    assert entity.tokens(Moment(0.5)).features.shape == (4, 7)
+
+
+def test_embedding_of_a_human_stands_at_its_parts(toy_body, toy_pose):
+    features = EmbeddingFeatures.from_config(EmbeddingConfig(), BuildContext())
+    entity = human(toy_body, features)
+    early = entity.tokens(Moment(0.1, poses={"human": BodyPose.zeros(betas=2)}))
+    late = entity.tokens(Moment(0.9, poses={"human": toy_pose(1)}))
+    assert early.features.shape == (16, 96)
+    assert torch.equal(early.features, late.features)
+    torch.testing.assert_close(early.positions[3], torch.tensor([0.0, 0.55, 0.0]))
+    assert (early.positions - late.positions).abs().max() > 0.01
+    late.features.sum().backward()
+    assert (features.embedding.grad == 1).all()
+
+
+def test_embedding_of_an_object_is_one_a_gaussian():
+    entity = Entity(
+        Gaussians.from_points(torch.randn(9, 3)), MlpDeformation(8, 2), EmbeddingFeatures()
+    )
+    tokens = entity.tokens(Moment(0.2))
+    assert tokens.features.shape == (9, 96)
+    torch.testing.assert_close(tokens.positions, entity.means.detach())
+    entity.apply_topology(
+        TopologyChange.keep(torch.arange(9) < 4), entity.rest.detach()[torch.arange(4)]
+    )
+    torch.testing.assert_close(entity.tokens(Moment(0.2)).features, tokens.features[:4])
+    few = Entity(Gaussians.from_points(torch.randn(9, 3)), Static(), EmbeddingFeatures(3, 5))
+    tokens = few.tokens(Moment(0.0))
+    assert tokens.features.shape == (3, 5)
+    torch.testing.assert_close(tokens.positions, few.means.mean(0).expand(3, 3))
