@@ -89,10 +89,20 @@ class Camera:
         fov_y: float,
         up: tuple[float, float, float] = (0.0, 1.0, 0.0),
     ) -> Camera:
-        """A camera at `eye` that looks at `target`; `fov_y` is the vertical angle in radians."""
+        """A camera at `eye` that looks at `target`; `fov_y` is the vertical angle in radians.
+
+        Raises:
+            ValueError: it would look along `up`, or at its own place, so that no upright is left.
+        """
         forward = torch.nn.functional.normalize(target - eye, dim=0)
         down = -torch.tensor(up, dtype=eye.dtype, device=eye.device)
-        right = torch.nn.functional.normalize(torch.linalg.cross(down, forward), dim=0)
+        right = torch.linalg.cross(down, forward)
+        if not right.norm() > 1e-6 * down.norm():
+            raise ValueError(
+                f"a camera at {eye.tolist()} that looks at {target.tolist()} has no upright: "
+                f"the view is along up = {up}; give another `up`"
+            )
+        right = torch.nn.functional.normalize(right, dim=0)
         rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
         viewmat = torch.eye(4, dtype=eye.dtype, device=eye.device)
         viewmat[:3, :3] = rotation

@@ -123,9 +123,7 @@ class Gaussians:
         for f in fields(self):
             value = getattr(self, f.name)
             if not torch.isfinite(value).all():
-                bad = int((~torch.isfinite(value)).flatten(1).any(1).sum()) if value.dim() > 1 else (
-                    int((~torch.isfinite(value)).sum())
-                )
+                bad = int((~torch.isfinite(value)).reshape(len(self), -1).any(1).sum())
                 raise NotFiniteError(f"{owner}.{f.name}: {bad} of {len(self)} rows are not finite")
 
     @staticmethod
@@ -170,7 +168,7 @@ class Gaussians:
         if scales is None:
             scales = neighbour_distances(points)
         if not isinstance(scales, Tensor):
-            scales = torch.full((count,), float(scales))
+            scales = points.new_full((count,), float(scales))
         scales = scales.to(points).clamp_min(1e-6)
         sh = points.new_zeros(count, (sh_degree + 1) ** 2, 3)
         if colors is not None:
