@@ -59,7 +59,8 @@ def depth_picture(output: RenderOutput, span: tuple[float, float]) -> UInt8[np.n
     """Depth in false colour, near is bright; darkened where the view is transparent."""
     near, far = span
     closeness = (far - output.expected_depth) / (far - near)
-    shown = false_color(closeness, "magma").astype(np.float32)
+    # the map's darkest tenth is left for emptiness
+    shown = false_color(0.1 + 0.9 * closeness.clamp(0, 1), "magma").astype(np.float32)
     return (shown * output.alpha.clamp(0, 1)[..., None].cpu().numpy()).round().astype(np.uint8)
 
 

@@ -129,13 +129,13 @@ def test_times_and_sizes(model: SceneModel, clip: Clip) -> None:
     assert (timing.frames, timing.warmup) == (5, 2)
     assert 0 < timing.deform_ms < timing.total_ms
     assert 0 < timing.raster_ms < timing.total_ms
-    assert 0 < timing.drawn <= 720
+    assert 0 < timing.drawn <= 240
     assert shares == sorted(shares) and shares[-1] == 1.0
     sizes = {part.name: part for part in evaluation.sizes}
-    assert sizes["man"].gaussians == 160
+    assert sizes["man"].gaussians == 60
     # 3 means, 4 quats, 3 scales, 1 opacity, 3 colour, and the amplitude of the swing
-    assert sizes["man"].parameters == 160 * 14 + 1
-    assert sizes["man"].megabytes == pytest.approx(4e-6 * (160 * 14 + 1))
+    assert sizes["man"].parameters == 60 * 14 + 1
+    assert sizes["man"].megabytes == pytest.approx(4e-6 * (60 * 14 + 1))
 
 
 def test_a_spent_budget_is_confessed(model: SceneModel, clip: Clip) -> None:
@@ -172,4 +172,4 @@ def test_tables_are_rectangular_and_explain_gaps(model: SceneModel, clip: Clip) 
     row = next(row for row in scores.rows if row[0] == "object")
     assert set(row[1:]) == {"0", "–"}
     assert any(note.startswith("object: not computed") for note in scores.notes)
-    assert sizes.rows[-1][0] == "total" and sizes.rows[-1][2] == "720"
+    assert sizes.rows[-1][0] == "total" and sizes.rows[-1][2] == "240"

@@ -46,7 +46,7 @@ def test_pivot_without_a_human_or_anything_that_moves(model: SceneModel, clip: C
     del model.entities["man"], model.entities["ball"]
     wall = pivot(model, clip, moment, camera)
     pixel, depth = camera.project(wall)
-    torch.testing.assert_close(pixel, torch.tensor([32.0, 24.0]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(pixel, torch.tensor([24.0, 16.0]), atol=1e-3, rtol=0)
     assert abs(float(depth) - 4.0) < 0.3
 
 

@@ -23,7 +23,7 @@ HUES = ("#ffb26b", "#62c6b5", "#8fa8ff", "#f27d8b", "#c3d86a", "#c79bf2")
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text, in the page's own font
     "svg.hashsalt": "hoigs",  # the same run gives the same bytes
-    "font.size": 9.5,
+    "font.size": 10.5,
     "text.color": INK,
     "axes.labelcolor": QUIET,
     "axes.edgecolor": LINES,
@@ -75,7 +75,7 @@ def loss_curve(records: Sequence[dict[str, Any]]) -> str:
         total = [r["loss"] for r in records]
         axes.plot(steps, smoothed(total), color=INK, linewidth=1.8, label="total, weighted")
         axes.set_yscale("log")
-        axes.legend(frameon=False, fontsize=8, ncols=2, labelcolor="linecolor")
+        axes.legend(frameon=False, fontsize=9, ncols=2, labelcolor="linecolor")
 
     return _figure("loss", "step", paint)
 
@@ -90,7 +90,7 @@ def psnr_curve(records: Sequence[dict[str, Any]]) -> str:
             points = [(r["step"], r["psnr"][split]) for r in scored if split in r["psnr"]]
             x, y = zip(*points, strict=True)
             axes.plot(x, y, color=hue, linewidth=1.8, marker="o", markersize=3, label=split)
-        axes.legend(frameon=False, fontsize=8.5, labelcolor="linecolor", loc="lower right")
+        axes.legend(frameon=False, fontsize=9.5, labelcolor="linecolor", loc="lower right")
 
     return _figure("PSNR dB, a few frames of each split", "step", paint)
 
@@ -107,7 +107,7 @@ def count_curve(records: Sequence[dict[str, Any]]) -> str:
             axes.step(x, y, color=hue, linewidth=1.6, where="post", label=name)
         axes.set_ylim(bottom=0)
         axes.yaxis.set_major_formatter(FuncFormatter(_thousands))
-        axes.legend(frameon=False, fontsize=8.5, labelcolor="linecolor")
+        axes.legend(frameon=False, fontsize=9.5, labelcolor="linecolor")
 
     return _figure("Gaussians", "step", paint)
 
@@ -129,8 +129,8 @@ def frame_bars(view: ViewScores) -> str:
         axes.set_xticks(range(len(view.frames)), [str(f.index) for f in view.frames])
         axes.grid(False, axis="x")
         axes.legend(
-            frameon=False, fontsize=8.5, labelcolor="linecolor", ncols=2, loc="lower right",
-            bbox_to_anchor=(1.0, 1.0),
+            frameon=False, fontsize=9.5, labelcolor="linecolor", ncols=2, loc="upper center",
+            bbox_to_anchor=(0.5, -0.16),
         )  # fmt: skip
 
     return _figure(f"PSNR dB of each frame, {view.name}", "frame", paint)
@@ -150,7 +150,7 @@ def _figure(title: str, xlabel: str, paint: Callable[[Axes], None]) -> str:
         figure = Figure(figsize=(5.6, 3.1), layout="constrained")
         axes = figure.add_subplot()
         paint(axes)
-        axes.set_title(title, loc="left", fontsize=10.5)
+        axes.set_title(title, loc="left", fontsize=11.5)
         axes.set_xlabel(xlabel)
         axes.tick_params(length=0)
         if axes.get_xscale() == "linear" and xlabel == "step":

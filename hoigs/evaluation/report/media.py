@@ -102,9 +102,9 @@ def comparisons(model: SceneModel, clip: Clip, evaluation: Evaluation) -> list[C
         source = clip.held_out if held_out else clip
         if source is None:
             continue
+        name = "Held-out camera, frame" if held_out else view.name.capitalize()[:-1]
         chosen = evenly(view.frames, HELD_OUT if held_out else COMPARED)
         for scored in chosen:
-            name = "held-out camera" if held_out else view.name.removesuffix("s")
             made.append(_compare(model, source[scored.position], scored, name))
     return made
 
@@ -118,7 +118,7 @@ def _compare(model: SceneModel, frame: Frame, scored: FrameScores, name: str) ->
         if not isinstance(value, NotComputed):
             words.append(f"{value:.1f} dB {word}")
     return Comparison(
-        label=f"{name}, frame {scored.index}",
+        label=f"{name} {scored.index}",
         score=" · ".join(words),
         video=still(video, COMPARE_WIDTH, 86),
         render=still(render, COMPARE_WIDTH, 86),

@@ -18,9 +18,9 @@ def tiles(evaluation: Evaluation, records: Sequence[dict[str, Any]]) -> str:
     shown: list[tuple[str, str, str]] = []
     first = evaluation.views[0]
     for region, label in (("full", "full frame"), ("human_object", "human + object")):
-        shown += _decibels(first.mean(region, "psnr")[0], f"{label}, {first.name}")
+        shown += _decibels(first.mean(region, "psnr")[0], label, first.name)
     for view in evaluation.views[1:]:
-        shown += _decibels(view.mean("full", "psnr")[0], f"full frame, {view.name}")
+        shown += _decibels(view.mean("full", "psnr")[0], "full frame", view.name)
     count = sum(part.gaussians for part in evaluation.sizes)
     megabytes = sum(part.megabytes for part in evaluation.sizes)
     shown.append((short(count), "Gaussians", f"{megabytes:.1f} MB"))
@@ -38,8 +38,10 @@ def tiles(evaluation: Evaluation, records: Sequence[dict[str, Any]]) -> str:
     return f"<div class='tiles'>{''.join(cells)}</div>"
 
 
-def _decibels(value: Value, what: str) -> list[tuple[str, str, str]]:
-    return [] if isinstance(value, NotComputed) else [(f"{value:.2f}", "dB PSNR", what)]
+def _decibels(value: Value, what: str, view: str) -> list[tuple[str, str, str]]:
+    if isinstance(value, NotComputed):
+        return []
+    return [(f"{value:.2f} dB", f"PSNR, {what}", view)]
 
 
 def pair(image: str, left: str, right: str, alt: str) -> str:

@@ -1,0 +1,169 @@
+"""The report: whole, self-contained, escaped, and true to its inputs."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hoigs.core.clip import Clip
+from hoigs.core.errors import HoigsError
+from hoigs.core.scene import SceneModel
+from hoigs.evaluation.contact_sheet import contact_sheet
+from hoigs.evaluation.evaluate import evaluate
+from hoigs.evaluation.report import write_report
+from hoigs.evaluation.report.curves import read_metrics, smoothed
+from hoigs.evaluation.report.media import animation, evenly, key_position
+from hoigs.evaluation.report.sections import clock, short
+
+VOID = {"meta", "img", "input", "br"}
+
+
+class Balance(HTMLParser):
+    """Fails on a tag that is closed out of order or never."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag, attrs) -> None:
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs) -> None:
+        pass
+
+    def handle_endtag(self, tag) -> None:
+        assert self.open and self.open[-1] == tag, (self.open[-3:], tag)
+        self.open.pop()
+
+    def handle_data(self, data) -> None:
+        self.text.append(data)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    (tmp_path / "spec.yaml").write_text("name: toy # <tricky> & $title\n")
+    (tmp_path / "provenance.json").write_text(json.dumps({"versions": {"torch": "9.9.9"}}))
+    lines = []
+    for step in range(25, 1001, 25):
+        decay = math.exp(-step / 300)
+        record = {
+            "step": step, "time_s": 0.1 * step, "loss": 0.1 + decay,
+            "losses": {"scene": 0.1 + decay, "human/man": decay, "regularizer/man/tv": 0.0},
+            "counts": {"wall": 500, "man": 160 + step, "ball": 60},
+        }  # fmt: skip
+        if step % 100 == 0:
+            record["psnr"] = {"train": 30 - decay, "test": 28 - decay}
+        lines.append(json.dumps(record))
+    (tmp_path / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+    return tmp_path
+
+
+def test_the_page_is_whole_and_needs_nothing_else(run: Path, model: SceneModel, clip: Clip) -> None:
+    model.train()
+    named = replace(clip, name="<b>&toy</b>")
+    evaluation = evaluate(model, named, timing_frames=3, timing_warmup=0)
+    path = write_report(run, model, named, evaluation)
+    assert model.training
+    assert sorted(p.name for p in run.iterdir()) == [
+        "metrics.jsonl", "provenance.json", "report.html", "spec.yaml",
+    ]  # fmt: skip
+    page = path.read_text()
+    assert len(page) < 8_000_000
+    parser = Balance()
+    parser.feed(page)
+    assert parser.open == []
+    text = "".join(parser.text)
+    assert "<b>&toy</b>" in text and "name: toy # <tricky> & $title" in text
+    sources = re.findall(r"(?:src|href)=['\"]([^'\"]*)", page)
+    assert sources and all(s.startswith(("data:", "#")) for s in sources)
+    assert not re.search(r"url\((?!#)|@import", page)
+    for expected in ("9.9.9", "1,000 steps", "LPIPS not computed", "held-out cameras", "1:40"):
+        assert expected in text
+    for score in ("human_object", "full"):
+        assert f"{evaluation.score(score, 'psnr'):.2f} dB" in text
+
+
+def test_its_pictures_show_the_clip(run: Path, model: SceneModel, clip: Clip) -> None:
+    evaluation = evaluate(model, clip, timing_frames=0)
+    page = write_report(run, model, clip, evaluation).read_text()
+    encoded = re.findall(r"data:image/webp;base64,([A-Za-z0-9+/=]+)", page)
+    pictures = [Image.open(io.BytesIO(base64.b64decode(data))) for data in encoded]
+    moving = [p for p in pictures if getattr(p, "n_frames", 1) > 1]
+    assert [p.n_frames for p in moving] == [8, 36]  # playback of 8 frames, orbit
+    # the model is the truth: both halves of the playback agree, in every frame
+    for index in range(8):
+        moving[0].seek(index)
+        pair = np.asarray(moving[0].convert("RGB")).astype(float)
+        half = pair.shape[1] // 2
+        assert np.abs(pair[:, :half] - pair[:, half:]).mean() < 6
+    cutouts = [p for p in pictures if p.mode == "RGBA" and p not in moving]
+    assert len(cutouts) == 3
+    opacity = [np.asarray(p)[..., 3].mean() for p in cutouts]
+    assert opacity[0] > 240 and 5 < opacity[1] < 120 and 1 < opacity[2] < 60
+
+
+def test_a_bare_folder_says_what_is_absent(tmp_path: Path, model: SceneModel, clip: Clip) -> None:
+    evaluation = evaluate(model, clip, timing_frames=0, held_out=False)
+    page = write_report(tmp_path, model, clip, evaluation).read_text()
+    assert "Absent: provenance.json, spec.yaml." in page
+    assert "metrics.jsonl is absent" in page and "timing_frames is 0" in page
+
+
+def test_damaged_metrics_name_the_line_and_leave_no_page(
+    run: Path, model: SceneModel, clip: Clip
+) -> None:
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 1025, "lo')
+    with pytest.raises(HoigsError, match=r"metrics\.jsonl:41"):
+        write_report(run, model, clip, evaluate(model, clip, timing_frames=0))
+    assert not (run / "report.html").exists()
+    assert read_metrics(run / "absent.jsonl") == []
+
+
+def test_key_moment_is_where_man_and_ball_meet(clip: Clip) -> None:
+    assert key_position(clip) >= 5  # the ball swings towards the man
+    alone = replace(clip, kinds={"man": "human"})
+    assert key_position(alone) == len(clip) // 2
+
+
+def test_animations_shrink_until_they_fit() -> None:
+    generator = np.random.default_rng(0)
+    noise = [
+        Image.fromarray(generator.integers(0, 255, (64, 64, 3), dtype=np.uint8)) for _ in range(4)
+    ]
+    generous, tight = animation(noise, 50, 10**9), animation(noise, 50, 1)
+    assert len(tight) < 0.6 * len(generous)
+
+
+def test_contact_sheet_is_video_above_render(tmp_path: Path, model: SceneModel, clip: Clip) -> None:
+    path = contact_sheet(model, clip, [1, 5], tmp_path / "docs" / "sheet.png", tile_width=48)
+    sheet = np.asarray(Image.open(path).convert("RGB")).astype(float)
+    assert sheet.shape == (2 * 18 + 2 * 26 + 2 * 32 + 6, 2 * 18 + 26 + 2 * 48 + 6, 3)
+    top, left = 18 + 52, 18 + 26
+    video = sheet[top : top + 32, left : left + 48]
+    render = sheet[top + 38 : top + 70, left : left + 48]
+    assert np.abs(video - clip[1].image.numpy()).max() == 0
+    assert np.abs(video - render).max() <= 1
+    assert [p.name for p in path.parent.iterdir()] == ["sheet.png"]
+    with pytest.raises(ValueError, match="at least one"):
+        contact_sheet(model, clip, [], tmp_path / "none.png")
+
+
+def test_small_words() -> None:
+    assert [clock(s) for s in (7.2, 59.7, 307, 7500)] == ["7 s", "1:00", "5:07", "2:05:00"]
+    assert [short(n) for n in (812, 12_345, 2_500_000)] == ["812", "12.3k", "2.50M"]
+    assert evenly(range(100), 4) == [12, 37, 62, 87]
+    assert evenly([1, 2], 4) == [1, 2]
+    assert smoothed([2.0, 2.0, 2.0]) == pytest.approx([2.0, 2.0, 2.0])
