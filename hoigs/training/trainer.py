@@ -89,9 +89,9 @@ class Trainer:
         self.model.train()
         started = time.perf_counter() - self.elapsed
         while self.step < self.spec.steps:
-            result = self._step()
+            terms = self._step()
             self.elapsed = time.perf_counter() - started
-            report = self._report(result)
+            report = self._report(terms)
             if report is not None:
                 if self.run is not None:
                     self.run.log(report.record())
@@ -102,8 +102,12 @@ class Trainer:
                 self.checkpoint().save(self.run.checkpoints)
         self.model.eval()
 
-    def _step(self) -> ObjectiveResult | None:
-        """One optimizer step; None when the guard skipped it."""
+    def _step(self) -> dict[str, float] | None:
+        """One optimizer step: its loss terms and their "total"; None when the guard skipped it.
+
+        Nothing of the graph may outlive this call: autograd remembers the shape of a parameter as
+        long as any graph that used it lives, and refinement changes shapes.
+        """
         progress = self.step / self.spec.steps
         self.step += 1
         self.model.interaction_enabled = progress >= self.spec.warmup.interaction
@@ -123,7 +127,8 @@ class Trainer:
         self.guard.passed()
         self.optimizer.step()
         self._refine(result, camera.width, camera.height)
-        return result
+        terms = {name: float(term.detach()) for name, term in result.terms.items()}
+        return {**terms, "total": float(result.total.detach())}
 
     def _refine(self, result: ObjectiveResult, width: int, height: int) -> None:
         gradient = result.screen_offsets.grad
@@ -136,17 +141,17 @@ class Trainer:
                 result.state.gaussians[name], self.optimizer, self.step, self.spec.steps
             )
 
-    def _report(self, result: ObjectiveResult | None) -> StepReport | None:
+    def _report(self, terms: dict[str, float] | None) -> StepReport | None:
         last = self.step == self.spec.steps
         preview = self.spec.preview_every
         scored = preview > 0 and (last or self.step % preview == 0 or self.step == 1)
-        if result is None or not (scored or last or self.step % self.spec.log_every == 0):
+        if terms is None or not (scored or last or self.step % self.spec.log_every == 0):
             return None
         return StepReport(
             step=self.step,
             time_s=round(self.elapsed, 3),
-            loss=float(result.total.detach()),
-            losses={name: float(term.detach()) for name, term in result.terms.items()},
+            loss=terms["total"],
+            losses={name: value for name, value in terms.items() if name != "total"},
             counts=self.model.count(),
             psnr=self._preview() if scored else {},
         )
