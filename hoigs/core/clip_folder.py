@@ -173,6 +173,11 @@ class ClipWriter:
                 shutil.rmtree(self._root)
 
     @property
+    def root(self) -> Path:
+        """The temporary folder that becomes the clip: put files of your own there, by new names."""
+        return self._root
+
+    @property
     def frames(self) -> int:
         """Frames added so far."""
         return len(self._main.cameras)

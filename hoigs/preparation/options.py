@@ -42,6 +42,7 @@ class PrepareOptions(ComponentConfig):
         gt=1,
         description="distance of a static background, in distances of the person",
     )
+    overwrite: bool = Field(default=False, description="replace an older clip at the target")
     overlay_width: int = Field(
         default=640, ge=0, description="of overlay.mp4, pixels; 0 writes none"
     )

@@ -51,22 +51,27 @@ class PrepareReport:
     def to_json(self) -> str:
         return json.dumps(asdict(self), indent=2, allow_nan=False)
 
-    def to_markdown(self) -> str:
+    def rows(self) -> list[tuple[str, str, str]]:
+        """What, value and note of each measure."""
         rows = [
-            ("video", self.video),
-            ("frames", f"{self.frames} of {self.width}x{self.height} at {self.fps:g} fps"),
-            ("camera", f"{self.camera}, parallax {self.parallax_degrees:.1f} degrees"),
-            ("body", f"landmarks missed by {self.body_residual_px:.1f} px (median)"),
-            ("scene scale", f"{self.scene_scale:.4g} metres a unit"),
-            ("object seen", f"in {100 * self.object_observed:.0f} % of the frames"),
-            ("object scale spread", f"{100 * self.object_scale_spread:.1f} %"),
-            ("scene points", f"{self.scene_points}"),
+            ("video", self.video, ""),
+            ("frames", f"{self.frames} of {self.width}x{self.height}", f"{self.fps:g} fps"),
+            ("camera", self.camera, f"parallax {self.parallax_degrees:.1f} degrees"),
+            ("body", f"{self.body_residual_px:.1f} px", "median distance from the landmarks"),
+            ("scene scale", f"{self.scene_scale:.4g}", "metres a unit of the source"),
+            ("object seen", f"{100 * self.object_observed:.0f} %", "of the frames"),
+            ("object scale spread", f"{100 * self.object_scale_spread:.1f} %", "so its depth's"),
+            ("scene points", f"{self.scene_points}", ""),
         ]
-        rows += [(f"mask of {n}", _coverage(c)) for n, c in self.coverage.items()]
-        rows.append(("time", ", ".join(f"{n} {s:.1f} s" for n, s in self.seconds.items())))
-        table = "\n".join(f"| {name} | {value} |" for name, value in rows)
+        rows += [(f"mask of {n}", *_coverage(c)) for n, c in self.coverage.items()]
+        rows.append(("time", f"{sum(self.seconds.values()):.0f} s", _times(self.seconds)))
+        return rows
+
+    def to_markdown(self) -> str:
+        table = "\n".join(f"| {what} | {value} | {note} |" for what, value, note in self.rows())
         made = "\n".join(f"- **{name}**: {text}" for name, text in self.provenance.items())
-        lines = [f"# {self.name}", "", "| | |", "|---|---|", table, "", "## Made from", "", made]
+        lines = [f"# {self.name}", "", "| | | |", "|---|---|---|", table]
+        lines += ["", "## Made from", "", made]
         if self.warnings:
             lines += ["", "## Beware", "", *(f"- {w}" for w in self.warnings)]
         return "\n".join(lines) + "\n"
@@ -80,14 +85,18 @@ class PrepareReport:
 _BARS = "▁▂▃▄▅▆▇█"
 
 
-def _coverage(values: list[float]) -> str:
-    """Mean and extent, and a sparkline over time."""
+def _coverage(values: list[float]) -> tuple[str, str]:
+    """Mean part of the image; a sparkline over time, the maximum and the empty frames."""
     if not values:
-        return "no frames"
+        return "no frames", ""
     top = max(values) or 1.0
     chosen = [values[i * len(values) // 32] for i in range(32)] if len(values) > 32 else values
     line = "".join(_BARS[min(7, int(8 * v / top))] if v else " " for v in chosen)
     empty = sum(v == 0 for v in values)
     note = f", empty in {empty} frames" if empty else ""
     mean = sum(values) / len(values)
-    return f"{100 * mean:.1f} % of the image (`{line}`, up to {100 * top:.1f} %{note})"
+    return f"{100 * mean:.1f} %", f"of the image, {line} up to {100 * top:.1f} %{note}"
+
+
+def _times(seconds: dict[str, float]) -> str:
+    return ", ".join(f"{name} {value:.1f}" for name, value in seconds.items())

@@ -1,0 +1,122 @@
+"""overlay.mp4: what was prepared, drawn over the frames, to judge it by."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from PIL import Image
+from scipy import ndimage
+from torch import Tensor
+
+from hoigs.core.camera import Camera
+from hoigs.preparation.video_out import VideoWriter
+
+HUMAN_COLOR, OBJECT_COLOR, TRACK_COLOR = (64, 220, 120), (255, 210, 40), (255, 60, 200)
+SHOWN_POINTS = 150
+
+
+class OverlayVideo:
+    """Frames with the fitted body, the masks' outlines and the object's points.
+
+    Args:
+        path: mp4 to write. fps: frames a second.
+        width: of the video, pixels, at most the frames'; 0 writes none.
+        faces: of the body.
+    """
+
+    def __init__(self, path: Path, fps: float | int, width: int, faces: Int[Tensor, "T 3"]) -> None:
+        self.width, self.faces = width, faces
+        self._video = VideoWriter(path, fps) if width else None
+
+    def __enter__(self) -> OverlayVideo:
+        if self._video:
+            self._video.__enter__()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        if self._video:
+            self._video.__exit__(kind, error, at)
+
+    def add(
+        self,
+        image: UInt8[np.ndarray, "H W 3"],
+        camera: Camera,
+        vertices: Float[Tensor, "V 3"],
+        human: Bool[np.ndarray, "H W"],
+        thing: Bool[np.ndarray, "H W"],
+        points: Float[Tensor, "P 3"],
+    ) -> None:
+        """One frame: vertices of the body and points of the object in the world."""
+        if self._video is None:
+            return
+        width = min(self.width, camera.width)
+        small = camera.resized(width, max(1, round(camera.height * width / camera.width)))
+        size = (small.width, small.height)
+        human, thing = shrink_mask(human, *size), shrink_mask(thing, *size)
+        self._video.add(self._draw(shrink(image, *size), small, vertices, human, thing, points))
+
+    def _draw(
+        self,
+        image: UInt8[np.ndarray, "H W 3"],
+        camera: Camera,
+        vertices: Float[Tensor, "V 3"],
+        human: Bool[np.ndarray, "H W"],
+        thing: Bool[np.ndarray, "H W"],
+        points: Float[Tensor, "P 3"],
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """The body shaded over the image, the masks' outlines and some of the object's points."""
+        from hoigs.preparation.body_fit import overlay_frame
+
+        drawn = np.array(overlay_frame(image, camera, vertices, self.faces))
+        draw_outline(drawn, human, HUMAN_COLOR)
+        draw_outline(drawn, thing, OBJECT_COLOR)
+        draw_points(drawn, points, camera, TRACK_COLOR)
+        return drawn
+
+
+def draw_outline(
+    image: UInt8[np.ndarray, "H W 3"],
+    mask: Bool[np.ndarray, "H W"],
+    color: tuple[int, int, int],
+) -> None:
+    """Colours the mask's border pixels, in place."""
+    image[mask & ~ndimage.binary_erosion(mask)] = color
+
+
+def draw_points(
+    image: UInt8[np.ndarray, "H W 3"],
+    points: Float[Tensor, "P 3"],
+    camera: Camera,
+    color: tuple[int, int, int],
+) -> None:
+    """Colours the pixels of some world points that lie before the camera, in place."""
+    xy, depth = camera.project(points[:: max(1, len(points) // SHOWN_POINTS)])
+    column, row = xy.floor().long().unbind(-1)
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    inside &= depth > 0
+    image[row[inside].numpy(), column[inside].numpy()] = color
+
+
+def shrink(
+    image: UInt8[np.ndarray, "H W 3"], width: int, height: int
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The image at another size, area-averaged."""
+    if (width, height) == image.shape[1::-1]:
+        return image
+    return np.array(Image.fromarray(image).resize((width, height), Image.Resampling.BOX))
+
+
+def shrink_mask(mask: Bool[np.ndarray, "H W"], width: int, height: int) -> Bool[np.ndarray, "h w"]:
+    """The mask at another size, by nearest pixel."""
+    if (width, height) == mask.shape[1::-1]:
+        return mask
+    grey = Image.fromarray(mask.astype(np.uint8) * 255)
+    return np.array(grey.resize((width, height), Image.Resampling.NEAREST)) > 127

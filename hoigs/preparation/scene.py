@@ -1,0 +1,103 @@
+"""Scene points in metres: COLMAP's without the people, or a supposed floor and wall."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.core.camera import Camera
+from hoigs.preparation.masks import MaskStack
+from hoigs.preparation.overlay import shrink, shrink_mask
+from hoigs.preparation.scene_points import (
+    MASK_MARGIN,
+    PLATE_FRAMES,
+    REFERENCE_WIDTH,
+    background_plate,
+    plate_points,
+)
+from hoigs.preparation.separate import Images
+from hoigs.preparation.source import SourceError
+
+
+@dataclass(frozen=True)
+class ScenePoints:
+    """Points in the world, metres, RGB in [0, 1], and what they were made from."""
+
+    points: Float[Tensor, "P 3"]
+    colors: Float[Tensor, "P 3"]
+    provenance: str
+
+
+def colmap_scene(
+    points: Float[Tensor, "P 3"],
+    colors: Float[Tensor, "P 3"],
+    masks: Sequence[MaskStack],
+    cameras: Sequence[Camera],
+) -> ScenePoints:
+    """COLMAP's points without those that lie on the person or the object.
+
+    A point goes if, of the frames that see its place, at least half see it inside a mask.
+    """
+    inside = torch.zeros(len(points))
+    visible = torch.zeros(len(points))
+    for i, camera in enumerate(cameras):
+        xy, depth = camera.project(points)
+        column, row = xy.floor().long().unbind(-1)
+        seen = (depth > 0) & (column >= 0) & (column < camera.width)
+        seen &= (row >= 0) & (row < camera.height)
+        moving = torch.from_numpy(np.logical_or.reduce([m[i] for m in masks]))
+        visible += seen
+        inside[seen] += moving[row[seen], column[seen]]
+    keep = inside < 0.5 * visible.clamp_min(1)
+    if not keep.any():
+        raise SourceError("every COLMAP point lies on the person or the object")
+    text = f"COLMAP points, {int((~keep).sum())} of {len(points)} on the person or object dropped"
+    return ScenePoints(points[keep], colors[keep], text)
+
+
+def static_scene(
+    images: Images,
+    masks: Sequence[MaskStack],
+    camera: Camera,
+    *,
+    ground: float,
+    distance: float,
+    backdrop: float,
+    spacing: float,
+) -> ScenePoints:
+    """A floor under the feet and a wall behind, coloured by the frames' unmasked pixels.
+
+    Args:
+        images: gives the frames anew. masks: of everything that moves.
+        ground: height of the camera over the floor, metres. distance: of the person, metres.
+        backdrop: distance of the wall in distances of the person.
+        spacing: of the points at 640 pixels' width, pixels.
+    """
+    width = min(camera.width, REFERENCE_WIDTH)
+    small = camera.resized(width, max(1, round(camera.height * width / camera.width)))
+    count = len(masks[0])
+    chosen = set(np.linspace(0, count - 1, PLATE_FRAMES).round().astype(int).tolist())
+
+    def frames():
+        for i, image in enumerate(images()):
+            if i in chosen:
+                moving = np.logical_or.reduce([m[i] for m in masks])
+                size = (small.width, small.height)
+                yield shrink(image, *size), shrink_mask(moving, *size)
+
+    margin = max(1, round(MASK_MARGIN * width / REFERENCE_WIDTH))
+    plate = background_plate(frames(), margin)
+    points, colors = plate_points(
+        plate, small, ground=ground, backdrop=backdrop * distance, spacing=spacing
+    )
+    text = (
+        f"supposed: a level floor {ground:.2f} m below a level camera and a wall at "
+        f"{backdrop * distance:.1f} m, coloured by the median of unmasked pixels; its depth is "
+        f"not measured, and {100 * (1 - plate.seen.mean()):.1f} % of it is never seen"
+    )
+    return ScenePoints(points, colors, text)
