@@ -20,6 +20,7 @@ from hoigs.cli.common import (
 
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Run folder.")] = Path("runs/demo"),
+    steps: Annotated[int, typer.Option("--steps", help="Training steps of each model.")] = 1500,
     settings: SetOption = None,
     rasterizer: RasterizerOption = None,
     device: DeviceOption = "auto",
@@ -47,7 +48,7 @@ def demo(
             clip,
             spec,
             out=folder,
-            overrides=overrides(settings, rasterizer),
+            overrides=[f"train.steps={steps}", *overrides(settings, rasterizer)],
             device=where,
             overwrite=overwrite,
         )
