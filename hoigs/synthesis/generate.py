@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -92,15 +95,12 @@ class SyntheticScene:
 
     def things(self, frame: int) -> Layer:
         """Person, object and furniture of a frame, ready for rays."""
-        vertices, faces = self.body_vertices[frame].astype(float), self.dressed.faces
-        person = TexturedMesh(
-            vertices,
-            faces,
-            smooth_normals(vertices, faces)[faces],
-            np.zeros((len(faces), 3, 2)),
-            np.full(len(faces), -1),
-        )
+        vertices, faces = self.body_vertices[frame], self.dressed.faces
+        normals = smooth_normals(vertices, faces)[faces]
         thing = self.object_at(frame)
+        person = TexturedMesh(
+            vertices, faces, normals, np.zeros((len(faces), 3, 2)), np.full(len(faces), -1)
+        )
         numbers = np.repeat([1, 2, 0], [len(faces), len(thing.faces), len(self.props.faces)])
         return Layer.build(TexturedMesh.join([person, thing, self.props]), numbers, self._fine)
 
@@ -112,11 +112,32 @@ class SyntheticScene:
         return TrueView(frame, camera, image, picture.depth, picture.entity)
 
     def views(self) -> Iterator[tuple[TrueView, list[TrueView]]]:
-        """Every frame from the path's camera, with the held-out views of that moment."""
-        for frame, camera in enumerate(self.cameras):
-            layer = self.things(frame)
-            others = [self.render(f, c, layer) for f, c in self.held_out if f == frame]
-            yield self.render(frame, camera, layer), others
+        """Every frame from the path's camera, with the held-out views of that moment.
+
+        Frames are rendered side by side, a few ahead of the one that is asked for.
+        """
+        threads = _cores()
+        _ = self.body_vertices, self._caster, self._fine  # made once, before threads ask for them
+        with ThreadPoolExecutor(threads) as pool:
+            ahead: deque[Future[tuple[TrueView, list[TrueView]]]] = deque()
+            for frame in range(len(self.cameras)):
+                ahead.append(pool.submit(self._moment, frame))
+                if len(ahead) > 2 * threads:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+
+    def _moment(self, frame: int) -> tuple[TrueView, list[TrueView]]:
+        things = self.things(frame)
+        others = [self.render(f, c, things) for f, c in self.held_out if f == frame]
+        return self.render(frame, self.cameras[frame], things), others
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def generate(knobs: SceneKnobs, body: BodyModel) -> SyntheticScene:

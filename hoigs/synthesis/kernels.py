@@ -2,13 +2,13 @@
 
 Directions have unit length along the camera's z, so a hit's parameter *is* the depth. A sample
 looks at one of the DIRECTIONS of the sun's disc and of the sky. Every pixel takes the same ones in
-the same order, so that soft shadows carry no noise, and a pixel whose first samples disagree goes
+the same order, so that soft shadows carry no noise; a pixel whose first samples disagree goes
 on to see them all.
 """
 
 # No `from __future__ import annotations` here: Warp reads kernel annotations as objects.
 # float(1.0) declares a variable that a loop may change; a bare literal would be a constant.
-# ruff: noqa: UP018
+# ruff: noqa: UP018, RUF046
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
@@ -17,6 +17,7 @@ FINE = 4  # micro-triangles along an edge of a face with mesh colours
 FINE_COUNT = (FINE + 1) * (FINE + 2) // 2
 DIRECTIONS = 8  # over the sun's disc and over the sky
 FAR = 100.0
+REACH = 0.55  # of ambient occlusion, metres
 
 
 @wp.struct
@@ -82,6 +83,7 @@ def nearest(shell: Surface, things: Surface, origin: wp.vec3, ray: wp.vec3):
         best.face = q.face
         best.u = q.u
         best.v = q.v
+        return best  # things stand inside the shell
     q = wp.mesh_query_ray(shell.mesh, origin, ray, best.t)
     if q.result:
         best.t = q.t
@@ -233,7 +235,7 @@ def shade(
     if lights.occlusion > 0.0:
         local = lights.skies[sample % DIRECTIONS]
         up = tangent * local[0] + bitangent * local[1] + smooth * local[2]
-        out.hidden = blocked(things, start, up, 0.7)
+        out.hidden = blocked(things, start, up, REACH)
     sun = wp.max(facing, 0.0) * (1.0 - lights.shadows * out.dark)
     sky = lights.sky * (0.5 + 0.5 * smooth[1]) + lights.ground * (0.5 - 0.5 * smooth[1])
     open_share = 1.0 - lights.occlusion * out.hidden
@@ -267,8 +269,7 @@ def direction(view: View, x: float, y: float):
 
 
 @wp.kernel
-def render_rows(
-    first: int,
+def render(
     shell: Surface,
     things: Surface,
     texels: wp.array(dtype=wp.vec3),
@@ -282,7 +283,7 @@ def render_rows(
     depth: wp.array(dtype=wp.float32),
     entity: wp.array(dtype=wp.int32),
 ):
-    pixel = first + wp.tid()
+    pixel = wp.tid()
     column = float(pixel % view.width)
     row = float(pixel // view.width)
     centre = nearest(shell, things, view.eye, direction(view, column + 0.5, row + 0.5))
@@ -305,7 +306,9 @@ def render_rows(
     wanted = int(samples)
     while count < wanted:
         ray = direction(view, column + offsets[count][0], row + offsets[count][1])
-        hit = nearest(shell, things, view.eye, ray)
+        hit = centre  # the first sample
+        if count > 0:
+            hit = nearest(shell, things, view.eye, ray)
         shaded = radiance(shell, things, texels, levels, lights, view, ray, hit, count)
         total += shaded.value
         count += 1

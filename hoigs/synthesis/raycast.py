@@ -6,16 +6,12 @@ depends on the view: two cameras that see one point see one colour.
 
 from __future__ import annotations
 
-import itertools
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 from jaxtyping import Float, Int
-from scipy.stats import qmc
 
 from hoigs.core.camera import Camera
 from hoigs.synthesis import kernels
@@ -36,7 +32,7 @@ class Layer:
 
     @staticmethod
     def build(mesh: TexturedMesh, entity: Int[Array, " F"], fine: wp.array | None = None) -> Layer:
-        """Args: entity: number of the entity of each face. fine: mesh colours, from `fine_array`."""
+        """Args: entity: number of each face's entity. fine: mesh colours, from `fine_array`."""
         built = wp.Mesh(
             points=wp.array(mesh.vertices.astype(np.float32), dtype=wp.vec3, device="cpu"),
             indices=wp.array(mesh.faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu"),
@@ -100,36 +96,25 @@ class RayCaster:
         self.samples, self.edge_samples = samples, max(samples, edge_samples)
         offsets = pixel_samples(samples, self.edge_samples)
         self.offsets = wp.array(offsets, dtype=wp.vec2, device="cpu")
-        self.threads = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity")
-                           else os.cpu_count() or 1)  # fmt: skip
 
     def render(self, camera: Camera, things: Layer) -> Picture:
-        """Depth and entities at pixel centres, colour averaged over the pixel."""
+        """Depth and entities at pixel centres, colour averaged over the pixel.
+
+        One thread, and the GIL is released: frames side by side keep all cores busy.
+        """
         count = camera.width * camera.height
         color = wp.zeros(count, dtype=wp.vec3, device="cpu")
         depth = wp.zeros(count, dtype=wp.float32, device="cpu")
         entity = wp.zeros(count, dtype=wp.int32, device="cpu")
-        view = _view(camera)
-
-        def rows(part: tuple[int, int]) -> None:
-            first, last = part
-            wp.launch(
-                kernels.render_rows,
-                dim=last - first,
-                inputs=[
-                    first, self.shell.surface, things.surface, self.texels,
-                    self.levels, self.lights, view, self.offsets, self.samples, self.edge_samples, color, depth,
-                    entity,
-                ],
-                device="cpu",
-            )  # fmt: skip
-
-        # A launch is one loop on the calling thread and releases the GIL; short bands share out
-        # the person, who costs more than the wall.
-        edges = np.linspace(0, count, 8 * self.threads + 1).astype(int).tolist()
-        parts = list(itertools.pairwise(edges))
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(rows, parts))
+        wp.launch(
+            kernels.render,
+            dim=count,
+            inputs=[
+                self.shell.surface, things.surface, self.texels, self.levels, self.lights,
+                _view(camera), self.offsets, self.samples, self.edge_samples, color, depth, entity,
+            ],
+            device="cpu",
+        )  # fmt: skip
         shape = (camera.height, camera.width)
         return Picture(
             color.numpy().reshape(*shape, 3).copy(),
@@ -139,13 +124,17 @@ class RayCaster:
 
 
 def pixel_samples(plain: int, more: int) -> Float[Array, "S 2"]:
-    """Stratified places in a pixel (Sobol): first the plain ones, then those that edges add.
+    """Places in a pixel: its centre, a ring of plain samples, a wider ring that edges add.
 
-    Each of the two sets is centred, so that neither shifts the image.
+    Each ring is centred, so that neither shifts the image.
     """
-    points = qmc.Sobol(2, scramble=False).random(more)
-    sets = (points[:plain], points[plain:])
-    return np.concatenate([p - p.mean(0) + 0.5 for p in sets if len(p)]).astype(np.float32)
+
+    def ring(count: int, radius: float, phase: float) -> Array:
+        angle = phase + 2 * np.pi * np.arange(count) / max(count, 1)
+        return 0.5 + radius * np.stack((np.cos(angle), np.sin(angle)), -1)
+
+    rings = [np.full((1, 2), 0.5), ring(plain - 1, 0.34, 0.3), ring(more - plain, 0.52, 0.9)]
+    return np.concatenate(rings).astype(np.float32)
 
 
 def _disc(count: int) -> Float[Array, "N 2"]:
