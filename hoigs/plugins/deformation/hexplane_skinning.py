@@ -265,16 +265,19 @@ class HexPlaneSkinning(SkinnedBody):
         """phi at the posed body, relative to its pelvis and before alpha, and its world places.
 
         The body points are vertices of the template, so every part is described however few
-        Gaussians it has.
+        Gaussians it has. Features have gradients in the planes alone, not in the pose: what moves
+        the person is learned from images, not from where its features are read.
         """
         del rest
-        pose = self.pose(moment)
-        transforms = self.body.skinning_transforms(pose)
-        points = self.shaped(pose.betas)[0][self.field_vertices]
-        posed = skin_points(points, self.body.skinning_weights[self.field_vertices], transforms)
-        pelvis = self.posed_joints(pose, transforms, [PELVIS])[0]
-        features = self.planes((posed - pelvis) / self.half_box, moment.time)
-        return features, self.scaled(posed, pelvis, moment)
+        with torch.no_grad():
+            pose = self.pose(moment)
+            transforms = self.body.skinning_transforms(pose)
+            points = self.shaped(pose.betas)[0][self.field_vertices]
+            weights = self.body.skinning_weights[self.field_vertices]
+            posed = skin_points(points, weights, transforms)
+            pelvis = self.posed_joints(pose, transforms, [PELVIS])[0]
+            places = self.scaled(posed, pelvis, moment)
+        return self.planes((posed - pelvis) / self.half_box, moment.time), places
 
     def field_parts(self) -> Int[Tensor, " V"]:
         """Body part (0..15) of each point of `posed_field`."""

@@ -130,7 +130,9 @@ class SkinnedBody(DeformationModel):
             center = self.camera_centers[min(max(round(moment.time * last), 0), last)]
         return center + self.log_alpha.exp() * (points - center)
 
+    @torch.no_grad()
     def anchors(self, moment: Moment) -> Float[Tensor, "A 3"]:
+        """Pelvis, wrists and feet in the world, without gradient."""
         pose = self.pose(moment)
         transforms = self.body.skinning_transforms(pose)
         joints = self.posed_joints(pose, transforms, list(ANCHORS))
