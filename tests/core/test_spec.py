@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from fake_plugins import PluginFolder
@@ -380,3 +381,11 @@ def flat(tree, prefix=""):
     if not isinstance(tree, dict):
         return {prefix.rstrip("."): tree}
     return {k: v for key, value in tree.items() for k, v in flat(value, f"{prefix}{key}.").items()}
+
+
+def test_the_spec_in_the_reference_is_one():
+    page = Path(__file__).parents[2] / "docs" / "reference" / "spec.md"
+    text = page.read_text().partition("```yaml\n")[2].partition("```")[0]
+    spec = Spec.parse(text)
+    assert spec.model["human"].body.settings["path"] == "SMPLX_NEUTRAL.npz"
+    assert spec.model["human"].deformation == Spec.load("hoigs").model["human"].deformation

@@ -98,4 +98,4 @@ class UniformBSpline(DeformationModel):
 
     def on_topology(self, change: TopologyChange) -> None:
         super().on_topology(change)
-        self.control.data += change.offsets[:, None]
+        self.control.data += change.offsets[:, None]  # a turning object would turn these too
