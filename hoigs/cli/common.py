@@ -80,7 +80,13 @@ class Bar:
 def progress_bar(title: str, total: float) -> Iterator[Bar]:
     """A bar with elapsed time and ETA on stderr; quiet when stderr is not a terminal."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     console = Console(stderr=True)
     with Progress(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +17,9 @@ from hoigs.cli.common import (
     print_table,
 )
 
+if TYPE_CHECKING:
+    from hoigs.evaluation.scores import Evaluation
+
 
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Run folder.")] = Path("runs/demo"),
@@ -27,7 +30,9 @@ def demo(
     baseline: Annotated[
         bool, typer.Option("--baseline/--no-baseline", help="Also train a static model to compare.")
     ] = True,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier demo.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier demo.")
+    ] = False,
 ) -> None:
     """Generate a clip with known truth, reconstruct it, and write report.html."""
     from hoigs.cli.evaluate import score_run
@@ -43,6 +48,7 @@ def demo(
     runs = {"hoigs": out}
     if baseline:
         runs["static"] = out.with_name(f"{out.name}-static")
+    evaluations = {}
     for spec, folder in runs.items():
         session = Session.open(
             clip,
@@ -53,19 +59,16 @@ def demo(
             overwrite=overwrite,
         )
         run_session(session)
-        score_run(folder, device=where)
-    if baseline:
-        _compare(runs)
+        evaluations[spec] = score_run(folder, device=where)
+    _compare(evaluations)
     typer.echo(f"demo took {time.perf_counter() - began:.0f} s; open {out / 'report.html'}")
 
 
-def _compare(runs: dict[str, Path]) -> None:
-    """PSNR of both runs, region by region, on the same test frames."""
-    from hoigs.evaluation.evaluate import read_scores
-
-    scores = {name: read_scores(path / "evaluation.json", "test", "psnr") for name, path in runs.items()}
-    regions = list(scores["hoigs"])
-    rows = [
-        (name, *(scores[name].get(region, "not computed") for region in regions)) for name in runs
-    ]
+def _compare(evaluations: dict[str, Evaluation]) -> None:
+    """PSNR of the runs, region by region, on the same test frames."""
+    regions = ("full", "human_object", "human", "object", "interaction", "background")
+    rows = []
+    for name, evaluation in evaluations.items():
+        scores = [evaluation.score(region, "psnr") for region in regions]
+        rows.append((name, *(f"{s:.2f}" if isinstance(s, float) else str(s) for s in scores)))
     print_table("PSNR on test frames, dB", ("spec", *regions), rows)

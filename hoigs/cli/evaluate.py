@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hoigs.cli.common import DeviceOption, RasterizerOption, pick_device, print_table, progress_bar
+
+if TYPE_CHECKING:
+    from hoigs.evaluation.scores import Evaluation
 
 LpipsOption = Annotated[
     Path | None,
@@ -44,7 +47,7 @@ def score_run(
     lpips_weights: Path | None = None,
     device: str = "cpu",
     report: bool = True,
-) -> None:
+) -> Evaluation:
     """Load, score, print, write."""
     from hoigs.evaluation.evaluate import evaluate as judge
     from hoigs.evaluation.report import write_report
@@ -67,3 +70,4 @@ def score_run(
     if report:
         path = write_report(run, loaded.model, loaded.clip, evaluation)
         typer.echo(f"report: {path}")
+    return evaluation

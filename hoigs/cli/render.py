@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +12,7 @@ import typer
 from hoigs.cli.common import DeviceOption, RasterizerOption, pick_device, progress_bar
 
 
-class Path_(StrEnum):  # noqa: N801  (the option's type name shows in --help)
+class CameraPath(StrEnum):
     playback = "playback"
     orbit = "orbit"
 
@@ -20,8 +21,9 @@ def render(
     run: Annotated[Path, typer.Argument(help="Run folder.")],
     out: Annotated[Path | None, typer.Option("--out", help="Video; default RUN/renders/.")] = None,
     path: Annotated[
-        Path_, typer.Option("--path", help="The clip's own cameras, or an orbit while it plays.")
-    ] = Path_.playback,
+        CameraPath,
+        typer.Option("--path", help="The clip's own cameras, or an orbit while it plays."),
+    ] = CameraPath.playback,
     only: Annotated[
         list[str] | None, typer.Option("--only", help="Draw just this entity. Repeatable.")
     ] = None,
@@ -31,6 +33,7 @@ def render(
 ) -> None:
     """Draw a run to an mp4."""
     import numpy as np
+    import torch
 
     from hoigs.core.errors import HoigsError, did_you_mean
     from hoigs.evaluation.orbits import orbit_cameras
@@ -43,13 +46,13 @@ def render(
         if name not in model.entities:
             known = list(model.entities)
             raise HoigsError(f"--only {name}: this run has {known}{did_you_mean(name, known)}")
-    if path is Path_.orbit:
+    if path is CameraPath.orbit:
         cameras = orbit_cameras(source, model, len(source))
     else:
         cameras = list(source.cameras)
     target = out or run / "renders" / f"{path.value}.mp4"
 
-    def frames():  # type: ignore[no-untyped-def]
+    def frames() -> Iterator[np.ndarray]:
         with progress_bar("rendering", len(source)) as bar:
             for i, (moment, camera) in enumerate(zip(source.moments, cameras, strict=True)):
                 color = model.render(
@@ -57,8 +60,6 @@ def render(
                 ).color
                 bar.update(i + 1)
                 yield (color.clamp(0, 1) * 255).round().byte().cpu().numpy().astype(np.uint8)
-
-    import torch
 
     with torch.no_grad():
         write_video(target, frames(), fps=source.fps)

@@ -20,7 +20,9 @@ from hoigs.cli.common import (
 
 def train(
     clip: Annotated[Path, typer.Argument(help="Clip folder, as `hoigs prepare` makes it.")],
-    spec: Annotated[str, typer.Option("--spec", help="A built-in spec's name or a file.")] = "hoigs",
+    spec: Annotated[
+        str, typer.Option("--spec", help="A built-in spec's name or a file.")
+    ] = "hoigs",
     out: Annotated[
         Path | None, typer.Option("--out", help="Run folder; default runs/CLIP-SPEC.")
     ] = None,
@@ -28,7 +30,9 @@ def train(
     rasterizer: RasterizerOption = None,
     device: DeviceOption = "auto",
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the run in --out.")
+    ] = False,
     evaluate: Annotated[
         bool, typer.Option("--eval/--no-eval", help="Score the run and write its report.")
     ] = True,

@@ -28,6 +28,12 @@ class Entity(nn.Module):
             object if it has features or moves, else scene.
     """
 
+    means: nn.Parameter
+    quats: nn.Parameter
+    log_scales: nn.Parameter
+    opacity_logits: nn.Parameter
+    sh: nn.Parameter
+
     def __init__(
         self,
         rest: Gaussians,

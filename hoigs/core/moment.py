@@ -59,7 +59,7 @@ class BodyPose:
         )
 
     def map(self, function: Callable[[Tensor], Tensor]) -> BodyPose:
-        changed = {
+        changed: dict[str, Any] = {
             f.name: function(getattr(self, f.name))
             for f in fields(self)
             if f.name != "hand_pose_convention"

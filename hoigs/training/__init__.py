@@ -1,1 +1,1 @@
-"""The loop that fits a SceneModel to a Clip: losses, schedules, density, checkpoints, run folder."""
+"""Fitting a SceneModel to a Clip: losses, schedules, density, checkpoints, run folder."""

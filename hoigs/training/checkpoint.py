@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,10 +43,10 @@ class Checkpoint:
         tensors = {k: v.detach().cpu().contiguous() for k, v in self.tensors.items()}
         temporary = weights.with_suffix(".safetensors.part")
         save_file(tensors, temporary)
-        os.replace(temporary, weights)
+        temporary.replace(weights)
         temporary = meta.with_suffix(".json.part")
         temporary.write_text(json.dumps(self.meta, indent=1))
-        os.replace(temporary, meta)
+        temporary.replace(meta)
         return weights
 
 
@@ -92,9 +91,9 @@ def restore_model(model: SceneModel, checkpoint: Checkpoint, model_hash: str) ->
     if stored != model_hash:
         raise CheckpointError(
             f"checkpoint of step {checkpoint.meta['step']} was made by the spec "
-            f"{checkpoint.meta['spec_name']!r} (model hash {stored[:12]}), but this model's hash is "
-            f"{model_hash[:12]}: its `model`, `interaction` or `entities` differ; use the spec.yaml "
-            "that lies beside the checkpoint"
+            f"{checkpoint.meta['spec_name']!r} (model hash {stored[:12]}), but this model's hash "
+            f"is {model_hash[:12]}: its `model`, `interaction` or `entities` differ; use the "
+            "spec.yaml that lies beside the checkpoint"
         )
     counts = checkpoint.meta["counts"]
     if set(counts) != set(model.entities):

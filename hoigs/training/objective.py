@@ -55,9 +55,7 @@ class JointObjective:
         self.model, self.spec, self.depth_kind, self.lpips = model, spec, depth_kind, lpips
         self.weights = term_weights(spec)
 
-    def __call__(
-        self, frame: Frame, camera: Camera, generator: torch.Generator
-    ) -> ObjectiveResult:
+    def __call__(self, frame: Frame, camera: Camera, generator: torch.Generator) -> ObjectiveResult:
         device = camera.K.device
         state = self.model(frame.moment.to(device))
         offsets = torch.zeros(
@@ -134,9 +132,7 @@ class JointObjective:
             terms[f"{kind}/{name}/lpips"] = self.spec.lpips * self.lpips(render, target)
         return terms
 
-    def _regularize(
-        self, name: str, terms: dict[str, Tensor], weights: dict[str, float]
-    ) -> None:
+    def _regularize(self, name: str, terms: dict[str, Tensor], weights: dict[str, float]) -> None:
         defaults = self.model.entity(name).deformation.regularizer_weights
         for key, value in self.model.entity(name).regularizers().items():
             weight = self.spec.regularizers.get(key, defaults.get(key, 0.0))

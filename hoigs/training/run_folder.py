@@ -72,7 +72,7 @@ class RunFolder:
         (temporary / "metrics.jsonl").touch()
         if self.path.exists():
             shutil.rmtree(self.path)
-        os.replace(temporary, self.path)
+        temporary.replace(self.path)
 
     def log(self, record: dict[str, Any]) -> None:
         with self.metrics.open("a") as file:
@@ -81,11 +81,13 @@ class RunFolder:
     def cut_metrics(self, step: int) -> None:
         """Drop records after `step`: a resumed run writes them again."""
         kept = [
-            line for line in self.metrics.read_text().splitlines() if json.loads(line)["step"] <= step
+            line
+            for line in self.metrics.read_text().splitlines()
+            if json.loads(line)["step"] <= step
         ]
         temporary = self.metrics.with_suffix(".part")
         temporary.write_text("".join(line + "\n" for line in kept))
-        os.replace(temporary, self.metrics)
+        temporary.replace(self.metrics)
 
     def read_provenance(self) -> dict[str, Any]:
         return json.loads(self.provenance.read_text())

@@ -1,4 +1,4 @@
-"""Session: everything between a command line and a Trainer, all input checked before a file is made."""
+"""Session: from a command line to a Trainer; all input is checked before a file is made."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def read_clip(folder: Path, registry: Registry, width: int | None = None) -> Cli
             clip = reader.read(folder)
             return clip if width is None else clip.resized(width)
     raise ClipError(
-        f"{folder}: not a layout that {', '.join(registry.keys('reader'))} knows; a clip folder has "
-        "clip.json (docs/reference/clip.md); `hoigs prepare` makes one from a video"
+        f"{folder}: not a layout that {', '.join(registry.keys('reader'))} knows; a clip folder "
+        "has clip.json (docs/reference/clip.md); `hoigs prepare` makes one from a video"
     )
 
 

@@ -118,9 +118,7 @@ class Trainer:
         self.optimizer.zero_grad()
         result.total.backward()
         if not gradients_finite(self.optimizer.names):
-            culprit = first_not_finite(
-                result.terms, result.state.gaussians, self.optimizer.names
-            )
+            culprit = first_not_finite(result.terms, result.state.gaussians, self.optimizer.names)
             self.guard.failed(self.step, culprit or "a gradient")
             self.optimizer.zero_grad()
             return None
@@ -137,9 +135,7 @@ class Trainer:
         for name, density in self.density.items():
             if gradient is not None:
                 density.gather(gradient[rows[name]], radii[rows[name]], width, height)
-            density.refine(
-                result.state.gaussians[name], self.optimizer, self.step, self.spec.steps
-            )
+            density.refine(result.state.gaussians[name], self.optimizer, self.step, self.spec.steps)
 
     def _report(self, terms: dict[str, float] | None) -> StepReport | None:
         last = self.step == self.spec.steps

@@ -15,7 +15,7 @@ try:
     main()
 except SystemExit as stop:
     assert not stop.code, stop.code
-heavy = [m for m in ("torch", "warp", "kornia", "pycolmap", "scipy", "matplotlib") if m in sys.modules]
+heavy = {{"torch", "warp", "kornia", "pycolmap", "scipy", "matplotlib"}} & set(sys.modules)
 assert not heavy, heavy
 """
 
