@@ -75,7 +75,7 @@ class Protocol:
         )
         return [
             f"{self.frames} frames of split {self.split!r} from {self.views}, "
-            f"{self.unseen_times} of them at times that were not trained on; "
+            f"{self.unseen_times or 'none'} of them at times that were not trained on; "
             f"body poses: {self.test_pose}.",
             f"{self.width}x{self.height}, {self.pixels} pixels clamped to [0, 1] over "
             f"{self.background}; {self.averages}; drawn by {self.rasterizer} on {self.device}.",

@@ -30,6 +30,7 @@ STYLE: dict[Any, Any] = {
     "xtick.color": QUIET,
     "ytick.color": QUIET,
     "axes.grid": True,
+    "axes.axisbelow": True,
     "grid.color": LINES,
     "grid.linewidth": 0.6,
     "axes.spines.top": False,
@@ -75,7 +76,10 @@ def loss_curve(records: Sequence[dict[str, Any]]) -> str:
         total = [r["loss"] for r in records]
         axes.plot(steps, smoothed(total), color=INK, linewidth=1.8, label="total, weighted")
         axes.set_yscale("log")
-        axes.legend(frameon=False, fontsize=9, ncols=2, labelcolor="linecolor")
+        axes.legend(
+            frameon=False, fontsize=9, labelcolor="linecolor", ncols=3, loc="upper center",
+            bbox_to_anchor=(0.45, -0.2), columnspacing=1, handlelength=1.4,
+        )  # fmt: skip
 
     return _figure("loss", "step", paint)
 
@@ -92,7 +96,7 @@ def psnr_curve(records: Sequence[dict[str, Any]]) -> str:
             axes.plot(x, y, color=hue, linewidth=1.8, marker="o", markersize=3, label=split)
         axes.legend(frameon=False, fontsize=9.5, labelcolor="linecolor", loc="lower right")
 
-    return _figure("PSNR dB, a few frames of each split", "step", paint)
+    return _figure("PSNR dB, a few frames", "step", paint)
 
 
 def count_curve(records: Sequence[dict[str, Any]]) -> str:
@@ -133,7 +137,7 @@ def frame_bars(view: ViewScores) -> str:
             bbox_to_anchor=(0.5, -0.16),
         )  # fmt: skip
 
-    return _figure(f"PSNR dB of each frame, {view.name}", "frame", paint)
+    return _figure(f"PSNR dB of each frame, {view.name}", "frame", paint, width=5.6)
 
 
 def smoothed(values: Sequence[float], keep: float = 0.8) -> list[float]:
@@ -145,16 +149,16 @@ def smoothed(values: Sequence[float], keep: float = 0.8) -> list[float]:
     return out
 
 
-def _figure(title: str, xlabel: str, paint: Callable[[Axes], None]) -> str:
+def _figure(title: str, xlabel: str, paint: Callable[[Axes], None], width: float = 4.2) -> str:
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(5.6, 3.1), layout="constrained")
+        figure = Figure(figsize=(width, 3.0), layout="constrained")
         axes = figure.add_subplot()
         paint(axes)
         axes.set_title(title, loc="left", fontsize=11.5)
         axes.set_xlabel(xlabel)
         axes.tick_params(length=0)
         if axes.get_xscale() == "linear" and xlabel == "step":
-            axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+            axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
         figure.patch.set_alpha(0)
         axes.patch.set_alpha(0)
         buffer = io.StringIO()

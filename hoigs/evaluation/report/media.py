@@ -30,7 +30,7 @@ Item = TypeVar("Item")
 
 PLAYBACK_FRAMES, ORBIT_FRAMES, COMPARED, HELD_OUT = 48, 36, 6, 3
 PANEL_WIDTH, COMPARE_WIDTH = 400, 720
-PLAYBACK_BYTES, ORBIT_BYTES = 2_400_000, 1_400_000
+PLAYBACK_BYTES, ORBIT_BYTES = 2_000_000, 1_200_000
 
 
 @dataclass(frozen=True)
@@ -120,9 +120,9 @@ def _compare(model: SceneModel, frame: Frame, scored: FrameScores, name: str) ->
     return Comparison(
         label=f"{name} {scored.index}",
         score=" · ".join(words),
-        video=still(video, COMPARE_WIDTH, 86),
-        render=still(render, COMPARE_WIDTH, 86),
-        error=still(error_picture(output.color, frame.rgb), COMPARE_WIDTH, 75),
+        video=still(video, COMPARE_WIDTH, 84),
+        render=still(render, COMPARE_WIDTH, 84),
+        error=still(error_picture(output.color, frame.rgb), COMPARE_WIDTH, 65),
         thumb=still(render, 120, 70),
     )
 

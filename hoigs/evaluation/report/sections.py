@@ -81,7 +81,8 @@ def apart(cutouts: Sequence[Cutout]) -> str:
     cells = (
         f"<figure class='{escape(c.kind, quote=True)}'><img src='{c.image}' "
         f"alt='{escape(c.name, quote=True)} alone'><figcaption><b>{escape(c.name)}</b> "
-        f"{escape(c.kind)} · {c.gaussians:,} Gaussians</figcaption></figure>"
+        f"{escape(c.kind) + ' · ' if c.kind != c.name else ''}{c.gaussians:,} Gaussians"
+        "</figcaption></figure>"
         for c in cutouts
     )
     return f"<div class='apart'>{''.join(cells)}</div>"

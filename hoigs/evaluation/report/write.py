@@ -72,7 +72,8 @@ def write_report(
 
 def _lead(model: SceneModel, clip: Clip) -> str:
     """What was reconstructed, in a sentence."""
-    cast = [f"{name} ({model.entity(name).kind})" for name in model.entities]
+    kinds = {name: model.entity(name).kind for name in model.entities}
+    cast = [name if name == kind else f"{name} ({kind})" for name, kind in kinds.items()]
     listed = " and ".join([", ".join(cast[:-1]), cast[-1]]) if len(cast) > 1 else cast[0]
     camera = clip.cameras[0]
     return (
@@ -90,9 +91,11 @@ def _hero(model: SceneModel, clip: Clip) -> str:
 
 def _compared(model: SceneModel, clip: Clip, evaluation: Evaluation) -> str:
     comparisons = media.comparisons(model, clip, evaluation)
+    unseen = all(view.protocol.split == "test" for view in evaluation.views)
     return _section(
-        "Frames it never saw",
-        "These frames took no part in training. Drag the seam; choose a frame below.",
+        "Frames it never saw" if unseen else "Frame by frame",
+        ("None of these images took part in training. " if unseen else "")
+        + "Drag the seam; choose a frame below.",
         sections.comparer(comparisons),
     )
 
