@@ -150,3 +150,43 @@ def test_slerp_equal_and_opposite_turns_are_finite():  # F5
         out.sum().backward()
         assert torch.isfinite(out).all() and torch.isfinite(a.grad).all()
         assert torch.isfinite(b.grad).all()
+
+
+def sampled(knots: torch.Tensor, tangents: torch.Tensor, frames: int) -> torch.Tensor:
+    times = [f / (frames - 1) for f in range(frames)]
+    return torch.stack([spline.cubic_hermite(knots[None], tangents[None], t)[0] for t in times])
+
+
+def test_fit_recovers_a_spline():
+    g = torch.Generator().manual_seed(0)
+    knots, tangents = torch.randn(2, 5, 3, generator=g, dtype=torch.float64)
+    samples = sampled(knots, tangents, 41)
+    m, tau = spline.fit(samples, 5, free_tangents=True, smoothness=1e-9)
+    torch.testing.assert_close(m, knots, atol=1e-5, rtol=0)
+    torch.testing.assert_close(tau, tangents, atol=1e-4, rtol=0)
+    rom = spline.catmull_rom_tangents(knots[None])[0]
+    m, tau = spline.fit(sampled(knots, rom, 41), 5, free_tangents=False, smoothness=1e-9)
+    torch.testing.assert_close(m, knots, atol=1e-5, rtol=0)
+    torch.testing.assert_close(tau, rom, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("free", [True, False])
+@pytest.mark.parametrize(("frames", "keyframes"), [(2, 2), (2, 5), (3, 9), (9, 9), (64, 17)])
+def test_fit_is_determined_for_any_counts(frames: int, keyframes: int, free: bool):
+    s = torch.linspace(0, 1, frames)
+    line = torch.stack((s, 2 - s), -1)
+    m, tau = spline.fit(line, keyframes, free_tangents=free)
+    expected = torch.linspace(0, 1, keyframes)
+    torch.testing.assert_close(m, torch.stack((expected, 2 - expected), -1), atol=1e-4, rtol=0)
+    step = 1 / (keyframes - 1)
+    torch.testing.assert_close(tau[:, 0], torch.full((keyframes,), step), atol=1e-4, rtol=0)
+
+
+def test_fit_weighs_samples():
+    line = torch.linspace(0, 1, 21)[:, None].repeat(1, 1)
+    spoilt = line.clone()
+    spoilt[7] += 5
+    weights = torch.ones(21)
+    weights[7] = 0
+    m, _ = spline.fit(spoilt, 6, free_tangents=True, weights=weights)
+    torch.testing.assert_close(m, torch.linspace(0, 1, 6)[:, None], atol=1e-4, rtol=0)

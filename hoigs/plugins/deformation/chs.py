@@ -63,8 +63,9 @@ class CubicHermite(DeformationModel):
     Args:
         keyframes: K; or None with `num_frames`, for one every `keyframe_step` frames.
         num_frames: frames of the clip; by default those of the track.
-        track: rest is then the canonical object, and knot k starts at R_k p + t_k, the track
-            taken at the knot's real-valued time. Without one every knot starts at rest.
+        track: rest is then the canonical object; knots and tangents start as the spline nearest
+            to R_f p + t_f over all frames, knot rotations as the track's at the knot's real-valued
+            time. Without a track every knot starts at rest.
     """
 
     provides = frozenset({"velocity"})
@@ -75,7 +76,7 @@ class CubicHermite(DeformationModel):
         "opacity_logits": "opacity",
     }
 
-    regularizer_weights: ClassVar[Mapping[str, float]] = {"tangent": 0.1, "acceleration": 0.01}
+    regularizer_weights: ClassVar[Mapping[str, float]] = {"tangent": 0.01}
 
     rest_quats: Tensor
 
@@ -126,11 +127,11 @@ class CubicHermite(DeformationModel):
 
     def bind(self, rest: Gaussians) -> None:
         rest = rest.detach()
-        means, quats = self._initial_knots(rest.means, normalize_quats(rest.quats))
+        means, tangents, quats = self._initial_knots(rest.means, normalize_quats(rest.quats))
         self.keyframe_means = nn.Parameter(means)
         self.keyframe_quats = nn.Parameter(quats)
         if self.learned:
-            self.tangents = nn.Parameter(spline.catmull_rom_tangents(means))
+            self.tangents = nn.Parameter(tangents)
         if self.keyed:
             logits = rest.opacity_logits[:, None].repeat(1, self.keyframes)
             self.opacity_logits = nn.Parameter(logits)
@@ -140,10 +141,12 @@ class CubicHermite(DeformationModel):
 
     def _initial_knots(
         self, means: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]
-    ) -> tuple[Float[Tensor, "N K 3"], Float[Tensor, "N K 4"]]:
+    ) -> tuple[Float[Tensor, "N K 3"], Float[Tensor, "N K 3"], Float[Tensor, "N K 4"]]:
+        """Means, tangents and rotations at every knot: at rest, or along the track."""
         count = self.keyframes
         if self._track is None:
-            return means[:, None].repeat(1, count, 1), quats[:, None].repeat(1, count, 1)
+            still = means[:, None].repeat(1, count, 1)
+            return still, torch.zeros_like(still), quats[:, None].repeat(1, count, 1)
         track = RigidTrack(self._track).to(means)
         if track.largest_step(count) > LARGE_STEP:
             warnings.warn(
@@ -152,8 +155,10 @@ class CubicHermite(DeformationModel):
                 "more keyframes (a smaller keyframe_step)",
                 stacklevel=3,
             )
-        placed = [track.place(means, quats, k / (count - 1)) for k in range(count)]
-        return torch.stack([m for m, _ in placed], 1), torch.stack([q for _, q in placed], 1)
+        knots, tangents = track.knots(means, count, free_tangents=self.learned)
+        times = [k / (count - 1) for k in range(count)]
+        turned = [track.place(means, quats, time)[1] for time in times]
+        return knots, tangents, torch.stack(turned, 1)
 
     def forward(
         self, rest: Gaussians, moment: Moment, residual: Residual | None = None

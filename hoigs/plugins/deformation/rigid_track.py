@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hoigs.core import spline
 from hoigs.core.clip import ObjectTrack
 from hoigs.core.rotation import matrices_to_quats, multiply_quats, quats_to_matrices, slerp
 from hoigs.core.spline import catmull_rom, keyframe_position
@@ -19,14 +20,17 @@ class RigidTrack(nn.Module):
 
     quats: Tensor
     translations: Tensor
+    observed: Tensor
 
     def __init__(self, track: ObjectTrack) -> None:
         super().__init__()
-        quats, translations = matrices_to_quats(track.rotations), track.translations
-        if len(quats) == 1:
-            quats, translations = quats.repeat(2, 1), translations.repeat(2, 1)
-        self.register_buffer("quats", quats.detach().clone())
-        self.register_buffer("translations", translations.detach().clone())
+        for name, value in {
+            "quats": matrices_to_quats(track.rotations),
+            "translations": track.translations,
+            "observed": track.observed.to(track.translations),
+        }.items():
+            frames = value if len(value) > 1 else value.repeat(2, *[1] * (value.dim() - 1))
+            self.register_buffer(name, frames.detach().clone())
 
     def at(self, time: float) -> tuple[Float[Tensor, " 4"], Float[Tensor, " 3"]]:
         """Rotation (wxyz) and translation, object to world, at `time` in [0, 1]."""
@@ -45,6 +49,25 @@ class RigidTrack(nn.Module):
         rotation, translation = self.at(time)
         turned = multiply_quats(rotation.expand_as(quats), quats)
         return means @ quats_to_matrices(rotation).mT + translation, turned
+
+    def knots(
+        self, means: Float[Tensor, "N 3"], keyframes: int, *, free_tangents: bool
+    ) -> tuple[Float[Tensor, "N K 3"], Float[Tensor, "N K 3"]]:
+        """Knots and tangents of each point's path, fitted to all frames of the track.
+
+        A point's place R p + t is linear in R and t, so the twelve entries are fitted once and
+        serve every point. Frames in which the object was not seen weigh a tenth.
+        """
+        matrices = quats_to_matrices(self.quats)
+        entries = torch.cat((matrices.flatten(1), self.translations), dim=1)
+        fitted = spline.fit(
+            entries, keyframes, free_tangents=free_tangents, weights=0.1 + 0.9 * self.observed
+        )
+        knots, tangents = (
+            torch.einsum("kij,nj->nki", x[:, :9].unflatten(1, (3, 3)), means) + x[:, 9:]
+            for x in fitted
+        )
+        return knots, tangents
 
     def largest_step(self, keyframes: int) -> float:
         """Largest rotation between neighbouring keyframes of a uniform spline, radians."""

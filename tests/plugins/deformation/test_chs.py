@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from hoigs.core import spline
 from hoigs.core.clip import ObjectTrack
 from hoigs.core.context import BuildContext
 from hoigs.core.entity import Entity
@@ -91,8 +90,7 @@ def test_follows_the_track():
     for frame in range(17):
         out = entity(Moment(frame / 16))
         expected = rest.means @ track.rotations[frame].mT + track.translations[frame]
-        tolerance = 1e-5 if frame % 4 == 0 else 0.08
-        assert (out.means - expected).norm(dim=-1).max() < tolerance
+        assert (out.means - expected).norm(dim=-1).max() < 2e-3
         turned = quats_to_matrices(out.quats) - track.rotations[frame]
         assert turned.abs().max() < 1e-5  # slerp of a constant turn is exact
 
@@ -203,13 +201,15 @@ def test_rows_stay_together_and_children_turn_with_the_object():
     for name in ("keyframe_quats", "opacity_logits"):
         torch.testing.assert_close(model.get_parameter(name).data, old[name][change.source])
     torch.testing.assert_close(model.keyframe_means[:2], old["keyframe_means"][[3, 0]])
-    for frame in (0, 8, 16):  # knots: each child must be where the rigid object carries it
+    for frame in (
+        0,
+        6,
+        8,
+        16,
+    ):  # knots and between: each child must be where the rigid object carries it
         expected = rest.means @ track.rotations[frame].mT + track.translations[frame]
         got = entity(Moment(frame / 16)).means
-        torch.testing.assert_close(got, expected, atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(
-        model.tangents.data, spline.catmull_rom_tangents(model.keyframe_means.data)
-    )
+        torch.testing.assert_close(got, expected, atol=2e-3, rtol=0)
 
 
 def test_resize_then_load_restores():
