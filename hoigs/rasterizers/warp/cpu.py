@@ -10,8 +10,9 @@ from torch import Tensor
 
 from hoigs.core.errors import RenderError
 from hoigs.rasterizers.warp import cpu_kernels as kernels
+from hoigs.rasterizers.warp.calls import flat, record
 from hoigs.rasterizers.warp.cpu_source import MAX_ROWS
-from hoigs.rasterizers.warp.frame import Images, Inputs, Lists, Settings, flat
+from hoigs.rasterizers.warp.frame import Images, Inputs, Lists, Settings
 from hoigs.rasterizers.warp.projecting import (
     Gradients,
     Projected,
@@ -20,7 +21,7 @@ from hoigs.rasterizers.warp.projecting import (
 )
 from hoigs.rasterizers.warp.projection import project, project_adjoint
 from hoigs.rasterizers.warp.records import MOMENTS, SMALLEST_ALPHA
-from hoigs.rasterizers.warp.workers import SerialWorkers, Workers, record
+from hoigs.rasterizers.warp.workers import SerialWorkers, Workers
 
 ROWS_PER_WORKER = 512  # fewer Gaussians than this are not worth another core
 INT32 = 2**31 - 1

@@ -10,6 +10,7 @@ start for lanes beyond the right edge. Names of arguments stand in `cpu_kernels`
 """
 
 MAX_ROWS = 64
+UNROLL = 2  # rows in flight at once: one alone leaves the core waiting for its own results
 EXTRA = 16  # feature channels composited in one pass; more take further passes
 
 _TYPES = r"""
@@ -17,24 +18,19 @@ _TYPES = r"""
     typedef int i16 __attribute__((vector_size(64)));
     typedef float f8 __attribute__((vector_size(32)));
     typedef float f4 __attribute__((vector_size(16)));
-    constexpr int MAX_ROWS = %(MAX_ROWS)d, EXTRA = %(EXTRA)d;
+    constexpr int ROWS = %(ROWS)d, EXTRA = %(EXTRA)d, U = %(UNROLL)d, AHEAD = 4;
     const i16 SIGN = (i16){} | (int)0x80000000;
     auto same = [](float x) -> f16 { return (f16){} + x; };
     auto any = [](i16 mask) -> bool { return __builtin_reduce_or(mask) != 0; };
     auto least = [](float a, float b) { return a < b ? a : b; };
     auto most = [](float a, float b) { return a > b ? a : b; };
     auto root = [](float x) { return __builtin_sqrtf(x > 0.0f ? x : 0.0f); };
-    // 2^x for x in [-126, 0], relative error 2e-7: the magic number leaves round(x) in the low bits
-    auto exp2_ = [&](f16 x) -> f16 {
-        const f16 shifted = x + 12582912.0f;
-        const f16 f = x - (shifted - 12582912.0f);
-        f16 p = f * 1.339887440e-3f + 9.618437358e-3f;
-        p = p * f + 5.550332471e-2f;
-        p = p * f + 2.402264791e-1f;
-        p = p * f + 6.931472029e-1f;
-        p = p * f + 1.0f;
-        return (f16)((i16)p + ((i16)shifted << 23));
-    };
+    // read through `volatile`, constants stay in registers; LLVM would fetch each anew in every row
+    volatile float constants[] = {1.339887440e-3f, 9.618437358e-3f, 5.550332471e-2f,
+        2.402264791e-1f, 6.931472029e-1f, 12582912.0f};
+    const f16 e5 = same(constants[0]), e4 = same(constants[1]), e3 = same(constants[2]);
+    const f16 e2 = same(constants[3]), e1 = same(constants[4]), magic = same(constants[5]);
+    const f16 ceiling = same(max_alpha);
     f16 lane;
     for (int i = 0; i < 16; ++i) lane[i] = (float)i + 0.5f;
     const float* records_ = (const float*)records.data;
@@ -46,8 +42,9 @@ _TYPES = r"""
     float* alpha_ = (float*)alpha.data;
     float* depth_ = (float*)depth.data;
     float* extra_ = (float*)extra.data;
-    f16 T[MAX_ROWS], red[MAX_ROWS], green[MAX_ROWS], blue[MAX_ROWS], dist[MAX_ROWS];
-    f16 more[MAX_ROWS * EXTRA];
+    #define EACH for (int j = 0; j < U; ++j)
+    f16 T[ROWS], red[ROWS], green[ROWS], blue[ROWS], dist[ROWS];
+    f16 more[ROWS * EXTRA];
 """
 _TILES = r"""
     for (;;) {
@@ -73,6 +70,9 @@ _PAIR = r"""
                 }
                 const long long id = pairs_[2 * k];
                 const float* g = records_ + 16 * id;
+                const int* ahead = pairs_ + 2 * (k + AHEAD < end ? k + AHEAD : k);
+                __builtin_prefetch(records_ + 16ll * ahead[0]);
+                %(AHEAD)s
                 const float cx = g[0] - (float)X, cy = g[1] - (float)Y;
                 const float a = g[2], shear = g[3], c = g[4], log2_opacity = g[5];
                 const float half_width = g[10];
@@ -90,22 +90,35 @@ _PAIR = r"""
                 const f16 dx = lane - cx;
                 const float* f = features_ + id * channels + pass;
                 %(BEFORE)s
-                for (int r = first; r <= last; ++r) {
-                    const float dy = (float)r + 0.5f - cy;
-                    const f16 u = dx - shear * dy;
-                    const f16 exponent = (log2_opacity - c * dy * dy) - a * u * u;
-                    const i16 hit = exponent >= log2_min_alpha;
-                    if (!any(hit)) continue;
-                    const f16 raw = exp2_(exponent);
-                    const f16 opaque = __builtin_elementwise_min(raw, same(max_alpha));
-                    const f16 Tr = T[r];
-                    const f16 weight_ = Tr * opaque, next = Tr - weight_;
-                    const i16 alive = next > min_transmittance;
-                    const i16 drawn = hit & alive;
-                    const f16 weight = (f16)((i16)weight_ & drawn);
+                for (int r = first; r <= last; r += U) {
+                    float dy[U];
+                    f16 exponent[U], near[U], power[U], raw[U], opaque[U], next[U], weight[U];
+                    i16 hit[U], drawn[U];
+                    bool some = false;
+                    EACH dy[j] = (float)(r + j) + 0.5f - cy;
+                    EACH near[j] = dx - shear * dy[j];
+                    EACH exponent[j] = (log2_opacity - c * dy[j] * dy[j]) - a * near[j] * near[j];
+                    EACH hit[j] = exponent[j] >= log2_min_alpha;
+                    EACH some |= any(hit[j]);
+                    if (!some) continue;
+                    // 2^x, x in [-126, 0]; adding the magic number leaves round(x) in the low bits
+                    EACH near[j] = exponent[j] + magic;
+                    EACH exponent[j] -= near[j] - magic;
+                    EACH power[j] = exponent[j] * e5 + e4;
+                    EACH power[j] = power[j] * exponent[j] + e3;
+                    EACH power[j] = power[j] * exponent[j] + e2;
+                    EACH power[j] = power[j] * exponent[j] + e1;
+                    EACH power[j] = power[j] * exponent[j] + 1.0f;
+                    EACH raw[j] = (f16)((i16)power[j] + ((i16)near[j] << 23));
+                    EACH opaque[j] = raw[j] < ceiling ? raw[j] : ceiling;
+                    EACH weight[j] = T[r + j] * opaque[j];
+                    EACH next[j] = T[r + j] - weight[j];
+                    EACH drawn[j] = hit[j] & (next[j] > min_transmittance);
+                    EACH weight[j] = (f16)((i16)weight[j] & drawn[j]);
                     %(ROW)s
-                    const i16 kept = (i16)Tr | (hit & ~alive & SIGN);
-                    T[r] = (f16)(((i16)next & drawn) | (kept & ~drawn));
+                    // a pixel that is hit but not drawn has stopped
+                    EACH T[r + j] = (f16)(((i16)next[j] & drawn[j])
+                        | (((i16)T[r + j] | (hit[j] & SIGN)) & ~drawn[j]));
                 }
                 %(AFTER)s
             }
@@ -117,13 +130,15 @@ _FORWARD = r"""
                 red[r] = green[r] = blue[r] = dist[r] = same(0.0f);
                 for (int i = wide; i < 16; ++i) T[r][i] = -1.0f;
             }
-            for (int j = 0; j < extras * high; ++j) more[j] = same(0.0f);
+            for (int j = 0; j < extras; ++j)
+                for (int r = 0; r < high; ++r) more[j * ROWS + r] = same(0.0f);
+            for (int r = high; r < high + U; ++r) T[r] = same(-1.0f);
             %(PAIR)s
             for (int r = 0; r < high; ++r) {
                 const long long o = (long long)(Y + r) * width + X;
                 for (int i = 0; i < wide; ++i) {
                     float* e = extra_ + (o + i) * channels + pass;
-                    for (int j = 0; j < extras; ++j) e[j] = more[j * high + r][i];
+                    for (int j = 0; j < extras; ++j) e[j] = more[j * ROWS + r][i];
                 }
                 if (pass != 0) continue;
                 for (int i = 0; i < wide; ++i) {
@@ -144,17 +159,23 @@ _FORWARD = r"""
 # S is what the splats not yet passed still add to the loss's gradient, a scalar a pixel:
 # sum over them of w (colour . v_colour + ...). It starts from the finished image.
 _BACKWARD = r"""
+            // rows below the image, reached by the last step of U rows: never drawn
+            for (int r = high; r < high + U; ++r) {
+                T[r] = same(-1.0f);
+                S[r] = red[r] = green[r] = blue[r] = dist[r] = veil[r] = same(0.0f);
+                for (int j = 0; j < extras; ++j) more[j * ROWS + r] = same(0.0f);
+            }
             for (int r = 0; r < high; ++r) {
                 const long long o = (long long)(Y + r) * width + X;
                 T[r] = same(1.0f);
                 S[r] = red[r] = green[r] = blue[r] = dist[r] = veil[r] = same(0.0f);
                 for (int i = wide; i < 16; ++i) T[r][i] = -1.0f;
-                for (int j = 0; j < extras; ++j) more[j * high + r] = same(0.0f);
+                for (int j = 0; j < extras; ++j) more[j * ROWS + r] = same(0.0f);
                 for (int i = 0; i < wide; ++i) {
                     float s = 0.0f;
                     for (int j = 0; j < extras; ++j) {
                         const long long e = (o + i) * channels + pass + j;
-                        more[j * high + r][i] = v_extra_[e];
+                        more[j * ROWS + r][i] = v_extra_[e];
                         s += extra_[e] * v_extra_[e];
                     }
                     if (pass == 0) {
@@ -184,7 +205,17 @@ _BACKWARD_HEAD = r"""
     const float* v_extra_ = (const float*)v_extra.data;
     float* partials_ = (float*)partials.data;
     const int stride = 10 + channels;
-    f16 S[MAX_ROWS], veil[MAX_ROWS], sums[EXTRA];
+    f16 S[ROWS], veil[ROWS], sums[EXTRA];
+    const f16 tiny = same(1e-7f);
+    auto reciprocal = [](f16 x) -> f16 {
+#if defined(__AVX512F__)
+        // 14 bits and one Newton step, relative error 1e-7: a division holds the core up
+        const f16 r = __builtin_ia32_rcp14ps512_mask(x, x, (unsigned short)-1);
+        return r * (2.0f - x * r);
+#else
+        return 1.0f / x;
+#endif
+    };
     auto total = [](f16 x) -> float {
         const f8 h = __builtin_shufflevector(x, x, 0, 1, 2, 3, 4, 5, 6, 7)
             + __builtin_shufflevector(x, x, 8, 9, 10, 11, 12, 13, 14, 15);
@@ -202,25 +233,27 @@ _BACKWARD_BEFORE = r"""
                 const float middle = 0.5f * (float)(first + last + 1) - cy;
 """
 _BACKWARD_ROW = r"""
-                    f16 value = g[6] * red[r] + g[7] * green[r] + g[8] * blue[r] + g[9] * dist[r]
-                        + veil[r];
-                    r0 += weight * red[r];
-                    r1 += weight * green[r];
-                    r2 += weight * blue[r];
-                    r3 += weight * dist[r];
-                    for (int j = 0; j < extras; ++j) {
-                        value += f[j] * more[j * high + r];
-                        sums[j] += weight * more[j * high + r];
+                    f16 value[U], slope[U];
+                    EACH value[j] = g[6] * red[r + j] + veil[r + j];
+                    EACH value[j] += g[7] * green[r + j];
+                    EACH value[j] += g[8] * blue[r + j];
+                    EACH value[j] += g[9] * dist[r + j];
+                    EACH r0 += weight[j] * red[r + j];
+                    EACH r1 += weight[j] * green[r + j];
+                    EACH r2 += weight[j] * blue[r + j];
+                    EACH r3 += weight[j] * dist[r + j];
+                    for (int i = 0; i < extras; ++i) {
+                        EACH value[j] += f[i] * more[i * ROWS + r + j];
+                        EACH sums[i] += weight[j] * more[i * ROWS + r + j];
                     }
-                    const f16 behind = S[r] - weight * value;
-                    S[r] = behind;
-                    const f16 clear = __builtin_elementwise_max(1.0f - opaque, same(1e-7f));
-                    const f16 slope = opaque * (Tr * value - behind / clear);
-                    const f16 gq = (f16)((i16)slope & (drawn & (raw <= max_alpha)));
-                    const float t = dy - middle;
-                    g0 += gq;
-                    g1 += gq * t;
-                    g2 += gq * (t * t);
+                    EACH S[r + j] -= weight[j] * value[j];
+                    EACH slope[j] = 1.0f - opaque[j];
+                    EACH slope[j] = reciprocal(slope[j] < tiny ? tiny : slope[j]);
+                    EACH slope[j] = opaque[j] * (T[r + j] * value[j] - S[r + j] * slope[j]);
+                    EACH slope[j] = (f16)((i16)slope[j] & (drawn[j] & (raw[j] <= ceiling)));
+                    EACH g0 += slope[j];
+                    EACH g1 += slope[j] * (dy[j] - middle);
+                    EACH g2 += slope[j] * ((dy[j] - middle) * (dy[j] - middle));
 """
 _BACKWARD_AFTER = r"""
                 float* o = partials_ + (long long)pairs_[2 * k + 1] * stride;
@@ -244,16 +277,18 @@ _BACKWARD_AFTER = r"""
                 for (int j = 0; j < extras; ++j) o[10 + pass + j] = total(sums[j]);
 """
 _FORWARD_ROW = r"""
-                    red[r] += weight * g[6];
-                    green[r] += weight * g[7];
-                    blue[r] += weight * g[8];
-                    dist[r] += weight * g[9];
-                    for (int j = 0; j < extras; ++j) more[j * high + r] += weight * f[j];
+                    EACH red[r + j] += weight[j] * g[6];
+                    EACH green[r + j] += weight[j] * g[7];
+                    EACH blue[r + j] += weight[j] * g[8];
+                    EACH dist[r + j] += weight[j] * g[9];
+                    for (int i = 0; i < extras; ++i)
+                        EACH more[i * ROWS + r + j] += weight[j] * f[i];
 """
 
-_SIZES = {"MAX_ROWS": MAX_ROWS, "EXTRA": EXTRA}
-_FORWARD_PAIR = _PAIR % {"BEFORE": "", "ROW": _FORWARD_ROW, "AFTER": ""}
+_SIZES = {"ROWS": MAX_ROWS + UNROLL + 1, "EXTRA": EXTRA, "UNROLL": UNROLL}
+_FORWARD_PAIR = _PAIR % {"AHEAD": "", "BEFORE": "", "ROW": _FORWARD_ROW, "AFTER": ""}
 _BACKWARD_PAIR = _PAIR % {
+    "AHEAD": "__builtin_prefetch(partials_ + (long long)ahead[1] * stride, 1);",
     "BEFORE": _BACKWARD_BEFORE,
     "ROW": _BACKWARD_ROW,
     "AFTER": _BACKWARD_AFTER,

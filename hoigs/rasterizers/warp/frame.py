@@ -3,14 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import torch
 from torch import Tensor
-
-from hoigs.rasterizers.warp.runtime import wp
-
-_TYPES = {torch.float32: wp.float32, torch.int32: wp.int32, torch.uint8: wp.uint8}
 
 
 @dataclass(frozen=True)
@@ -80,16 +74,3 @@ class Images:
     alpha: Tensor
     depth: Tensor
     extra: Tensor
-
-
-def flat(tensor: Tensor) -> Any:
-    """A contiguous tensor as a flat array for a kernel."""
-    return wp.from_torch(
-        tensor.view(-1), dtype=_TYPES[tensor.dtype], requires_grad=False, return_ctype=True
-    )
-
-
-def vectors(tensor: Tensor, dtype: Any) -> Any:
-    """A contiguous tensor whose last dimension is a vector, as a flat array of vectors."""
-    size = tensor.shape[-1]
-    return wp.from_torch(tensor.view(-1, size), dtype=dtype, requires_grad=False, return_ctype=True)

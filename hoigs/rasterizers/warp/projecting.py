@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.rasterizers.warp.frame import Inputs, Lists, Settings, flat, vectors
+from hoigs.rasterizers.warp.calls import flat
+from hoigs.rasterizers.warp.frame import Inputs, Lists, Settings
 from hoigs.rasterizers.warp.records import POSE, RECORD, SMALLEST_ALPHA
-from hoigs.rasterizers.warp.runtime import wp
 
 
 class Projected:
@@ -25,11 +25,11 @@ class Projected:
 def project_arguments(inputs: Inputs, settings: Settings, out: Projected) -> list[Any]:
     """Arguments of `projection.project` but for its last two, the range of rows."""
     return [
-        vectors(inputs.means, wp.vec3),
-        vectors(inputs.quats, wp.vec4),
-        vectors(inputs.log_scales, wp.vec3),
+        flat(inputs.means, 3),
+        flat(inputs.quats, 4),
+        flat(inputs.log_scales, 3),
         flat(inputs.opacity_logits),
-        vectors(inputs.sh, wp.vec3),
+        flat(inputs.sh, 3),
         inputs.sh.shape[1],
         settings.bands,
         flat(inputs.features),
@@ -91,11 +91,11 @@ def adjoint_arguments(
 ) -> list[Any]:
     """Arguments of `projection.project_adjoint` but for its last two, the range of rows."""
     return [
-        vectors(inputs.means, wp.vec3),
-        vectors(inputs.quats, wp.vec4),
-        vectors(inputs.log_scales, wp.vec3),
+        flat(inputs.means, 3),
+        flat(inputs.quats, 4),
+        flat(inputs.log_scales, 3),
         flat(inputs.opacity_logits),
-        vectors(inputs.sh, wp.vec3),
+        flat(inputs.sh, 3),
         inputs.sh.shape[1],
         settings.bands,
         inputs.channels,
@@ -110,11 +110,11 @@ def adjoint_arguments(
         flat(lists.first),
         flat(lists.slots),
         flat(partials),
-        vectors(out.means, wp.vec3),
-        vectors(out.quats, wp.vec4),
-        vectors(out.log_scales, wp.vec3),
+        flat(out.means, 3),
+        flat(out.quats, 4),
+        flat(out.log_scales, 3),
         flat(out.opacity_logits),
-        vectors(out.sh, wp.vec3),
+        flat(out.sh, 3),
         flat(out.offsets),
         flat(out.features),
         flat(out.pose),

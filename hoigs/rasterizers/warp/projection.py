@@ -44,7 +44,9 @@ from hoigs.rasterizers.warp.records import (
     X,
     Y,
 )
-from hoigs.rasterizers.warp.runtime import wp
+from hoigs.rasterizers.warp.runtime import CPU_FLAGS, wp
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS, "max_unroll": 4})
 
 RECORD_C = wp.constant(RECORD)
 MOMENTS_C = wp.constant(MOMENTS)
@@ -89,7 +91,7 @@ def log2_sigmoid(logit: float) -> float:
     return -wp.log2(1.0 + wp.exp(-logit))
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def project(
     means: VEC3,
     quats: VEC4,
@@ -190,7 +192,7 @@ def project(
     records[r + INVERSE_HALF_WIDTH] = 1.0 / wp.max(half_width, 1.0e-6)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def project_adjoint(
     means: VEC3,
     quats: VEC4,

@@ -9,12 +9,7 @@ from contextlib import contextmanager
 import warp as wp
 
 # -ffp-contract=fast: multiply-adds in one instruction, which Warp's CPU kernels otherwise forgo.
-CPU_FLAGS = (
-    "-march=native -ffp-contract=fast -mllvm=-inline-threshold=9000"
-    " -mllvm=-inline-cold-callsite-threshold=3000"
-)
-
-
+CPU_FLAGS = f"{wp.config.cpu_compiler_flags or '-march=native'} -ffp-contract=fast"
 NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 
 

@@ -19,6 +19,7 @@ from typing import Any, Literal, Protocol
 
 import torch
 
+from hoigs.rasterizers.warp.calls import flat, record
 from hoigs.rasterizers.warp.runtime import wp
 
 Scheduler = Literal["auto", "openmp", "threads", "serial"]
@@ -30,11 +31,6 @@ class Workers(Protocol):
     name: str
 
     def run(self, launches: Sequence[Any]) -> None: ...
-
-
-def record(kernel: Any, dim: int, inputs: Sequence[Any]) -> Any:
-    """A CPU launch to be run later."""
-    return wp.launch(kernel, dim=dim, inputs=inputs, device="cpu", record_cmd=True)
 
 
 class SerialWorkers:
@@ -120,7 +116,7 @@ class OpenMPWorkers:
     def _check(self, kernel: Any) -> None:
         """Run something small and see that all of it was done."""
         sums = [torch.zeros(1, dtype=torch.int32) for _ in range(4)]
-        self.run([record(kernel, 10, [wp.from_torch(s, dtype=wp.int32)]) for s in sums])
+        self.run([record(kernel, 10, [flat(s)]) for s in sums])
         if [int(s) for s in sums] != [45] * 4:
             raise RuntimeError(f"a trial on torch's OpenMP pool gave {sums}, expected 45 each")
 
