@@ -49,39 +49,36 @@ class NativePath:
         rows = tile_rows(settings)
         across, down = -(-settings.width // kernels.TILE_WIDTH), -(-settings.height // rows)
         tiles, chunks = across * down, self._chunks(count)
-        ints = lambda size: torch.empty(size, dtype=torch.int32)  # noqa: E731
-        zeros = lambda size: torch.zeros(size, dtype=torch.int32)  # noqa: E731
-        counters, order, spans_before = zeros(kernels.COUNTERS), ints(2 * count), ints(chunks + 1)
-        a_records, a_counters, a_order = flat(projected.records), flat(counters), flat(order)
-        a_before = flat(spans_before)
+        counters, spans_before, slots, tile_counts, histogram = torch.zeros(
+            kernels.COUNTERS + chunks + 1 + count + chunks * tiles + kernels.HISTOGRAM,
+            dtype=torch.int32,
+        ).split([kernels.COUNTERS, chunks + 1, count, chunks * tiles, kernels.HISTOGRAM])
+        keys, order, first, offsets, span_counts = torch.empty(
+            5 * count + tiles + 1 + chunks, dtype=torch.int32
+        ).split([2 * count, 2 * count, count, tiles + 1, chunks])
+        records, work, before = flat(projected.records), flat(counters), flat(spans_before)
+        order, span_counts, places = flat(order), flat(span_counts), flat(tile_counts)
         self._once(
             kernels.sort_by_depth,
-            [a_records, flat(projected.depths), count, rows, down, chunks, flat(ints(2 * count)),
-             a_order, flat(zeros(3 * 2048)), a_before, a_counters],
+            [records, flat(projected.drawn_depths), count, rows, down, chunks, flat(keys), order,
+             flat(histogram), before, work],
         )  # fmt: skip
-        spans, span_counts = ints(3 * int(spans_before[-1])), flat(ints(chunks))
-        tile_counts, slots_before = flat(zeros(chunks * tiles)), flat(zeros(chunks + 1))
-        a_spans = flat(spans)
+        spans = flat(torch.empty(3 * int(spans_before[-1]), dtype=torch.int32))
         self._together(
             kernels.count_pairs, chunks,
-            [a_records, a_order, rows, across, down, settings.width, chunks, a_before, a_spans,
-             span_counts, tile_counts, a_counters],
+            [records, order, rows, across, down, settings.width, chunks, before, spans,
+             span_counts, places, flat(slots), work],
         )  # fmt: skip
-        offsets = ints(tiles + 1)
         self._once(
             kernels.place_pairs,
-            [tiles, chunks, tile_counts, flat(offsets), slots_before, a_counters],
+            [tiles, chunks, count, places, flat(offsets), flat(slots), flat(first), work],
         )
-        lists = Lists(
-            rows, across, down, ints((int(counters[kernels.N_PAIRS]), 2)), offsets, ints(count),
-            zeros(count),
-        )  # fmt: skip
+        pairs = torch.empty(int(counters[kernels.N_PAIRS]), 2, dtype=torch.int32)
         self._together(
             kernels.scatter_pairs, chunks,
-            [tiles, chunks, a_before, a_spans, span_counts, tile_counts, slots_before,
-             flat(lists.pairs), flat(lists.first), flat(lists.slots), a_counters],
+            [tiles, chunks, before, spans, span_counts, places, flat(first), flat(pairs), work],
         )  # fmt: skip
-        return lists
+        return Lists(rows, across, down, pairs, offsets, first, slots)
 
     def composite(
         self, inputs: Inputs, settings: Settings, projected: Tensor, lists: Lists
@@ -146,7 +143,8 @@ class NativePath:
 
 def tile_rows(settings: Settings) -> int:
     """Height of a tile: tall ones make fewer pairs, low ones spread better over cores."""
-    return 16 if settings.width * settings.height <= 256 * 256 else min(32, MAX_ROWS)
+    pixels = settings.width * settings.height
+    return 16 if pixels <= 128 * 128 else 32 if pixels <= 256 * 256 else MAX_ROWS
 
 
 def _tile_arguments(

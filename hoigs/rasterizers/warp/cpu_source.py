@@ -296,6 +296,8 @@ _BACKWARD_PAIR = _PAIR % {
 FORWARD = _TYPES % _SIZES + _TILES + _FORWARD % {"PAIR": _FORWARD_PAIR}
 BACKWARD = _TYPES % _SIZES + _BACKWARD_HEAD + _TILES + _BACKWARD % {"PAIR": _BACKWARD_PAIR}
 
+PREFETCH = r"""__builtin_prefetch((const float*)array.data + index);"""
+
 # The number of the next piece of work, for workers that share `counters`.
 TAKE = r"""return __atomic_fetch_add((int*)counters.data + counter, 1, __ATOMIC_RELAXED);"""
 

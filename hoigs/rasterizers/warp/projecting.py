@@ -13,12 +13,13 @@ from hoigs.rasterizers.warp.records import POSE, RECORD, SMALLEST_ALPHA
 
 
 class Projected:
-    """What `projection.project` writes: records [N, 16], means2d [N, 2], depths [N], radii [N]."""
+    """What `projection.project` writes:"""
 
     def __init__(self, like: Tensor, count: int) -> None:
         self.records = like.new_empty(count, RECORD)
         self.means2d = like.new_empty(count, 2)
         self.depths = like.new_empty(count)
+        self.drawn_depths = like.new_empty(count)
         self.radii = like.new_empty(count)
 
 
@@ -49,6 +50,7 @@ def project_arguments(inputs: Inputs, settings: Settings, out: Projected) -> lis
         flat(out.records),
         flat(out.means2d),
         flat(out.depths),
+        flat(out.drawn_depths),
         flat(out.radii),
     ]
 

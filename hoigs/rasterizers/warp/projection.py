@@ -117,6 +117,7 @@ def project(
     records: F32,
     means2d: F32,
     depths: F32,
+    drawn_depths: F32,  # negative where nothing is drawn
     radii: F32,
     base: int,
     count: int,
@@ -129,6 +130,7 @@ def project(
     means2d[2 * row] = 0.0
     means2d[2 * row + 1] = 0.0
     depths[row] = 0.0
+    drawn_depths[row] = -1.0
     radii[row] = 0.0
     if has_subset != 0:  # noqa: SIM102  Warp's `and` evaluates both sides
         if subset[row] == wp.uint8(0):
@@ -175,6 +177,7 @@ def project(
 
     reach = reach * REACH_SLACK
     half_width = wp.sqrt(reach * s.xx)
+    drawn_depths[row] = s.cam[2]
     records[r + X] = s.u
     records[r + Y] = s.v
     records[r + A] = HALF_LOG2E * s.yy / s.det
