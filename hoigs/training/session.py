@@ -11,7 +11,7 @@ import torch
 
 from hoigs.core.clip import Clip
 from hoigs.core.compose import compose, compose_density
-from hoigs.core.errors import HoigsError
+from hoigs.core.errors import ClipError, HoigsError
 from hoigs.core.registry import Registry, default_registry
 from hoigs.core.scene import SceneModel
 from hoigs.core.spec import Spec
@@ -21,14 +21,20 @@ from hoigs.training.run_folder import RunFolder, versions
 from hoigs.training.trainer import StepReport, Trainer
 
 
-def read_clip(folder: Path, registry: Registry, width: int | None = None) -> Clip:
+def read_clip(
+    folder: Path | str, registry: Registry | None = None, width: int | None = None
+) -> Clip:
     """The clip in `folder`, by the first reader that knows its layout, at a training width.
+
+    Args:
+        folder: as `hoigs prepare` makes it, or any layout that an installed reader knows.
+        registry: where readers are looked up; by default what is installed.
+        width: resize to this image width, aspect kept; None leaves the clip as it is.
 
     Raises:
         ClipError: no reader knows it, or the reader found it incomplete.
     """
-    from hoigs.core.errors import ClipError
-
+    folder, registry = Path(folder), registry or default_registry()
     if not folder.is_dir():
         raise ClipError(f"{folder}: no such folder; `hoigs prepare VIDEO --out {folder}` makes one")
     for key in registry.keys("reader"):
