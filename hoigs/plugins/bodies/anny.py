@@ -81,7 +81,7 @@ def _dense_weights(weights: np.ndarray, joints: np.ndarray, count: int) -> Float
 def _carried(
     offsets: Float[Tensor, "B J 3"], turn: Float[Tensor, "J 3 3"], parents: tuple[int, ...]
 ) -> Float[Tensor, "B J 3"]:
-    """Rest offsets of the joints after the tree was turned: bones turn, and add up from the root."""
+    """Rest offsets of the joints once the tree is turned: bones turn, and add up from the root."""
     places = [offsets[:, 0]]
     for joint in range(1, len(parents)):
         above = parents[joint]
