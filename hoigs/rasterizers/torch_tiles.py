@@ -28,7 +28,7 @@ class TorchRasterizer(Rasterizer):
     """
 
     capabilities = Capabilities(
-        devices=frozenset({"cpu", "cuda", "mps"}),
+        devices=frozenset({"cpu", "cuda"}),
         dtypes=frozenset({"float32", "float64"}),
         camera_gradients=True,
         deterministic=True,
