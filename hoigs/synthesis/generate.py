@@ -7,24 +7,26 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+import warp as wp
+from jaxtyping import Bool, Float, Int, UInt8
 
 from hoigs.core.body import BodyModel
 from hoigs.core.camera import Camera
 from hoigs.core.moment import BodyPose
 from hoigs.synthesis.clothes import DressedBody, dress
+from hoigs.synthesis.designs import crate_faces
 from hoigs.synthesis.knobs import SceneKnobs
 from hoigs.synthesis.meshes import TexturedMesh, box, smooth_normals
 from hoigs.synthesis.objects import MOTIONS, ObjectScript, bent_mesh
 from hoigs.synthesis.paths import camera_path, held_out_views
 from hoigs.synthesis.person import Choreographer
 from hoigs.synthesis.raycast import Layer, RayCaster, fine_array
-from hoigs.synthesis.room import HIGH, LOW, Palette, build_room
-from hoigs.synthesis.textures import TextureAtlas, crate_faces, to_srgb
+from hoigs.synthesis.room import HIGH, LOW, Palette, Room, Stand, build_room
+from hoigs.synthesis.textures import TextureAtlas, to_srgb
 
 Array = np.ndarray
 ENTITIES = ("human", "object")  # numbers 1 and 2 in entity images; 0 is the scene
@@ -43,7 +45,7 @@ class TrueView:
     camera: Camera
     image: UInt8[Array, "H W 3"]
     depth: Float[Array, "H W"]
-    entity: Float[Array, "H W"] | Array
+    entity: Int[Array, "H W"]
 
     def mask(self, name: str) -> Bool[Array, "H W"]:
         """Visible pixels of "human" or "object"."""
@@ -78,11 +80,11 @@ class SyntheticScene:
     @cached_property
     def _caster(self) -> RayCaster:
         k = self.knobs
-        shell = Layer.build(self.shell, np.zeros(len(self.shell.faces)))
+        shell = Layer.build(self.shell, np.zeros(len(self.shell.faces), int))
         return RayCaster(shell, self.atlas, k.light, (LOW, HIGH), k.samples, k.edge_samples)
 
     @cached_property
-    def _fine(self):  # type: ignore[no-untyped-def]
+    def _fine(self) -> wp.array:
         return fine_array(self.dressed.colors)
 
     def object_at(self, frame: int) -> TexturedMesh:
@@ -149,11 +151,11 @@ def generate(knobs: SceneKnobs, body: BodyModel) -> SyntheticScene:
     script = MOTIONS[knobs.object.motion](knobs).script()
     person = Choreographer(body, knobs)
     poses = person.perform(script, knobs)
-    palette = Palette()
-    room = build_room(palette, script.stands, knobs.seed)
-    faces = crate_faces(np.random.default_rng(knobs.seed + 1), 256, knobs.object.textured)
+    room, atlas = _furnished(script.stands, knobs.seed)
+    sides = crate_faces(np.random.default_rng(knobs.seed + 1), 256, knobs.object.textured)
     columns = 24 if knobs.object.motion == "bending" else 1
-    thing = box(knobs.object.size, [palette.add(face) for face in faces], columns)
+    numbers = [len(atlas.levels) + i for i in range(6)]
+    thing = box(knobs.object.size, numbers, columns)
     return SyntheticScene(
         knobs=knobs,
         poses=poses,
@@ -162,10 +164,17 @@ def generate(knobs: SceneKnobs, body: BodyModel) -> SyntheticScene:
         object_mesh=thing,
         shell=room.shell,
         props=room.props,
-        atlas=TextureAtlas.pack(palette.images),
+        atlas=atlas.extended(sides),
         cameras=camera_path(knobs),
         held_out=held_out_views(knobs),
     )
+
+
+@lru_cache(maxsize=4)  # a study makes many clips of one room
+def _furnished(stands: tuple[Stand, ...], seed: int) -> tuple[Room, TextureAtlas]:
+    palette = Palette()
+    room = build_room(palette, stands, seed)
+    return room, TextureAtlas.pack(palette.images)
 
 
 def canonical(scene: SyntheticScene, points: Float[Array, "P 3"], frame: int) -> Array:

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Warp kernels of the ray caster: nearest hit, texture and mesh colours, Lambert shading.
 
 Directions have unit length along the camera's z, so a hit's parameter *is* the depth. A sample
@@ -221,7 +222,7 @@ def shade(
         smooth = -smooth
     point = view.eye + ray * hit.t
     footprint = hit.t / view.fx / wp.sqrt(wp.max(wp.abs(slant) / wp.length(ray), 0.05))
-    color = albedo(surface, texels, levels, hit, 0.6 * footprint)
+    color = albedo(surface, texels, levels, hit, 0.75 * footprint)
     start = point + flat * 2.0e-3
     tangent = wp.normalize(wp.cross(smooth, wp.vec3(0.31, 0.17, 0.93)))
     bitangent = wp.cross(smooth, tangent)

@@ -30,7 +30,7 @@ class TexturedMesh:
     def moved(
         self,
         rotation: Float[Array, "3 3"] | None = None,
-        shift: Sequence[float] | Array = (0, 0, 0),
+        shift: Sequence[float | int] | Array = (0, 0, 0),
     ) -> TexturedMesh:
         """R x + t of every vertex."""
         rotation = np.eye(3) if rotation is None else rotation
@@ -99,9 +99,7 @@ def box(size: Sequence[float], textures: int | Sequence[int], columns: int = 1) 
     )
 
 
-def lathe(
-    profile: Sequence[tuple[float, float]], texture: int, sides: int = 20, smooth: bool = True
-) -> TexturedMesh:
+def lathe(profile: Sequence[tuple[float, float]], texture: int, sides: int = 20) -> TexturedMesh:
     """A surface of revolution about y.
 
     Args:
@@ -120,15 +118,7 @@ def lathe(
     a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
     faces = np.concatenate((np.stack((a, c, b), -1), np.stack((a, d, c), -1))).reshape(-1, 3)
     vertices, normals, uv = (v.reshape(-1, v.shape[-1]) for v in (vertices, normals, uv))
-    corner_normals = normals[faces]
-    if not smooth:
-        flat = np.cross(
-            vertices[faces[:, 1]] - vertices[faces[:, 0]],
-            vertices[faces[:, 2]] - vertices[faces[:, 0]],
-        )
-        flat /= np.maximum(np.linalg.norm(flat, axis=-1, keepdims=True), 1e-12)
-        corner_normals = np.broadcast_to(flat[:, None], corner_normals.shape)
-    return TexturedMesh(vertices, faces, corner_normals, uv[faces], np.full(len(faces), texture))
+    return TexturedMesh(vertices, faces, normals[faces], uv[faces], np.full(len(faces), texture))
 
 
 def cylinder(radius: float, height: float, texture: int, cap: int | None = None) -> TexturedMesh:

@@ -134,7 +134,7 @@ class Thrown(ObjectMotion):
     def script(self) -> ObjectScript:
         low, chest = self.rest_height, 0.5 * (self.rest_height + self.object.lift_height)
         flight = 2 * np.sqrt(2 * self.object.throw_height / GRAVITY)
-        seconds = self.knobs.frames / self.knobs.fps
+        seconds = (self.knobs.frames - 1) / self.knobs.fps
         share = min(0.5, flight / seconds)
         up, down = 0.5 - share / 2, 0.5 + share / 2
         keys = np.array(

@@ -134,7 +134,7 @@ class Choreographer:
             p - np.einsum("fij,j->fi", self._hand_rotation(k, f), self.palms[k].offset)
             for k, (p, f) in enumerate(zip(targets.points, targets.frames, strict=True))
         ]
-        object_yaw, lean = self._lean(script, wrists, knobs)
+        object_yaw, lean = self._lean(script, wrists)
         local, root = self._torso(object_yaw, lean)
         self._look(local, root, script.track.translations)
         self._legs(local, root)
@@ -152,7 +152,7 @@ class Choreographer:
     def _hand_rotation(self, hand: int, frames: Array) -> Array:
         return frames @ self.palms[hand].frame.T
 
-    def _lean(self, script: ObjectScript, wrists: list[Array], knobs: SceneKnobs):  # type: ignore[no-untyped-def]
+    def _lean(self, script: ObjectScript, wrists: list[Array]) -> tuple[Array, Array]:
         """Yaw of the object, and the least forward lean from which both hands reach."""
         place = script.hold.translations
         yaw = np.arctan2(place[:, 0], place[:, 2])
@@ -244,12 +244,22 @@ class Choreographer:
         return missed
 
     def _fingers(self, local: Array, grip: Array) -> None:
-        """Slightly curled when free, flat on the object when holding."""
-        curl = 0.26 - 0.26 * grip
+        """Slightly curled when free, flat on the object when holding; thumbs out of its way."""
+        curl = 0.26 * (1 - grip)
         for first, side in ((22, 1.0), (37, -1.0)):
             bent = about(-side * Z, curl)
             for joint in range(first, first + 12):
                 local[:, joint] = bent
+            local[:, first + 12] = self._thumb_aside(first + 12)
+
+    def _thumb_aside(self, thumb: int) -> Float[Array, "3 3"]:
+        """Turn of a thumb's first joint that lifts it from the palm's side into its plane."""
+        along = unit(self.rest[thumb + 2] - self.rest[thumb])
+        level = unit(along * [1, 0, 1])
+        lifted = unit(level + 0.15 * Y)
+        axis = np.cross(along, lifted)
+        angle = np.arctan2(np.linalg.norm(axis), along @ lifted)
+        return about(axis, np.full(1, angle))[0]
 
     def _pose(self, local: Array, root: Array) -> BodyPose:
         """Matrices as a BodyPose, float32."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -90,12 +91,12 @@ class RayCaster:
     ):
         wp.load_module(kernels, device="cpu")  # compile before threads ask for it
         self.shell = shell
-        self.texels = wp.array(atlas.texels, dtype=wp.vec3, device="cpu")
-        self.levels = wp.array(atlas.levels, dtype=wp.vec3i, device="cpu")
+        self.texels: wp.array = wp.array(atlas.texels, dtype=wp.vec3, device="cpu")
+        self.levels: wp.array = wp.array(atlas.levels, dtype=wp.vec3i, device="cpu")
         self.lights = _lights(light, room)
         self.samples, self.edge_samples = samples, max(samples, edge_samples)
         offsets = pixel_samples(samples, self.edge_samples)
-        self.offsets = wp.array(offsets, dtype=wp.vec2, device="cpu")
+        self.offsets: wp.array = wp.array(offsets, dtype=wp.vec2, device="cpu")
 
     def render(self, camera: Camera, things: Layer) -> Picture:
         """Depth and entities at pixel centres, colour averaged over the pixel.
@@ -124,16 +125,16 @@ class RayCaster:
 
 
 def pixel_samples(plain: int, more: int) -> Float[Array, "S 2"]:
-    """Places in a pixel: its centre, a ring of plain samples, a wider ring that edges add.
+    """Places in a pixel: its centre, a ring of plain samples, another ring that edges add.
 
     Each ring is centred, so that neither shifts the image.
     """
 
-    def ring(count: int, radius: float, phase: float) -> Array:
+    def ring(count: int, phase: float) -> Array:
         angle = phase + 2 * np.pi * np.arange(count) / max(count, 1)
-        return 0.5 + radius * np.stack((np.cos(angle), np.sin(angle)), -1)
+        return 0.5 + 0.42 * np.stack((np.cos(angle), np.sin(angle)), -1)
 
-    rings = [np.full((1, 2), 0.5), ring(plain - 1, 0.34, 0.3), ring(more - plain, 0.52, 0.9)]
+    rings = [np.full((1, 2), 0.5), ring(plain - 1, 0.3), ring(more - plain, 0.9)]
     return np.concatenate(rings).astype(np.float32)
 
 
@@ -155,7 +156,7 @@ def _lights(light: LightKnobs, room: tuple[Sequence[float], Sequence[float]]) ->
     suns /= np.linalg.norm(suns, axis=-1, keepdims=True)
     skies = np.concatenate((disc, np.sqrt(1 - (disc**2).sum(-1, keepdims=True))), -1)
     order = np.array([0, 4, 2, 6, 1, 5, 3, 7])  # neighbours in a sample lie apart
-    lights = Lights()
+    lights: Any = Lights()
     lights.sun = wp.vec3(*(light.sun * np.array([1.0, 0.94, 0.84])))
     lights.sky = wp.vec3(*(light.ambient * np.array([0.93, 0.97, 1.05])))
     lights.ground = wp.vec3(*(light.ambient * np.array([0.60, 0.53, 0.46])))
@@ -169,7 +170,7 @@ def _lights(light: LightKnobs, room: tuple[Sequence[float], Sequence[float]]) ->
 def _view(camera: Camera) -> View:
     K = camera.K.double().numpy()
     to_camera = camera.world_to_camera.double().numpy()
-    view = View()
+    view: Any = View()
     view.fx, view.fy, view.cx, view.cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     view.width = camera.width
     view.to_world = wp.mat33(*to_camera[:3, :3].T.ravel())

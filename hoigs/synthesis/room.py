@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from hoigs.synthesis import designs
 from hoigs.synthesis import textures as tx
 from hoigs.synthesis.meshes import TexturedMesh, ball, box, cylinder, lathe, quad
 
@@ -97,10 +98,10 @@ def _pictures(palette: Palette, rng: np.random.Generator) -> list[TexturedMesh]:
     placed = []
     for x, y, width, height, style in ((-0.62, 1.72, 0.62, 0.80, 0), (0.20, 1.80, 0.52, 0.52, 2),
                                        (0.20, 1.16, 0.52, 0.40, 1)):  # fmt: skip
-        image = palette.add(tx.poster(rng, int(320 * height / width), 320, style))
+        image = palette.add(designs.poster(rng, int(320 * height / width), 320, style))
         picture = box((width, height, 0.03), [frame, frame, frame, frame, image, frame])
         placed.append(picture.moved(shift=(x, y, LOW[2] + 0.016)))
-    view = palette.add(tx.window_view(rng, 512, 448))
+    view = palette.add(designs.window_view(rng, 512, 448))
     sill = palette.plain("#efece4")
     window = box((0.05, 1.35, 1.20), [view, sill, sill, sill, sill, sill])
     placed.append(window.moved(shift=(LOW[0] + 0.026, 1.55, 0.2)))
@@ -161,7 +162,7 @@ def _books(
 
 
 def _plant(palette: Palette, rng: np.random.Generator) -> list[TexturedMesh]:
-    leaves = palette.add(tx.foliage(rng, 256))
+    leaves = palette.add(designs.foliage(rng, 256))
     clay = palette.add(tx.plaster(rng, 64, 64, (0.74, 0.42, 0.28), 0.12))
     soil = palette.plain("#3a2a20")
     pot = lathe([(0.20, 0.38), (0.21, 0.34), (0.18, 0.32), (0.14, 0.0)], clay)
@@ -239,7 +240,7 @@ def _stools(
                     (stand.height - 0.04) / 2,
                     sz * (stand.depth / 2 - 0.04),
                 )
-            )  # fmt: skip
+            )
             for sx in (-1, 1)
             for sz in (-1, 1)
         ]
