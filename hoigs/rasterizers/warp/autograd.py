@@ -21,9 +21,10 @@ class Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, path: Any, settings: Settings, *tensors: Tensor) -> tuple[Tensor, ...]:
         inputs = Inputs(*tensors)
-        projected = path.project(inputs, settings)
-        lists = path.bin(projected, settings)
-        images = path.composite(inputs, settings, projected.records, lists)
+        with torch.cuda.device_of(inputs.means):
+            projected = path.project(inputs, settings)
+            lists = path.bin(projected, settings)
+            images = path.composite(inputs, settings, projected.records, lists)
         ctx.path, ctx.settings = path, settings
         ctx.tiling = (lists.tile_rows, lists.across, lists.down)
         ctx.save_for_backward(
@@ -45,9 +46,10 @@ class Render(torch.autograd.Function):
         images = Images(*saved[5:9])
         v = Images(*(x.contiguous() for x in upstream[:4]))
         needs = Inputs(*ctx.needs_input_grad[2:])
-        out = ctx.path.gradients(
-            inputs, ctx.settings, records, lists, images, v, pose=bool(needs.view)
-        )
+        with torch.cuda.device_of(inputs.means):
+            out = ctx.path.gradients(
+                inputs, ctx.settings, records, lists, images, v, pose=bool(needs.view)
+            )
         background = None
         if needs.background:
             background = v.color * (1.0 - images.alpha)[..., None]

@@ -8,26 +8,13 @@ worker makes the same call. What a piece writes does not depend on who does it.
 """
 
 from hoigs.rasterizers.warp import cpu_source
-from hoigs.rasterizers.warp.records import (
-    F32,
-    HALF_HEIGHT,
-    HALF_WIDTH,
-    I32,
-    RECORD,
-    SHEAR,
-    SLOPE,
-    U64,
-    WAIST_X,
-    X,
-    Y,
-)
+from hoigs.rasterizers.warp.records import F32, I32, RECORD, U64
 from hoigs.rasterizers.warp.runtime import CPU_FLAGS, wp
+from hoigs.rasterizers.warp.tile_spans import span, tile_rows_under
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS, "max_unroll": 1})
 
 RECORD_C = wp.constant(RECORD)
-TILE_WIDTH = 16
-TILE_WIDTH_C = wp.constant(TILE_WIDTH)
 DIGIT = wp.constant(2048)  # radix sort takes 11 bits at a time
 HISTOGRAM = 3 * 2048
 # slots of `counters`: work drawn by each stage, then results of the serial stages
@@ -107,45 +94,9 @@ def sort_by_depth(
         spans_before[chunk] = total_spans
         for j in range(visible * chunk // chunks, visible * (chunk + 1) // chunks):
             prefetch(records, order[wp.min(j + AHEAD, visible - 1)] * RECORD_C)
-            r = order[j] * RECORD_C
-            y = records[r + Y]
-            half = records[r + HALF_HEIGHT]
-            total_spans += tile_row(y + half, rows, down) - tile_row(y - half, rows, down) + 1
+            under = tile_rows_under(records, order[j] * RECORD_C, rows, down)
+            total_spans += under[1] - under[0] + 1
     spans_before[chunks] = total_spans
-
-
-@wp.func
-def tile_row(y: float, rows: int, down: int) -> int:
-    return int(wp.clamp(wp.floor(y / float(rows)), 0.0, float(down - 1)))
-
-
-@wp.func
-def span(records: F32, r: int, ty: int, rows: int, across: int, width: int) -> wp.vec2i:
-    """First and last tile of tile row ty whose pixel centres a splat's ellipse may touch."""
-    x = records[r + X]
-    half = records[r + HALF_HEIGHT]
-    above = float(ty * rows) + 0.5 - records[r + Y]
-    y0 = wp.max(above, -half)
-    y1 = wp.min(above + float(rows - 1), half)
-    if y0 > y1:
-        return wp.vec2i(1, 0)
-    # x(y) = shear y +- waist sqrt(1 - (y / half)^2); extreme where y = +-slope half_width
-    shear = records[r + SHEAR]
-    waist = records[r + WAIST_X]
-    far = records[r + SLOPE] * records[r + HALF_WIDTH]
-    inverse = 1.0 / wp.max(half, 1.0e-6)
-    yr = wp.clamp(far, y0, y1)
-    yl = wp.clamp(-far, y0, y1)
-    sr = yr * inverse
-    sl = yl * inverse
-    right = x + shear * yr + waist * wp.sqrt(wp.max(0.0, 1.0 - sr * sr))
-    left = x + shear * yl - waist * wp.sqrt(wp.max(0.0, 1.0 - sl * sl))
-    if right < 0.5 or left > float(width) - 0.5:
-        return wp.vec2i(1, 0)
-    size = float(TILE_WIDTH_C)
-    first = int(wp.floor(wp.max(0.0, left - 0.5) / size))
-    last = int(wp.floor(wp.min(float(width) - 0.5, right - 0.5) / size))
-    return wp.vec2i(first, wp.min(last, across - 1))
 
 
 @wp.kernel
@@ -175,9 +126,8 @@ def count_pairs(
             row = order[j]
             r = row * RECORD_C
             total = int(0)
-            y = records[r + Y]
-            half = records[r + HALF_HEIGHT]
-            for ty in range(tile_row(y - half, rows, down), tile_row(y + half, rows, down) + 1):
+            under = tile_rows_under(records, r, rows, down)
+            for ty in range(under[0], under[1] + 1):
                 s = span(records, r, ty, rows, across, width)
                 if s[1] >= s[0]:
                     spans[3 * q] = row
@@ -208,6 +158,12 @@ def place_pairs(
     for row in range(count):
         first[row] = slot
         slot += slots[row]
+    total = wp.int64(0)
+    for tile in range(chunks * tiles):
+        total += wp.int64(tile_counts[tile])
+    if total > wp.int64(2147483647):
+        counters[N_PAIRS_C] = -1
+        return
     place = int(0)
     for tile in range(tiles):
         offsets[tile] = place
@@ -255,7 +211,7 @@ def scatter_pairs(
 
 @wp.func_native(cpu_source.FORWARD)
 def forward_native(
-    counters: I32, counter: int, tiles: int, across: int, rows: int, width: int, height: int,
+    counters: I32, counter: int, rows: int, tiles: int, across: int, width: int, height: int,
     max_alpha: float, log2_min_alpha: float, min_transmittance: float, records: F32, pairs: I32,
     offsets: I32, features: F32, channels: int, background: F32, background_stride: int,
     color: F32, alpha: F32, depth: F32, extra: F32,
@@ -265,9 +221,9 @@ def forward_native(
 @wp.kernel
 def forward_tiles(
     counters: I32,
+    rows: int,
     tiles: int,
     across: int,
-    rows: int,
     width: int,
     height: int,
     max_alpha: float,
@@ -286,7 +242,7 @@ def forward_tiles(
     extra: F32,  # [H, W, channels]
 ):
     forward_native(
-        counters, TILE_WORK, tiles, across, rows, width, height, max_alpha, log2_min_alpha,
+        counters, TILE_WORK, rows, tiles, across, width, height, max_alpha, log2_min_alpha,
         min_transmittance, records, pairs, offsets, features, channels, background,
         background_stride, color, alpha, depth, extra,
     )  # fmt: skip
@@ -294,7 +250,7 @@ def forward_tiles(
 
 @wp.func_native(cpu_source.BACKWARD)
 def backward_native(
-    counters: I32, counter: int, tiles: int, across: int, rows: int, width: int, height: int,
+    counters: I32, counter: int, rows: int, tiles: int, across: int, width: int, height: int,
     max_alpha: float, log2_min_alpha: float, min_transmittance: float, records: F32, pairs: I32,
     offsets: I32, features: F32, channels: int, background: F32, background_stride: int,
     color: F32, alpha: F32, depth: F32, extra: F32,
@@ -305,9 +261,9 @@ def backward_native(
 @wp.kernel
 def backward_tiles(
     counters: I32,
+    rows: int,
     tiles: int,
     across: int,
-    rows: int,
     width: int,
     height: int,
     max_alpha: float,
@@ -331,7 +287,7 @@ def backward_tiles(
     partials: F32,  # [pairs, MOMENTS + channels], zero
 ):
     backward_native(
-        counters, TILE_WORK, tiles, across, rows, width, height, max_alpha, log2_min_alpha,
+        counters, TILE_WORK, rows, tiles, across, width, height, max_alpha, log2_min_alpha,
         min_transmittance, records, pairs, offsets, features, channels, background,
         background_stride, color, alpha, depth, extra, v_color, v_alpha, v_depth, v_extra,
         partials,

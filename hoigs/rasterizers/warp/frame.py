@@ -6,6 +6,10 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from hoigs.core.errors import RenderError
+
+INT32 = 2**31 - 1
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -65,6 +69,10 @@ class Lists:
     first: Tensor  # [N] int32
     slots: Tensor  # [N] int32
 
+    @property
+    def tiles(self) -> int:
+        return self.across * self.down
+
 
 @dataclass(frozen=True)
 class Images:
@@ -74,3 +82,21 @@ class Images:
     alpha: Tensor
     depth: Tensor
     extra: Tensor
+
+    @staticmethod
+    def empty(inputs: Inputs, settings: Settings) -> Images:
+        size, new = (settings.height, settings.width), inputs.means.new_empty
+        return Images(new(*size, 3), new(size), new(size), new(*size, inputs.channels))
+
+
+def check_addressable(numbers: int, what: str) -> None:
+    """Raise when kernels could not address so many numbers with their 32-bit indices.
+
+    Raises:
+        RenderError: too many.
+    """
+    if numbers > INT32:
+        raise RenderError(
+            f"WarpRasterizer: {what} make {numbers} numbers, more than {INT32}, the most in one "
+            "render; render parts of the image (Camera.cropped), or fewer channels at a time"
+        )

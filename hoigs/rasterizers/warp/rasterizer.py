@@ -89,22 +89,32 @@ class WarpRasterizer(Rasterizer):
             raise RenderError(
                 "WarpRasterizer needs Warp, which is not installed: pip install warp-lang"
             ) from error
-        from hoigs.rasterizers.warp.cpu import NativePath
+        from hoigs.rasterizers.warp.launchers import Cores, CudaStream
+        from hoigs.rasterizers.warp.pixels import PixelPath
+
+        if device == "cuda":
+            self._report |= {"warp": warp.config.version, "cuda": "pixel kernels"}
+            return PixelPath(CudaStream())
         from hoigs.rasterizers.warp.workers import make_workers
 
         workers, reason = make_workers(self.scheduler)
-        self._report = {
+        self._report |= {
             "warp": warp.config.version,
             "cpu_kernels": self.cpu_kernels,
             "scheduler": workers.name,
             "scheduler_reason": reason,
         }
-        return NativePath(workers, self.threads)
+        cores = Cores(workers, self.threads)
+        if self.cpu_kernels == "portable":
+            return PixelPath(cores)
+        from hoigs.rasterizers.warp.cpu import NativePath
+
+        return NativePath(cores)
 
 
 def _prepare(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> tuple[Any, list]:
     """Settings, and tensors in the order of `frame.Inputs`: contiguous, absent ones empty."""
-    from hoigs.rasterizers.warp.frame import Settings
+    from hoigs.rasterizers.warp.frame import Settings, check_addressable
 
     like = gaussians.means
     count, stored = gaussians.sh.shape[:2]
@@ -121,27 +131,12 @@ def _prepare(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> tu
     )
     if request.near < 0:
         raise RenderError(f"WarpRasterizer: near is {request.near}, expected 0 or more (metres)")
-    expected = {
-        "means": (gaussians.means, (count, 3)),
-        "quats": (gaussians.quats, (count, 4)),
-        "log_scales": (gaussians.log_scales, (count, 3)),
-        "opacity_logits": (gaussians.opacity_logits, (count,)),
-        "sh": (gaussians.sh, (count, stored, 3)),
-    }
-    for name, (value, shape) in expected.items():
-        if value.shape != shape or value.dtype != torch.float32 or value.device != like.device:
-            raise RenderError(
-                f"WarpRasterizer: gaussians.{name} is {tuple(value.shape)} {value.dtype} on "
-                f"{value.device}, expected {shape} float32 on {like.device}"
-            )
-    background = request.background
-    if background is None:
-        background = like.new_zeros(3)
-    elif background.shape not in ((3,), (camera.height, camera.width, 3)):
-        raise RenderError(
-            f"WarpRasterizer: background has shape {tuple(background.shape)}, expected (3,) or "
-            f"({camera.height}, {camera.width}, 3)"
-        )
+    channels = 0 if request.features is None else request.features.shape[1]
+    check_addressable(
+        camera.width * camera.height * max(3, channels),
+        f"{camera.width}x{camera.height} pixels with {channels} feature channels",
+    )
+    background = like.new_zeros(3) if request.background is None else request.background
     features, offsets, subset = request.features, request.screen_offsets, request.subset
     tensors = [
         gaussians.means,

@@ -1,14 +1,15 @@
-"""Calls of the kernels in `projection`; shared by every path."""
+"""What the kernels are given and write; shared by every path."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from hoigs.rasterizers.warp.calls import flat
-from hoigs.rasterizers.warp.frame import Inputs, Lists, Settings
+from hoigs.rasterizers.warp.frame import Images, Inputs, Lists, Settings
 from hoigs.rasterizers.warp.records import POSE, RECORD, SMALLEST_ALPHA
 
 
@@ -121,4 +122,41 @@ def adjoint_arguments(
         flat(out.features),
         flat(out.pose),
         int(out.pose.numel() > 0),
+    ]
+
+
+def tile_arguments(
+    inputs: Inputs, settings: Settings, records: Tensor, lists: Lists, images: Images
+) -> list[Any]:
+    """Arguments that the tile kernels of all paths have in common, forward."""
+    return [
+        lists.tiles,
+        lists.across,
+        settings.width,
+        settings.height,
+        settings.max_alpha,
+        math.log2(max(settings.min_alpha, SMALLEST_ALPHA)),
+        settings.min_transmittance if settings.min_transmittance > 0 else -1.0,
+        flat(records),
+        flat(lists.pairs),
+        flat(lists.offsets),
+        flat(inputs.features),
+        inputs.channels,
+        flat(inputs.background),
+        3 if inputs.background.dim() == 3 else 0,
+        flat(images.color),
+        flat(images.alpha),
+        flat(images.depth),
+        flat(images.extra),
+    ]
+
+
+def upstream_arguments(upstream: Images, partials: Tensor) -> list[Any]:
+    """What the backward tile kernels take besides: gradients of the images, and partials."""
+    return [
+        flat(upstream.color),
+        flat(upstream.alpha),
+        flat(upstream.depth),
+        flat(upstream.extra),
+        flat(partials),
     ]

@@ -1,0 +1,78 @@
+"""Where kernels run: on the cores of this machine, or on torch's current CUDA stream."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import torch
+
+from hoigs.rasterizers.warp.calls import record
+from hoigs.rasterizers.warp.runtime import wp
+from hoigs.rasterizers.warp.workers import SerialWorkers, Workers
+
+ITEMS_PER_CORE = 512  # fewer Gaussians than this are not worth another core
+CUDA_BLOCK = 128
+
+
+class Launcher(Protocol):
+    def each(self, kernel: Any, count: int, arguments: list[Any]) -> None:
+        """Run a kernel for items 0 to count; its last two parameters, base and count, are added."""
+
+
+class Cores:
+    """CPU cores.
+
+    Args:
+        workers: how launches are spread over cores.
+        threads: how many cores; None is torch's own number, asked at each call.
+    """
+
+    def __init__(self, workers: Workers, threads: int | None) -> None:
+        self.workers, self.threads = workers, threads
+
+    def number(self, pieces: int) -> int:
+        """How many cores to use for so many pieces of work."""
+        return max(1, min(self.threads or torch.get_num_threads(), pieces))
+
+    def chunks(self, count: int) -> int:
+        """In how many parts to take `count` Gaussians."""
+        return self.number(count // ITEMS_PER_CORE)
+
+    def once(self, kernel: Any, arguments: list[Any]) -> None:
+        record(kernel, 1, arguments).launch()
+
+    def together(self, kernel: Any, cores: int, arguments: list[Any]) -> None:
+        """The same launch on several cores, which share the work through `counters`."""
+        self._run([record(kernel, 1, arguments)] * cores)
+
+    def each(self, kernel: Any, count: int, arguments: list[Any]) -> None:
+        if count == 0:
+            return
+        chunks = self.chunks(count)
+        size = -(-count // chunks)
+        self._run([record(kernel, size, [*arguments, j * size, count]) for j in range(chunks)])
+
+    def _run(self, launches: list[Any]) -> None:
+        (SerialWorkers() if len(launches) == 1 else self.workers).run(launches)
+
+
+class CudaStream:
+    """torch's current stream of the current device, at each call."""
+
+    def __init__(self) -> None:
+        self._streams: dict[tuple[int, int], Any] = {}
+
+    def each(self, kernel: Any, count: int, arguments: list[Any]) -> None:
+        if count == 0:
+            return
+        current = torch.cuda.current_stream()
+        key = (current.device_index, current.cuda_stream)
+        if key not in self._streams:
+            self._streams[key] = wp.stream_from_torch(current)
+        wp.launch(
+            kernel,
+            dim=count,
+            inputs=[*arguments, 0, count],
+            stream=self._streams[key],
+            block_dim=CUDA_BLOCK,
+        )
