@@ -16,4 +16,5 @@ camera = h.Camera(K, torch.eye(4), width=64, height=64)
 reference = h.OracleRasterizer(cutoffs=True).render(gaussians, camera).color
 for backend in (h.TorchRasterizer(), h.WarpRasterizer()):
     image = backend.render(gaussians, camera).color
-    print(f"{type(backend).__name__:>16}: {float((image - reference).abs().max()):.1e} off the oracle")
+    off = float((image - reference).abs().max())
+    print(f"{type(backend).__name__:>16}: {off:.1e} off the oracle")

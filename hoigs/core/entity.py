@@ -108,6 +108,8 @@ class Entity(nn.Module):
 
     def resize(self, count: int) -> None:
         """Allocate `count` Gaussians with arbitrary content: before loading a checkpoint."""
+        if count == len(self):
+            return  # what a deformation derives from its points stays as it was bound
         source = torch.arange(count, device=self.means.device) % max(1, len(self))
         change = TopologyChange(
             source,
