@@ -45,7 +45,7 @@ class TextureAtlas:
         """Args: images: sRGB [H, W, 3] in [0, 1]."""
         texels, table, start = [], [], 0
         for image in images:
-            level = to_linear(np.asarray(image, np.float32)).astype(np.float32)
+            level: Array = to_linear(np.asarray(image, np.float32)).astype(np.float32)
             rows = []
             for _ in range(levels):
                 height, width = level.shape[:2]
@@ -148,7 +148,7 @@ def wallpaper(rng: np.random.Generator, height: int, width: int, colors: Sequenc
     cell = np.abs((v * rows + shift) % 1 - 0.5)
     lozenge = np.abs(phase - 0.25) / 0.16 + cell / 0.22
     mark = np.clip((1 - lozenge) * 6, 0, 1)[..., None]
-    return np.clip(base * (1 - 0.55 * mark) + 0.55 * mark * np.asarray(colors[1]), 0, 1)
+    return np.clip(base * (1 - 0.4 * mark) + 0.4 * mark * np.asarray(colors[1]), 0, 1)
 
 
 def rug(rng: np.random.Generator, size: int, colors: Sequence[Color]) -> Array:
