@@ -25,6 +25,7 @@ from hoigs.plugins.deformation.skinned_body import ScaleAbout, SkinnedBody
 from hoigs.plugins.deformation.skinning import skin_points, skin_quats
 
 OPAQUE = 4.6  # logit of 0.99
+APART = 0.05  # metres; rest made with another seed is decimetres off, a padded one centimetres
 
 
 class HexPlaneSkinningConfig(ComponentConfig):
@@ -158,7 +159,9 @@ class HexPlaneSkinning(SkinnedBody):
             settings["num_frames"] = clip.num_frames
             train = {clip.moments[i].index for i in clip.split.get("train", range(len(clip)))}
             settings["trained_frames"] = sorted(train)
-            settings["camera_centers"] = torch.stack([c.center for c in clip.cameras])
+            by_frame = {m.index: c for m, c in zip(clip.moments, clip.cameras, strict=True)}
+            centers = [by_frame[i].center for i in sorted(by_frame)]
+            settings["camera_centers"] = torch.stack(centers)
         return cls(context.body, entity=context.entity, seed=context.seed, **settings)
 
     def bind(self, rest: Gaussians) -> None:
@@ -166,6 +169,13 @@ class HexPlaneSkinning(SkinnedBody):
         if len(surface.points) != len(rest):
             raise ValueError(
                 f"{len(rest)} rest Gaussians, but a surface of {len(surface.points)} points"
+            )
+        apart = (surface.points - rest.means.detach()).norm(dim=-1)
+        if len(apart) and apart.median() > APART:
+            raise ValueError(
+                f"rest Gaussians stand {apart.median():.2f} m from the surface that weights them; "
+                "make rest with body.rest(count, betas, seed) of the same betas "
+                "and seed, or pass its `surface`"
             )
         for name, value in {
             "log_weights": (surface.weights + 1e-6).log(),

@@ -355,6 +355,8 @@ def test_errors_speak(toy_body, toy_pose):
     model = HexPlaneSkinning(toy_body, surface=toy_body.surface(10), resolution=4)
     with pytest.raises(ValueError, match="20 rest Gaussians, but a surface of 10"):
         Entity(toy_body.rest(20), model)
+    with pytest.raises(ValueError, match="from the surface that weights them"):
+        Entity(toy_body.rest(20, seed=1), HexPlaneSkinning(toy_body, resolution=4))
 
 
 def test_from_config(toy_body):
