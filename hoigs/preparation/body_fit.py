@@ -27,9 +27,11 @@ class FitOptions:
     Attributes:
         steps: of Adam, over all frames at once. rate: its rate, radians.
         spread: residual at which a landmark begins to count as an outlier, in image widths.
-        bones: of 3D bone directions. limits: of joint limits. rest: of any bend at all.
+        bones: of 3D bone directions. limits: of joint limits. rest: of departures from the start,
+            which is a straight spine with limbs along the 3D landmarks.
         smooth: of accelerations of the landmarks in the world. turn: of changes of pose.
         shape: of the shape coefficients, in standard deviations.
+        offset: of shifts between the landmarks and the body's own points, in `OFFSET`.
         scale: find the cameras' unit in metres too (a moving camera of unknown scale).
     """
 
@@ -42,7 +44,11 @@ class FitOptions:
     smooth: float = 30.0
     turn: float = 1.0
     shape: float = 0.01
+    offset: float = 0.01
     scale: bool = False
+
+
+OFFSET = 0.03  # metres that a landmark's point may well lie off the joint it is named after
 
 
 @dataclass(frozen=True)
@@ -65,13 +71,13 @@ class BodyFit:
 class _Unknowns(nn.Module):
     """What is solved for."""
 
-    def __init__(self, start: Start, betas: int, scale: bool) -> None:
+    def __init__(self, start: Start, betas: int, pairs: int, scale: bool) -> None:
         super().__init__()
-        frames = len(start.transl)
         self.global_orient = nn.Parameter(start.global_orient.clone())
         self.transl = nn.Parameter(start.transl.clone())
-        self.body = nn.Parameter(torch.zeros(frames, 21, 3))
+        self.body = nn.Parameter(start.body.clone())
         self.betas = nn.Parameter(torch.zeros(betas))
+        self.offsets = nn.Parameter(torch.zeros(pairs, 3))
         self.log_scale = nn.Parameter(torch.tensor(start.scale).log(), requires_grad=scale)
 
     def pose(self) -> BodyPose:
@@ -109,7 +115,8 @@ def fit_body(
             "at least 2: is the person in view?"
         )
     problem = _Problem(body, landmarks, cameras, options)
-    unknowns = _Unknowns(problem.start, body.num_betas, options.scale)
+    pairs = int(problem.points.pairs.max()) + 1
+    unknowns = _Unknowns(problem.start, body.num_betas, pairs, options.scale)
     solve(problem, unknowns, options, progress)
     with torch.no_grad():
         return problem.result(unknowns)
@@ -126,6 +133,7 @@ def solve(
         {"params": [unknowns.body, unknowns.global_orient], "lr": options.rate},
         {"params": [unknowns.transl], "lr": options.rate},
         {"params": [unknowns.betas], "lr": options.rate},
+        {"params": [unknowns.offsets], "lr": 0.1 * options.rate},
     ]
     if options.scale:
         groups.append({"params": [unknowns.log_scale], "lr": 0.1 * options.rate})
@@ -166,22 +174,26 @@ class _Problem:
         world = landmarks.world[:, rows].nan_to_num()
         self.bone_targets = _directions(world, self.bones)
         self.bone_weights = self.visible[:, self.bones[:, 0]] * self.visible[:, self.bones[:, 1]]
+        above = [body.parents[joint] for joint in self.points.joints.tolist()]
+        bones = nn.functional.one_hot(torch.tensor(above), len(body.parents))
+        on_skin = body.skinning_weights[self.points.vertices]
+        self.carriers = torch.cat((bones.to(on_skin), on_skin))
         self.start = first_guess(body, landmarks, cameras, options.scale)
 
-    def locate(self, pose: BodyPose) -> Float[Tensor, "F L 3"]:
-        """World positions of the points that stand for landmarks, metres."""
+    def locate(
+        self, pose: BodyPose, offsets: Float[Tensor, "P 3"] | None = None
+    ) -> Float[Tensor, "F L 3"]:
+        """World positions of the points that stand for landmarks, metres.
+
+        A landmark named after a joint rides on the bone above it: a shoulder on the collar bone.
+        `offsets` shift the points in the rest pose, left and right as mirror images.
+        """
+        points = self.points
         vertices, joints = self.body.shaped(pose.betas)
-        transforms = self.body.skinning_transforms(pose)
-        chosen = transforms[:, self.points.joints]
-        at_joints = (chosen[..., :3, :3] @ joints[self.points.joints][..., None])[..., 0]
-        at_joints = at_joints + chosen[..., :3, 3]
-        rows = self.points.vertices
-        on_skin = skin(
-            vertices[rows].expand(len(transforms), -1, 3),
-            transforms,
-            self.body.skinning_weights[rows],
-        )
-        return torch.cat((at_joints, on_skin), 1)
+        rest = torch.cat((joints[points.joints], vertices[points.vertices]))
+        if offsets is not None:
+            rest = rest + offsets[points.pairs] * points.mirror
+        return skin(rest, self.body.skinning_transforms(pose), self.carriers)
 
     def project(
         self, points: Float[Tensor, "F L 3"], scale: Tensor
@@ -195,7 +207,7 @@ class _Problem:
 
     def energy(self, unknowns: _Unknowns, widen: float) -> Float[Tensor, ""]:
         options, pose = self.options, unknowns.pose()
-        points = self.locate(pose)
+        points = self.locate(pose, unknowns.offsets)
         pixels, turned = self.project(points, unknowns.log_scale.exp())
         squared = (pixels - self.pixels).square().sum(-1) / self.width**2
         spread = (options.spread * widen) ** 2
@@ -209,8 +221,9 @@ class _Problem:
             data,
             options.bones * bones,
             options.limits * limit_penalty(unknowns.body),
-            options.rest * unknowns.body.square().sum((-1, -2)).mean(),
+            options.rest * (unknowns.body - self.start.body).square().sum((-1, -2)).mean(),
             options.shape * unknowns.betas.square().sum(),
+            options.offset * (unknowns.offsets / OFFSET).square().sum(),
             options.smooth * accelerations.square().sum(-1).mean() if len(points) > 2 else 0.0,
             options.turn * turns.square().sum(-1).mean() if len(points) > 1 else 0.0,
         )
@@ -219,7 +232,7 @@ class _Problem:
     def result(self, unknowns: _Unknowns) -> BodyFit:
         pose = unknowns.pose().map(lambda x: x.detach().clone())
         scale = unknowns.log_scale.exp()
-        pixels, _ = self.project(self.locate(pose), scale)
+        pixels, _ = self.project(self.locate(pose, unknowns.offsets.detach()), scale)
         distance = (pixels - self.pixels).norm(dim=-1)
         counted = self.visible > 0.5
         residual = (distance * counted).sum(1) / counted.sum(1)

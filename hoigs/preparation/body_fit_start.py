@@ -13,6 +13,7 @@ from hoigs.core.body import BodyModel
 from hoigs.core.camera import Camera
 from hoigs.core.rotation import matrices_to_quats
 from hoigs.preparation.landmarks import JOINTS, TORSO, LandmarkTrack
+from hoigs.preparation.limb_start import limb_pose
 
 ANKLES = (27, 28)
 
@@ -23,11 +24,13 @@ class Start:
 
     Attributes:
         global_orient: axis-angle, continuous over frames. transl: metres, world.
+        body: axis-angle of joints 1..21; limbs follow the 3D landmarks, the spine is straight.
         scale: metres a unit of the cameras' world.
     """
 
     global_orient: Float[Tensor, "F 3"]
     transl: Float[Tensor, "F 3"]
+    body: Float[Tensor, "F 21 3"]
     scale: float
 
 
@@ -55,7 +58,13 @@ def first_guess(
     orient = back @ torch.stack(rotations)
     pelvis, between_hips = joints[0], joints[[1, 2]].mean(0)
     transl = place - (orient @ (between_hips - pelvis)[..., None])[..., 0] - pelvis
-    return Start(_fill(_continuous_axis_angle(orient), seen), _fill(transl, seen), scale)
+    limbs = limb_pose(landmarks.world[seen], torch.stack(rotations)).flatten(1)
+    return Start(
+        _fill(_continuous_axis_angle(orient), seen),
+        _fill(transl, seen),
+        _fill(limbs, seen).unflatten(1, (21, 3)),
+        scale,
+    )
 
 
 def _kabsch(source: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"]) -> Float[Tensor, "3 3"]:
@@ -115,7 +124,7 @@ def _continuous_axis_angle(rotations: Float[Tensor, "F 3 3"]) -> Float[Tensor, "
     return quats[:, 1:] / sine.clamp_min(1e-8) * angle
 
 
-def _fill(values: Float[Tensor, "S 3"], seen: Bool[Tensor, " F"]) -> Float[Tensor, "F 3"]:
+def _fill(values: Float[Tensor, "S D"], seen: Bool[Tensor, " F"]) -> Float[Tensor, "F D"]:
     """Values of the seen frames, interpolated linearly over the others, held at the ends."""
     known = seen.nonzero().squeeze(1)
     frames = torch.arange(len(seen))

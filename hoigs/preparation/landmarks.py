@@ -59,11 +59,15 @@ class LandmarkPoints:
     Attributes:
         landmarks: numbers of the landmarks that have a counterpart, in the order of `locate`.
         joints: joint of each of the first landmarks. vertices: vertex of each of the others.
+        pairs: number of each landmark's left-right pair. mirror: factors of x, y, z that take the
+            pair's offset to this side.
     """
 
     landmarks: tuple[int, ...]
     joints: Int[Tensor, " A"]
     vertices: Int[Tensor, " B"]
+    pairs: Int[Tensor, " L"]
+    mirror: Float[Tensor, "L 3"]
 
     def index(self, landmark: int) -> int:
         return self.landmarks.index(landmark)
@@ -88,8 +92,23 @@ def points_of(body: BodyModel) -> LandmarkPoints:
         floor = foot[template[foot, 1] < template[foot, 1].min() + 0.04]
         by_vertex[heel] = floor[template[floor, 2].argmin()]
         by_vertex[toe] = floor[template[floor, 2].argmax()]
+    landmarks = (*by_joint, *by_vertex)
+    pairs, mirror = _left_right(landmarks)
     return LandmarkPoints(
-        (*by_joint, *by_vertex),
+        landmarks,
         torch.tensor(list(by_joint.values())),
         torch.stack(list(by_vertex.values())),
+        pairs,
+        mirror,
     )
+
+
+def _left_right(landmarks: tuple[int, ...]) -> tuple[Int[Tensor, " L"], Float[Tensor, "L 3"]]:
+    """Pair of each landmark, and the mirror's signs: odd numbers are left, the next is right.
+
+    The nose is its own pair and may not move aside.
+    """
+    left = [mark if mark % 2 or mark == 0 else mark - 1 for mark in landmarks]
+    numbers = sorted(set(left))
+    signs = [(0.0 if m == 0 else 1.0 if m % 2 else -1.0, 1.0, 1.0) for m in landmarks]
+    return torch.tensor([numbers.index(n) for n in left]), torch.tensor(signs)
