@@ -19,8 +19,9 @@ def crop(mask: torch.Tensor, ignore: torch.Tensor | None = None) -> Crop:
 
 
 def test_supplement_weights_and_overrides():
-    assert term_weights(LossSpec()) == {"human": 0.5, "object": 1.0, "scene": 0.25, "depth": 1.0}
-    assert set(term_weights(LossSpec(weights="main")).values()) == {1.0}
+    supplement = {"human": 0.5, "object": 1.0, "scene": 0.25, "depth": 1.0}
+    assert term_weights(LossSpec(weights="supp")) == supplement
+    assert set(term_weights(LossSpec()).values()) == {1.0}
     assert term_weights(LossSpec(depth=0.1))["depth"] == 0.1
 
 
