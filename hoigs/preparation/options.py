@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from hoigs.core.config import ComponentConfig
+from hoigs.preparation.body_fit import FitOptions
 
 
 class PrepareOptions(ComponentConfig):
@@ -26,6 +27,7 @@ class PrepareOptions(ComponentConfig):
         "None assumes 0.8 x the longer side (64 degrees), which scales all depths",
     )
     body: str = Field(default="body:anny", description="key of the body model, for the clip")
+    fit_steps: int = Field(default=FitOptions.steps, ge=1, description="of the body fit")
     human: str = Field(default="human", description="name of the person's entity")
     object: str = Field(default="object", description="name of the object's entity")
     ball_radius: float = Field(

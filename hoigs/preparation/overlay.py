@@ -12,6 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from hoigs.core.camera import Camera
+from hoigs.preparation.mesh_overlay import overlay_frame
 from hoigs.preparation.video_out import VideoWriter
 
 HUMAN_COLOR, OBJECT_COLOR, TRACK_COLOR = (64, 220, 120), (255, 210, 40), (255, 60, 200)
@@ -73,9 +74,7 @@ class OverlayVideo:
         points: Float[Tensor, "P 3"],
     ) -> UInt8[np.ndarray, "H W 3"]:
         """The body shaded over the image, the masks' outlines and some of the object's points."""
-        from hoigs.preparation.body_fit import overlay_frame
-
-        drawn = np.array(overlay_frame(image, camera, vertices, self.faces))
+        drawn = overlay_frame(image, camera, vertices, self.faces, strength=0.45)
         draw_outline(drawn, human, HUMAN_COLOR)
         draw_outline(drawn, thing, OBJECT_COLOR)
         draw_points(drawn, points, camera, TRACK_COLOR)

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from PIL import Image
 from scipy import ndimage
 
-from hoigs.preparation.masks import MaskStack, largest_parts
+from hoigs.preparation.masks import MaskStack
+from hoigs.preparation.overlay import shrink, shrink_mask
 
 BINS = 24  # a colour channel
+WORK_SIDE = 480  # pixels; masks need no more to be told apart, and time grows with area
+GUESSED = 0.4  # weight of a silhouette in a frame whose body was not seen
+STRAY = 0.15  # of the longer side: parts farther than this from the object are not of it
 MARGIN = 0.03  # of the image's longer side: how far clothes reach beyond the body
 Images = Callable[[], Iterable[UInt8[np.ndarray, "H W 3"]]]
 
 
 def separate(
-    images: Images, together: MaskStack, bodies: MaskStack, rounds: int = 3
+    images: Images,
+    together: MaskStack,
+    bodies: MaskStack,
+    fitted: Bool[np.ndarray, " F"],
+    rounds: int = 4,
 ) -> tuple[MaskStack, MaskStack]:
     """The person's and the object's masks, which share out `together`.
 
@@ -25,34 +34,76 @@ def separate(
     the masks of the round before give over all frames, from the object's place in the frames
     before and after, and from its neighbours (a mean field with a box neighbourhood). It is
     GrabCut's idea (Rother et al. 2004) with histograms in place of mixtures and a mean field in
-    place of the cut.
+    place of the cut. Large frames are worked on at a longer side of 480 pixels.
 
     Args:
         images: gives the frames anew on every call.
         together: person and object. bodies: silhouettes of the fitted body, unclothed.
+        fitted: frames whose body was fitted to something seen; silhouettes of the others are
+            guesses: they count less, and colours are not learnt from them.
         rounds: of colours and masks, after the first masks from the silhouettes alone.
 
     Returns:
         human, object
     """
-    trust = [_trust(b, t) for b, t in zip(bodies, together, strict=True)]
-    odds = [w * _silhouette_odds(b) for b, w in zip(bodies, trust, strict=True)]
-    objects = [t & (o > 0) for t, o in zip(together, odds, strict=True)]
+    size = _work_size(together[0].shape)
+    wholes = [shrink_mask(m, *size) for m in together]
+    pictures = [shrink(image, *size) for image in images()]
+    small_bodies = [shrink_mask(b, *size) for b in bodies]
+    trust = [
+        _trust(b, t) * (1.0 if seen else GUESSED)
+        for b, t, seen in zip(small_bodies, wholes, fitted, strict=True)
+    ]
+    odds = [w * _silhouette_odds(b) for b, w in zip(small_bodies, trust, strict=True)]
+    objects = [t & (o > 0) for t, o in zip(wholes, odds, strict=True)]
     for turn in range(rounds):
-        colors = ColorOdds()
-        for image, mask, part, odd, w in zip(images(), together, objects, odds, trust, strict=True):
-            if w > 0.5 * max(trust):
-                # pixels on the silhouette's border teach nothing
-                sure = mask & (np.abs(odd) > w)
-                colors.learn(image, sure & part, sure & ~part)
-        colors.settle()
+        colors = _learned(pictures, wholes, objects, odds, trust)
         places = [_place(objects, i) if turn else 0.0 for i in range(len(objects))]
-        objects = [
-            largest_parts(_mean_field(odd + colors(image) + place, mask), smallest=0.25)
-            for image, mask, odd, place in zip(images(), together, odds, places, strict=True)
-        ]
-    humans = MaskStack(t & ~o for t, o in zip(together, objects, strict=True))
-    return humans, MaskStack(objects)
+        for i, mask in enumerate(wholes):
+            color = colors(pictures[i])
+            objects[i] = _object_parts(_mean_field(odds[i] + color + places[i], mask), color)
+        objects = _without_strays(objects)
+    humans, things = MaskStack(), MaskStack()
+    for mask, part, whole in zip(together, objects, wholes, strict=True):
+        thing = mask & _enlarged(part, whole & ~part, mask.shape)
+        humans.append(mask & ~thing)
+        things.append(thing)
+    return humans, things
+
+
+def _work_size(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Width and height to work at."""
+    factor = min(1.0, WORK_SIDE / max(shape))
+    return max(1, round(shape[1] * factor)), max(1, round(shape[0] * factor))
+
+
+def _enlarged(
+    thing: Bool[np.ndarray, "h w"], human: Bool[np.ndarray, "h w"], shape: tuple[int, ...]
+) -> Bool[np.ndarray, "H W"]:
+    """Where, at the full size, the object is nearer than the person."""
+    if thing.shape == shape:
+        return thing
+    nearer = ndimage.gaussian_filter(thing.astype(np.float32) - human, 1.0)
+    large = Image.fromarray(nearer).resize((shape[1], shape[0]), Image.Resampling.BILINEAR)
+    return np.asarray(large) > 0
+
+
+def _learned(
+    pictures: Sequence[np.ndarray],
+    wholes: Sequence[np.ndarray],
+    objects: Sequence[np.ndarray],
+    odds: Sequence[np.ndarray],
+    trust: Sequence[float],
+) -> ColorOdds:
+    """Colours of both, from the frames whose silhouette is to be trusted."""
+    colors = ColorOdds()
+    for image, mask, part, odd, w in zip(pictures, wholes, objects, odds, trust, strict=True):
+        if w > 0.5 * max(trust):
+            # pixels on the silhouette's border teach nothing
+            sure = mask & (np.abs(odd) > 0.5 * w)
+            colors.learn(image, sure & part, sure & ~part)
+    colors.settle()
+    return colors
 
 
 def _trust(body: Bool[np.ndarray, "H W"], together: Bool[np.ndarray, "H W"]) -> float:
@@ -62,13 +113,13 @@ def _trust(body: Bool[np.ndarray, "H W"], together: Bool[np.ndarray, "H W"]) -> 
 
 
 def _silhouette_odds(body: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
-    """Log-odds of the object from the signed distance to a silhouette: -3 inside, 3 far off."""
+    """Log-odds of the object from the signed distance to a silhouette: -2 inside, 2 far off."""
     if not body.any():
         return np.zeros(body.shape, np.float32)
     scale = MARGIN * max(body.shape)
     outside = ndimage.distance_transform_edt(~body)
     inside = ndimage.distance_transform_edt(body)
-    return (3 * np.tanh((outside - inside - scale) / scale)).astype(np.float32)
+    return (2 * np.tanh((outside - inside - scale) / scale)).astype(np.float32)
 
 
 def _place(objects: list[Bool[np.ndarray, "H W"]], frame: int) -> Float[np.ndarray, "H W"]:
@@ -104,7 +155,7 @@ class ColorOdds:
             return
         smooth = np.stack([ndimage.gaussian_filter(c, 1.0) for c in self._counts])
         likelihood = smooth / totals[:, None, None, None]
-        floor = 0.1 / BINS**3 + 0.02 * likelihood.max() / BINS
+        floor = 0.3 / BINS**3
         ratio = np.log(likelihood[0] + floor) - np.log(likelihood[1] + floor)
         self._odds = np.clip(ratio, -4, 4).astype(np.float32)
 
@@ -115,6 +166,53 @@ class ColorOdds:
 
 def _bins(pixels: UInt8[np.ndarray, "*batch 3"]) -> np.ndarray:
     return pixels.astype(np.int64) * BINS // 256
+
+
+def _object_parts(
+    mask: Bool[np.ndarray, "H W"], color: Float[np.ndarray, "H W"], smallest: float = 0.1
+) -> Bool[np.ndarray, "H W"]:
+    """The parts whose colours are the object's on average, without crumbs.
+
+    A shoulder that the fitted body misses is as far from the silhouette as a bag; its colours tell.
+    """
+    labels, count = ndimage.label(mask)
+    if not count:
+        return mask
+    index = np.arange(1, count + 1)
+    like = ndimage.mean(color, labels, index) > 0
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:] * like
+    keep = like & (sizes >= smallest * sizes.max())
+    return np.concatenate(([False], keep))[labels]
+
+
+def _without_strays(
+    objects: list[Bool[np.ndarray, "H W"]], reach: int = 6
+) -> list[Bool[np.ndarray, "H W"]]:
+    """Drops parts that are far from where the object is in the frames around.
+
+    Where it is: the median, over `reach` frames before and after, of the largest part's middle.
+    Far: no pixel within STRAY of it.
+    """
+    labelled = [ndimage.label(o) for o in objects]
+    middles = np.full((len(objects), 2), np.nan)
+    for i, (labels, count) in enumerate(labelled):
+        if count:
+            largest = 1 + np.bincount(labels.ravel())[1:].argmax()
+            middles[i] = np.argwhere(labels == largest).mean(0)
+    kept = []
+    for i, (labels, count) in enumerate(labelled):
+        around = middles[max(0, i - reach) : i + reach + 1]
+        around = around[np.isfinite(around[:, 0])]
+        if not count or not len(around):
+            kept.append(objects[i])
+            continue
+        middle = np.median(around, axis=0)
+        rows, columns = np.nonzero(labels)
+        away = np.hypot(rows - middle[0], columns - middle[1])
+        numbers = labels[rows, columns]
+        near = np.unique(numbers[away <= STRAY * max(labels.shape)])
+        kept.append(np.isin(labels, near) & (labels > 0))
+    return kept
 
 
 def _mean_field(

@@ -3,46 +3,63 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool
 from scipy import ndimage
 
 from hoigs.preparation.ball import BallTrack
 from hoigs.preparation.cameras import Undistortion
 from hoigs.preparation.frames import VideoFrames
-from hoigs.preparation.masks import MaskStack, load_masks
+from hoigs.preparation.masks import MaskStack, largest_parts, load_masks
 from hoigs.preparation.separate import Images, separate
 from hoigs.preparation.source import Source
 
 
+@dataclass(frozen=True)
+class GivenMasks:
+    """Masks as the source has them: together, or the person's and perhaps the object's apart."""
+
+    together: MaskStack | None = None
+    human: MaskStack | None = None
+    thing: MaskStack | None = None
+
+
+def read_masks(
+    source: Source, video: VideoFrames, undistort: Undistortion, names: tuple[str, str]
+) -> GivenMasks:
+    """The source's masks of the chosen frames; `names` of the human and object entities."""
+    apart = {n: load_masks(folder, video, undistort) for n, folder in source.apart.items()}
+    human, thing = (apart.get(name) for name in names)
+    if source.together is None or (human and thing):
+        return GivenMasks(human=human, thing=thing)
+    return GivenMasks(together=load_masks(source.together, video, undistort))
+
+
 def entity_masks(
-    source: Source,
-    video: VideoFrames,
-    undistort: Undistortion,
+    given: GivenMasks,
     ball: BallTrack | None,
     images: Images,
     silhouettes: Callable[[], MaskStack],
-    names: tuple[str, str],
+    fitted: Bool[np.ndarray, " F"],
 ) -> tuple[MaskStack, MaskStack, str]:
     """Masks of person and object, disjoint, and what they were made from.
 
     Args:
         images: gives the undistorted frames anew on every call.
         silhouettes: gives the fitted body's; called only if masks must be taken apart.
-        names: of the human and object entities.
+        fitted: frames whose body was fitted to landmarks.
     """
-    human_name, object_name = names
-    if set(source.apart) == {human_name, object_name}:
-        human = load_masks(source.apart[human_name], video, undistort)
-        things = load_masks(source.apart[object_name], video, undistort)
-        human = MaskStack(h & ~o for h, o in zip(human, things, strict=True))
-        return human, things, "given for each entity; the object's win where they overlap"
-    folder = source.together or source.apart[human_name]
-    together = load_masks(folder, video, undistort)
+    if given.human is not None and given.thing is not None:
+        human = MaskStack(h & ~o for h, o in zip(given.human, given.thing, strict=True))
+        return human, given.thing, "given for each entity; the object's win where they overlap"
+    together = given.together or given.human
+    assert together is not None  # find_source asks for one or the other
     if ball is not None:
         human, things = _disc_masks(together, ball)
         return human, things, "ball: its disc; person: the given mask without the disc"
-    human, things = separate(images, together, silhouettes())
+    human, things = separate(images, together, silhouettes(), fitted)
     text = (
         "one given mask of person and object, taken apart by the fitted body's silhouette, "
         "colour and neighbouring frames: borders between them are weak, more so where the body "
@@ -57,6 +74,7 @@ def _disc_masks(together: MaskStack, ball: BallTrack) -> tuple[MaskStack, MaskSt
         disc = ball.disc(i, mask.shape[1], mask.shape[0])
         seen = bool(ball.observed[i])
         # an unseen ball is still no person, and the interpolated disc only roughly where it is
-        human.append(mask & ~(disc if seen else ndimage.binary_dilation(disc, iterations=3)))
+        person = mask & ~(disc if seen else ndimage.binary_dilation(disc, iterations=3))
+        human.append(largest_parts(person, smallest=0.01))
         things.append(disc if seen else np.zeros_like(disc))
     return human, things

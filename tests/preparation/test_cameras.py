@@ -23,7 +23,7 @@ FOCAL, K1 = 90.0, -0.3
 
 
 def colmap_model(folder: Path, frames: range = range(FRAMES), k1: float = K1) -> Path:
-    """A model of a camera that walks sideways past ten points, written as text."""
+    """A model of a camera that walks sideways past a row of ten points, written as text."""
     folder.mkdir(parents=True)
     lens = f"1 SIMPLE_RADIAL {WIDTH} {HEIGHT} {FOCAL} {WIDTH / 2} {HEIGHT / 2} {k1}\n"
     (folder / "cameras.txt").write_text(lens)
@@ -35,7 +35,7 @@ def colmap_model(folder: Path, frames: range = range(FRAMES), k1: float = K1) ->
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     tracks = " ".join(f"{i + 1} {{n}}" for i in frames)
     points = [
-        f"{n + 1} {0.1 * n} 0 4 255 128 0 0.3 {tracks.format(n=n)}".replace("{n}", str(n))
+        f"{n + 1} {0.3 * (n - 4.5)} 0.6 4 255 128 0 0.3 {tracks.format(n=n)}".replace("{n}", str(n))
         for n in range(10)
     ]
     (folder / "points3D.txt").write_text("\n".join(points) + "\n")

@@ -10,6 +10,7 @@ from hoigs.core.camera import Camera
 from hoigs.preparation.masks import MaskStack
 from hoigs.preparation.object_shape import ColorSampler, inflated_outline, sphere_points
 from hoigs.preparation.object_track import apparent_size, hand_depths, held_object
+from hoigs.preparation.outlines import long_axis, outlines_of
 from hoigs.preparation.source import SourceError
 
 WIDTH, HEIGHT, F = 80, 60, 9
@@ -100,27 +101,84 @@ def test_the_nearest_hand_gives_the_depth() -> None:
     np.testing.assert_allclose(hand_depths(masks, cameras, wrists), 2.0, atol=1e-5)
 
 
+def box_of(xy: torch.Tensor) -> torch.Tensor:
+    return torch.cat((xy.min(0).values, xy.max(0).values))
+
+
 def test_held_object_projects_onto_its_mask() -> None:
     masks, cameras, wrists = held()
     track, normals, spread = held_object(masks, cameras, wrists, 500)
     assert track.observed.tolist() == [i != 4 for i in range(F)]
     assert track.points.shape == normals.shape and spread < 0.05
     for i in range(F):
-        xy, depth = cameras[i].project(track.points + track.translations[i])
-        low, high = xy.min(0).values, xy.max(0).values
-        expected = torch.tensor([14.0 + 4 * i, 22.0])
-        torch.testing.assert_close(low, expected, atol=1.5, rtol=0)
-        torch.testing.assert_close(high, expected + 16, atol=1.5, rtol=0)
+        world = track.points @ track.rotations[i].mT + track.translations[i]
+        xy, depth = cameras[i].project(world)
+        expected = torch.tensor([14.0 + 4 * i, 22, 30 + 4 * i, 38])
+        torch.testing.assert_close(box_of(xy), expected, atol=1.5, rtol=0)
         assert float(depth.mean()) == pytest.approx(2.0, abs=0.02)
-    assert "no rotation" in track.provenance
+    assert "a weak guess" in track.provenance
 
 
-def test_apparent_size_ignores_masks_that_the_border_cuts() -> None:
+def test_size_corrects_hands_that_point_the_wrong_way() -> None:
+    """The object comes nearer, from 2.4 to 1.6 m; the fitted wrist stays at 2 m."""
+    depths = np.linspace(2.4, 1.6, 2 * F)
+    masks = MaskStack([square(40, 30, round(16 / d)) for d in depths])
+    wrist = camera().unproject(torch.tensor([[40.0, 20], [5, 55]]), torch.tensor([2.0, 3]))
+    track, _, _ = held_object(masks, [camera()] * 2 * F, wrist.expand(2 * F, 2, 3), 500)
+    found = track.translations[:, 2].numpy()
+    assert np.abs(found - 2.0).max() > 0.2, "hands alone would keep it at 2 m"
+    assert np.abs(found - depths).max() < 0.2
+
+
+def test_roll_follows_the_long_axis() -> None:
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    angles = np.linspace(0.3, 2.2, 2 * F)  # past pi / 2: an axis without a sign
+    masks = MaskStack()
+    for angle in angles:
+        along = (x - 40) * np.cos(angle) + (y - 30) * np.sin(angle)
+        across = (y - 30) * np.cos(angle) - (x - 40) * np.sin(angle)
+        masks.append((np.abs(along) < 18) & (np.abs(across) < 6))
+    # a camera that lies on its side: the roll is about its axis, wherever that points
+    side = camera()
+    turned = torch.eye(4)
+    turned[:3, :3] = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    side = Camera(side.K, turned, WIDTH, HEIGHT)
+    wrist = side.unproject(torch.tensor([[40.0, 20], [5, 55]]), torch.tensor([2.0, 3]))
+    track, _, _ = held_object(masks, [side] * 2 * F, wrist.expand(2 * F, 2, 3), 800)
+    for i in range(1, 2 * F - 1):
+        xy, _ = side.project(track.points @ track.rotations[i].mT + track.translations[i])
+        column, row = xy.floor().long().numpy().T
+        assert masks[i][row, column].mean() > 0.9
+    torch.testing.assert_close(
+        torch.linalg.det(track.rotations), torch.ones(2 * F), atol=1e-5, rtol=0
+    )
+
+
+def test_crumbs_are_no_observation_and_cut_masks_have_no_length() -> None:
+    stack = MaskStack(
+        [square(40, 30, 10), square(40, 30, 2), square(70, 30, 12), square(40, 30, 9)]
+    )
+    outlines = outlines_of(stack)
+    assert outlines.observed.tolist() == [True, False, True, True]
+    assert outlines.whole.tolist() == [True, False, False, True]
+    assert np.isfinite(outlines.lengths).tolist() == [True, False, False, True]
+    assert np.isnan(outlines.angles).all(), "a square has no long axis"
+    assert outlines.lengths[0] == pytest.approx(4 * 20 / np.sqrt(12), rel=0.01)
+    np.testing.assert_allclose(outlines.centers[:2], [[40, 30], [53.0, 30]], atol=2.5)
+
+
+def test_long_axis_directions() -> None:
+    x = np.linspace(-10, 10, 50)
+    for angle in (-1.2, 0.0, 0.8, np.pi / 2):
+        line = np.stack((x * np.cos(angle), x * np.sin(angle)), 1)
+        assert long_axis(line)[1] == pytest.approx(angle, abs=1e-6)
+
+
+def test_apparent_size_is_the_median_over_whole_masks() -> None:
     points = (torch.rand(400, 3, generator=torch.Generator().manual_seed(0)) - 0.5) * 0.2
-    masks = [square(40, 30, 10), square(40, 30, 10), square(4, 30, 10)[:, :WIDTH]]
-    masks[2][:, :14] |= masks[0][:, 30:44]
-    shift = torch.tensor([[0.0, 0, 2]]).expand(3, 3)
-    size, spread = apparent_size(points, shift, MaskStack(masks), [camera()] * 3)
+    masks = MaskStack([square(40, 30, 10), square(40, 30, 10), square(74, 30, 14)])
+    shift, eyes = torch.tensor([[0.0, 0, 2]]).expand(3, 3), torch.eye(3).expand(3, 3, 3)
+    size, spread = apparent_size(points, eyes, shift, masks, outlines_of(masks), [camera()] * 3)
     assert size == pytest.approx(20 / 10, rel=0.08) and spread == pytest.approx(0, abs=1e-6)
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+from PIL import Image
 
 FRAMES, WIDTH, HEIGHT = 12, 96, 64
 _Y, _X = np.mgrid[:HEIGHT, :WIDTH] + 0.5
@@ -53,13 +56,32 @@ for _i in (4, 5, 6):
     _BODY[_i] = (-0.03, -0.65, -0.09)
 
 
-def landmarks(depth: float = 2.8) -> dict[str, np.ndarray]:
-    """pose_mediapipe.npz of that person standing still before a camera of focal 0.8 x width."""
-    focal = 0.8 * WIDTH
-    pixels = _BODY[:, :2] / (_BODY[:, 2:] + depth) * focal + (WIDTH / 2, 32)
-    image = np.concatenate((pixels, _BODY[:, 2:] * 30, np.full((33, 1), 0.99)), -1)
+def landmarks(focal: float = 0.8 * WIDTH, step: float = 0.0) -> dict[str, np.ndarray]:
+    """pose_mediapipe.npz of that person standing still 2.8 m away.
+
+    Args:
+        focal: pixels. step: how far the camera walks to the right in each frame, metres.
+    """
+    image = np.zeros((FRAMES, 33, 4))
+    for frame in range(FRAMES):
+        seen = _BODY + np.array((-step * frame, 0, 2.8))
+        image[frame, :, :2] = seen[:, :2] / seen[:, 2:] * focal + (WIDTH / 2, 32)
+    image[..., 2], image[..., 3] = _BODY[:, 2] * 30, 0.99
     world = np.concatenate((_BODY, np.full((33, 1), 0.99)), -1)
     return {
-        "image_xyzv": np.repeat(image[None], FRAMES, 0).astype(np.float32),
+        "image_xyzv": image.astype(np.float32),
         "world_xyzv": np.repeat(world[None], FRAMES, 0).astype(np.float32),
     }
+
+
+def make_source(folder: Path, video: Path) -> Path:
+    """A source folder: video, masks together, ball track, landmarks; no COLMAP."""
+    (folder / "hoi_mask").mkdir(parents=True)
+    (folder / "video.mp4").write_bytes(video.read_bytes())
+    for i in range(FRAMES):
+        Image.fromarray(np.logical_or(*masks(i))).save(folder / f"hoi_mask/{i:05d}.png")
+    track = np.array([BALL(i) for i in range(FRAMES)], np.float32)
+    track[5] = np.nan  # not found there
+    np.savez(folder / "ball_track.npz", xyr=track)
+    np.savez(folder / "pose_mediapipe.npz", **landmarks())
+    return folder

@@ -1,0 +1,128 @@
+"""The person: landmarks in the frames' pixels, the body fitted to them, and what follows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hoigs.core.body import PELVIS, BodyModel
+from hoigs.core.camera import Camera
+from hoigs.core.clip_format import load_arrays
+from hoigs.core.moment import BodyPose
+from hoigs.preparation.body_fit import FitOptions, fit_body
+from hoigs.preparation.cameras import CameraTrack
+from hoigs.preparation.frames import VideoFrames
+from hoigs.preparation.landmarks import LandmarkTrack
+from hoigs.preparation.silhouette import posed
+from hoigs.preparation.source import SourceError
+
+POOR_FIT = 0.02  # of the image's longer side: a fit that misses by more deserves a warning
+
+
+@dataclass(frozen=True)
+class FittedBody:
+    """A body in the world, metres.
+
+    Attributes:
+        poses: batched over the frames. joints: world.
+        scene_scale: metres a unit of the cameras' own world.
+        residual_px: mean distance of visible landmarks, median over frames, pixels of the frames.
+        ground: largest y of the body, median over frames: the floor's height, if y points down.
+        found: frames with landmarks; the body of the others is interpolated.
+        report: what the fit says of itself.
+    """
+
+    poses: BodyPose
+    joints: Float[Tensor, "F J 3"]
+    scene_scale: float
+    residual_px: float
+    ground: float
+    found: Bool[np.ndarray, " F"]
+    provenance: str
+    report: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    def posed(self, body: BodyModel) -> Iterator[tuple[Tensor, Tensor]]:
+        """Vertices and joints, frame by frame."""
+        return posed(body, self.poses)
+
+    def distance(self, cameras: Sequence[Camera]) -> float:
+        """Median depth of the pelvis, metres."""
+        depths = [c.to_camera(p)[2] for c, p in zip(cameras, self.joints[:, PELVIS], strict=True)]
+        return float(torch.stack(depths).median())
+
+
+def load_landmarks(path: Path, video: VideoFrames, track: CameraTrack) -> LandmarkTrack:
+    """pose_mediapipe.npz in pixels of the frames, distortion removed.
+
+    Raises:
+        SourceError: arrays are absent, of another length than the video, or no person is found.
+    """
+    try:
+        arrays = load_arrays(path)
+        image, world = (arrays[name] for name in ("image_xyzv", "world_xyzv"))
+    except (ValueError, KeyError) as error:
+        raise SourceError(
+            f"{path}: expected an npz with image_xyzv and world_xyzv [F, 33, 4]; {error}"
+        ) from error
+    for name, array in (("image_xyzv", image), ("world_xyzv", world)):
+        if array.ndim != 3 or array.shape[1:] != (33, 4) or len(array) < video.total:
+            raise SourceError(
+                f"{path}: {name} has shape {list(array.shape)}, expected [{video.total}, 33, 4]: "
+                "MediaPipe's 33 landmarks of each video frame, NaN where no person was found"
+            )
+    image = image[video.indices].astype(np.float64)
+    image[..., :3] *= video.width / video.native_width
+    image[..., :2] = track.undistort.pixels(image[..., :2])
+    landmarks = LandmarkTrack.from_mediapipe(image, world[video.indices].astype(np.float64))
+    if not landmarks.found.any():
+        raise SourceError(f"{path}: no person was found in the {len(image)} chosen frames")
+    return landmarks
+
+
+def fit_person(
+    landmarks: LandmarkTrack,
+    video: VideoFrames,
+    track: CameraTrack,
+    body: BodyModel,
+    steps: int,
+    progress: Callable[[float], None] | None = None,
+) -> FittedBody:
+    """Fits the body to landmarks in `steps`; finds the scale of a world that has none."""
+    options = FitOptions(scale=not track.metric, steps=steps)
+    fit = fit_body(body, landmarks, track.cameras, options=options, progress=progress)
+    frames = list(posed(body, fit.poses))
+    residual = float(fit.residual_px.nanmedian())
+    found = int(landmarks.found.sum())
+    return FittedBody(
+        poses=fit.poses,
+        joints=torch.stack([joints for _, joints in frames]),
+        scene_scale=fit.scene_scale,
+        residual_px=residual,
+        ground=float(torch.stack([vertices[:, 1].max() for vertices, _ in frames]).median()),
+        found=landmarks.found.numpy(),
+        provenance=(
+            f"fitted to MediaPipe landmarks of {found} of {len(video)} frames, "
+            f"{residual:.1f} px off (median of frames); hands are not fitted"
+        ),
+        report=fit.report,
+        warnings=_warnings(residual, found, video),
+    )
+
+
+def _warnings(residual: float, found: int, video: VideoFrames) -> list[str]:
+    warnings = []
+    if residual > POOR_FIT * max(video.width, video.height):
+        warnings.append(f"the body misses its landmarks by {residual:.1f} px: see overlay.mp4")
+    if found < 0.8 * len(video):
+        warnings.append(
+            f"landmarks were found in {found} of {len(video)} frames; the others are interpolated"
+        )
+    return warnings

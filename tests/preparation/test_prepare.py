@@ -1,0 +1,196 @@
+"""A source folder becomes a clip folder: a tiny made-up one, and the first frames of real ones."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from test_cameras import FOCAL, colmap_model
+from tiny import BALL, FRAMES, WIDTH, background, landmarks, make_source, masks
+
+from hoigs.core.clip import Clip
+from hoigs.core.clip_folder import check_clip
+from hoigs.core.errors import ClipError
+from hoigs.plugins.bodies.anny import AnnyBody
+from hoigs.plugins.readers.clip import ClipFolderReader
+from hoigs.preparation.frames import VideoFrames
+from hoigs.preparation.prepare import PrepareOptions, PrepareReport, prepare
+from hoigs.preparation.source import SourceError
+
+QUICK = {"fit_steps": 30, "overlay_width": 0}  # what is tested here is not the fit
+
+
+@pytest.fixture(scope="module")
+def body() -> AnnyBody:
+    return AnnyBody()
+
+
+@pytest.fixture(scope="module")
+def static(
+    tmp_path_factory: pytest.TempPathFactory, tiny_video: Path, body: AnnyBody
+) -> tuple[Path, PrepareReport, list[float]]:
+    """The tiny source, prepared once: the clip, the report and the progress that was told."""
+    folder = tmp_path_factory.mktemp("static")
+    seen: list[float] = []
+    report = prepare(
+        make_source(folder / "source", tiny_video),
+        folder / "clip",
+        body=body,
+        options=PrepareOptions(fit_steps=60),
+        progress=lambda done, _: seen.append(done),
+    )
+    return folder / "clip", report, seen
+
+
+def prepared(
+    source: Path, out: Path, body: AnnyBody, **options: object
+) -> tuple[Clip, PrepareReport]:
+    report = prepare(source, out, body=body, options=PrepareOptions(**{**QUICK, **options}))  # type: ignore[arg-type]
+    assert check_clip(out) == []
+    return ClipFolderReader().read(out), report
+
+
+def test_static_camera_and_ball(
+    static: tuple[Path, PrepareReport, list[float]], body: AnnyBody
+) -> None:
+    out, report, seen = static
+    clip = ClipFolderReader().read(out)
+    assert seen == sorted(seen) and seen[-1] == pytest.approx(1)
+    assert len(clip) == FRAMES and clip.kinds == {"human": "human", "object": "object"}
+    assert clip.depth_kind == "none" and clip.fps == 12
+    track = clip.objects["object"]
+    assert track.observed.tolist() == [i != 5 for i in range(FRAMES)]
+    for i, frame in enumerate(clip):
+        xy, _ = frame.camera.project(track.translations[i])
+        assert np.abs(xy.numpy() - BALL(i)[:2]).max() < 0.6
+        assert not (frame.masks["human"] & frame.masks["object"]).any()
+        if i != 5:
+            true = torch.from_numpy(masks(i)[1])
+            assert float((frame.masks["object"] & true).sum() / true.sum()) > 0.9
+    # the ball is bright, the background what was behind the person
+    assert float(track.colors.median()) > 0.75
+    xy, _ = clip.cameras[0].project(clip.points)
+    column, row = xy.floor().long().numpy().T
+    error = np.abs(clip.point_colors.numpy() - background()[row, column] / 255)
+    assert np.median(error) < 0.03
+    # the body stands where the landmarks are, upright, 2.8 m away give or take the shape
+    pelvis = body(clip.moments[6].poses["human"]).joints[0]
+    assert abs(float(clip.cameras[6].project(pelvis)[0][0]) - WIDTH / 2) < 3
+    assert 2.0 < float(pelvis[2]) < 3.6
+    assert report.camera == "static" and report.parallax_degrees == pytest.approx(0, abs=1e-3)
+    assert report.body_residual_px < 3
+    assert report.coverage["object"][5] == 0
+
+
+def test_files_beside_the_clip(static: tuple[Path, PrepareReport, list[float]]) -> None:
+    out, _, _ = static
+    numbers = json.loads((out / "report.json").read_text())
+    assert numbers["frames"] == FRAMES and numbers["seconds"]["writing"] > 0
+    assert "focal length is assumed" in (out / "report.md").read_text()
+    overlay = VideoFrames(out / "overlay.mp4")
+    assert (len(overlay), overlay.width) == (FRAMES, WIDTH)
+    assert sorted(p.name for p in out.parent.iterdir()) == ["clip", "source"]
+
+
+def test_options(tiny_source: Path, tmp_path: Path, body: AnnyBody) -> None:
+    clip, report = prepared(
+        tiny_source, tmp_path / "clip", body, width=48, every=2, max_frames=4, focal=100.0,
+        image_format="png", human="man", object="ball",
+    )  # fmt: skip
+    assert (len(clip), clip.cameras[0].width, clip.fps) == (4, 48, 6)
+    assert float(clip.cameras[0].K[0, 0]) == 50
+    assert set(clip.kinds) == {"man", "ball"}
+    assert not (tmp_path / "clip/overlay.mp4").exists()
+    assert (tmp_path / "clip/images/00003.png").is_file()
+    assert report.width == 48
+
+
+def test_moving_camera_and_masks_apart(tiny_source: Path, tmp_path: Path, body: AnnyBody) -> None:
+    """A COLMAP model of its own unit, masks by entity, no ball: the hands place the object."""
+    colmap_model(tiny_source / "sparse", k1=0.0)  # 0.1 units a frame, in truth 0.05 m
+    np.savez(tiny_source / "pose_mediapipe.npz", **landmarks(FOCAL, step=0.05))
+    (tiny_source / "ball_track.npz").unlink()
+    for i in range(FRAMES):
+        (tiny_source / f"hoi_mask/{i:05d}.png").unlink()
+        for name, mask in zip(("human", "object"), masks(i), strict=True):
+            folder = tiny_source / f"masks/{name}"
+            folder.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(mask).save(folder / f"{i:05d}.png")
+    clip, report = prepared(tiny_source, tmp_path / "clip", body, fit_steps=60)
+    assert report.camera == "moving" and 0.35 < report.scene_scale < 0.7
+    assert (tmp_path / "clip/colmap/cameras.txt").is_file()
+    for i in (2, 9):
+        assert torch.equal(clip[i].masks["object"], torch.from_numpy(masks(i)[1]))
+        xy, depth = clip.cameras[i].project(clip.objects["object"].translations[i])
+        assert float(depth) > 0 and np.abs(xy.numpy() - BALL(i)[:2]).max() < 1
+    # cameras and points are scaled alike
+    step = (clip.cameras[1].center - clip.cameras[0].center).norm()
+    assert float(step) == pytest.approx(0.1 * report.scene_scale, rel=1e-3)
+    assert float(clip.points[:, 2].max()) == pytest.approx(4 * report.scene_scale, rel=1e-3)
+
+
+def test_faults_leave_nothing_behind(tiny_source: Path, tmp_path: Path, body: AnnyBody) -> None:
+    out = tmp_path / "clip"
+    (tiny_source / "hoi_mask/00004.png").unlink()
+    with pytest.raises(SourceError, match=r"lacks 1 of 12 masks: 00004\.png"):
+        prepare(tiny_source, out, body=body)
+    np.savez(tiny_source / "pose_mediapipe.npz", image_xyzv=np.zeros((3, 33, 4)))
+    with pytest.raises(SourceError, match="expected an npz with image_xyzv and world_xyzv"):
+        prepare(tiny_source, out, body=body)
+    nobody = np.full((FRAMES, 33, 4), np.nan)
+    np.savez(tiny_source / "pose_mediapipe.npz", image_xyzv=nobody, world_xyzv=nobody)
+    with pytest.raises(SourceError, match="no person was found in the 12 chosen frames"):
+        prepare(tiny_source, out, body=body)
+    (tiny_source / "video.mp4").write_bytes(b"")
+    with pytest.raises(SourceError, match="is not a readable video"):
+        prepare(tiny_source, out, body=body)
+    assert [p.name for p in tmp_path.iterdir()] == ["source"]
+
+
+def test_targets_are_not_overwritten(tiny_source: Path, tmp_path: Path, body: AnnyBody) -> None:
+    out = tmp_path / "clip"
+    options = PrepareOptions(max_frames=4, width=48, fit_steps=2, overlay_width=0)
+    prepare(tiny_source, out, body=body, options=options)
+    with pytest.raises(ClipError, match="holds a clip already; choose another name"):
+        prepare(tiny_source, out, body=body, options=options)
+    prepare(tiny_source, out, body=body, options=options.model_copy(update={"overwrite": True}))
+    with pytest.raises(SourceError, match="is a clip already, and whole"):
+        prepare(out, tmp_path / "other", body=body)
+    with pytest.raises(ClipError, match="is not empty"):
+        prepare(tiny_source, tiny_source, body=body)
+
+
+@pytest.mark.parametrize(
+    ("name", "camera", "spread"), [("juggle", "static", 0.03), ("backpack", "moving", 0.3)]
+)
+def test_real_videos(
+    shared_data: Path, tmp_path: Path, body: AnnyBody, name: str, camera: str, spread: float
+) -> None:
+    every = 1 if name == "juggle" else 8  # backpack's landmarks begin at frame 25
+    clip, report = prepared(
+        shared_data / name,
+        tmp_path / name,
+        body,
+        every=every,
+        max_frames=8,
+        width=320,
+        fit_steps=60,
+    )
+    assert report.camera == camera and report.object_scale_spread < spread
+    assert report.body_residual_px < 0.04 * 320
+    human, thing = (np.array(report.coverage[n]) for n in ("human", "object"))
+    assert (human > 0.05).all() and np.median(thing) > 0.003 and (human.mean() > thing.mean())
+    # points of the object fall on its mask
+    track = clip.objects["object"]
+    for i in np.flatnonzero(thing > 0.5 * np.median(thing)).tolist():
+        xy, _ = clip.cameras[i].project(
+            track.points @ track.rotations[i].mT + track.translations[i]
+        )
+        column, row = xy.floor().long().T.clamp(min=0)
+        mask = clip[i].masks["object"]
+        column, row = column.clamp(max=mask.shape[1] - 1), row.clamp(max=mask.shape[0] - 1)
+        assert float(mask[row, column].float().mean()) > (0.85 if name == "juggle" else 0.5)
