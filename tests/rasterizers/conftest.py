@@ -16,7 +16,7 @@ def make(name: str) -> Rasterizer:
         return TorchRasterizer()
     from hoigs.rasterizers.warp import WarpRasterizer
 
-    return WarpRasterizer()
+    return WarpRasterizer(cpu_kernels="portable" if name == "warp-portable" else "native")
 
 
 DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
@@ -28,8 +28,8 @@ DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
         pytest.param(
             (name, device), id=f"{name}-{device}", marks=[pytest.mark.gpu] * (device != "cpu")
         )
-        for name in ("torch", "warp")
-        for device in DEVICES
+        for name in ("torch", "warp", "warp-portable")  # portable: CUDA's kernels, on the CPU
+        for device in (DEVICES if name != "warp-portable" else ["cpu"])
     ],
 )
 def backend(request: pytest.FixtureRequest) -> Backend:

@@ -19,6 +19,7 @@ from typing import Any, Literal, Protocol
 
 import torch
 
+from hoigs.core.errors import RenderError
 from hoigs.rasterizers.warp.calls import flat, record
 from hoigs.rasterizers.warp.runtime import wp
 
@@ -122,14 +123,20 @@ class OpenMPWorkers:
 
 
 def make_workers(scheduler: Scheduler) -> tuple[Workers, str]:
-    """Workers and a line that says why they were chosen."""
+    """Workers and a line that says why they were chosen.
+
+    Raises:
+        RenderError: "openmp" was asked for and cannot be used here.
+    """
     if scheduler == "serial":
         return SerialWorkers(), "asked for"
     if scheduler == "threads":
         return ThreadWorkers(), "asked for"
-    if scheduler == "openmp":
-        return OpenMPWorkers(), "asked for"
     try:
-        return OpenMPWorkers(), "torch's OpenMP pool passed its trial"
+        workers = OpenMPWorkers()
     except (ImportError, OSError, AttributeError, RuntimeError, TypeError) as error:
-        return ThreadWorkers(), f"torch's OpenMP pool cannot be used here: {error}"
+        reason = f"torch's OpenMP pool cannot be used here: {error}"
+        if scheduler == "openmp":
+            raise RenderError(f'WarpRasterizer: {reason}; use scheduler="threads"') from error
+        return ThreadWorkers(), reason
+    return workers, "torch's OpenMP pool passed its trial"

@@ -1,0 +1,246 @@
+"""What is particular to the Warp backend; what it shares is in the conformance tests."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+import threading
+import weakref
+from pathlib import Path
+
+import pytest
+import torch
+from raster_scenes import (
+    CUT,
+    RAW,
+    a_camera,
+    assert_close_gradient,
+    assert_same_picture,
+    clear_of_cutoffs,
+    forged,
+    front_camera,
+    images,
+    random_scene,
+)
+from torch import Tensor
+
+from hoigs.core.camera import Camera
+from hoigs.core.errors import RenderError
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.rasterizer import Rasterizer, RenderRequest
+from hoigs.rasterizers.oracle import OracleRasterizer
+from hoigs.rasterizers.warp import WarpConfig, WarpRasterizer
+
+
+def gradients(
+    rasterizer: Rasterizer,
+    gaussians: Gaussians,
+    camera: Camera,
+    request: RenderRequest | None = None,
+) -> dict[str, Tensor]:
+    """Gradients of a fixed random weighting of every image, by raw field and by pose."""
+    leaves = gaussians.map(lambda x: x.clone().requires_grad_())
+    view = camera.world_to_camera.clone().requires_grad_()
+    output = rasterizer.render(leaves, forged(camera, world_to_camera=view), request)
+    generator = torch.Generator().manual_seed(1)
+    loss = torch.zeros((), dtype=output.color.dtype)
+    for image in images(output).values():
+        loss = loss + (image * torch.randn(image.shape, generator=generator)).sum()
+    loss.backward()
+    found = {name: getattr(leaves, name).grad for name in RAW}
+    return {**found, "pose": view.grad}
+
+
+def test_schedulers_and_threads_agree_bit_for_bit() -> None:
+    scene, camera = random_scene(2500), a_camera(150, 90)  # enough for several chunks and tiles
+    request = RenderRequest(features=torch.randn(2500, 3))
+    first = WarpRasterizer(scheduler="serial", threads=1)
+    picture, gradient = first.render(scene, camera, request), gradients(first, scene, camera)
+    for scheduler, threads in (("threads", 2), ("threads", 5), ("auto", 2), ("auto", 3)):
+        other = WarpRasterizer(scheduler=scheduler, threads=threads)
+        for name, image in images(other.render(scene, camera, request)).items():
+            assert torch.equal(image, images(picture)[name]), (scheduler, threads, name)
+        for name, value in gradients(other, scene, camera).items():
+            assert torch.equal(value, gradient[name]), (scheduler, threads, name)
+
+
+def test_native_and_portable_kernels_agree() -> None:
+    scene, camera = random_scene(800), a_camera(131, 77)
+    request = RenderRequest(features=torch.randn(800, 5), background=torch.rand(77, 131, 3))
+    clear = clear_of_cutoffs(scene, camera, request)
+    pictures = [
+        images(WarpRasterizer(cpu_kernels=kernels).render(scene, camera, request))
+        for kernels in ("native", "portable")
+    ]
+    for name, image in pictures[0].items():
+        torch.testing.assert_close(image[clear], pictures[1][name][clear], atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [15, 16, 17, 33])
+def test_features_beyond_one_pass(channels: int) -> None:
+    scene, camera = random_scene(60), a_camera()
+    values = torch.randn(60, channels)
+    request = RenderRequest(features=values)
+    clear = clear_of_cutoffs(scene, camera, request)
+    assert_same_picture(
+        WarpRasterizer().render(scene, camera, request), CUT.render(scene, camera, request), clear
+    )
+    weights = torch.randn(*clear.shape, channels) * clear[..., None]
+    found = []
+    for rasterizer in (WarpRasterizer(), CUT):
+        leaf = values.clone().requires_grad_()
+        means = scene.means.clone().requires_grad_()
+        output = rasterizer.render(
+            scene.replace(means=means), camera, request.replace(features=leaf)
+        )
+        assert output.features is not None
+        (output.features * weights).sum().backward()
+        found.append((leaf.grad, means.grad))
+    for name, actual, wanted in zip(("features", "means"), *found):
+        assert wanted is not None
+        assert_close_gradient(name, actual, wanted)
+
+
+@pytest.mark.parametrize("kernels", ["native", "portable"])
+def test_needles_lose_no_precision(kernels: str) -> None:
+    """Splats hundreds of times longer than wide: conics in float32 would cancel."""
+    scene = random_scene(200)
+    scales = torch.tensor([0.5, 0.002, 0.002]).log().expand(200, 3)
+    scene, camera = scene.replace(log_scales=scales), a_camera(90, 70)
+    smooth = RenderRequest(min_alpha=0.0, min_transmittance=0.0, low_pass=0.05)
+    wanted = gradients(OracleRasterizer(), scene, camera, smooth)
+    actual = gradients(WarpRasterizer(cpu_kernels=kernels), scene, camera, smooth)
+    for name in wanted:
+        assert_close_gradient(name, actual[name], wanted[name])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 200), (200, 1), (16, 64), (17, 65), (300, 140)])
+def test_tiles_cover_images_of_any_size(size: tuple[int, int]) -> None:
+    scene = random_scene(150)
+    camera = a_camera(*size)
+    clear = clear_of_cutoffs(scene, camera, RenderRequest())
+    assert_same_picture(WarpRasterizer().render(scene, camera), CUT.render(scene, camera), clear)
+
+
+def test_a_large_image_needs_little_more_than_itself() -> None:
+    camera = front_camera(4000, 3000, 4000.0, cx=2000.0, cy=1500.0)
+    scene = random_scene(50)
+    scene = scene.replace(means=scene.means + torch.tensor([0.0, 0.0, 4.0]))
+    output = WarpRasterizer().render(scene, camera, RenderRequest(background=torch.ones(3)))
+    assert output.color.shape == (3000, 4000, 3)
+    torch.testing.assert_close(output.color[0, 0], torch.ones(3))
+    assert output.alpha.max() > 0.5
+
+
+def test_an_image_beyond_32_bits_is_refused() -> None:
+    with pytest.raises(RenderError, match=r"50000x50000 pixels .*Camera\.cropped"):
+        WarpRasterizer().render(random_scene(2), front_camera(50_000, 50_000))
+
+
+def test_threads_of_the_caller_do_not_disturb_each_other() -> None:
+    rasterizer = WarpRasterizer(scheduler="threads", threads=2)
+    scenes = [random_scene(1500, seed=seed) for seed in range(4)]
+    camera = a_camera(120, 80)
+    alone = [gradients(rasterizer, scene, camera) for scene in scenes]
+    together: dict[int, list[dict[str, Tensor]]] = {}
+
+    def work(index: int) -> None:
+        together[index] = [gradients(rasterizer, scenes[index], camera) for _ in range(5)]
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for index, results in together.items():
+        for result in results:
+            for name, value in result.items():
+                assert torch.equal(value, alone[index][name]), (index, name)
+
+
+def test_renders_share_no_memory_and_keep_none() -> None:
+    rasterizer, camera = WarpRasterizer(), a_camera()
+    scene = random_scene().map(lambda x: x.requires_grad_())
+    first = rasterizer.render(scene, camera)
+    kept = {name: image.detach().clone() for name, image in images(first).items()}
+    rasterizer.render(scene.map(lambda x: x.detach() + 0.1), camera)
+    for name, image in images(first).items():
+        assert torch.equal(image, kept[name])
+    gone = [weakref.ref(image) for image in images(first).values()]
+    first.color.sum().backward()
+    del first, image
+    gc.collect()
+    assert all(reference() is None for reference in gone)
+
+
+def test_backward_may_run_twice() -> None:
+    scene = random_scene().map(lambda x: x.requires_grad_())
+    loss = WarpRasterizer().render(scene, a_camera()).color.square().sum()
+    once = torch.autograd.grad(loss, scene.means, retain_graph=True)[0]
+    assert torch.equal(once, torch.autograd.grad(loss, scene.means)[0])
+
+
+def test_no_graph_without_gradients() -> None:
+    scene = random_scene().map(lambda x: x.requires_grad_())
+    with torch.no_grad():
+        assert not WarpRasterizer().render(scene, a_camera()).color.requires_grad
+
+
+def test_report_names_what_runs() -> None:
+    report = WarpRasterizer(scheduler="threads").backend_report()
+    assert report["scheduler"] == "threads"
+    assert report["cpu_kernels"] == "native"
+    assert report["warp"]
+
+
+def test_without_openmp_threads_take_over_and_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    from hoigs.rasterizers.warp import workers
+
+    def fail(self: object) -> None:
+        raise OSError("no libgomp in sight")
+
+    monkeypatch.setattr(workers.OpenMPWorkers, "__init__", fail)
+    report = WarpRasterizer(scheduler="auto").backend_report()
+    assert report["scheduler"] == "threads"
+    assert "no libgomp in sight" in report["scheduler_reason"]
+    with pytest.raises(RenderError, match=r"no libgomp in sight.*threads"):
+        WarpRasterizer(scheduler="openmp").backend_report()
+
+
+def test_config_and_arguments_are_checked() -> None:
+    rasterizer = WarpRasterizer.from_config(WarpConfig(cpu_kernels="portable", threads=1))
+    assert rasterizer.cpu_kernels == "portable"
+    with pytest.raises(RenderError, match="threads is 0"):
+        WarpRasterizer(threads=0)
+    with pytest.raises(RenderError, match="near is -1"):
+        WarpRasterizer().render(random_scene(2), a_camera(), RenderRequest(near=-1.0))
+
+
+def test_importing_is_light_and_rendering_is_quiet() -> None:
+    code = """
+import sys
+from hoigs.rasterizers.warp import WarpRasterizer
+rasterizer = WarpRasterizer()
+assert "warp" not in sys.modules, "constructing it loaded Warp"
+sys.path.insert(0, "tests/rasterizers")
+from raster_scenes import a_camera, random_scene
+rasterizer.render(random_scene(10), a_camera())
+"""
+    root = Path(__file__).parents[2]
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=root, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["projection", "pair_kernels", "pixel_kernels"])
+def test_kernels_compile_for_cuda(name: str, tmp_path: Path) -> None:
+    """No GPU is needed to compile; to run them see the conformance tests on "cuda"."""
+    import importlib
+
+    from hoigs.rasterizers.warp.runtime import wp
+
+    module = importlib.import_module(f"hoigs.rasterizers.warp.{name}")
+    wp.compile_aot_module(module, arch=80, module_dir=str(tmp_path))
+    assert list(tmp_path.glob("*.cubin")) or list(tmp_path.glob("*.ptx"))
