@@ -96,12 +96,12 @@ def draw_points(
     camera: Camera,
     color: tuple[int, int, int],
 ) -> None:
-    """Colours the pixels of some world points that lie before the camera, in place."""
+    """Draws some world points that lie before the camera as 2x2 pixels, in place."""
     xy, depth = camera.project(points[:: max(1, len(points) // SHOWN_POINTS)])
-    column, row = xy.floor().long().unbind(-1)
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    inside &= depth > 0
-    image[row[inside].numpy(), column[inside].numpy()] = color
+    # single pixels would drown in the video's halved colour resolution
+    for column, row in xy[depth > 0].round().long().tolist():
+        if 0 < column <= camera.width and 0 < row <= camera.height:
+            image[row - 1 : row + 1, column - 1 : column + 1] = color
 
 
 def shrink(

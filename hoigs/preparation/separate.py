@@ -14,7 +14,8 @@ from hoigs.preparation.overlay import shrink, shrink_mask
 
 BINS = 24  # a colour channel
 WORK_SIDE = 480  # pixels; masks need no more to be told apart, and time grows with area
-GUESSED = 0.4  # weight of a silhouette in a frame whose body was not seen
+GUESSED = 0.2  # weight of a silhouette in a frame whose body was not seen
+CRUMB = 0.05  # of the person's largest part
 STRAY = 0.15  # of the longer side: parts farther than this from the object are not of it
 MARGIN = 0.03  # of the image's longer side: how far clothes reach beyond the body
 Images = Callable[[], Iterable[UInt8[np.ndarray, "H W 3"]]]
@@ -64,7 +65,7 @@ def separate(
             objects[i] = _object_parts(_mean_field(odds[i] + color + places[i], mask), color)
         objects = _without_strays(objects)
     humans, things = MaskStack(), MaskStack()
-    for mask, part, whole in zip(together, objects, wholes, strict=True):
+    for mask, part, whole in zip(together, _adopted(objects, wholes), wholes, strict=True):
         thing = mask & _enlarged(part, whole & ~part, mask.shape)
         humans.append(mask & ~thing)
         things.append(thing)
@@ -183,6 +184,22 @@ def _object_parts(
     sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:] * like
     keep = like & (sizes >= smallest * sizes.max())
     return np.concatenate(([False], keep))[labels]
+
+
+def _adopted(
+    objects: list[Bool[np.ndarray, "H W"]], wholes: list[Bool[np.ndarray, "H W"]]
+) -> list[Bool[np.ndarray, "H W"]]:
+    """Objects with the crumbs of the person that touch them and nothing else of the person: a dark
+    edge, a buckle."""
+    adopted = []
+    for thing, whole in zip(objects, wholes, strict=True):
+        labels, count = ndimage.label(whole & ~thing)
+        sizes = np.bincount(labels.ravel(), minlength=count + 1)
+        sizes[0] = 0
+        touching = np.unique(labels[ndimage.binary_dilation(thing)])
+        crumbs = [n for n in touching.tolist() if n and sizes[n] < CRUMB * sizes.max()]
+        adopted.append(thing | np.isin(labels, crumbs))
+    return adopted
 
 
 def _without_strays(

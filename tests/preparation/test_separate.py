@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hoigs.preparation.masks import MaskStack
-from hoigs.preparation.separate import ColorOdds, _without_strays, separate
+from hoigs.preparation.separate import ColorOdds, _adopted, _without_strays, separate
 
 WIDTH, HEIGHT, F = 90, 120, 6
 ALL = np.ones(F, bool)
@@ -111,3 +111,14 @@ def test_what_strays_is_not_the_object() -> None:
     kept = _without_strays(frames)
     assert not kept[4].any() and not kept[3][2:8, 2:8].any()
     assert all(kept[i][60:80, 40:60].all() for i in range(9) if i != 4)
+
+
+def test_crumbs_of_the_person_on_the_object_are_the_objects() -> None:
+    thing = np.zeros((HEIGHT, WIDTH), bool)
+    thing[50:80, 50:80] = True
+    thing[60:63, 60:63] = False  # a buckle of the person's colour
+    whole = thing.copy()
+    whole[60:63, 60:63] = whole[10:100, 10:48] = whole[5:8, 70:73] = True
+    (kept,) = _adopted([thing], [whole])
+    assert kept[50:80, 50:80].all()
+    assert not kept[10:100, 10:48].any() and not kept[5:8, 70:73].any()
