@@ -112,7 +112,7 @@ class NativePath:
     def _tiles(self, kernel: Any, lists: Lists, arguments: list[Any]) -> None:
         """Every core takes tile after tile."""
         counters = torch.zeros(kernels.COUNTERS, dtype=torch.int32)
-        cores = self.cores.number(lists.tiles)
+        cores = min(self.cores.number(lists.tiles), self.cores.chunks(4 * lists.pairs.shape[0]))
         self.cores.together(kernel, cores, [flat(counters), lists.tile_rows, *arguments])
 
 

@@ -10,7 +10,6 @@ from hoigs.rasterizers.warp.calls import record
 from hoigs.rasterizers.warp.runtime import wp
 from hoigs.rasterizers.warp.workers import SerialWorkers, Workers
 
-ITEMS_PER_CORE = 512  # fewer Gaussians than this are not worth another core
 CUDA_BLOCK = 128
 
 
@@ -36,7 +35,7 @@ class Cores:
 
     def chunks(self, count: int) -> int:
         """In how many parts to take `count` Gaussians."""
-        return self.number(count // ITEMS_PER_CORE)
+        return self.number(count // self.workers.worthwhile)
 
     def once(self, kernel: Any, arguments: list[Any]) -> None:
         record(kernel, 1, arguments).launch()

@@ -17,7 +17,7 @@ class WarpConfig(ComponentConfig):
     """Settings of WarpRasterizer; see there."""
 
     cpu_kernels: Literal["native", "portable"] = "native"
-    scheduler: Literal["auto", "openmp", "threads", "serial"] = "auto"
+    scheduler: Literal["threads", "openmp", "auto", "serial"] = "threads"
     threads: int | None = None
 
 
@@ -50,7 +50,7 @@ class WarpRasterizer(Rasterizer):
     def __init__(
         self,
         cpu_kernels: Literal["native", "portable"] = "native",
-        scheduler: Literal["auto", "openmp", "threads", "serial"] = "auto",
+        scheduler: Literal["threads", "openmp", "auto", "serial"] = "threads",
         threads: int | None = None,
     ) -> None:
         if threads is not None and threads < 1:

@@ -27,15 +27,22 @@ Scheduler = Literal["auto", "openmp", "threads", "serial"]
 
 
 class Workers(Protocol):
-    """Something that finishes a list of recorded launches, in any order, before it returns."""
+    """Something that finishes a list of recorded launches, in any order, before it returns.
+
+    Attributes:
+        name: for reports.
+        worthwhile: Gaussians that are worth another worker: about what waking it takes.
+    """
 
     name: str
+    worthwhile: int
 
     def run(self, launches: Sequence[Any]) -> None: ...
 
 
 class SerialWorkers:
     name = "serial"
+    worthwhile = 2**31
 
     def run(self, launches: Sequence[Any]) -> None:
         for launch in launches:
@@ -46,6 +53,7 @@ class ThreadWorkers:
     """A shared pool of Python threads; the caller is one of the workers."""
 
     name = "threads"
+    worthwhile = 4096
     _pool: ThreadPoolExecutor | None = None
     _owner = 0
 
@@ -83,6 +91,7 @@ class OpenMPWorkers:
     """
 
     name = "openmp"
+    worthwhile = 512
 
     def __init__(self) -> None:
         from warp._src.context import _build_cpu_args_structs
