@@ -34,10 +34,8 @@ class PrepareOptions(ComponentConfig):
         default=0.11, gt=0, description="of a tracked ball, metres; a football's is 0.11"
     )
     object_points: int = Field(default=4000, ge=8, description="points that start the object")
-    scene_spacing: float = Field(
-        default=3.0,
-        gt=0,
-        description="of a static background's points, pixels at 640 wide: 3 gives about 26,000",
+    scene_points: int = Field(
+        default=25_000, ge=100, description="points that start a static camera's background"
     )
     backdrop: float = Field(
         default=3.0,

@@ -187,7 +187,7 @@ class _Preparation:
             scene = static_scene(
                 self.images, masks, self.cameras[0],
                 ground=self.person.ground, distance=self.person.distance(self.cameras),
-                backdrop=self.options.backdrop, spacing=self.options.scene_spacing,
+                backdrop=self.options.backdrop, count=self.options.scene_points,
             )  # fmt: skip
             self.warnings.append(
                 "the camera stands still: the scene's depth is supposed, only what moves has a "

@@ -68,7 +68,7 @@ def static_scene(
     ground: float,
     distance: float,
     backdrop: float,
-    spacing: float,
+    count: int,
 ) -> ScenePoints:
     """A floor under the feet and a wall behind, coloured by the frames' unmasked pixels.
 
@@ -76,7 +76,7 @@ def static_scene(
         images: gives the frames anew. masks: of everything that moves.
         ground: height of the camera over the floor, metres. distance: of the person, metres.
         backdrop: distance of the wall in distances of the person.
-        spacing: of the points at 640 pixels' width, pixels.
+        count: of points, about.
     """
     width = min(camera.width, REFERENCE_WIDTH)
     small = camera.resized(width, max(1, round(camera.height * width / camera.width)))
@@ -93,7 +93,7 @@ def static_scene(
     margin = max(1, round(MASK_MARGIN * width / REFERENCE_WIDTH))
     plate = background_plate(frames(), margin)
     points, colors = plate_points(
-        plate, small, ground=ground, backdrop=backdrop * distance, spacing=spacing
+        plate, small, ground=ground, backdrop=backdrop * distance, count=count
     )
     text = (
         f"supposed: a level floor {ground:.2f} m below a level camera and a wall at "

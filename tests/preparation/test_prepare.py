@@ -146,7 +146,7 @@ def test_faults_leave_nothing_behind(tiny_source: Path, tmp_path: Path, body: An
     with pytest.raises(SourceError, match="no person was found in the 12 chosen frames"):
         prepare(tiny_source, out, body=body)
     (tiny_source / "video.mp4").write_bytes(b"")
-    with pytest.raises(SourceError, match="is not a readable video"):
+    with pytest.raises(SourceError, match="is empty: 0 bytes"):
         prepare(tiny_source, out, body=body)
     assert [p.name for p in tmp_path.iterdir()] == ["source"]
 

@@ -8,7 +8,12 @@ import torch
 from tiny import FRAMES, HEIGHT, WIDTH, background, masks, picture
 
 from hoigs.core.camera import Camera
-from hoigs.preparation.scene_points import background_plate, plate_points, supposed_depth
+from hoigs.preparation.scene_points import (
+    background_plate,
+    plate_points,
+    quadtree,
+    supposed_depth,
+)
 
 
 def camera() -> Camera:
@@ -35,10 +40,23 @@ def test_floor_then_wall() -> None:
 
 def test_points_lie_under_their_pixels_with_their_colours() -> None:
     plate = background_plate([(background(), np.zeros((HEIGHT, WIDTH), bool))], 0)
-    points, colors = plate_points(plate, camera(), ground=1.5, backdrop=7.0, spacing=20.0)
-    assert points.shape == colors.shape == (32 * 21, 3), "3 pixels apart at 96 wide"
+    points, colors = plate_points(plate, camera(), ground=1.5, backdrop=7.0, count=600)
+    assert points.shape == colors.shape and 600 <= len(points) <= 603
     xy, depth = camera().project(points)
     assert float(depth.min()) > 0 and float(depth.max()) <= 7
     column, row = xy.floor().long().numpy().T
     expected = background()[row, column] / 255
     assert np.abs(colors.numpy() - expected).max() < 0.03
+
+
+def test_quadtree_tiles_the_image_and_goes_where_the_detail_is() -> None:
+    image = np.full((40, 52, 3), 90, np.uint8)
+    image[:20, :20] = np.random.default_rng(0).integers(0, 255, (20, 20, 3))
+    cells = quadtree(image, 200)
+    covered = np.zeros((40, 52), int)
+    for y, x, h, w in cells:
+        covered[y : y + h, x : x + w] += 1
+    assert (covered == 1).all() and 200 <= len(cells) <= 203
+    busy = sum(y < 20 and x < 20 for y, x, _, _ in cells)
+    assert busy > 0.85 * len(cells), "a flat area needs few cells"
+    assert all(min(h, w) == 1 for _, _, h, w in quadtree(image, 10**6)), "no more than pixels"

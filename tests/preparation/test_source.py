@@ -62,3 +62,10 @@ def test_an_empty_sparse_folder_is_not_a_static_camera(tiny_source: Path) -> Non
     for name in ("cameras", "images", "points3D"):
         (tiny_source / f"sparse/0/{name}.txt").write_text("")
     assert find_source(tiny_source).colmap == tiny_source / "sparse/0"
+
+
+def test_an_empty_video_is_said_before_what_is_absent(tmp_path: Path) -> None:
+    (tmp_path / "video.mp4").write_bytes(b"")
+    for path in (tmp_path, tmp_path / "video.mp4"):
+        with pytest.raises(SourceError, match=r"video\.mp4 is empty: 0 bytes"):
+            find_source(path)
