@@ -80,8 +80,8 @@ def static_scene(
     """
     width = min(camera.width, REFERENCE_WIDTH)
     small = camera.resized(width, max(1, round(camera.height * width / camera.width)))
-    count = len(masks[0])
-    chosen = set(np.linspace(0, count - 1, PLATE_FRAMES).round().astype(int).tolist())
+    last = len(masks[0]) - 1
+    chosen = set(np.linspace(0, last, PLATE_FRAMES).round().astype(int).tolist())
 
     def frames():
         for i, image in enumerate(images()):

@@ -71,6 +71,7 @@ def test_static_camera_and_ball(
         if i != 5:
             true = torch.from_numpy(masks(i)[1])
             assert float((frame.masks["object"] & true).sum() / true.sum()) > 0.9
+    assert len(clip.points) == report.scene_points > 5000, "nearly one a pixel: the clip is tiny"
     # the ball is bright, the background what was behind the person
     assert float(track.colors.median()) > 0.75
     xy, _ = clip.cameras[0].project(clip.points)
@@ -184,6 +185,7 @@ def test_real_videos(
     assert report.body_residual_px < 0.04 * 320
     human, thing = (np.array(report.coverage[n]) for n in ("human", "object"))
     assert (human > 0.05).all() and np.median(thing) > 0.003 and (human.mean() > thing.mean())
+    assert report.scene_points > 2000
     # points of the object fall on its mask
     track = clip.objects["object"]
     for i in np.flatnonzero(thing > 0.5 * np.median(thing)).tolist():
