@@ -17,7 +17,8 @@ from hoigs.core.moment import BodyPose
 from hoigs.core.skinning import skin
 from hoigs.preparation.body_fit_start import Start, first_guess
 from hoigs.preparation.body_limits import limit_penalty
-from hoigs.preparation.landmarks import BONES, LandmarkPoints, LandmarkTrack, points_of
+from hoigs.preparation.landmarks import BONES, FEET, LandmarkPoints, LandmarkTrack, points_of
+from hoigs.preparation.scene_scale import ground_scale
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,7 @@ def fit_body(
     cameras: Sequence[Camera],
     *,
     options: FitOptions | None = None,
+    points: Float[Tensor, "S 3"] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> BodyFit:
     """Pose, shape and place of a body in every frame, in metres.
@@ -99,8 +101,13 @@ def fit_body(
     visibility; directions of bones against the 3D landmarks; joint limits; acceleration in the
     world; a shape prior. Frames without landmarks are carried by smoothness.
 
-    With `options.scale` the cameras' translations are multiplied by one unknown number, found from
-    feet that stand still and from smoothness: the body is metric, and so becomes the world.
+    With `options.scale` the cameras' translations are multiplied by one unknown number: the body
+    is metric, and so becomes the world. It comes from the scene's points on the ground at the feet,
+    or, without them, from feet that stand still and from smoothness (poor if the person walks).
+
+    Args:
+        points: of the scene, in the cameras' own unit; only used to find the scale.
+        progress: called with 0..1.
 
     Raises:
         HoigsError: cameras and landmarks differ in number, or there are hardly any landmarks.
@@ -115,6 +122,8 @@ def fit_body(
             "at least 2: is the person in view?"
         )
     problem = _Problem(body, landmarks, cameras, options)
+    if options.scale and points is not None:
+        problem.ground = points
     pairs = int(problem.points.pairs.max()) + 1
     unknowns = _Unknowns(problem.start, body.num_betas, pairs, options.scale)
     solve(problem, unknowns, options, progress)
@@ -140,9 +149,11 @@ def solve(
     adam = torch.optim.Adam(groups)
     decay = torch.optim.lr_scheduler.ExponentialLR(adam, 0.01 ** (1 / options.steps))
     for step in range(options.steps):
+        if step in (options.steps // 3, 2 * options.steps // 3):
+            problem.rescale(unknowns)
         adam.zero_grad()
         # the robust spread narrows, so that a poor start is not taken for outliers
-        widen = 1 + 9 * max(0.0, 1 - 2 * step / options.steps)
+        widen = 1 + 2 * max(0.0, 1 - 2 * step / options.steps)
         problem.energy(unknowns, widen).backward()
         adam.step()
         decay.step()
@@ -170,6 +181,8 @@ class _Problem:
         self.K = torch.stack([c.K for c in cameras])
         self.viewmats = torch.stack([c.world_to_camera for c in cameras])
         self.width = float(cameras[0].width)
+        self.cameras, self.ground = cameras, cameras[0].K.new_zeros(0, 3)
+        self.scale_from = "feet that stand still" if options.scale else "the cameras: given"
         self.bones = torch.tensor([(self.points.index(a), self.points.index(b)) for a, b in BONES])
         world = landmarks.world[:, rows].nan_to_num()
         self.bone_targets = _directions(world, self.bones)
@@ -204,6 +217,25 @@ class _Problem:
         xy = cam[..., :2] / cam[..., 2:].clamp_min(0.1)
         focal = torch.stack((self.K[:, 0, 0], self.K[:, 1, 1]), -1)
         return xy * focal[:, None] + self.K[:, None, :2, 2], turned
+
+    @torch.no_grad()
+    def rescale(self, unknowns: _Unknowns) -> None:
+        """Take the scale from the ground at the feet; every camera sees the body where it was."""
+        if not len(self.ground):
+            return
+        old = unknowns.log_scale.exp()
+        shift = self.viewmats[:, :3, 3]
+        _, turned = self.project(self.locate(unknowns.pose(), unknowns.offsets), old)
+        feet = turned[:, [self.points.index(mark) for mark in FEET]] + old * shift[:, None]
+        found = ground_scale(feet, self.ground, self.cameras, self.seen)
+        if found is None:
+            return
+        scale, frames = found
+        self.scale_from = f"scene points on the ground at the feet, {frames} frames"
+        back = self.viewmats[:, :3, :3].mT @ ((old - scale) * shift)[..., None]
+        unknowns.transl.add_(back[..., 0])
+        unknowns.log_scale.fill_(torch.tensor(scale).log())
+        unknowns.log_scale.requires_grad_(False)
 
     def energy(self, unknowns: _Unknowns, widen: float) -> Float[Tensor, ""]:
         options, pose = self.options, unknowns.pose()
@@ -241,9 +273,11 @@ class _Problem:
             "landmark_error_px": round(mean, 2),
             "landmark_error_px_median": round(float(distance[counted].median()), 2),
             "landmark_error_px_at_1280": round(mean * 1280 / self.width, 2),
+            "landmark_offset_m_largest": round(float(unknowns.offsets.norm(dim=-1).max()), 3),
             "frames_with_landmarks": int(self.seen.sum()),
             "frames": len(self.seen),
             "scene_scale": round(float(scale), 5),
+            "scene_scale_from": self.scale_from,
         }
         return BodyFit(pose, residual, float(scale), report)
 

@@ -16,6 +16,7 @@ from hoigs.preparation.landmarks import JOINTS, TORSO, LandmarkTrack
 from hoigs.preparation.limb_start import limb_pose
 
 ANKLES = (27, 28)
+REWEIGHTINGS = 5
 
 
 @dataclass(frozen=True)
@@ -78,20 +79,27 @@ def _kabsch(source: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"]) -> Float
 def _place(
     image: Float[Tensor, "33 3"], world: Float[Tensor, "33 3"], K: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "3"]:
-    """Position of the hips' middle along the camera's axes, from a linear least-squares fit.
+    """Position of the hips' middle along the camera's axes, from a robust linear fit.
 
-    (X + tx) f = (x - c) (Z + tz), two equations a landmark, weighted by visibility.
+    (X + tx) f = (x - c) (Z + tz), two equations a landmark, weighted by visibility and, again and
+    again, by how well the landmark agrees with the others.
     """
-    weight = image[:, 2]
     rows, right = [], []
     for axis in range(2):
         ray = (image[:, axis] - K[axis, 2]) / K[axis, axis]
         row = torch.zeros(len(ray), 3)
         row[:, axis] = 1.0
         row[:, 2] = -ray
-        rows.append(row * weight[:, None])
-        right.append((ray * world[:, 2] - world[:, axis]) * weight)
-    return torch.linalg.lstsq(torch.cat(rows), torch.cat(right)[:, None]).solution[:, 0]
+        rows.append(row)
+        right.append(ray * world[:, 2] - world[:, axis])
+    matrix, vector = torch.stack(rows), torch.stack(right)
+    weight, place = image[:, 2], torch.zeros(3)
+    for _ in range(REWEIGHTINGS):
+        scaled = (matrix * weight[:, None]).flatten(0, 1), (vector * weight).flatten()
+        place = torch.linalg.lstsq(scaled[0], scaled[1][:, None]).solution[:, 0]
+        miss = (matrix @ place - vector).norm(dim=0)
+        weight = image[:, 2] / (1 + (miss / (2 * miss.median().clamp_min(1e-3))).square())
+    return place
 
 
 def _still_feet(ankles: Float[Tensor, "F 2 3"], centers: Float[Tensor, "F 3"]) -> float:
