@@ -153,7 +153,7 @@ def solve(
             problem.rescale(unknowns)
         adam.zero_grad()
         # the robust spread narrows, so that a poor start is not taken for outliers
-        widen = 1 + 2 * max(0.0, 1 - 2 * step / options.steps)
+        widen = 1 + 4 * max(0.0, 1 - 2 * step / options.steps)
         problem.energy(unknowns, widen).backward()
         adam.step()
         decay.step()
