@@ -7,10 +7,11 @@ from typing import Any, Protocol
 import torch
 
 from hoigs.rasterizers.warp.calls import record
+from hoigs.rasterizers.warp.pixel_source import WARPS
 from hoigs.rasterizers.warp.runtime import wp
 from hoigs.rasterizers.warp.workers import SerialWorkers, Workers
 
-CUDA_BLOCK = 128
+CUDA_BLOCK = 32 * WARPS
 
 
 class Launcher(Protocol):

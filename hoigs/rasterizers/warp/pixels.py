@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hoigs.rasterizers.warp import pair_kernels, pixel_kernels
+from hoigs.rasterizers.warp import pair_kernels, pixel_kernels, pixel_source
 from hoigs.rasterizers.warp.arguments import (
     Gradients,
     Projected,
@@ -41,7 +41,7 @@ class PixelPath:
     def bin(self, projected: Projected, settings: Settings) -> Lists:
         """Tile lists by depth, ties by index: slots rise with rows, and the sort is stable."""
         depths = projected.drawn_depths
-        count, rows = depths.shape[0], pixel_kernels.TILE_ROWS
+        count, rows = depths.shape[0], pixel_source.TILE_ROWS
         across, down = -(-settings.width // TILE_WIDTH), -(-settings.height // rows)
         ints = {"dtype": torch.int32, "device": depths.device}
         slots = torch.empty(count, **ints)
@@ -74,7 +74,7 @@ class PixelPath:
         images = Images.empty(inputs, settings)
         self.launcher.each(
             pixel_kernels.forward_pixels,
-            lists.tiles * pixel_kernels.LANES,
+            lists.tiles * pixel_source.LANES,
             tile_arguments(inputs, settings, records, lists, images),
         )
         return images
@@ -95,7 +95,7 @@ class PixelPath:
         arguments = tile_arguments(inputs, settings, records, lists, images)
         arguments += upstream_arguments(upstream, partials)
         self.launcher.each(
-            pixel_kernels.backward_pixels, lists.tiles * pixel_kernels.LANES, arguments
+            pixel_kernels.backward_pixels, lists.tiles * pixel_source.LANES, arguments
         )
         out = Gradients(inputs, pose)
         self.launcher.each(

@@ -132,7 +132,7 @@ def project(
     depths[row] = 0.0
     drawn_depths[row] = -1.0
     radii[row] = 0.0
-    if has_subset != 0:  # noqa: SIM102  Warp's `and` evaluates both sides
+    if has_subset != 0:  # noqa: SIM102  older Warps' `and` evaluates both sides
         if subset[row] == wp.uint8(0):
             return
     mean = means[row]
