@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -166,13 +167,16 @@ def _check_views(folder: Path, view: _View, header: ClipHeader) -> list[Problem]
     problems += _check_cameras(path, arrays)
     problems += _each_frame(root, view, image_path, IMAGE, _image_problem)
     for name in header.entities:
-        found = _each_frame(
-            root, view, lambda r, i, n=name: mask_path(r, n, i), MASK, _mask_problem
-        )
+        at = functools.partial(_mask_at, name)
+        found = _each_frame(root, view, at, MASK, _mask_problem)
         problems += found or _check_mask_content(root, view, name)
     if header.depth_kind != "none":
         problems += _each_frame(root, view, depth_path, DEPTH, _depth_problem)
     return problems
+
+
+def _mask_at(entity: str, folder: Path, frame: int) -> Path:
+    return mask_path(folder, entity, frame)
 
 
 def _each_frame(
@@ -271,9 +275,9 @@ def _check_arrays(
                 problems.append(Problem(path, message))
             continue
         got = arrays[want.name]
-        message = _array_problem(got, want.shape, want.kind, sizes)
-        if message:
-            problems.append(Problem(path, f"{want.name} {message}"))
+        fault = _array_problem(got, want.shape, want.kind, sizes)
+        if fault:
+            problems.append(Problem(path, f"{want.name} {fault}"))
         else:
             good[want.name] = got
     return problems, good

@@ -58,8 +58,8 @@ Count = Annotated[int, Field(ge=1)]
 class ClipHeader(_Strict):
     """clip.json."""
 
-    format: Literal["hoigs-clip"] = Field(default=FORMAT, description='always "hoigs-clip"')
-    version: Literal[1] = Field(default=VERSION, description="of this layout: 1")
+    format: Literal["hoigs-clip"] = Field(default="hoigs-clip", description='always "hoigs-clip"')
+    version: Literal[1] = Field(default=1, description="of this layout: 1")
     name: str = Field(min_length=1, description="for reports")
     fps: float = Field(gt=0, strict=False, description="frames a second")
     width: Count = Field(description="of every image, mask and depth map, pixels")
@@ -94,8 +94,8 @@ class ClipHeader(_Strict):
 class ViewsHeader(_Strict):
     """held_out/views.json."""
 
-    format: Literal["hoigs-views"] = Field(default=VIEWS_FORMAT, description='"hoigs-views"')
-    version: Literal[1] = Field(default=VERSION, description="1")
+    format: Literal["hoigs-views"] = Field(default="hoigs-views", description='"hoigs-views"')
+    version: Literal[1] = Field(default=1, description="1")
     width: Count = Field(description="of the held-out images, pixels")
     height: Count = Field(description="likewise")
     frames: list[int] = Field(

@@ -97,7 +97,8 @@ def fit_person(
 ) -> FittedBody:
     """Fits the body to landmarks in `steps`; finds the scale of a world that has none."""
     options = FitOptions(scale=not track.metric, steps=steps)
-    fit = fit_body(body, landmarks, track.cameras, options=options, progress=progress)
+    known = None if track.metric else track.points
+    fit = fit_body(body, landmarks, track.cameras, options=options, points=known, progress=progress)
     frames = list(posed(body, fit.poses))
     residual = float(fit.residual_px.nanmedian())
     found = int(landmarks.found.sum())
