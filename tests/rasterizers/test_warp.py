@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import gc
+import pickle
 import subprocess
 import sys
 import threading
@@ -185,6 +187,14 @@ def test_no_graph_without_gradients() -> None:
     scene = random_scene().map(lambda x: x.requires_grad_())
     with torch.no_grad():
         assert not WarpRasterizer().render(scene, a_camera()).color.requires_grad
+
+
+def test_copies_carry_the_settings() -> None:
+    rasterizer = WarpRasterizer(scheduler="auto", threads=1)
+    before = rasterizer.render(random_scene(20), a_camera())
+    for copied in (copy.deepcopy(rasterizer), pickle.loads(pickle.dumps(rasterizer))):
+        assert (copied.scheduler, copied.threads) == ("auto", 1)
+        assert torch.equal(copied.render(random_scene(20), a_camera()).color, before.color)
 
 
 def test_report_names_what_runs() -> None:

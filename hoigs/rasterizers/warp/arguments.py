@@ -14,7 +14,13 @@ from hoigs.rasterizers.warp.records import POSE, RECORD, SMALLEST_ALPHA
 
 
 class Projected:
-    """What `projection.project` writes:"""
+    """What `projection.project` writes.
+
+    Attributes:
+        records: [N, RECORD], see `records`.
+        means2d: [N, 2] pixels. depths: [N] metres. radii: [N] pixels; all 0 when culled.
+        drawn_depths: [N] metres, negative where nothing is drawn.
+    """
 
     def __init__(self, like: Tensor, count: int) -> None:
         self.records = like.new_empty(count, RECORD)
