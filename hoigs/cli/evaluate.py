@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hoigs.cli.common import DeviceOption, RasterizerOption, pick_device, print_table, progress_bar
+from hoigs.cli.common import (
+    DeviceOption,
+    PluginOption,
+    RasterizerOption,
+    pick_device,
+    print_table,
+    progress_bar,
+)
 
 if TYPE_CHECKING:
     from hoigs.evaluation.scores import Evaluation
@@ -27,6 +35,7 @@ def evaluate(
     lpips_weights: LpipsOption = None,
     device: DeviceOption = "auto",
     report: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html.")] = True,
+    plugin: PluginOption = None,
 ) -> None:
     """Score a run, print the table, and write evaluation.json and report.html."""
     score_run(
@@ -36,6 +45,7 @@ def evaluate(
         lpips_weights=lpips_weights,
         device=pick_device(device),
         report=report,
+        plugins=plugin or (),
     )
 
 
@@ -47,13 +57,14 @@ def score_run(
     lpips_weights: Path | None = None,
     device: str = "cpu",
     report: bool = True,
+    plugins: Sequence[Path] = (),
 ) -> Evaluation:
     """Load, score, print, write."""
     from hoigs.evaluation.evaluate import evaluate as judge
     from hoigs.evaluation.report import write_report
     from hoigs.training.session import LoadedRun
 
-    loaded = LoadedRun.open(run, clip=clip, rasterizer=rasterizer, device=device)
+    loaded = LoadedRun.open(run, clip=clip, rasterizer=rasterizer, device=device, plugins=plugins)
     with progress_bar("scoring", 1.0) as bar:
         evaluation = judge(
             loaded.model,

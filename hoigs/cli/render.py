@@ -9,7 +9,13 @@ from typing import Annotated
 
 import typer
 
-from hoigs.cli.common import DeviceOption, RasterizerOption, pick_device, progress_bar
+from hoigs.cli.common import (
+    DeviceOption,
+    PluginOption,
+    RasterizerOption,
+    pick_device,
+    progress_bar,
+)
 
 
 class CameraPath(StrEnum):
@@ -30,6 +36,7 @@ def render(
     clip: Annotated[Path | None, typer.Option("--clip", help="The clip, if it has moved.")] = None,
     rasterizer: RasterizerOption = None,
     device: DeviceOption = "auto",
+    plugin: PluginOption = None,
 ) -> None:
     """Draw a run to an mp4."""
     import numpy as np
@@ -40,7 +47,13 @@ def render(
     from hoigs.evaluation.video import write_video
     from hoigs.training.session import LoadedRun
 
-    loaded = LoadedRun.open(run, clip=clip, rasterizer=rasterizer, device=pick_device(device))
+    loaded = LoadedRun.open(
+        run,
+        clip=clip,
+        rasterizer=rasterizer,
+        device=pick_device(device),
+        plugins=plugin or (),
+    )
     model, source = loaded.model, loaded.clip
     for name in only or []:
         if name not in model.entities:

@@ -55,7 +55,7 @@ def train(
     )
     run_session(session)
     if evaluate:
-        score_run(session.run.path, device=where)
+        score_run(session.run.path, device=where, plugins=plugin or ())
 
 
 def run_session(session: object) -> None:

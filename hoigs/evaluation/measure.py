@@ -56,7 +56,7 @@ def render_time(
     drawn: list[int] = []
     started = time.perf_counter()
     warmed = 0
-    note = "nothing is cached between frames"
+    note = "what does not depend on time may be cached"
     for step in range(frames + warmup):
         late = time.perf_counter() - started > budget_s
         if late and len(total) >= 3:

@@ -82,7 +82,7 @@ class Timing:
     height: int
     device: str
     rasterizer: str
-    note: str = "nothing is cached between frames"
+    note: str = "what does not depend on time may be cached"
 
     @property
     def fps(self) -> float:

@@ -101,7 +101,8 @@ class Session:
         else:
             provenance = {
                 "versions": versions(),
-                "components": registry.provenance(spec),
+                "components": registry.provenance(spec)
+                | {f"body of {n}": registry.origin(t.model) for n, t in clip.bodies.items()},
                 "spec_hash": spec.hash(),
                 "clip": {"name": clip.name, "path": run.relative(clip_folder)},
                 "clip_provenance": dict(clip.provenance),
@@ -142,11 +143,12 @@ class LoadedRun:
         clip: Path | None = None,
         rasterizer: str | None = None,
         device: str = "cpu",
+        plugins: Sequence[Path] = (),
     ) -> LoadedRun:
         """Read a run folder; `clip` and `rasterizer` replace what it was trained with."""
         run = RunFolder(path)
         run.require()
-        registry = default_registry()
+        registry = default_registry(plugin_files=plugins)
         changes = []
         if rasterizer is not None:
             key = rasterizer if ":" in rasterizer else f"rasterizer:{rasterizer}"
