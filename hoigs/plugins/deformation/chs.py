@@ -112,7 +112,6 @@ class CubicHermite(DeformationModel):
         self.owns = frozenset({"means", "quats"} | ({"opacity_logits"} if self.keyed else set()))
         self.rest_space = "canonical" if track is not None else "world"
         self._track = track
-        self.rest_space = "world" if track is None else "canonical"
 
     @classmethod
     def from_config(cls, config: CubicHermiteConfig, context: BuildContext) -> Self:

@@ -78,7 +78,6 @@ class MlpDeformation(DeformationModel):
         nn.init.zeros_(self.heads.bias)
         self.track = RigidTrack(track) if track is not None else None
         self.rest_space = "world" if track is None else "canonical"
-        self.rest_space = "canonical" if track is not None else "world"
 
     @classmethod
     def from_config(cls, config: MlpConfig, context: BuildContext) -> Self:
