@@ -95,7 +95,7 @@ class TrainSpec(_Strict):
             preview_every scores a few test frames for the curve in the report (0 = never).
     """
 
-    steps: int = Field(3000, ge=1)
+    steps: int = Field(2000, ge=1)
     seed: int = Field(0, ge=0)
     width: int | None = Field(None, ge=16)
     warmup: WarmupSpec = WarmupSpec()
