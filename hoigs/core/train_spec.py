@@ -61,8 +61,9 @@ class RatesSpec(_Strict):
     Sources: 3DGS (Kerbl 2023) for the Gaussian fields, ExAvatar (Moon 2024) for networks and
     poses, 4DGS (Wu 2024) for planes, E-D3DGS (Bae 2024) for embeddings; methods A.10, D.4. Those
     of means, sh, planes and networks are 2 to 6 times the published ones, because runs here take
-    thousands of steps, not tens of thousands: on the built-in clip, 1500 steps, they gain 0.7 dB
-    (full frame) and 0.4 dB (human and object).
+    thousands of steps, not tens of thousands: against means 1.6e-4, sh 5e-3, planes 5e-3, networks
+    1e-3 they gain 0.7 dB (full frame) and 0.4 dB (human and object) in 1500 steps on the built-in
+    clip (docs/results/README.md).
     `*_final` rates are reached log-linearly at the last step.
     """
 
