@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -23,12 +24,19 @@ class Capabilities:
         devices: torch device types. dtypes: names of the floating types it computes in.
         camera_gradients: whether gradients reach `Camera.world_to_camera`.
         deterministic: whether two runs agree bit for bit.
+        fixed: options of a request that the backend cannot change, with their only value.
+        image_error: largest error of an image against float64 away from cut-offs (depth: in parts
+            of its largest value).
+        gradient_error: largest relative L2 error of a gradient, likewise.
     """
 
     devices: frozenset[str]
     dtypes: frozenset[str]
     camera_gradients: bool
     deterministic: bool
+    fixed: Mapping[str, float] = field(default_factory=dict, hash=False)
+    image_error: float = 1e-5
+    gradient_error: float = 1e-4
 
 
 @dataclass(frozen=True)
@@ -157,6 +165,12 @@ class Rasterizer(ABC):
             if not good:
                 raise RenderError(
                     f"{name}: request.{key} is {getattr(request, key)}, expected {wanted}"
+                )
+        for key, value in self.capabilities.fixed.items():
+            if getattr(request, key) != value:
+                raise RenderError(
+                    f"{name}: request.{key} is {getattr(request, key)}; this backend can only "
+                    f"draw with {key} = {value}"
                 )
 
 
