@@ -24,6 +24,7 @@ class Capabilities:
         devices: torch device types. dtypes: names of the floating types it computes in.
         camera_gradients: whether gradients reach `Camera.world_to_camera`.
         deterministic: whether two runs agree bit for bit.
+        absolute_gradients: whether `RenderRequest.absolute_gradients` is filled in.
         fixed: options of a request that the backend cannot change, with their only value.
         image_error: largest error of an image against float64 away from cut-offs (depth: in parts
             of its largest value).
@@ -34,6 +35,7 @@ class Capabilities:
     dtypes: frozenset[str]
     camera_gradients: bool
     deterministic: bool
+    absolute_gradients: bool = False
     fixed: Mapping[str, float] = field(default_factory=dict, hash=False)
     image_error: float = 1e-5
     gradient_error: float = 1e-4
@@ -50,6 +52,11 @@ class RenderRequest:
         sh_degree: highest SH band to use, 0..3; None is all that are stored.
         screen_offsets: added to the projected means, pixels. A zero tensor that requires grad
             receives the screen-space gradient that density control needs, on every backend alike.
+        absolute_gradients: changes nothing that is drawn, whatever it holds. A tensor that requires
+            grad receives, beside each Gaussian, the sum over pixels p of (|dL_p / du|, |dL_p / dv|),
+            where (u, v) is its projected mean and L_p the share of the loss that passes through
+            pixel p, all channels together: opposite pulls do not cancel (AbsGS, Ye et al. 2024,
+            eq. 4). Only of backends whose `Capabilities.absolute_gradients` says so.
         near: Gaussians whose centre is nearer than this are culled, metres.
         low_pass: variance added to the screen covariance, square pixels (3DGS: 0.3).
         max_alpha: alpha of one Gaussian at one pixel is clamped to this (no gradient above).
@@ -62,6 +69,7 @@ class RenderRequest:
     background: Tensor | None = None
     sh_degree: int | None = None
     screen_offsets: Float[Tensor, "N 2"] | None = None
+    absolute_gradients: Float[Tensor, "N 2"] | None = None
     near: float = 0.05
     low_pass: float = 0.3
     max_alpha: float = 0.999
@@ -134,6 +142,11 @@ class Rasterizer(ABC):
             )
         if camera.width < 1 or camera.height < 1:
             raise RenderError(f"{name}: image size {camera.width}x{camera.height} is empty")
+        if request.absolute_gradients is not None and not self.capabilities.absolute_gradients:
+            raise RenderError(
+                f"{name}: cannot give absolute screen gradients (request.absolute_gradients); use a "
+                "rasterizer that can, for example rasterizer:torch"
+            )
         for key, (value, shapes) in _expected_shapes(gaussians, camera, request).items():
             if value is None:
                 continue
@@ -193,6 +206,7 @@ def _expected_shapes(
         "request.features": (request.features, [(count, None)]),
         "request.subset": (request.subset, [(count,)]),
         "request.screen_offsets": (request.screen_offsets, [(count, 2)]),
+        "request.absolute_gradients": (request.absolute_gradients, [(count, 2)]),
         "request.background": (request.background, [(3,), image]),
     }
 

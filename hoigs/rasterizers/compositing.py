@@ -30,6 +30,7 @@ class Splats:
         means2d: centres, pixels. covs, conics: (xx, xy, yy), as `Projection` has them.
         opacities: activated. extents: half sizes of the box where alpha >= min_alpha, pixels.
         channels: what is composited: RGB, depth, then the features; C = 4 + F.
+        absolutes: takes the absolute gradients (A = 2), or nothing when not asked for (A = 0).
     """
 
     means2d: Float[Tensor, "M 2"]
@@ -38,6 +39,7 @@ class Splats:
     opacities: Float[Tensor, " M"]
     extents: Float[Tensor, "M 2"]
     channels: Float[Tensor, "M C"]
+    absolutes: Float[Tensor, "M A"]
 
     def __len__(self) -> int:
         return self.means2d.shape[0]
@@ -63,6 +65,9 @@ def prepare(
     channels = [colors, shown.depths[:, None]]
     if request.features is not None:
         channels.append(request.features[shown.index].to(colors.dtype))
+    absolutes = colors.new_empty(len(shown), 0)
+    if request.absolute_gradients is not None:
+        absolutes = request.absolute_gradients[shown.index].to(colors.dtype)
     splats = Splats(
         shown.means2d,
         shown.covs,
@@ -70,6 +75,7 @@ def prepare(
         shown.opacities,
         shown.extents,
         torch.cat(channels, dim=-1),
+        absolutes,
     )
 
     def scattered(values: Tensor) -> Tensor:
@@ -99,12 +105,29 @@ def squared_distances(
     return (dx - (xy / yy) * dy).square() * conics[..., 0] + dy.square() / yy
 
 
+class _Absolute(torch.autograd.Function):
+    """Lets values [P, M] pass; the second argument [M] receives sum_p |gradient|."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, absolutes: Tensor) -> Tensor:
+        del ctx, absolutes
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        del ctx
+        return gradient, gradient.abs().sum(0)
+
+
 def splat_alphas(
     pixels: Float[Tensor, "P 2"], splats: Splats, max_alpha: float, min_alpha: float
 ) -> Float[Tensor, "P M"]:
     """Alpha of every splat at every pixel centre; 0 where it is skipped."""
     dx = pixels[:, :1] - splats.means2d[:, 0]
     dy = pixels[:, 1:] - splats.means2d[:, 1]
+    if splats.absolutes.shape[1] == 2:
+        dx = _Absolute.apply(dx, splats.absolutes[:, 0])
+        dy = _Absolute.apply(dy, splats.absolutes[:, 1])
     distances = squared_distances(dx, dy, splats.covs, splats.conics)
     alphas = (splats.opacities * torch.exp(-0.5 * distances)).clamp_max(max_alpha)
     return torch.where(alphas >= min_alpha, alphas, 0.0) if min_alpha > 0 else alphas

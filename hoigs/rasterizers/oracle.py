@@ -33,6 +33,7 @@ class OracleRasterizer(Rasterizer):
         dtypes=frozenset({"float32", "float64"}),
         camera_gradients=True,
         deterministic=True,
+        absolute_gradients=True,
     )
 
     def __init__(self, cutoffs: bool = False) -> None:

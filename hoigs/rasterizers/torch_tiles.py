@@ -32,6 +32,7 @@ class TorchRasterizer(Rasterizer):
         dtypes=frozenset({"float32", "float64"}),
         camera_gradients=True,
         deterministic=True,
+        absolute_gradients=True,
     )
 
     def __init__(self, tile_size: int = 16) -> None:

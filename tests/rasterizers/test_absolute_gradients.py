@@ -1,0 +1,123 @@
+"""RenderRequest.absolute_gradients: sums over pixels that do not cancel."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from raster_scenes import Backend, a_camera, front_camera, one_gaussian, random_scene
+from torch import Tensor
+
+from hoigs.core.errors import RenderError
+from hoigs.core.rasterizer import RenderOutput, RenderRequest
+from hoigs.rasterizers.oracle import OracleRasterizer
+
+CAMERA = a_camera(width=20, height=14)
+
+
+def a_loss(output: RenderOutput) -> Tensor:
+    """Of every pixel, [H, W]: it looks at all that is composited, with signs of all kinds."""
+    generator = torch.Generator().manual_seed(4)
+    shape = (*output.alpha.shape, 7)
+    weights = torch.randn(shape, generator=generator).to(output.color)
+    features = output.features if output.features is not None else output.color[..., :2]
+    parts = (output.color, output.alpha[..., None], output.depth[..., None], features)
+    return (weights * torch.cat(parts, -1)).sum(-1)
+
+
+def capable(backend: Backend) -> Backend:
+    if not backend.rasterizer.capabilities.absolute_gradients:
+        pytest.skip("this backend says that it cannot")
+    return backend
+
+
+def watched(backend: Backend, scene, camera, **fields: Tensor) -> Tensor:
+    absolutes = torch.zeros(len(scene), 2, device=backend.device, requires_grad=True)
+    request = RenderRequest(absolute_gradients=absolutes, **fields)
+    a_loss(backend.render(scene, camera, request)).sum().backward()
+    assert absolutes.grad is not None
+    return absolutes.grad.cpu()
+
+
+def one_pixel_at_a_time(scene, camera, **fields: Tensor) -> tuple[Tensor, Tensor]:
+    """By the definition: the screen gradient of each pixel's loss alone; its |.| and itself, summed."""
+    offsets = torch.zeros(len(scene), 2, dtype=torch.float64, requires_grad=True)
+    request = RenderRequest(screen_offsets=offsets, **fields)
+    losses = a_loss(OracleRasterizer(cutoffs=True).render(scene, camera, request)).flatten()
+    rows = [torch.autograd.grad(loss, offsets, retain_graph=True)[0] for loss in losses]
+    return torch.stack(rows).abs().sum(0), torch.stack(rows).sum(0)
+
+
+@pytest.mark.parametrize("with_features", [False, True])
+def test_they_are_the_sum_of_each_pixels_own(backend: Backend, with_features: bool) -> None:
+    backend = capable(backend)
+    scene = random_scene(40, degree=1)
+    fields = {"features": torch.randn(40, 2, generator=torch.Generator().manual_seed(1))}
+    fields = fields if with_features else {}
+    found = watched(backend, scene, CAMERA, **fields).double()
+    expected, signed = one_pixel_at_a_time(scene, CAMERA, **fields)
+    assert float((found - expected).norm() / expected.norm()) < 2e-3  # float32, a cut-off pixel
+    assert (expected > signed.abs() * 1.5).any(-1).float().mean() > 0.5  # much does cancel
+
+
+def test_the_oracle_gives_them_too() -> None:
+    scene = random_scene(25, degree=0)
+    absolutes = torch.zeros(25, 2, requires_grad=True)
+    output = OracleRasterizer(cutoffs=True).render(
+        scene, CAMERA, RenderRequest(absolute_gradients=absolutes)
+    )
+    a_loss(output).sum().backward()
+    expected, _ = one_pixel_at_a_time(scene, CAMERA)
+    torch.testing.assert_close(absolutes.grad.double(), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_opposite_pulls_cancel_only_in_the_signed_gradient(backend: Backend) -> None:
+    backend = capable(backend)
+    offsets = torch.zeros(1, 2, device=backend.device, requires_grad=True)
+    absolutes = torch.zeros(1, 2, device=backend.device, requires_grad=True)
+    request = RenderRequest(screen_offsets=offsets, absolute_gradients=absolutes)
+    output = backend.render(one_gaussian(), front_camera(), request)
+    output.color.sum().backward()  # symmetric: each side pulls its own way
+    assert offsets.grad is not None
+    assert absolutes.grad is not None
+    assert float(absolutes.grad.min()) > 1.0
+    assert float(offsets.grad.abs().max()) < 1e-4
+
+
+def test_they_leave_picture_and_other_gradients_alone(backend: Backend) -> None:
+    backend = capable(backend)
+    found = []
+    for asked in (False, True):
+        scene = random_scene(40, degree=1).map(lambda x: x.clone().requires_grad_())
+        absolutes = torch.full((40, 2), 7.0, device=backend.device, requires_grad=True)
+        request = RenderRequest(absolute_gradients=absolutes if asked else None)
+        output = backend.render(scene, CAMERA, request)
+        a_loss(output).sum().backward()
+        found.append((output.color.detach(), scene.means.grad, scene.opacity_logits.grad))
+    for plain, other in zip(*found, strict=True):
+        assert torch.equal(plain, other)
+
+
+def test_culled_rows_receive_nothing(backend: Backend) -> None:
+    backend = capable(backend)
+    scene = random_scene(12, degree=0)
+    subset = torch.arange(12) % 3 != 0
+    found = watched(backend, scene, CAMERA, subset=subset)
+    assert (found[~subset] == 0).all()
+    assert (found[subset].sum(-1) > 0).any()
+
+
+def test_a_backend_that_cannot_says_so(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+    capabilities = backend.rasterizer.capabilities
+    cannot = type(capabilities)(**{**vars(capabilities), "absolute_gradients": False})
+    monkeypatch.setattr(type(backend.rasterizer), "capabilities", cannot)
+    request = RenderRequest(absolute_gradients=torch.zeros(12, 2))
+    with pytest.raises(RenderError, match="cannot give absolute screen gradients"):
+        backend.render(random_scene(12), CAMERA, request)
+
+
+def test_their_shape_is_checked(backend: Backend) -> None:
+    backend = capable(backend)
+    with pytest.raises(RenderError, match=r"absolute_gradients has shape \[11, 2\]"):
+        backend.render(
+            random_scene(12), CAMERA, RenderRequest(absolute_gradients=torch.zeros(11, 2))
+        )
