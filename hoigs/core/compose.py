@@ -13,7 +13,7 @@ from torch import Tensor
 from hoigs.core.clip import Clip
 from hoigs.core.context import BuildContext
 from hoigs.core.deformation import DeformationModel
-from hoigs.core.density import DensityControl
+from hoigs.core.density import DensityControl, check_rasterizer
 from hoigs.core.entity import Entity
 from hoigs.core.errors import HoigsError, PluginError, SpecError, did_you_mean
 from hoigs.core.gaussians import Gaussians
@@ -57,14 +57,14 @@ def compose_density(
         SpecError, PluginError: as `compose`.
     """
     builder = _Builder(spec, clip, registry or default_registry())
-    return {
-        name: builder.part(
-            ("model", place, "density"),
-            block.density,
-            BuildContext(entity=name, clip=clip, seed=spec.train.seed),
-        )
-        for name, _, place, block in builder.chosen()
-    }
+    controls = {}
+    for name, _, place, block in builder.chosen():
+        where = ("model", place, "density")
+        context = BuildContext(entity=name, clip=clip, seed=spec.train.seed)
+        controls[name] = builder.part(where, block.density, context)
+        with _blaming(spec, *where):
+            check_rasterizer(controls[name], builder.registry.get(spec.rasterizer.use))
+    return controls
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,13 @@ class DeformationModel(nn.Module, ABC):
             residual: correction from the interaction module; None is no correction.
         """
 
+    def peak_opacity_logits(self, rest: Gaussians) -> Float[Tensor, " N"]:
+        """The largest opacity logit of each Gaussian over time, by which density control judges it.
+
+        The default is that at rest; a deformation that keys opacities knows better.
+        """
+        return rest.opacity_logits
+
     def on_topology(self, change: TopologyChange) -> None:
         """Follow a change of Gaussian count; the default reindexes `per_gaussian` parameters."""
         reindex((self.get_parameter(name) for name in self.per_gaussian), change)

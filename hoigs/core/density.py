@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import zlib
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -10,11 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.errors import RenderError
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.topology import TopologyChange
 
 if TYPE_CHECKING:
     from hoigs.core.context import BuildContext
+    from hoigs.core.rasterizer import Rasterizer
 
 
 @dataclass
@@ -26,15 +30,26 @@ class DensityStatistics:
             the image (3DGS's NDC convention).
         visible_count: number of views in which each Gaussian was drawn.
         max_radius: largest screen radius seen, pixels.
+        absolute_sum: as `gradient_sum`, of the absolute gradient (`RenderRequest
+            .absolute_gradients`); zero unless a controller asks for it.
+        loss_sum: sum over visible views of the view's loss.
     """
 
     gradient_sum: Float[Tensor, " N"]
     visible_count: Float[Tensor, " N"]
     max_radius: Float[Tensor, " N"]
+    absolute_sum: Float[Tensor, " N"] = None  # type: ignore[assignment]  # zero if left out
+    loss_sum: Float[Tensor, " N"] = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.absolute_sum is None:
+            self.absolute_sum = torch.zeros_like(self.gradient_sum)
+        if self.loss_sum is None:
+            self.loss_sum = torch.zeros_like(self.gradient_sum)
 
     @staticmethod
     def zeros(count: int, device: torch.device | str = "cpu") -> DensityStatistics:
-        return DensityStatistics(*(torch.zeros(count, device=device) for _ in range(3)))
+        return DensityStatistics(*(torch.zeros(count, device=device) for _ in range(5)))
 
     def add(
         self,
@@ -42,18 +57,36 @@ class DensityStatistics:
         radii: Float[Tensor, " N"],
         width: int,
         height: int,
+        *,
+        absolute_gradient: Float[Tensor, "N 2"] | None = None,
+        loss: Float[Tensor, ""] | None = None,
     ) -> None:
-        """Count one view. `screen_gradient` is in pixels, as `RenderRequest.screen_offsets`."""
+        """Count one view.
+
+        Args:
+            screen_gradient: per pixel of displacement, as `RenderRequest.screen_offsets` has it.
+            radii: pixels, 0 where not drawn. width, height: of the image, pixels.
+            absolute_gradient: as `RenderRequest.absolute_gradients` has it. loss: of the view.
+        """
         visible = radii > 0
         half = screen_gradient.new_tensor((width / 2, height / 2))
         norm = (screen_gradient * half).norm(dim=-1)
         self.gradient_sum += torch.where(visible, norm, torch.zeros_like(norm))
         self.visible_count += visible
         self.max_radius = torch.maximum(self.max_radius, radii.to(self.max_radius))
+        if absolute_gradient is not None:
+            norm = (absolute_gradient * half).norm(dim=-1)
+            self.absolute_sum += torch.where(visible, norm, torch.zeros_like(norm))
+        if loss is not None:
+            self.loss_sum += visible * loss.to(self.loss_sum)
 
     @property
     def mean_gradient(self) -> Float[Tensor, " N"]:
         return self.gradient_sum / self.visible_count.clamp_min(1)
+
+    @property
+    def mean_absolute_gradient(self) -> Float[Tensor, " N"]:
+        return self.absolute_sum / self.visible_count.clamp_min(1)
 
 
 @dataclass(frozen=True)
@@ -71,7 +104,19 @@ class Refinement:
 
 
 class DensityControl(ABC):
-    """A strategy for one entity. It decides; training applies, optimizer state included."""
+    """A strategy for one entity. It decides; training applies, optimizer state included.
+
+    It keeps nothing from one step to the next (random numbers come from `step_generator`), so that
+    a resumed run equals an unbroken one.
+
+    Attributes:
+        absolute_gradients: whether it decides on absolute screen gradients, which not every
+            rasterizer gives; see `check_rasterizer`.
+        regularizer_weights: default weight of each penalty of `regularizers`; 0 where absent.
+    """
+
+    absolute_gradients: bool = False
+    regularizer_weights: Mapping[str, float] = {}
 
     @classmethod
     def from_config(cls, config: Any, context: BuildContext) -> Self:
@@ -91,7 +136,53 @@ class DensityControl(ABC):
         """Called after every step; None means nothing changes at this one.
 
         Args:
-            rest: the entity's canonical Gaussians. current: the same at the last moment drawn.
+            rest: the entity's canonical Gaussians, with the largest opacity that each has over
+                time. current: the same at the last moment drawn.
             statistics: gathered since the last refinement that was not None.
             extent: scene extent, metres, guarded to be positive for static cameras.
         """
+
+    def perturb(
+        self, rest: Gaussians, *, step: int, total_steps: int, rate: float
+    ) -> Float[Tensor, "N 3"] | None:
+        """Called after every step and after `refine`: offsets to be added, or None for none.
+
+        Offsets are in rest coordinates, metres; a deformation that keeps positions of its own
+        turns them as it turns the Gaussian. Optimizer moments stay.
+
+        Args:
+            rest: as `refine` has it. rate: learning rate of the positions now, metres a step; 0
+                while they are frozen.
+        """
+        del rest, step, total_steps, rate
+        return None
+
+    def regularizers(self, current: Gaussians) -> dict[str, Tensor]:
+        """Named scalar penalties, unweighted, of the Gaussians at the moment drawn."""
+        del current
+        return {}
+
+
+def check_rasterizer(control: DensityControl, rasterizer: Rasterizer | type[Rasterizer]) -> None:
+    """Raise RenderError when `control` decides on what `rasterizer` cannot tell."""
+    if control.absolute_gradients and not rasterizer.capabilities.absolute_gradients:
+        name = rasterizer.__name__ if isinstance(rasterizer, type) else type(rasterizer).__name__
+        raise RenderError(
+            f"{type(control).__name__} decides on absolute screen gradients, which {name} does "
+            "not give; use rasterizer:torch, or density:adc, which does without"
+        )
+
+
+def step_generator(seed: int, step: int, device: torch.device, stream: int = 0) -> torch.Generator:
+    """Random numbers of one step: the same in a resumed run, with nothing to store.
+
+    Args:
+        stream: tells apart what draws in the same step.
+    """
+    mixed = (seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9 + stream) % 2**63
+    return torch.Generator(device=device).manual_seed(mixed)
+
+
+def entity_seed(context: BuildContext) -> int:
+    """A seed that differs between the entities of one run."""
+    return (context.seed << 32) + zlib.crc32(context.entity.encode())

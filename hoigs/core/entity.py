@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from hoigs.core.deformation import DeformationModel, ProvidesSkeleton
@@ -12,7 +13,7 @@ from hoigs.core.features import FeatureExtractor, Tokens
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.interaction import EntityKind, Residual, Role
 from hoigs.core.moment import Moment
-from hoigs.core.topology import TopologyChange
+from hoigs.core.topology import TopologyChange, share_opacity
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
@@ -73,6 +74,12 @@ class Entity(nn.Module):
     def rest(self) -> Gaussians:
         return Gaussians(*(getattr(self, name) for name in FIELDS))
 
+    @property
+    def at_peak(self) -> Gaussians:
+        """The rest Gaussians with the largest opacity that each has over time."""
+        rest = self.rest
+        return rest.replace(opacity_logits=self.deformation.peak_opacity_logits(rest))
+
     def tokens(self, moment: Moment) -> Tokens | None:
         if self.features is None:
             return None
@@ -103,8 +110,20 @@ class Entity(nn.Module):
             parameter.grad = None
             parameter.data = getattr(rest, name).detach().clone()
         self.deformation.on_topology(change)
+        if change.copies is not None:
+            for name in self.deformation.per_gaussian:
+                if name.rpartition(".")[2] == "opacity_logits":
+                    keyed = self.deformation.get_parameter(name)
+                    keyed.data = share_opacity(keyed.data, change.copies)
         if self.features is not None:
             self.features.on_topology(change)
+
+    @torch.no_grad()
+    def displace(self, offsets: Float[Tensor, "N 3"]) -> None:
+        """Move every Gaussian by an offset in rest coordinates, metres; nothing else changes."""
+        self.means.data += offsets
+        if "means" in self.deformation.owns:  # it keeps positions of its own
+            self.deformation.on_topology(TopologyChange.displaced(offsets))
 
     def resize(self, count: int) -> None:
         """Allocate `count` Gaussians with arbitrary content: before loading a checkpoint."""

@@ -53,10 +53,10 @@ class RenderRequest:
         screen_offsets: added to the projected means, pixels. A zero tensor that requires grad
             receives the screen-space gradient that density control needs, on every backend alike.
         absolute_gradients: changes nothing that is drawn, whatever it holds. A tensor that requires
-            grad receives, beside each Gaussian, the sum over pixels p of (|dL_p / du|, |dL_p / dv|),
+            grad receives for each Gaussian the sum over pixels p of (|dL_p / du|, |dL_p / dv|),
             where (u, v) is its projected mean and L_p the share of the loss that passes through
-            pixel p, all channels together: opposite pulls do not cancel (AbsGS, Ye et al. 2024,
-            eq. 4). Only of backends whose `Capabilities.absolute_gradients` says so.
+            pixel p, all channels together: opposite pulls do not cancel (AbsGS, Ye et al. 2024).
+            Only from backends whose `Capabilities.absolute_gradients` says so.
         near: Gaussians whose centre is nearer than this are culled, metres.
         low_pass: variance added to the screen covariance, square pixels (3DGS: 0.3).
         max_alpha: alpha of one Gaussian at one pixel is clamped to this (no gradient above).
@@ -144,8 +144,8 @@ class Rasterizer(ABC):
             raise RenderError(f"{name}: image size {camera.width}x{camera.height} is empty")
         if request.absolute_gradients is not None and not self.capabilities.absolute_gradients:
             raise RenderError(
-                f"{name}: cannot give absolute screen gradients (request.absolute_gradients); use a "
-                "rasterizer that can, for example rasterizer:torch"
+                f"{name}: cannot give absolute screen gradients (request.absolute_gradients); use "
+                "a rasterizer that can, for example rasterizer:torch"
             )
         for key, (value, shapes) in _expected_shapes(gaussians, camera, request).items():
             if value is None:

@@ -16,14 +16,18 @@ class TopologyChange:
 
     Attributes:
         source: old row of each new Gaussian.
-        fresh: True for a clone or split child, whose optimizer moments start at zero.
+        fresh: True for a clone, a split child or a relocated row: its optimizer moments start at 0.
         offsets: displacement of each new Gaussian from its source, metres, to be added to any
             position that a deformation keeps per Gaussian (all its keyframes alike).
+        copies: how many new Gaussians stand together for the source of each, itself included; the
+            opacity is shared among them by `share_opacity`. None: each keeps the whole of it. The
+            entity does this for `opacity_logits` that its deformation keeps per Gaussian.
     """
 
     source: Int[Tensor, " M"]
     fresh: Bool[Tensor, " M"]
     offsets: Float[Tensor, "M 3"]
+    copies: Int[Tensor, " M"] | None = None
 
     @staticmethod
     def keep(mask: Bool[Tensor, " N"]) -> TopologyChange:
@@ -35,8 +39,28 @@ class TopologyChange:
             torch.zeros(len(source), 3, device=mask.device),
         )
 
+    @staticmethod
+    def displaced(offsets: Float[Tensor, "N 3"]) -> TopologyChange:
+        """Every row stays, moments and all, and moves by its offset."""
+        source = torch.arange(len(offsets), device=offsets.device)
+        return TopologyChange(source, torch.zeros_like(source, dtype=torch.bool), offsets)
+
     def __len__(self) -> int:
         return self.source.shape[0]
+
+
+def share_opacity(
+    logits: Float[Tensor, "M *rest"], copies: Int[Tensor, " M"]
+) -> Float[Tensor, "M *rest"]:
+    """Opacity logits of n coincident Gaussians that look like one: o' = 1 - (1 - o)^(1 / n).
+
+    Exact at the centre, where transmittances multiply (3DGS-MCMC, Kheradmand et al. 2024, eq. 9).
+    Rows with one copy are left bit for bit.
+    """
+    shares = copies.reshape(-1, *(1,) * (logits.dim() - 1))
+    log_clear = torch.nn.functional.logsigmoid(-logits) / shares  # ln(1 - o')
+    shared = torch.log(-torch.expm1(log_clear)) - log_clear
+    return torch.where(shares > 1, shared, logits)
 
 
 def reindex(parameters: Iterable[nn.Parameter], change: TopologyChange) -> None:

@@ -45,6 +45,12 @@ PARTS = (
      "the clip folder that `hoigs prepare` writes"),
     ("density:adc", "hoigs.plugins.density.adc", "AdaptiveDensity", "AdaptiveDensityConfig",
      "clone, split and prune as 3DGS does, under a hard cap"),
+    ("density:absgrad", "hoigs.plugins.density.absgrad", "AbsoluteGradientDensity",
+     "AbsoluteGradientConfig", "as adc, by gradients whose opposite pulls do not cancel (AbsGS)"),
+    ("density:mcmc", "hoigs.plugins.density.mcmc", "McmcDensity", "McmcDensityConfig",
+     "relocate what is dead, explore with noise, grow to the cap (3DGS-MCMC)"),
+    ("density:budget", "hoigs.plugins.density.budget", "BudgetDensity", "BudgetDensityConfig",
+     "exactly as many as asked for, grown where it matters (Taming 3DGS)"),
     ("density:none", "hoigs.plugins.density.none", "NoDensity", "NoDensityConfig",
      "the number of Gaussians stays"),
 )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -10,6 +11,8 @@ from torch import Tensor
 
 from hoigs.core.camera import Camera
 from hoigs.core.clip import Frame
+from hoigs.core.density import DensityControl
+from hoigs.core.gaussians import Gaussians
 from hoigs.core.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.scene import SceneModel, SceneState
 from hoigs.core.train_spec import LossSpec
@@ -32,6 +35,7 @@ class ObjectiveResult:
         terms: unweighted losses by name. total: their weighted sum.
         state: the Gaussians that were drawn. composite: the full render.
         screen_offsets: receives the screen-space gradient of `state.joined()`, pixels.
+        absolute_gradients: receives its absolute sums, where a density control asks for them.
     """
 
     terms: dict[str, Tensor]
@@ -40,6 +44,7 @@ class ObjectiveResult:
     composite: RenderOutput
     screen_offsets: Float[Tensor, "N 2"]
     weights: dict[str, float] = field(default_factory=dict)
+    absolute_gradients: Float[Tensor, "N 2"] | None = None
 
 
 class JointObjective:
@@ -50,9 +55,15 @@ class JointObjective:
     """
 
     def __init__(
-        self, model: SceneModel, spec: LossSpec, depth_kind: str, lpips: Lpips | None = None
+        self,
+        model: SceneModel,
+        spec: LossSpec,
+        depth_kind: str,
+        lpips: Lpips | None = None,
+        density: Mapping[str, DensityControl] | None = None,
     ) -> None:
         self.model, self.spec, self.depth_kind, self.lpips = model, spec, depth_kind, lpips
+        self.density = dict(density or {})  # whose regularisers count too
         self.weights = term_weights(spec)
 
     def __call__(self, frame: Frame, camera: Camera, generator: torch.Generator) -> ObjectiveResult:
@@ -61,8 +72,13 @@ class JointObjective:
         offsets = torch.zeros(
             sum(len(g) for g in state.gaussians.values()), 2, device=device, requires_grad=True
         )
+        absolutes = None
+        if any(control.absolute_gradients for control in self.density.values()):
+            absolutes = torch.zeros_like(offsets, requires_grad=True)
         composite = self.model.rasterizer.render(
-            state.joined(), camera, RenderRequest(screen_offsets=offsets)
+            state.joined(),
+            camera,
+            RenderRequest(screen_offsets=offsets, absolute_gradients=absolutes),
         )
         image = frame.image.to(device).float() / 255.0
         terms: dict[str, Tensor] = {}
@@ -78,9 +94,9 @@ class JointObjective:
                 terms.update(self._entity(name, kind, frame, camera, state, generator))
         weights = {name: self.weights[name.partition("/")[0]] for name in terms}
         for name in self.model.entities:
-            self._regularize(name, terms, weights)
+            self._regularize(name, state.gaussians[name], terms, weights)
         total = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
-        return ObjectiveResult(terms, total, state, composite, offsets, weights)
+        return ObjectiveResult(terms, total, state, composite, offsets, weights, absolutes)
 
     def _scene(
         self,
@@ -132,9 +148,16 @@ class JointObjective:
             terms[f"{kind}/{name}/lpips"] = self.spec.lpips * self.lpips(render, target)
         return terms
 
-    def _regularize(self, name: str, terms: dict[str, Tensor], weights: dict[str, float]) -> None:
-        defaults = self.model.entity(name).deformation.regularizer_weights
-        for key, value in self.model.entity(name).regularizers().items():
+    def _regularize(
+        self, name: str, current: Gaussians, terms: dict[str, Tensor], weights: dict[str, float]
+    ) -> None:
+        defaults = dict(self.model.entity(name).deformation.regularizer_weights)
+        penalties = self.model.entity(name).regularizers()
+        if name in self.density:
+            control = self.density[name]
+            defaults |= control.regularizer_weights
+            penalties |= control.regularizers(current)
+        for key, value in penalties.items():
             weight = self.spec.regularizers.get(key, defaults.get(key, 0.0))
             if weight > 0:
                 terms[f"regularizer/{name}/{key}"] = value

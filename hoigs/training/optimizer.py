@@ -76,6 +76,7 @@ class GroupedAdam:
         self, model: SceneModel, rates: RatesSpec, warmup: WarmupSpec, scene_extent: float
     ) -> None:
         self.names: dict[str, nn.Parameter] = {}
+        self.roles: list[str] = []  # name of the rate of each, in the same order
         self.schedules: list[Schedule] = []
         groups = []
         for name, parameter, rate, entity in named_rates(model):
@@ -89,6 +90,7 @@ class GroupedAdam:
                 start, final = start * extent, final * extent
             begin = getattr(warmup, WAITING[rate]) if rate in WAITING else 0.0
             self.names[name] = parameter
+            self.roles.append(rate)
             self.schedules.append(Schedule(start, final, begin))
             groups.append({"params": [parameter], "lr": start})
         # eps as in 3DGS: gradients of single Gaussians are tiny, the default would damp them
@@ -97,6 +99,23 @@ class GroupedAdam:
     def set_progress(self, progress: float) -> None:
         for group, schedule in zip(self.adam.param_groups, self.schedules, strict=True):
             group["lr"] = schedule.at(progress)
+
+    def position_rate(self, entity: str) -> float:
+        """Learning rate now of an entity's positions, metres a step.
+
+        Of its rest means, or of the keyframes of a deformation that owns these; 0 when neither
+        is trained.
+        """
+        mine = {
+            name.removeprefix(f"entities.{entity}."): (role, group["lr"])
+            for name, role, group in zip(
+                self.names, self.roles, self.adam.param_groups, strict=True
+            )
+            if name.startswith(f"entities.{entity}.")
+        }
+        if "means" in mine:
+            return float(mine["means"][1])
+        return max((float(rate) for role, rate in mine.values() if role == "keyframes"), default=0)
 
     def step(self) -> None:
         self.adam.step()

@@ -18,16 +18,29 @@ class EntityDensity:
         self.statistics = DensityStatistics.zeros(len(entity), entity.means.device)
 
     def gather(
-        self, screen_gradient: torch.Tensor, radii: torch.Tensor, width: int, height: int
+        self,
+        screen_gradient: torch.Tensor,
+        radii: torch.Tensor,
+        width: int,
+        height: int,
+        absolute_gradient: torch.Tensor | None,
+        loss: torch.Tensor,
     ) -> None:
-        self.statistics.add(screen_gradient, radii, width, height)
+        self.statistics.add(
+            screen_gradient,
+            radii,
+            width,
+            height,
+            absolute_gradient=absolute_gradient,
+            loss=loss.detach(),
+        )
 
     def refine(
         self, current: Gaussians, optimizer: GroupedAdam, step: int, total_steps: int
     ) -> bool:
         """Ask the controller, and apply what it decides. True when the count changed."""
         decision = self.control.refine(
-            self.entity.rest.detach(),
+            self.entity.at_peak.detach(),
             current.detach(),
             self.statistics,
             step=step,
@@ -39,6 +52,14 @@ class EntityDensity:
         apply_refinement(self.entity, decision, optimizer)
         self.statistics = DensityStatistics.zeros(len(self.entity), self.entity.means.device)
         return decision.change is not None
+
+    def perturb(self, step: int, total_steps: int, rate: float) -> None:
+        """Ask the controller for offsets, and move the Gaussians by them."""
+        offsets = self.control.perturb(
+            self.entity.at_peak.detach(), step=step, total_steps=total_steps, rate=rate
+        )
+        if offsets is not None:
+            self.entity.displace(offsets)
 
 
 @torch.no_grad()

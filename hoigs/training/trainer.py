@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from hoigs.core.clip import Clip
-from hoigs.core.density import DensityControl
+from hoigs.core.density import DensityControl, DensityStatistics, check_rasterizer
 from hoigs.core.scene import SceneModel
 from hoigs.core.train_spec import TrainSpec
 from hoigs.evaluation.lpips import Lpips
@@ -71,7 +71,9 @@ class Trainer:
         self.identity = dict(identity or {"spec_name": "", "model_hash": ""})
         self.generator = torch.Generator().manual_seed(spec.seed)
         self.sampler = EpochSampler(clip.split["train"], self.generator)
-        self.objective = JointObjective(model, spec.loss, clip.depth_kind, lpips)
+        for control in (density or {}).values():
+            check_rasterizer(control, model.rasterizer)
+        self.objective = JointObjective(model, spec.loss, clip.depth_kind, lpips, density)
         scene_extent = clip.extent()
         self.optimizer = GroupedAdam(model, spec.rates, spec.warmup, scene_extent)
         self.density = {
@@ -129,13 +131,19 @@ class Trainer:
         return {**terms, "total": float(result.total.detach())}
 
     def _refine(self, result: ObjectiveResult, width: int, height: int) -> None:
-        gradient = result.screen_offsets.grad
+        gradient, absolute = result.screen_offsets.grad, None
+        if result.absolute_gradients is not None:
+            absolute = result.absolute_gradients.grad
         radii = result.composite.info["radii"]
         rows = result.state.slices()
         for name, density in self.density.items():
+            row = rows[name]
             if gradient is not None:
-                density.gather(gradient[rows[name]], radii[rows[name]], width, height)
+                mine = None if absolute is None else absolute[row]
+                density.gather(gradient[row], radii[row], width, height, mine, result.total)
             density.refine(result.state.gaussians[name], self.optimizer, self.step, self.spec.steps)
+            rate = self.optimizer.position_rate(name)
+            density.perturb(self.step, self.spec.steps, rate)
 
     def _report(self, terms: dict[str, float] | None) -> StepReport | None:
         last = self.step == self.spec.steps
@@ -194,8 +202,9 @@ class Trainer:
         self.optimizer.load_tensors(checkpoint.part("optimizer"))
         for name, density in self.density.items():
             stored = checkpoint.part(f"density.{name}")
+            density.statistics = DensityStatistics.zeros(len(density.entity), self.model.device)
             for key, value in stored.items():
-                setattr(density.statistics, key, value.clone())
+                setattr(density.statistics, key, value.to(self.model.device).clone())
         self.generator.set_state(checkpoint.tensors["rng.generator"])
         torch.set_rng_state(checkpoint.tensors["rng.torch"])
         self.sampler.load(checkpoint.meta["sampler"])

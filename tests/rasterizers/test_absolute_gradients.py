@@ -39,7 +39,7 @@ def watched(backend: Backend, scene, camera, **fields: Tensor) -> Tensor:
 
 
 def one_pixel_at_a_time(scene, camera, **fields: Tensor) -> tuple[Tensor, Tensor]:
-    """By the definition: the screen gradient of each pixel's loss alone; its |.| and itself, summed."""
+    """By the definition, from the screen gradient of each pixel's loss: sums of |.| and of it."""
     offsets = torch.zeros(len(scene), 2, dtype=torch.float64, requires_grad=True)
     request = RenderRequest(screen_offsets=offsets, **fields)
     losses = a_loss(OracleRasterizer(cutoffs=True).render(scene, camera, request)).flatten()

@@ -184,6 +184,9 @@ class CubicHermite(DeformationModel):
         del rest
         return self._means(moment.time, derivative=True)
 
+    def peak_opacity_logits(self, rest: Gaussians) -> Float[Tensor, " N"]:
+        return self.opacity_logits.amax(1) if self.keyed else rest.opacity_logits
+
     def on_topology(self, change: TopologyChange) -> None:
         """Rows follow; new Gaussians are displaced in every knot.
 

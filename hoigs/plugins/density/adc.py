@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from typing import Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,13 +10,18 @@ from pydantic import Field
 from torch import Tensor
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.density import DensityControl, DensityStatistics, Refinement
+from hoigs.core.context import BuildContext
+from hoigs.core.density import (
+    DensityControl,
+    DensityStatistics,
+    Refinement,
+    entity_seed,
+    step_generator,
+)
 from hoigs.core.gaussians import Gaussians
-from hoigs.core.rotation import quats_to_matrices
 from hoigs.core.topology import TopologyChange
+from hoigs.plugins.density.children import Window, with_children
 
-CHILDREN = 2
-SHRINK = math.log(0.8 * CHILDREN)  # a child's standard deviations are its parent's / 1.6
 LATEST_RESET = 0.85  # a reset in the last 15 % of the run would not be recovered from (F41)
 
 
@@ -54,15 +59,16 @@ class AdaptiveDensityConfig(ComponentConfig):
 class AdaptiveDensity(DensityControl):
     """Clone what is small, split what is large, prune what is not seen, under a hard cap.
 
-    When more Gaussians ask for refinement than the cap has room for, those with the largest
-    gradients get it. A Gaussian is removed for its opacity only if both its rest and its current
-    one are low, since a keyed opacity may be low at one moment alone.
+    Large ones are split in two, of standard deviations divided by 1.6. When more Gaussians ask for
+    refinement than the cap has room for, those with the largest gradients get it. A Gaussian is
+    removed for its opacity only if the largest that it has over time is low, since a keyed opacity
+    may be low at one moment alone.
 
     Split children are drawn from their parent at rest, so the offsets of the TopologyChange are in
     rest coordinates, as the new rest centres are; a deformation that keeps positions of its own
     turns them as it turns the Gaussian.
 
-    Args: as AdaptiveDensityConfig.
+    Args: as AdaptiveDensityConfig. seed: of the children's places.
     """
 
     def __init__(
@@ -79,12 +85,17 @@ class AdaptiveDensity(DensityControl):
         prune_radius: float | None = None,
         reset_every: int | None = None,
         reset_opacity: float = 0.01,
+        seed: int = 0,
     ) -> None:
-        self.start, self.stop, self.interval = start, stop, interval
+        self.window, self.seed = Window(start, stop, interval), seed
         self.threshold, self.cap, self.keep = threshold, cap, keep
         self.clone_scale, self.prune_opacity = clone_scale, prune_opacity
         self.prune_scale, self.prune_radius = prune_scale, prune_radius
         self.reset_every, self.reset_opacity = reset_every, reset_opacity
+
+    @classmethod
+    def from_config(cls, config: AdaptiveDensityConfig, context: BuildContext) -> Self:
+        return cls(**config.model_dump(), seed=entity_seed(context))
 
     @torch.no_grad()
     def refine(
@@ -97,14 +108,14 @@ class AdaptiveDensity(DensityControl):
         total_steps: int,
         extent: float,
     ) -> Refinement | None:
-        window = self.start * total_steps <= step <= self.stop * total_steps
-        refines = window and step > 0 and step % self.interval == 0
-        resets = window and self._resets(step, total_steps)
+        refines = self.window.refines(step, total_steps)
+        resets = self.window.contains(step, total_steps) and self._resets(step, total_steps)
         if not refines and not resets:
             return None
         change, children = None, None
         if refines:
-            change, children = self._change(rest, current, statistics, extent)
+            generator = step_generator(self.seed, step, rest.means.device)
+            change, children = self._change(rest, current, statistics, extent, generator)
         return Refinement(change, children, self.reset_opacity if resets else None)
 
     def _resets(self, step: int, total_steps: int) -> bool:
@@ -112,39 +123,34 @@ class AdaptiveDensity(DensityControl):
             return False
         return step <= LATEST_RESET * total_steps
 
+    def urgency(
+        self, statistics: DensityStatistics, large: Bool[Tensor, " N"]
+    ) -> Float[Tensor, " N"]:
+        """The gradient over its threshold: 1 and more asks for refinement."""
+        del large
+        return statistics.mean_gradient / self.threshold
+
     def _change(
-        self, rest: Gaussians, current: Gaussians, statistics: DensityStatistics, extent: float
+        self,
+        rest: Gaussians,
+        current: Gaussians,
+        statistics: DensityStatistics,
+        extent: float,
+        generator: torch.Generator,
     ) -> tuple[TopologyChange, Gaussians] | tuple[None, None]:
         """The index map and the new rest, or nothing when all stay as they are."""
         pruned = self._pruned(rest, current, statistics, extent)
-        gradient = statistics.mean_gradient
-        wanted = (gradient >= self.threshold) & ~pruned
+        large = current.scales.amax(1) > self.clone_scale * extent
+        urgency = self.urgency(statistics, large)
+        wanted = (urgency >= 1) & ~pruned
         room = max(0, self.cap - int((~pruned).sum()))
         if int(wanted.sum()) > room:
-            chosen = torch.where(wanted, gradient, -1.0).topk(room).indices
+            chosen = torch.where(wanted, urgency, -1.0).topk(room).indices
             wanted = torch.zeros_like(wanted)
             wanted[chosen] = True
         if not wanted.any() and not pruned.any():
             return None, None
-        large = current.scales.amax(1) > self.clone_scale * extent
-        kept = (~pruned & ~(wanted & large)).nonzero().squeeze(1)
-        clones = (wanted & ~large).nonzero().squeeze(1)
-        parents = (wanted & large).nonzero().squeeze(1)
-        source = torch.cat((kept, clones, parents.repeat(CHILDREN)))
-        fresh = torch.arange(len(source), device=source.device) >= len(kept)
-        split = torch.arange(len(source), device=source.device) >= len(kept) + len(clones)
-        sampled = rest[source]
-        offsets = split[:, None] * self._drawn(sampled)
-        children = sampled.replace(
-            means=sampled.means + offsets, log_scales=sampled.log_scales - SHRINK * split[:, None]
-        )
-        return TopologyChange(source, fresh, offsets), children
-
-    @staticmethod
-    def _drawn(gaussians: Gaussians) -> Float[Tensor, "N 3"]:
-        """An offset from the centre of each Gaussian, drawn from it."""
-        local = torch.randn_like(gaussians.means) * gaussians.scales
-        return (quats_to_matrices(gaussians.quats) @ local[..., None]).squeeze(-1)
+        return with_children(rest, ~pruned, wanted.long(), large, generator)
 
     def _pruned(
         self, rest: Gaussians, current: Gaussians, statistics: DensityStatistics, extent: float
