@@ -179,11 +179,11 @@ class Rasterizer(ABC):
                 raise RenderError(
                     f"{name}: request.{key} is {getattr(request, key)}, expected {wanted}"
                 )
-        for key, value in self.capabilities.fixed.items():
-            if getattr(request, key) != value:
+        for key, only in self.capabilities.fixed.items():
+            if getattr(request, key) != only:
                 raise RenderError(
                     f"{name}: request.{key} is {getattr(request, key)}; this backend can only "
-                    f"draw with {key} = {value}"
+                    f"draw with {key} = {only}"
                 )
 
 
