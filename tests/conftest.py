@@ -20,6 +20,7 @@ CHECKED = (
     "hoigs.rasterizers.torch_tiles",
     "hoigs.evaluation",
     "hoigs.training",
+    "hoigs.testing",
 )
 install_import_hook(list(CHECKED), "shapecheck.check")
 

@@ -1,0 +1,167 @@
+"""Check, CheckList and Report: how conformance checks are declared, run and counted."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Generic, TypeVar
+
+from hoigs.core.errors import did_you_mean
+
+Subject = TypeVar("Subject")
+Need = Callable[[Any], str | None]  # why the subject cannot be asked this; None when it can
+
+
+class CheckError(AssertionError):
+    """What was checked, what was expected and what came."""
+
+
+@dataclass(frozen=True)
+class Check(Generic[Subject]):
+    """One question to a plugin.
+
+    Attributes:
+        id: stable forever, for example "R07"; a check that is withdrawn leaves its id unused.
+        title: one line.
+        function: raises CheckError, or whatever the plugin raises.
+        needs: what the subject must declare for the question to make sense.
+    """
+
+    id: str
+    title: str
+    function: Callable[[Subject], None]
+    needs: tuple[Need, ...] = ()
+
+    def missing(self, subject: Subject) -> str | None:
+        """Why the subject cannot be asked this, or None."""
+        return next((why for need in self.needs if (why := need(subject)) is not None), None)
+
+    def run(self, subject: Subject) -> None:
+        self.function(subject)
+
+
+class CheckList(Generic[Subject]):
+    """The checks of one interface, ordered by id.
+
+    Args:
+        letter: what their ids begin with.
+    """
+
+    def __init__(self, letter: str) -> None:
+        self.letter = letter
+        self._checks: dict[str, Check[Subject]] = {}
+
+    def check(
+        self, id: str, *needs: Need
+    ) -> Callable[[Callable[[Subject], None]], Callable[[Subject], None]]:
+        """Decorator: adds a function; the first line of its docstring is the title."""
+        if not re.fullmatch(rf"{self.letter}\d\d", id) or id in self._checks:
+            raise ValueError(f'check id "{id}": expected {self.letter} and two digits, used once')
+
+        def add(function: Callable[[Subject], None]) -> Callable[[Subject], None]:
+            title = (function.__doc__ or function.__name__).strip().partition("\n")[0].rstrip(".")
+            self._checks[id] = Check(id, title, function, needs)
+            return function
+
+        return add
+
+    def __iter__(self) -> Iterator[Check[Subject]]:
+        return iter(sorted(self._checks.values(), key=lambda check: check.id))
+
+    def __len__(self) -> int:
+        return len(self._checks)
+
+    def __getitem__(self, id: str) -> Check[Subject]:
+        if id not in self._checks:
+            raise KeyError(f'no check "{id}"{did_you_mean(id, self._checks)}')
+        return self._checks[id]
+
+
+class Outcome(StrEnum):
+    PASSED = "passed"
+    FAILED = "failed"
+    SKIPPED = "skipped"
+    EXPECTED_FAILURE = "expected failure"
+    UNEXPECTED_PASS = "unexpected pass"
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of one check; `why` says so unless it passed."""
+
+    id: str
+    title: str
+    outcome: Outcome
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class Report:
+    """The results of a list of checks on one subject."""
+
+    subject: str
+    results: tuple[Result, ...]
+
+    def count(self, outcome: Outcome) -> int:
+        return sum(result.outcome is outcome for result in self.results)
+
+    @property
+    def run(self) -> int:
+        return len(self.results) - self.count(Outcome.SKIPPED)
+
+    @property
+    def ok(self) -> bool:
+        """Some check was run, none failed, and no expected failure passed."""
+        bad = self.count(Outcome.FAILED) + self.count(Outcome.UNEXPECTED_PASS)
+        return self.run > 0 and bad == 0
+
+    def __str__(self) -> str:
+        counts = ", ".join(f"{self.count(o)} {o}" for o in Outcome if self.count(o))
+        lines = [f"{self.subject}: {self.run} checks run ({counts or 'none'})"]
+        lines += [
+            f"  {r.id} {r.outcome}: {r.title}" + (f"\n      {r.why}" if r.why else "")
+            for r in self.results
+            if r.outcome is not Outcome.PASSED
+        ]
+        return "\n".join(lines)
+
+
+def run_checks(
+    checks: Iterable[Check[Subject]],
+    subject: Subject,
+    expected_failures: Mapping[str, str] | None = None,
+) -> Report:
+    """Run every check that the subject's declarations allow, and count what came of each.
+
+    Args:
+        expected_failures: id of a check -> why this subject is known to fail it. Such a check is
+            run all the same, and its passing is an error too.
+
+    Raises:
+        ValueError: `expected_failures` names a check that is not among `checks`.
+    """
+    checks, expected = list(checks), dict(expected_failures or {})
+    ids = [check.id for check in checks]
+    for id in expected:
+        if id not in ids:
+            raise ValueError(f'expected_failures: no check "{id}"{did_you_mean(id, ids)}')
+    results = tuple(_result(check, subject, expected.get(check.id)) for check in checks)
+    return Report(str(subject), results)
+
+
+def _result(check: Check[Subject], subject: Subject, expected: str | None) -> Result:
+    missing = check.missing(subject)
+    if missing is not None:
+        return Result(check.id, check.title, Outcome.SKIPPED, missing)
+    try:
+        check.run(subject)
+    except Exception as error:
+        text = str(error) if isinstance(error, CheckError) else f"{type(error).__name__}: {error}"
+        if expected is None:
+            return Result(check.id, check.title, Outcome.FAILED, text)
+        return Result(check.id, check.title, Outcome.EXPECTED_FAILURE, expected)
+    if expected is None:
+        return Result(check.id, check.title, Outcome.PASSED)
+    return Result(check.id, check.title, Outcome.UNEXPECTED_PASS, f"expected to fail: {expected}")

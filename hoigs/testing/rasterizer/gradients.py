@@ -1,0 +1,215 @@
+"""R40 to R49: gradients, against the oracle's, against rules and against differences."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+from torch import Tensor
+from torch.autograd.gradcheck import GradcheckError
+
+from hoigs.core.camera import Camera
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.rasterizer import RenderRequest
+from hoigs.testing.checks import CheckError
+from hoigs.testing.compare import require, require_close, require_finite, require_zero
+from hoigs.testing.rasterizer.reference import (
+    ORACLE,
+    PARTS,
+    reference,
+    require_reference_gradients,
+    weighing,
+)
+from hoigs.testing.rasterizer.scenes import (
+    RAW,
+    Scene,
+    a_camera,
+    front_camera,
+    images,
+    on,
+    one_gaussian,
+    random_gaussians,
+    random_scene,
+)
+from hoigs.testing.rasterizer.subject import (
+    CHECKS,
+    RasterizerSubject,
+    camera_gradients,
+    float64,
+    free,
+)
+
+
+@cache
+def graded_scene(seed: int = 0, degree: int = 3) -> Scene:
+    return random_scene(100, degree=degree, seed=seed)
+
+
+@CHECKS.check("R40")
+def gradients_are_the_oracles(subject: RasterizerSubject) -> None:
+    """Every raw field, features, offsets and background get the oracle's gradient."""
+    names = (*RAW, "features", "screen_offsets", "background")
+    for seed in (0, 1):
+        require_reference_gradients(subject, graded_scene(seed), names=names)
+
+
+@CHECKS.check("R41")
+def gradients_of_each_image_alone(subject: RasterizerSubject) -> None:
+    """The same when the loss sees colour, alpha, depth or features alone."""
+    for part in PARTS:
+        require_reference_gradients(subject, graded_scene(), (part,))
+
+
+@CHECKS.check("R42", camera_gradients)
+def gradients_of_the_pose(subject: RasterizerSubject) -> None:
+    """The camera's pose gets the oracle's gradient, through positions and through colours."""
+    for part in (PARTS, ("color",), ("depth",)):
+        require_reference_gradients(subject, graded_scene(1), part, ("world_to_camera",))
+
+
+@CHECKS.check("R43")
+def gradients_of_every_harmonic_degree(subject: RasterizerSubject) -> None:
+    """Coefficients, and means through the direction of view, for SH degrees 0, 1 and 2."""
+    for degree in range(3):
+        scene = graded_scene(3, degree)
+        require_reference_gradients(subject, scene, ("color",), ("sh", "means"))
+
+
+@CHECKS.check("R44")
+def background_colour_takes_its_gradient(subject: RasterizerSubject) -> None:
+    """The gradient of a background colour is the sum of what shines through."""
+    request = RenderRequest(background=torch.tensor([0.2, 0.5, 0.7]))
+    scene = Scene(random_gaussians(50, degree=0), a_camera(), request)
+    output, gradients = subject.drawn(scene, lambda output: output.color.sum())
+    left = float((1 - output.alpha.detach()).sum())
+    slope = gradients["background"]
+    require(slope is not None, "no gradient reached background")
+    assert slope is not None
+    require_close("gradient of background", slope, torch.full((3,), left), atol=0.0, rtol=1e-5)
+
+
+@CHECKS.check("R45")
+def screen_offsets_get_the_screen_space_gradient(subject: RasterizerSubject) -> None:
+    """Zero offsets that require grad, as density control uses them, get the true slope."""
+    request = RenderRequest(screen_offsets=torch.zeros(50, 2))
+    scene = Scene(random_gaussians(50, degree=0), a_camera(), request)
+    _, gradients = subject.drawn(scene, lambda output: output.color.square().sum())
+    slopes = gradients["screen_offsets"]
+    if slopes is None:
+        raise CheckError("no gradient reached screen_offsets")
+    seen = int(slopes.norm(dim=-1).argmax())
+    losses = []
+    for step in (1e-4, -1e-4):
+        shifted = torch.zeros(50, 2, dtype=torch.float64)
+        shifted[seen, 0] = step
+        moved = RenderRequest(screen_offsets=shifted)
+        losses.append(ORACLE.render(scene.gaussians, scene.camera, moved).color.square().sum())
+    slope = (losses[0] - losses[1]) / 2e-4
+    require_close(
+        f"gradient of screen_offsets[{seen}, 0]", slopes[seen, 0], slope, atol=0.0, rtol=1e-3
+    )
+
+
+@CHECKS.check("R46")
+def no_gradient_where_alpha_is_clamped(subject: RasterizerSubject) -> None:
+    """Where alpha is clamped to max_alpha, shape and opacity get no gradient."""
+    splat = one_gaussian(scale=30.0).replace(opacity_logits=torch.tensor([20.0]))
+    (limit,) = subject.choices("max_alpha", (0.3,))
+    scene = Scene(splat, front_camera(), RenderRequest(max_alpha=limit))
+    output, gradients = subject.drawn(scene, lambda output: output.alpha[5:10, 8:13].sum())
+    require_close("alpha", output.alpha[7, 10], limit, atol=1e-6)
+    for name in ("means", "log_scales", "opacity_logits"):
+        require_zero(f"gradient of {name}", gradients[name])
+
+
+@CHECKS.check("R47")
+def no_gradient_to_colours_clamped_at_zero(subject: RasterizerSubject) -> None:
+    """A colour below zero is drawn as zero and gets no gradient."""
+    scene = Scene(one_gaussian(color=(-0.5, 0.5, 0.5)), front_camera())
+    output, gradients = subject.drawn(scene, lambda output: output.color.sum())
+    require_zero("the red image", output.color[..., 0].detach())
+    slopes = gradients["sh"]
+    require(slopes is not None, "no gradient reached sh")
+    assert slopes is not None
+    require_zero("gradient of the red coefficient", slopes[0, 0, 0])
+    require(slopes[0, 0, 1] > 0, f"gradient of the green coefficient is {float(slopes[0, 0, 1])}")
+
+
+@CHECKS.check("R48")
+def culled_rows_get_zero_gradients(subject: RasterizerSubject) -> None:
+    """Rows behind the camera, off the image and fainter than min_alpha get zero gradients."""
+    behind, aside = one_gaussian((0, 0, -2)), one_gaussian((50, 0, 2))
+    faint = one_gaussian(opacity=0.001)
+    scene = Scene(Gaussians.cat([behind, one_gaussian(), aside, faint]), front_camera())
+    output, gradients = subject.drawn(
+        scene, lambda output: output.color.square().sum() + output.depth.sum()
+    )
+    shown = output.info["radii"].gt(0).tolist()
+    require(shown == [False, True, False, False], f"info['radii'] > 0 is {shown}")
+    for name in RAW:
+        gradient = gradients[name]
+        require(gradient is not None, f"no gradient reached {name}")
+        assert gradient is not None
+        require_finite(f"gradient of {name}", gradient)
+        require_zero(f"gradient of {name} in culled rows", gradient[[0, 2, 3]])
+    slope = gradients["opacity_logits"]
+    require(slope is not None and slope[1] != 0, "the one that is seen got no gradient")
+
+
+@CHECKS.check("R49", float64, free("min_alpha", "min_transmittance"))
+def gradcheck_in_float64(subject: RasterizerSubject) -> None:
+    """torch.autograd.gradcheck of every input in float64, without cut-offs."""
+    generator = torch.Generator().manual_seed(1)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    camera = a_camera(4, 3).to(torch.float64)
+    leaves = [
+        normal(3, 3) * 0.4,
+        normal(3, 4),
+        normal(3, 3) * 0.3 - 0.7,
+        normal(3) * 0.5,
+        normal(3, 4, 3) * 0.2,
+        normal(3, 1),
+        normal(3, 2) * 0.1,
+        torch.rand(3, generator=generator, dtype=torch.float64),
+    ]
+    if camera_gradients(subject) is None:
+        leaves.append(camera.world_to_camera.clone())
+    device = subject.device
+    smooth = RenderRequest(min_alpha=0.0, min_transmittance=0.0)
+
+    def render(*x: Tensor) -> tuple[Tensor, ...]:
+        request = smooth.replace(features=x[5], screen_offsets=x[6], background=x[7])
+        pose = x[8] if len(x) > 8 else camera.world_to_camera.to(device)
+        view = Camera(on(device, camera).K, pose, 4, 3)
+        return tuple(images(subject.rasterizer.render(Gaussians(*x[:5]), view, request)).values())
+
+    inputs = [x.to(device).requires_grad_() for x in leaves]
+    try:
+        torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-6)
+    except GradcheckError as error:
+        raise CheckError(f"in the order of the fields: {error}") from error
+
+
+@CHECKS.check("R50", float64)
+def float64_is_the_oracle(subject: RasterizerSubject) -> None:
+    """In float64 pictures and gradients are the oracle's to 1e-9, at every pixel."""
+    scene = graded_scene()
+    to64 = {
+        name: x.double()
+        for name in ("features", "screen_offsets", "background")
+        if (x := getattr(scene.request, name)) is not None
+    }
+    gaussians = scene.gaussians.to(torch.float64)
+    exact = Scene(gaussians, scene.camera.to(torch.float64), scene.request.replace(**to64))
+    everywhere = torch.ones_like(reference(scene).clear)
+    wanted, wanted_gradients = ORACLE.drawn(exact, weighing(PARTS, everywhere))
+    output, gradients = subject.drawn(exact, weighing(PARTS, everywhere))
+    for name, image in images(output).items():
+        require_close(name, image, images(wanted)[name], atol=1e-9)
+    for name, gradient in gradients.items():
+        want = wanted_gradients[name]
+        assert gradient is not None and want is not None
+        require_close(f"gradient of {name}", gradient, want, atol=1e-9, rtol=1e-9)
