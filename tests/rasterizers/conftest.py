@@ -1,38 +1,41 @@
-"""The backends that the conformance tests run on."""
+"""The backends that the conformance checks run on, each on every device that it declares."""
 
 from __future__ import annotations
 
+import importlib.util
+from collections.abc import Callable, Iterator
+
 import pytest
 import torch
-from raster_scenes import Backend
 
 from hoigs.core.rasterizer import Rasterizer
+from hoigs.rasterizers.oracle import OracleRasterizer
+from hoigs.rasterizers.torch_tiles import TorchRasterizer
+from hoigs.rasterizers.warp import WarpRasterizer
+from hoigs.testing.rasterizer import RasterizerSubject
+
+BACKENDS: dict[str, Callable[[], Rasterizer]] = {
+    "torch": TorchRasterizer,
+    "oracle": lambda: OracleRasterizer(cutoffs=True),
+    "warp": WarpRasterizer,
+    "warp-portable": lambda: WarpRasterizer(cpu_kernels="portable"),  # CUDA's kernels, on the CPU
+}
 
 
-def make(name: str) -> Rasterizer:
-    if name == "torch":
-        from hoigs.rasterizers.torch_tiles import TorchRasterizer
-
-        return TorchRasterizer()
-    from hoigs.rasterizers.warp import WarpRasterizer
-
-    return WarpRasterizer(cpu_kernels="portable" if name == "warp-portable" else "native")
+def cases() -> Iterator[pytest.ParameterSet]:
+    for name, make in BACKENDS.items():
+        devices = {"cpu"} if name == "warp-portable" else make().capabilities.devices
+        for device in sorted(devices):
+            marks = [pytest.mark.gpu] if device == "cuda" else []
+            yield pytest.param((name, device), id=f"{name}-{device}", marks=marks)
 
 
-DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-
-
-@pytest.fixture(
-    scope="session",
-    params=[
-        pytest.param(
-            (name, device), id=f"{name}-{device}", marks=[pytest.mark.gpu] * (device != "cpu")
-        )
-        for name in ("torch", "warp", "warp-portable")  # portable: CUDA's kernels, on the CPU
-        for device in (DEVICES if name != "warp-portable" else ["cpu"])
-    ],
-)
-def backend(request: pytest.FixtureRequest) -> Backend:
-    """Every backend on every device of this machine."""
+@pytest.fixture(scope="session", params=list(cases()))
+def backend(request: pytest.FixtureRequest) -> RasterizerSubject:
+    """Every backend on every device."""
     name, device = request.param
-    return Backend(make(name), torch.device(device))
+    if device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    if name == "gsplat" and importlib.util.find_spec("gsplat") is None:
+        pytest.skip("gsplat is not installed: pip install 'hoigs[gsplat]'")
+    return RasterizerSubject(BACKENDS[name](), torch.device(device))

@@ -11,6 +11,7 @@ from hoigs.rasterizers import compositing
 from hoigs.rasterizers.compositing import compositing_weights, prepare, splat_alphas
 from hoigs.rasterizers.oracle import OracleRasterizer
 from hoigs.rasterizers.torch_tiles import TorchRasterizer, list_by_tile
+from hoigs.testing.rasterizer import CHECKS, RasterizerSubject
 
 
 @pytest.mark.parametrize("limit", [0.0, 1e-4, 0.03, 0.5])
@@ -40,18 +41,20 @@ def test_tiles_list_every_splat_that_touches_a_pixel(tile_size: int, min_alpha: 
     splats, _ = prepare(random_scene(80, degree=0), camera, request)
     tiles, rows = list_by_tile(splats, camera, tile_size, min_alpha)
     across = -(-camera.width // tile_size)
-    listed = {(int(t), int(r)) for t, r in zip(tiles, rows)}
-    assert len(listed) == len(tiles)
-    assert torch.equal(tiles, tiles.sort().values)
-    for tile in tiles.unique():
-        assert (rows[tiles == tile].diff() > 0).all(), "splats of a tile are out of depth order"
+    listed = tiles * len(splats) + rows
+    assert (listed.diff() > 0).all(), "tiles ascend, and the splats of each are in depth order"
     grid = camera.pixel_grid().flatten(0, 1)
     pixel, row = torch.nonzero(splat_alphas(grid, splats, 0.999, min_alpha), as_tuple=True)
     column, line = (grid[pixel] // tile_size).long().unbind(-1)
-    touching = {(int(t), int(r)) for t, r in zip(line * across + column, row)}
-    assert touching <= listed
+    touching = torch.unique((line * across + column) * len(splats) + row)
+    assert torch.isin(touching, listed).all()
     # pixel-sized tiles leave no slack but the small margin for rounding
     assert tile_size > 1 or not min_alpha or len(listed) <= 1.01 * len(touching)
+
+
+@pytest.mark.parametrize("tile_size", [5, 64])
+def test_tiles_of_any_size_draw_the_same(tile_size: int) -> None:
+    CHECKS["R50"].run(RasterizerSubject(TorchRasterizer(tile_size), torch.device("cpu")))
 
 
 @pytest.mark.parametrize("rasterizer", [OracleRasterizer(), TorchRasterizer()])

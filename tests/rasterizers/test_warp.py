@@ -125,16 +125,6 @@ def test_tiles_cover_images_of_any_size(size: tuple[int, int]) -> None:
     assert_same_picture(WarpRasterizer().render(scene, camera), CUT.render(scene, camera), clear)
 
 
-def test_a_large_image_needs_little_more_than_itself() -> None:
-    camera = front_camera(4000, 3000, 4000.0, cx=2000.0, cy=1500.0)
-    scene = random_scene(50)
-    scene = scene.replace(means=scene.means + torch.tensor([0.0, 0.0, 4.0]))
-    output = WarpRasterizer().render(scene, camera, RenderRequest(background=torch.ones(3)))
-    assert output.color.shape == (3000, 4000, 3)
-    torch.testing.assert_close(output.color[0, 0], torch.ones(3))
-    assert output.alpha.max() > 0.5
-
-
 def test_an_image_beyond_32_bits_is_refused() -> None:
     with pytest.raises(RenderError, match=r"50000x50000 pixels .*Camera\.cropped"):
         WarpRasterizer().render(random_scene(2), front_camera(50_000, 50_000))
