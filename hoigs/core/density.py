@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -179,8 +180,9 @@ def step_generator(seed: int, step: int, device: torch.device, stream: int = 0) 
     Args:
         stream: tells apart what draws in the same step.
     """
-    mixed = (seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9 + stream) % 2**63
-    return torch.Generator(device=device).manual_seed(mixed)
+    # hashed, because torch's CPU generator reads no more than the low 32 bits of a seed
+    mixed = hashlib.blake2b(f"{seed} {step} {stream}".encode(), digest_size=4).digest()
+    return torch.Generator(device=device).manual_seed(int.from_bytes(mixed, "big"))
 
 
 def entity_seed(context: BuildContext) -> int:

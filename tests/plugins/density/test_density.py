@@ -6,37 +6,15 @@ import math
 
 import pytest
 import torch
+from density_cases import cloud, refine, statistics
 
 from hoigs.core.context import BuildContext
-from hoigs.core.density import DensityStatistics
 from hoigs.core.entity import Entity
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.moment import Moment
 from hoigs.plugins.deformation.chs import CubicHermite
 from hoigs.plugins.density.adc import AdaptiveDensity, AdaptiveDensityConfig
 from hoigs.plugins.density.none import NoDensity, NoDensityConfig
-
-EXTENT = 2.0  # so that scales up to 0.02 are cloned
-
-
-def cloud(scales, opacities=None) -> Gaussians:
-    scales = torch.as_tensor(scales)
-    count = len(scales)
-    points = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
-    rest = Gaussians.from_points(points, scales=scales)
-    if opacities is not None:
-        rest = rest.replace(opacity_logits=torch.logit(torch.as_tensor(opacities)))
-    return rest
-
-
-def statistics(gradients, radii=None) -> DensityStatistics:
-    gradients = torch.as_tensor(gradients)
-    radii = torch.ones_like(gradients) if radii is None else torch.as_tensor(radii)
-    return DensityStatistics(gradients * 3, torch.full_like(gradients, 3), radii)
-
-
-def refine(control, rest, stats, step=100, total=1000, current=None):
-    return control.refine(rest, current or rest, stats, step=step, total_steps=total, extent=EXTENT)
 
 
 def test_clone_split_prune_by_hand():
@@ -158,6 +136,15 @@ def test_keyframed_children_follow_the_motion():
             _axes(before[k])[source], (after.means - before[k].means[source])[..., None]
         )
         torch.testing.assert_close(local.squeeze(-1), decision.change.offsets, atol=1e-5, rtol=1e-4)
+
+
+def test_keyed_opacities_are_judged_at_their_largest():
+    entity = Entity(cloud([0.01] * 20), CubicHermite(keyframes=4))
+    with torch.no_grad():
+        entity.deformation.opacity_logits.fill_(-9.0)
+        entity.deformation.opacity_logits[:15, 2] = 0.0
+    decision = refine(AdaptiveDensity(keep=1), entity.at_peak.detach(), statistics([0.0] * 20))
+    assert decision.change.source.tolist() == list(range(15))
 
 
 def _axes(gaussians: Gaussians) -> torch.Tensor:
