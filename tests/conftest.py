@@ -16,6 +16,7 @@ CHECKED = (
     "hoigs.core",
     "hoigs.plugins",
     "hoigs.rasterizers.compositing",
+    "hoigs.rasterizers.gsplat",
     "hoigs.rasterizers.oracle",
     "hoigs.rasterizers.torch_tiles",
     "hoigs.evaluation",

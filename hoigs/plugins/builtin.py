@@ -19,6 +19,8 @@ PARTS = (
      "Warp kernels for CPU and CUDA with a hand-written backward pass"),
     ("rasterizer:oracle", "hoigs.rasterizers.oracle", "OracleRasterizer", "OracleConfig",
      "the yardstick: float64, every Gaussian at every pixel"),
+    ("rasterizer:gsplat", "hoigs.rasterizers.gsplat", "GsplatRasterizer", "GsplatConfig",
+     "gsplat's CUDA kernels, with their fixed cut-offs"),
     ("deformation:static", f"{DEFORMATION}.static", "Static", "StaticConfig",
      "does not move"),
     ("deformation:mlp", f"{DEFORMATION}.mlp", "MlpDeformation", "MlpConfig",
@@ -54,9 +56,16 @@ PARTS = (
     ("density:none", "hoigs.plugins.density.none", "NoDensity", "NoDensityConfig",
      "the number of Gaussians stays"),
 )  # fmt: skip
+EXTRAS = {"rasterizer:gsplat": "gsplat"}  # parts that need an optional dependency
 
 
 @hookimpl
 def hoigs_components() -> Iterator[Component]:
     for key, module, name, config, summary in PARTS:
-        yield Component(key, f"{module}:{name}", config=f"{module}:{config}", summary=summary)
+        yield Component(
+            key,
+            f"{module}:{name}",
+            config=f"{module}:{config}",
+            summary=summary,
+            extra=EXTRAS.get(key),
+        )

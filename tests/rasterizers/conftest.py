@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from hoigs.core.rasterizer import Rasterizer
+from hoigs.rasterizers.gsplat import GsplatRasterizer
 from hoigs.rasterizers.oracle import OracleRasterizer
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.rasterizers.warp import WarpRasterizer
@@ -19,6 +20,7 @@ BACKENDS: dict[str, Callable[[], Rasterizer]] = {
     "oracle": lambda: OracleRasterizer(cutoffs=True),
     "warp": WarpRasterizer,
     "warp-portable": lambda: WarpRasterizer(cpu_kernels="portable"),  # CUDA's kernels, on the CPU
+    "gsplat": GsplatRasterizer,
 }
 
 

@@ -41,16 +41,16 @@ from hoigs.testing.rasterizer.subject import (
 
 
 @cache
-def graded_scene(seed: int = 0, degree: int = 3) -> Scene:
-    return random_scene(100, degree=degree, seed=seed)
+def graded_scene(seed: int = 0, degree: int = 3, offset: float = 0.5) -> Scene:
+    return random_scene(100, degree=degree, seed=seed, offset=offset)
 
 
 @CHECKS.check("R40")
 def gradients_are_the_oracles(subject: RasterizerSubject) -> None:
     """Every raw field, features, offsets and background get the oracle's gradient."""
     names = (*RAW, "features", "screen_offsets", "background")
-    for seed in (0, 1):
-        require_reference_gradients(subject, graded_scene(seed), names=names)
+    for scene in (graded_scene(0), graded_scene(1, offset=0.0)):
+        require_reference_gradients(subject, scene, names=names)
 
 
 @CHECKS.check("R41")
@@ -63,15 +63,16 @@ def gradients_of_each_image_alone(subject: RasterizerSubject) -> None:
 @CHECKS.check("R42", camera_gradients)
 def gradients_of_the_pose(subject: RasterizerSubject) -> None:
     """The camera's pose gets the oracle's gradient, through positions and through colours."""
-    for part in (PARTS, ("color",), ("depth",)):
-        require_reference_gradients(subject, graded_scene(1), part, ("world_to_camera",))
+    for scene in (graded_scene(0), graded_scene(1, offset=0.0)):
+        for parts in (PARTS, ("color",), ("depth",)):
+            require_reference_gradients(subject, scene, parts, ("world_to_camera",))
 
 
 @CHECKS.check("R43")
 def gradients_of_every_harmonic_degree(subject: RasterizerSubject) -> None:
     """Coefficients, and means through the direction of view, for SH degrees 0, 1 and 2."""
     for degree in range(3):
-        scene = graded_scene(3, degree)
+        scene = graded_scene(3, degree, 0.0)
         require_reference_gradients(subject, scene, ("color",), ("sh", "means"))
 
 
