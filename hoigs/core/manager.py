@@ -169,8 +169,11 @@ class PluginManager(pluggy.PluginManager):
         self._settle()
 
     def failures(self) -> list[str]:
-        """One line for each plugin and component that is not in order; blocked ones are."""
-        fine = (Status.OK, Status.BLOCKED)
+        """One line for each plugin and component that is not in order.
+
+        Blocked ones are, and those whose extra nobody asked for.
+        """
+        fine = (Status.OK, Status.BLOCKED, Status.NEEDS_EXTRA)
         lines = [
             f"{p.dist} ({p.name}): {p.status}: {p.error}"
             for p in self.plugins

@@ -10,7 +10,7 @@ from fake_plugins import PluginFolder
 from hoigs.core.errors import PluginError
 from hoigs.core.manager import PluginManager, Status
 from hoigs.core.registry import Registry
-from hoigs.plugins.builtin import PARTS
+from hoigs.plugins.builtin import EXTRAS, PARTS
 
 GOOD = 'Component("deformation:good", target="fake_good:Good", summary="fine")'
 
@@ -34,12 +34,17 @@ def offers_of(manager, dist):
 
 
 def builtin_lines(manager):
-    return [(o.key, o.status, o.error) for o in offers_of(manager, "hoigs")]
+    """Those that need no extra; what the others are depends on what is installed here."""
+    offers = offers_of(manager, "hoigs")
+    return [(o.key, o.status, o.error) for o in offers if o.component.extra is None]
 
 
 def test_builtin_parts_enter_through_the_hook(plugins):
     manager = plugins.manager()
-    assert builtin_lines(manager) == [(part[0], Status.OK, "") for part in PARTS]
+    assert builtin_lines(manager) == [
+        (part[0], Status.OK, "") for part in PARTS if part[0] not in EXTRAS
+    ]
+    assert {o.key: o.component.extra for o in manager.offers if o.component.extra} == EXTRAS
     assert plugin_of(manager, "hoigs").builtin
 
 
