@@ -1,8 +1,13 @@
-"""What the kernels are given and write; shared by every path."""
+"""What the kernels are given and write; shared by every path.
+
+The lists of arguments hold what `array` makes of each tensor: a descriptor of Warp's unless told
+otherwise.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -11,6 +16,8 @@ from torch import Tensor
 from hoigs.rasterizers.warp.calls import flat
 from hoigs.rasterizers.warp.frame import Images, Inputs, Lists, Settings
 from hoigs.rasterizers.warp.records import POSE, RECORD, SMALLEST_ALPHA
+
+Array = Callable[..., Any]  # (tensor, size of its vectors = 1)
 
 
 class Projected:
@@ -30,35 +37,37 @@ class Projected:
         self.radii = like.new_empty(count)
 
 
-def project_arguments(inputs: Inputs, settings: Settings, out: Projected) -> list[Any]:
+def project_arguments(
+    inputs: Inputs, settings: Settings, out: Projected, array: Array = flat
+) -> list[Any]:
     """Arguments of `projection.project` but for its last two, the range of rows."""
     return [
-        flat(inputs.means, 3),
-        flat(inputs.quats, 4),
-        flat(inputs.log_scales, 3),
-        flat(inputs.opacity_logits),
-        flat(inputs.sh, 3),
+        array(inputs.means, 3),
+        array(inputs.quats, 4),
+        array(inputs.log_scales, 3),
+        array(inputs.opacity_logits),
+        array(inputs.sh, 3),
         inputs.sh.shape[1],
         settings.bands,
-        flat(inputs.features),
+        array(inputs.features),
         inputs.channels,
-        flat(inputs.offsets),
+        array(inputs.offsets),
         int(inputs.offsets.numel() > 0),
-        flat(inputs.subset),
+        array(inputs.subset),
         int(inputs.subset.numel() > 0),
-        flat(inputs.K),
-        flat(inputs.view),
+        array(inputs.K),
+        array(inputs.view),
         settings.width,
         settings.height,
         settings.near,
         settings.low_pass,
         settings.min_alpha,
         max(settings.min_alpha, SMALLEST_ALPHA),
-        flat(out.records),
-        flat(out.means2d),
-        flat(out.depths),
-        flat(out.drawn_depths),
-        flat(out.radii),
+        array(out.records),
+        array(out.means2d),
+        array(out.depths),
+        array(out.drawn_depths),
+        array(out.radii),
     ]
 
 
@@ -97,42 +106,48 @@ def adjoint_arguments(
     lists: Lists,
     partials: Tensor,
     out: Gradients,
+    array: Array = flat,
 ) -> list[Any]:
     """Arguments of `projection.project_adjoint` but for its last two, the range of rows."""
     return [
-        flat(inputs.means, 3),
-        flat(inputs.quats, 4),
-        flat(inputs.log_scales, 3),
-        flat(inputs.opacity_logits),
-        flat(inputs.sh, 3),
+        array(inputs.means, 3),
+        array(inputs.quats, 4),
+        array(inputs.log_scales, 3),
+        array(inputs.opacity_logits),
+        array(inputs.sh, 3),
         inputs.sh.shape[1],
         settings.bands,
         inputs.channels,
-        flat(inputs.offsets),
+        array(inputs.offsets),
         int(inputs.offsets.numel() > 0),
-        flat(inputs.K),
-        flat(inputs.view),
+        array(inputs.K),
+        array(inputs.view),
         settings.width,
         settings.height,
         settings.low_pass,
-        flat(records),
-        flat(lists.first),
-        flat(lists.slots),
-        flat(partials),
-        flat(out.means, 3),
-        flat(out.quats, 4),
-        flat(out.log_scales, 3),
-        flat(out.opacity_logits),
-        flat(out.sh, 3),
-        flat(out.offsets),
-        flat(out.features),
-        flat(out.pose),
+        array(records),
+        array(lists.first),
+        array(lists.slots),
+        array(partials),
+        array(out.means, 3),
+        array(out.quats, 4),
+        array(out.log_scales, 3),
+        array(out.opacity_logits),
+        array(out.sh, 3),
+        array(out.offsets),
+        array(out.features),
+        array(out.pose),
         int(out.pose.numel() > 0),
     ]
 
 
 def tile_arguments(
-    inputs: Inputs, settings: Settings, records: Tensor, lists: Lists, images: Images
+    inputs: Inputs,
+    settings: Settings,
+    records: Tensor,
+    lists: Lists,
+    images: Images,
+    array: Array = flat,
 ) -> list[Any]:
     """Arguments that the tile kernels of all paths have in common, forward."""
     return [
@@ -143,26 +158,26 @@ def tile_arguments(
         settings.max_alpha,
         math.log2(max(settings.min_alpha, SMALLEST_ALPHA)),
         settings.min_transmittance if settings.min_transmittance > 0 else -1.0,
-        flat(records),
-        flat(lists.pairs),
-        flat(lists.offsets),
-        flat(inputs.features),
+        array(records),
+        array(lists.pairs),
+        array(lists.offsets),
+        array(inputs.features),
         inputs.channels,
-        flat(inputs.background),
+        array(inputs.background),
         3 if inputs.background.dim() == 3 else 0,
-        flat(images.color),
-        flat(images.alpha),
-        flat(images.depth),
-        flat(images.extra),
+        array(images.color),
+        array(images.alpha),
+        array(images.depth),
+        array(images.extra),
     ]
 
 
-def upstream_arguments(upstream: Images, partials: Tensor) -> list[Any]:
+def upstream_arguments(upstream: Images, partials: Tensor, array: Array = flat) -> list[Any]:
     """What the backward tile kernels take besides: gradients of the images, and partials."""
     return [
-        flat(upstream.color),
-        flat(upstream.alpha),
-        flat(upstream.depth),
-        flat(upstream.extra),
-        flat(partials),
+        array(upstream.color),
+        array(upstream.alpha),
+        array(upstream.depth),
+        array(upstream.extra),
+        array(partials),
     ]

@@ -32,6 +32,7 @@ class Render(torch.autograd.Function):
             images.color, images.alpha, images.depth, images.extra,
         )  # fmt: skip
         ctx.mark_non_differentiable(projected.means2d, projected.depths, projected.radii)
+        ctx.set_materialize_grads(False)  # else zeros are made for the last three too
         return (
             images.color, images.alpha, images.depth, images.extra,
             projected.means2d, projected.depths, projected.radii,
@@ -39,12 +40,17 @@ class Render(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
         inputs, saved = Inputs(*saved[:11]), saved[11:]
         records, lists = saved[0], Lists(*ctx.tiling, *saved[1:5])
         images = Images(*saved[5:9])
-        v = Images(*(x.contiguous() for x in upstream[:4]))
+        v = Images(
+            *(
+                torch.zeros_like(image) if x is None else x.contiguous()
+                for image, x in zip(saved[5:9], upstream)
+            )
+        )
         needs = Inputs(*ctx.needs_input_grad[2:])
         with torch.cuda.device_of(inputs.means):
             out = ctx.path.gradients(

@@ -1,22 +1,13 @@
-"""Where kernels run: on the cores of this machine, or on torch's current CUDA stream."""
+"""Running kernels on the cores of this machine."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
 from hoigs.rasterizers.warp.calls import record
-from hoigs.rasterizers.warp.pixel_source import WARPS
-from hoigs.rasterizers.warp.runtime import wp
 from hoigs.rasterizers.warp.workers import SerialWorkers, Workers
-
-CUDA_BLOCK = 32 * WARPS
-
-
-class Launcher(Protocol):
-    def each(self, kernel: Any, count: int, arguments: list[Any]) -> None:
-        """Run a kernel for items 0 to count; its last two parameters, base and count, are added."""
 
 
 class Cores:
@@ -46,6 +37,7 @@ class Cores:
         self._run([record(kernel, 1, arguments)] * cores)
 
     def each(self, kernel: Any, count: int, arguments: list[Any]) -> None:
+        """Run a kernel for items 0 to count; its last two parameters, base and count, are added."""
         if count == 0:
             return
         chunks = self.chunks(count)
@@ -54,25 +46,3 @@ class Cores:
 
     def _run(self, launches: list[Any]) -> None:
         (SerialWorkers() if len(launches) == 1 else self.workers).run(launches)
-
-
-class CudaStream:
-    """torch's current stream of the current device, at each call."""
-
-    def __init__(self) -> None:
-        self._streams: dict[tuple[int, int], Any] = {}
-
-    def each(self, kernel: Any, count: int, arguments: list[Any]) -> None:
-        if count == 0:
-            return
-        current = torch.cuda.current_stream()
-        key = (current.device_index, current.cuda_stream)
-        if key not in self._streams:
-            self._streams[key] = wp.stream_from_torch(current)
-        wp.launch(
-            kernel,
-            dim=count,
-            inputs=[*arguments, 0, count],
-            stream=self._streams[key],
-            block_dim=CUDA_BLOCK,
-        )

@@ -1,7 +1,7 @@
 # mypy: ignore-errors
 # ruff: noqa: UP018, RUF046
 # Warp's arrays annotate as values, and int(0) declares a variable that a loop may change.
-"""Kernels that list the Gaussians of each tile by sorting 64-bit keys, as CUDA likes it."""
+"""Kernels that list the Gaussians of each tile by sorting 64-bit keys: the portable CPU path."""
 
 from hoigs.rasterizers.warp.records import F32, I32, I64, RECORD
 from hoigs.rasterizers.warp.runtime import CPU_FLAGS, wp

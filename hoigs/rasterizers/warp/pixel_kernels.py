@@ -16,10 +16,10 @@ BLOCK = wp.constant(32 * pixel_source.WARPS)
 
 @wp.func_native(pixel_source.FORWARD)
 def forward_native(
-    thread: int, across: int, width: int, height: int, max_alpha: float, log2_min_alpha: float,
-    min_transmittance: float, records: F32, pairs: I32, offsets: I32, features: F32,
-    channels: int, background: F32, background_stride: int, color: F32, alpha: F32, depth: F32,
-    extra: F32,
+    thread: int, tiles: int, across: int, width: int, height: int, max_alpha: float,
+    log2_min_alpha: float, min_transmittance: float, records: F32, pairs: I32, offsets: I32,
+    features: F32, channels: int, background: F32, background_stride: int, color: F32, alpha: F32,
+    depth: F32, extra: F32,
 ): ...  # fmt: skip
 
 
@@ -49,18 +49,18 @@ def forward_pixels(
     thread = wp.tid() + base
     if thread < count:
         forward_native(
-            thread, across, width, height, max_alpha, log2_min_alpha, min_transmittance, records,
-            pairs, offsets, features, channels, background, background_stride, color, alpha,
-            depth, extra,
+            thread, tiles, across, width, height, max_alpha, log2_min_alpha, min_transmittance,
+            records, pairs, offsets, features, channels, background, background_stride, color,
+            alpha, depth, extra,
         )  # fmt: skip
 
 
 @wp.func_native(pixel_source.BACKWARD)
 def backward_native(
-    thread: int, across: int, width: int, height: int, max_alpha: float, log2_min_alpha: float,
-    min_transmittance: float, records: F32, pairs: I32, offsets: I32, features: F32,
-    channels: int, background: F32, background_stride: int, color: F32, alpha: F32, depth: F32,
-    extra: F32, v_color: F32, v_alpha: F32, v_depth: F32, v_extra: F32, partials: F32,
+    thread: int, tiles: int, across: int, width: int, height: int, max_alpha: float,
+    log2_min_alpha: float, min_transmittance: float, records: F32, pairs: I32, offsets: I32,
+    features: F32, channels: int, background: F32, background_stride: int, color: F32, alpha: F32,
+    depth: F32, extra: F32, v_color: F32, v_alpha: F32, v_depth: F32, v_extra: F32, partials: F32,
 ): ...  # fmt: skip
 
 
@@ -88,14 +88,14 @@ def backward_pixels(
     v_alpha: F32,
     v_depth: F32,
     v_extra: F32,
-    partials: F32,  # [pairs, MOMENTS + channels], zero
+    partials: F32,  # [pairs, MOMENTS + channels]; zero, but see `pixel_source`
     base: int,
     count: int,
 ):
     thread = wp.tid() + base
     if thread < count:
         backward_native(
-            thread, across, width, height, max_alpha, log2_min_alpha, min_transmittance, records,
-            pairs, offsets, features, channels, background, background_stride, color, alpha,
-            depth, extra, v_color, v_alpha, v_depth, v_extra, partials,
+            thread, tiles, across, width, height, max_alpha, log2_min_alpha, min_transmittance,
+            records, pairs, offsets, features, channels, background, background_stride, color,
+            alpha, depth, extra, v_color, v_alpha, v_depth, v_extra, partials,
         )  # fmt: skip

@@ -3,8 +3,11 @@
 A warp of 32 lanes draws a tile, TILE_WIDTH pixels wide and TILE_ROWS high; a lane owns PIXELS
 pixels of one column. The warp fetches 32 records at a time into shared memory. For the gradient the
 sums over the tile are made by halving: each exchange of lanes also halves how many sums a lane
-keeps, so ten take 16 shuffles, and lanes write their sums side by side. There are no atomics and no
-barriers beyond the warp, and sums have the same order in every run.
+keeps, so ten take 12 shuffles, and lanes write their sums side by side. There are no barriers
+beyond the warp, no atomics, and sums have the same order in every run.
+
+On CUDA there may be one list for all tiles instead (see `list_source`): the warp then takes those
+of each 32 whose box touches its tile, and adds its sums to the row's by atomics.
 
 On a CPU the lanes run one after the other, and each adds its own share to the partials.
 Names of arguments stand in `pixel_kernels`.
@@ -20,20 +23,38 @@ WARPS = 4  # of a block
 _HEAD = r"""
     constexpr int P = %(PIXELS)d, STEP = 32 / %(TILE_WIDTH)d;  // rows between a lane's pixels
     const int lane = thread & 31, tile = thread >> 5;
-    const int x = tile %% across * %(TILE_WIDTH)d + lane %% %(TILE_WIDTH)d;
-    const int y = tile / across * %(TILE_ROWS)d + lane / %(TILE_WIDTH)d;
+    const int left = tile %% across * %(TILE_WIDTH)d, top = tile / across * %(TILE_ROWS)d;
+    const int x = left + lane %% %(TILE_WIDTH)d, y = top + lane / %(TILE_WIDTH)d;
     const float* records_ = (const float*)records.data;
     const float* features_ = (const float*)features.data;
     const float* background_ = (const float*)background.data;
     const int* pairs_ = (const int*)pairs.data;
+    const int* offsets_ = (const int*)offsets.data;
     float* color_ = (float*)color.data;
     float* alpha_ = (float*)alpha.data;
     float* depth_ = (float*)depth.data;
     float* extra_ = (float*)extra.data;
-    const int begin = ((const int*)offsets.data)[tile], end = ((const int*)offsets.data)[tile + 1];
+    int begin = offsets_[tile], end = offsets_[tile + 1];
 #if defined(__CUDA_ARCH__)
-    __shared__ float4 staged[%(WARPS)d * 32 * 4];
-    float4* stage = staged + (threadIdx.x >> 5) * 32 * 4;
+    const unsigned ALL = 0xffffffffu;
+    __shared__ float4 staged[%(WARPS)d * 32 * 3];
+    float4* stage = staged + (threadIdx.x >> 5) * 32 * 3;
+    const bool shared_list = offsets_[tiles + 1] >= 0;
+    if (shared_list) {
+        begin = 0;
+        end = offsets_[tiles + 1];
+    }
+    auto any = [&](bool here) -> bool { return __any_sync(ALL, here); };
+    auto exp2_of = [](float e) -> float {
+        float power;
+        asm("ex2.approx.ftz.f32 %%0, %%1;" : "=f"(power) : "f"(e));
+        return power;
+    };
+    auto quotient = [](float a, float b) -> float { return __fdividef(a, b); };
+#else
+    auto any = [](bool here) -> bool { return here; };
+    auto exp2_of = [](float e) -> float { return wp::exp(e * 0.693147180559945309f); };
+    auto quotient = [](float a, float b) -> float { return a / b; };
 #endif
     for (int block = 0; block == 0 || 4 * (block - 1) < channels; ++block) {
         const int channel = 4 * (block - 1);  // first feature of this block; block 0 is colour
@@ -46,87 +67,118 @@ _HEAD = r"""
         }
 """
 
-# One pair: `continue` leaves it. `raw[i]` is alpha before the clamp where pixel i is hit, else -1.
-_PAIR = r"""
-        for (int k = begin; k < end; ++k) {
-            const int batch = (k - begin) & 31;
-            if (batch == 0) {
-                bool running = false;
-                #pragma unroll
-                for (int i = 0; i < P; ++i) running |= T[i] > 0.0f;
+# The loop over the pairs of the tile, as long as some pixel goes on. It opens two blocks on CUDA
+# (32 pairs at a time, one pair) and one on a CPU; DONE closes them. `at` is the first pair not yet
+# taken when it ends.
+_EACH = r"""
+        int at = begin;
 #if defined(__CUDA_ARCH__)
-                if (!__any_sync(0xffffffffu, running)) break;
-                __syncwarp();  // the records before these have been read
-                if (k + lane < end) {
-                    const long long next = pairs_[2 * (k + lane)];
-                    const float4* source = (const float4*)records_ + 4 * next;
-                    for (int j = 0; j < 4; ++j) stage[4 * lane + j] = source[j];
-                }
-                __syncwarp();
-#else
-                if (!running) break;
-#endif
-            }
-            const int row = pairs_[2 * k];
-#if defined(__CUDA_ARCH__)
-            const float* g = (const float*)(stage + 4 * batch);
-#else
-            const float* g = records_ + 16ll * row;
-#endif
-            const float dx = (float)x + 0.5f - g[0], dy0 = (float)y + 0.5f - g[1];
-            const float a = g[2], shear = g[3], c = g[4], log2_opacity = g[5];
-            float raw[P], u[P];
-            bool hit = false;
+        #define DONE } at += 32; }
+        while (at < end) {
+            bool running = false;
             #pragma unroll
-            for (int i = 0; i < P; ++i) {
-                const float dy = dy0 + (float)(i * STEP);
-                u[i] = dx - shear * dy;
-                const float exponent = log2_opacity - c * dy * dy - a * u[i] * u[i];
-#if defined(__CUDA_ARCH__)
-                const float power = exp2f(exponent);
-#else
-                const float power = wp::exp(exponent * 0.693147180559945309f);
-#endif
-                raw[i] = exponent >= log2_min_alpha && T[i] > 0.0f ? power : -1.0f;
-                hit |= raw[i] >= 0.0f;
+            for (int i = 0; i < P; ++i) running |= T[i] > 0.0f;
+            if (!any(running)) break;
+            __syncwarp();  // the records before these have been read
+            int2 pair;
+            float4 first, third;
+            bool mine = at + lane < end;
+            if (mine) {
+                pair = ((const int2*)pairs_)[at + lane];
+                first = ((const float4*)records_)[4ll * pair.x];
+                third = ((const float4*)records_)[4ll * pair.x + 2];
+                if (shared_list)  // one pixel more than the box: rounding loses nothing
+                    mine = first.x + third.z > (float)left - 1.0f
+                        && first.x - third.z < (float)(left + %(TILE_WIDTH)d) + 1.0f
+                        && first.y + third.w > (float)top - 1.0f
+                        && first.y - third.w < (float)(top + %(TILE_ROWS)d) + 1.0f;
             }
-#if defined(__CUDA_ARCH__)
-            if (!__any_sync(0xffffffffu, hit)) continue;
-#else
-            if (!hit) continue;
-#endif
-            float f[4];
-            for (int j = 0; j < 4; ++j) {
-                if (block == 0) f[j] = g[6 + j];
-                else f[j] = channel + j < channels ? features_[row * channels + channel + j] : 0.0f;
+            const unsigned taken = __ballot_sync(ALL, mine);
+            if (mine) {
+                float4* to = stage + 3 * __popc(taken & ((1u << lane) - 1u));
+                third.z = __int_as_float(pair.x);
+                third.w = __int_as_float(pair.y);
+                to[0] = first;
+                to[1] = ((const float4*)records_)[4ll * pair.x + 1];
+                to[2] = third;
             }
+            __syncwarp();
+            const int number = __popc(taken);
+            for (int k = 0; k < number; ++k) {
+                const float4 g0 = stage[3 * k], g1 = stage[3 * k + 1], g2 = stage[3 * k + 2];
+                const int row = __float_as_int(g2.z), slot = __float_as_int(g2.w);
+                const float center_x = g0.x, center_y = g0.y, a = g0.z, shear = g0.w;
+                const float c = g1.x, log2_opacity = g1.y;
+                const float shown[4] = {g1.z, g1.w, g2.x, g2.y};
+#else
+        #define DONE }
+        for (; at < end; ++at) {
+                bool running = false;
+                for (int i = 0; i < P; ++i) running |= T[i] > 0.0f;
+                if (!running) break;
+                const int row = pairs_[2 * at], slot = pairs_[2 * at + 1];
+                const float* g = records_ + 16ll * row;
+                const float center_x = g[0], center_y = g[1], a = g[2], shear = g[3];
+                const float c = g[4], log2_opacity = g[5];
+                const float shown[4] = {g[6], g[7], g[8], g[9]};
+                (void)slot;
+#endif
+"""
+
+# One pair: `continue` leaves it. `exponent[i]` is log2 of alpha before the clamp, far below any
+# limit where pixel i is not hit.
+_PAIR = r"""
+                const float dx = (float)x + 0.5f - center_x, dy0 = (float)y + 0.5f - center_y;
+                float exponent[P], u[P];
+                bool hit = false;
+                #pragma unroll
+                for (int i = 0; i < P; ++i) {
+                    const float dy = dy0 + (float)(i * STEP);
+                    u[i] = dx - shear * dy;
+                    exponent[i] = log2_opacity - c * dy * dy - a * u[i] * u[i];
+                    if (!(exponent[i] >= log2_min_alpha && T[i] > 0.0f)) exponent[i] = -1e30f;
+                    hit |= exponent[i] > -1e30f;
+                }
+                if (!any(hit)) {
+                    %(MISS)s
+                    continue;
+                }
+                float f[4];
+                for (int j = 0; j < 4; ++j) {
+                    if (block == 0) f[j] = shown[j];
+                    else f[j] = channel + j < channels ? features_[row * channels + channel + j]
+                                                       : 0.0f;
+                }
 """
 
 _FORWARD = r"""
         float sums[P][4] = {};
-        %(PAIR)s
-            #pragma unroll
-            for (int i = 0; i < P; ++i) {
-                if (raw[i] < 0.0f) continue;
-                const float weight = T[i] * (raw[i] < max_alpha ? raw[i] : max_alpha);
-                const float next = T[i] - weight;
-                if (next > min_transmittance) {
-                    T[i] = next;
-                    for (int j = 0; j < 4; ++j) sums[i][j] += weight * f[j];
-                } else {
-                    T[i] = -T[i];
+        %(EACH)s
+            %(PAIR)s
+                #pragma unroll
+                for (int i = 0; i < P; ++i) {
+                    if (exponent[i] == -1e30f) continue;
+                    const float raw = exp2_of(exponent[i]);
+                    const float weight = T[i] * (raw < max_alpha ? raw : max_alpha);
+                    const float next = T[i] - weight;
+                    if (next > min_transmittance) {
+                        T[i] = next;
+                        for (int j = 0; j < 4; ++j) sums[i][j] += weight * f[j];
+                    } else {
+                        T[i] = -T[i];
+                    }
                 }
-            }
-        }
+        DONE
+        #undef DONE
         #pragma unroll
         for (int i = 0; i < P; ++i) {
             if (!inside[i]) continue;
             const int p = (y + i * STEP) * width + x;
             if (block == 0) {
-                const float left = T[i] < 0.0f ? -T[i] : T[i];
+                const float through = T[i] < 0.0f ? -T[i] : T[i];
                 const float* back = background_ + p * background_stride;
-                for (int j = 0; j < 3; ++j) color_[3 * p + j] = sums[i][j] + left * back[j];
-                alpha_[p] = 1.0f - left;
+                for (int j = 0; j < 3; ++j) color_[3 * p + j] = sums[i][j] + through * back[j];
+                alpha_[p] = 1.0f - through;
                 depth_[p] = sums[i][3];
             } else {
                 for (int j = 0; j < 4 && channel + j < channels; ++j)
@@ -136,7 +188,8 @@ _FORWARD = r"""
     }
 """
 
-# S: what the splats not yet passed still add, sum of w (channels . v + veil); see `cpu_source`
+# S: what the splats not yet passed still add, sum of w (channels . v + veil); see `cpu_source`.
+# Every partial is written, zeros where nothing is hit: they need not be cleared before.
 _BACKWARD = r"""
         float S[P], veil[P], v[P][4];
         #pragma unroll
@@ -162,73 +215,118 @@ _BACKWARD = r"""
                 }
             }
         }
-        %(PAIR)s
-            float sums[16] = {};  // six moments, four channels
-            #pragma unroll
-            for (int i = 0; i < P; ++i) {
-                if (raw[i] < 0.0f) continue;
-                const float opaque = raw[i] < max_alpha ? raw[i] : max_alpha;
-                const float weight = T[i] * opaque, next = T[i] - weight;
-                if (next > min_transmittance) {
-                    float value = veil[i];
-                    for (int j = 0; j < 4; ++j) {
-                        value += f[j] * v[i][j];
-                        sums[6 + j] += weight * v[i][j];
-                    }
-                    S[i] -= weight * value;
-                    const float clear = 1.0f - opaque > 1e-7f ? 1.0f - opaque : 1e-7f;
-                    const float slope = opaque * (T[i] * value - S[i] / clear);
-                    if (raw[i] <= max_alpha) {
-                        const float dy = dy0 + (float)(i * STEP);
-                        sums[0] += slope;
-                        sums[1] += slope * u[i];
-                        sums[2] += slope * dy;
-                        sums[3] += slope * u[i] * u[i];
-                        sums[4] += slope * u[i] * dy;
-                        sums[5] += slope * dy * dy;
-                    }
-                    T[i] = next;
-                } else {
-                    T[i] = -T[i];
-                }
-            }
-            float* out = partials_ + (long long)pairs_[2 * k + 1] * (10 + channels);
-#if defined(__CUDA_ARCH__)
-            #pragma unroll
-            for (int step = 0; step < 4; ++step) {
-                const int half = 8 >> step;
-                const bool upper = lane & (2 * half);
+        %(EACH)s
+            %(PAIR)s
+                float sums[10] = {};  // six moments, four channels
                 #pragma unroll
-                for (int j = 0; j < 8; ++j) {
-                    if (j >= half) continue;
-                    const float given = upper ? sums[j] : sums[j + half];
-                    const float kept = upper ? sums[j + half] : sums[j];
-                    sums[j] = kept + __shfl_xor_sync(0xffffffffu, given, 2 * half);
+                for (int i = 0; i < P; ++i) {
+                    if (exponent[i] == -1e30f) continue;
+                    const float raw = exp2_of(exponent[i]);
+                    const float opaque = raw < max_alpha ? raw : max_alpha;
+                    const float weight = T[i] * opaque, next = T[i] - weight;
+                    if (next > min_transmittance) {
+                        float value = veil[i];
+                        for (int j = 0; j < 4; ++j) {
+                            value += f[j] * v[i][j];
+                            sums[6 + j] += weight * v[i][j];
+                        }
+                        S[i] -= weight * value;
+                        const float clear = 1.0f - opaque > 1e-7f ? 1.0f - opaque : 1e-7f;
+                        const float slope = opaque * (T[i] * value - quotient(S[i], clear));
+                        if (raw <= max_alpha) {
+                            const float dy = dy0 + (float)(i * STEP);
+                            sums[0] += slope;
+                            sums[1] += slope * u[i];
+                            sums[2] += slope * dy;
+                            sums[3] += slope * u[i] * u[i];
+                            sums[4] += slope * u[i] * dy;
+                            sums[5] += slope * dy * dy;
+                        }
+                        T[i] = next;
+                    } else {
+                        T[i] = -T[i];
+                    }
+                }
+                float* out = partials_ + (long long)slot * (10 + channels);
+#if defined(__CUDA_ARCH__)
+                // 10 sums over 32 lanes: 5, 3, 2, 1 remain to a lane, then the last two lanes add
+                const bool in5 = lane & 16, in3 = lane & 8, in2 = lane & 4, in1 = lane & 2;
+                #pragma unroll
+                for (int j = 0; j < 5; ++j) {
+                    const float given = in5 ? sums[j] : sums[j + 5];
+                    const float kept = in5 ? sums[j + 5] : sums[j];
+                    sums[j] = kept + __shfl_xor_sync(ALL, given, 16);
+                }
+                sums[5] = 0.0f;
+                #pragma unroll
+                for (int j = 0; j < 3; ++j) {
+                    const float given = in3 ? sums[j] : sums[j + 3];
+                    const float kept = in3 ? sums[j + 3] : sums[j];
+                    sums[j] = kept + __shfl_xor_sync(ALL, given, 8);
+                }
+                sums[3] = 0.0f;
+                #pragma unroll
+                for (int j = 0; j < 2; ++j) {
+                    const float given = in2 ? sums[j] : sums[j + 2];
+                    const float kept = in2 ? sums[j + 2] : sums[j];
+                    sums[j] = kept + __shfl_xor_sync(ALL, given, 4);
+                }
+                const float given = in1 ? sums[0] : sums[1], kept = in1 ? sums[1] : sums[0];
+                float total = kept + __shfl_xor_sync(ALL, given, 2);
+                total += __shfl_xor_sync(ALL, total, 1);
+                if (sum_of_lane >= 0 && (block == 0 || sum_of_lane < 6
+                                         || channel + sum_of_lane - 6 < channels)) {
+                    float* to = out + sum_of_lane;
+                    if (block > 0 && sum_of_lane >= 6) to += 4 + channel;
+                    if (shared_list) atomicAdd(to, total);
+                    else if (block > 0 && sum_of_lane < 6) *to += total;
+                    else *to = total;
+                }
+#else
+                for (int j = 0; j < 10; ++j) {
+                    if (j < 6 || block == 0) out[j] += sums[j];
+                    else if (channel + j - 6 < channels) out[10 + channel + j - 6] += sums[j];
+                }
+#endif
+        DONE
+        #undef DONE
+#if defined(__CUDA_ARCH__)
+        if (!shared_list) {  // all pixels have stopped: the rest of the list got nothing
+            for (at += lane; at < end; at += 32) {
+                float* out = partials_ + (long long)pairs_[2 * at + 1] * (10 + channels);
+                if (block == 0) {
+                    for (int j = 0; j < 10; ++j) out[j] = 0.0f;
+                } else {
+                    for (int j = 0; j < 4 && channel + j < channels; ++j)
+                        out[10 + channel + j] = 0.0f;
                 }
             }
-            const float total = sums[0] + __shfl_xor_sync(0xffffffffu, sums[0], 1);
-            const int j = lane >> 1;  // the sum that this lane and its neighbour hold
-            if ((lane & 1) == 0 && j < 10) {
-                if (block == 0) out[j] = total;
-                else if (j < 6) out[j] += total;
-                else if (channel + j - 6 < channels) out[10 + channel + j - 6] = total;
-            }
-#else
-            for (int j = 0; j < 10; ++j) {
-                if (j < 6 || block == 0) out[j] += sums[j];
-                else if (channel + j - 6 < channels) out[10 + channel + j - 6] += sums[j];
-            }
-#endif
         }
+#endif
     }
 """
 
+# a missed pair of CUDA
+_CLEAR = r"""
+#if defined(__CUDA_ARCH__)
+                    if (!shared_list && lane < (block == 0 ? 10 : min(4, channels - channel)))
+                        partials_[(long long)slot * (10 + channels)
+                                  + (block == 0 ? 0 : 10 + channel) + lane] = 0.0f;
+#endif
+"""
+
+# Which sum a lane holds after the halving, -1 for none: lanes in pairs, and some hold padding.
 _UPSTREAM = r"""
     const float* v_color_ = (const float*)v_color.data;
     const float* v_alpha_ = (const float*)v_alpha.data;
     const float* v_depth_ = (const float*)v_depth.data;
     const float* v_extra_ = (const float*)v_extra.data;
     float* partials_ = (float*)partials.data;
+#if defined(__CUDA_ARCH__)
+    const int within = (thread & 4 ? 2 : 0) + (thread & 2 ? 1 : 0);  // of the three or two below
+    const int sum_of_lane = (thread & 1) || within >= (thread & 8 ? 2 : 3)
+        ? -1 : (thread & 16 ? 5 : 0) + (thread & 8 ? 3 : 0) + within;
+#endif
 """
 
 _SIZES = {
@@ -237,5 +335,12 @@ _SIZES = {
     "TILE_ROWS": TILE_ROWS,
     "WARPS": WARPS,
 }
-FORWARD = _HEAD % _SIZES + _FORWARD % {"PAIR": _PAIR}
-BACKWARD = _UPSTREAM + _HEAD % _SIZES + _BACKWARD % {"PAIR": _PAIR}
+
+
+def _filled(body: str, miss: str) -> str:
+    parts = {"EACH": _EACH % _SIZES, "PAIR": _PAIR % {"MISS": miss}}
+    return _HEAD % _SIZES + body % parts
+
+
+FORWARD = _filled(_FORWARD, "")
+BACKWARD = _UPSTREAM + _filled(_BACKWARD, _CLEAR)

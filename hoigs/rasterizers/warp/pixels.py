@@ -1,4 +1,4 @@
-"""The path of CUDA: keys sorted by torch, one warp a tile. It also runs on a CPU, for tests."""
+"""The portable path of the CPU: CUDA's pixel kernels as scalar code, lists sorted by torch."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from hoigs.rasterizers.warp.arguments import (
 )
 from hoigs.rasterizers.warp.calls import flat
 from hoigs.rasterizers.warp.frame import Images, Inputs, Lists, Settings, check_addressable
-from hoigs.rasterizers.warp.launchers import Launcher
+from hoigs.rasterizers.warp.launchers import Cores
 from hoigs.rasterizers.warp.projection import project, project_adjoint
 from hoigs.rasterizers.warp.records import MOMENTS
 from hoigs.rasterizers.warp.tile_spans import TILE_WIDTH
 
 
 class PixelPath:
-    """Renders with one thread for a few pixels.
+    """Renders with one lane for a few pixels, one lane after the other.
 
     Args:
-        launcher: what runs the kernels.
+        cores: what runs the kernels.
     """
 
-    def __init__(self, launcher: Launcher) -> None:
-        self.launcher = launcher
+    def __init__(self, cores: Cores) -> None:
+        self.cores = cores
 
     def project(self, inputs: Inputs, settings: Settings) -> Projected:
         out = Projected(inputs.means, inputs.count)
         arguments = project_arguments(inputs, settings, out)
-        self.launcher.each(project, inputs.count, arguments)
+        self.cores.each(project, inputs.count, arguments)
         return out
 
     def bin(self, projected: Projected, settings: Settings) -> Lists:
@@ -46,14 +46,14 @@ class PixelPath:
         ints = {"dtype": torch.int32, "device": depths.device}
         slots = torch.empty(count, **ints)
         splats = [flat(projected.records), flat(depths), rows, across, down, settings.width]
-        self.launcher.each(pair_kernels.count_tiles, count, [*splats, flat(slots)])
+        self.cores.each(pair_kernels.count_tiles, count, [*splats, flat(slots)])
         ends = slots.cumsum(0, dtype=torch.int64)
         total = int(ends[-1]) if count else 0
         check_addressable(total, f"the splats of {count} Gaussians in {across * down} tiles")
         first = (ends - slots).int()
         keys = torch.empty(total, dtype=torch.int64, device=depths.device)
         owners = torch.empty(total, **ints)
-        self.launcher.each(
+        self.cores.each(
             pair_kernels.write_keys,
             count,
             [*splats, flat(first), flat(slots), flat(keys), flat(owners)],
@@ -61,7 +61,7 @@ class PixelPath:
         keys, places = torch.sort(keys, stable=True)
         pairs = torch.empty(total, 2, **ints)
         offsets = torch.zeros(across * down + 1, **ints)
-        self.launcher.each(
+        self.cores.each(
             pair_kernels.write_lists,
             total,
             [flat(keys), flat(places), flat(owners), across * down, flat(pairs), flat(offsets)],
@@ -72,7 +72,7 @@ class PixelPath:
         self, inputs: Inputs, settings: Settings, records: Tensor, lists: Lists
     ) -> Images:
         images = Images.empty(inputs, settings)
-        self.launcher.each(
+        self.cores.each(
             pixel_kernels.forward_pixels,
             lists.tiles * pixel_source.LANES,
             tile_arguments(inputs, settings, records, lists, images),
@@ -94,11 +94,9 @@ class PixelPath:
         partials = inputs.means.new_zeros(lists.pairs.shape[0], stride)
         arguments = tile_arguments(inputs, settings, records, lists, images)
         arguments += upstream_arguments(upstream, partials)
-        self.launcher.each(
-            pixel_kernels.backward_pixels, lists.tiles * pixel_source.LANES, arguments
-        )
+        self.cores.each(pixel_kernels.backward_pixels, lists.tiles * pixel_source.LANES, arguments)
         out = Gradients(inputs, pose)
-        self.launcher.each(
+        self.cores.each(
             project_adjoint,
             inputs.count,
             adjoint_arguments(inputs, settings, records, lists, partials, out),

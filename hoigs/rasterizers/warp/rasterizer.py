@@ -11,6 +11,9 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import RenderError
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.rasterizer import Capabilities, Rasterizer, RenderOutput, RenderRequest
+from hoigs.rasterizers.warp.autograd import Render
+from hoigs.rasterizers.warp.captured import CapturedRender
+from hoigs.rasterizers.warp.inputs import prepare
 
 
 class WarpConfig(ComponentConfig):
@@ -58,21 +61,40 @@ class WarpRasterizer(Rasterizer):
         if threads is not None and threads < 1:
             raise RenderError(f"WarpRasterizer: threads is {threads}, expected at least 1")
         self.cpu_kernels, self.scheduler, self.threads = cpu_kernels, scheduler, threads
-        self._paths: dict[str, Any] = {}
+        self._paths: dict[torch.device, Any] = {}
         self._report: dict[str, str] = {}
 
     def render(
         self, gaussians: Gaussians, camera: Camera, request: RenderRequest | None = None
     ) -> RenderOutput:
         request = request or RenderRequest()
-        self.check_inputs(gaussians, camera, request)
-        from hoigs.rasterizers.warp.autograd import Render
-
-        settings, tensors = _prepare(gaussians, camera, request)
-        path = self._path(gaussians.means.device.type)
+        settings, tensors = prepare(self, gaussians, camera, request)
+        path = self.path(gaussians.means.device)
         color, alpha, depth, extra, means2d, depths, radii = Render.apply(path, settings, *tensors)
         info = {"radii": radii, "means2d": means2d, "depths": depths}
         return RenderOutput(color, alpha, depth, None if request.features is None else extra, info)
+
+    def capture(
+        self, gaussians: Gaussians, camera: Camera, request: RenderRequest | None = None
+    ) -> CapturedRender:
+        """Record a render on CUDA as a graph, to draw many views or moments with little delay.
+
+            draw = rasterizer.capture(gaussians, camera)
+            for view in views:
+                image = draw(camera=view).color  # valid until the next call
+
+        Sizes, SH bands and the numbers of the request are fixed; see CapturedRender. Without
+        gradients.
+
+        Raises:
+            RenderError: the Gaussians are not on CUDA, or cannot be drawn.
+        """
+        if gaussians.means.device.type != "cuda":
+            raise RenderError(
+                f"WarpRasterizer.capture: Gaussians are on {gaussians.means.device}, expected a "
+                "CUDA device: CUDA graphs are there alone; use render, or move them with .to(...)"
+            )
+        return CapturedRender(self, gaussians, camera, request or RenderRequest())
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies and pickles carry the settings; they bring up their own kernels."""
@@ -80,27 +102,28 @@ class WarpRasterizer(Rasterizer):
 
     def backend_report(self) -> dict[str, str]:
         """What runs the kernels and why, for `hoigs doctor` and run provenance."""
-        self._path("cpu")
+        self.path(torch.device("cpu"))
         return dict(self._report)
 
-    def _path(self, device: str) -> Any:
+    def path(self, device: torch.device) -> Any:
+        """What draws on a device: its kernels, brought up once."""
         if device not in self._paths:
             self._paths[device] = self._make_path(device)
         return self._paths[device]
 
-    def _make_path(self, device: str) -> Any:
+    def _make_path(self, device: torch.device) -> Any:
         try:
             import warp
         except ImportError as error:
             raise RenderError(
                 "WarpRasterizer needs Warp, which is not installed: pip install warp-lang"
             ) from error
-        from hoigs.rasterizers.warp.launchers import Cores, CudaStream
-        from hoigs.rasterizers.warp.pixels import PixelPath
+        if device.type == "cuda":
+            from hoigs.rasterizers.warp.cuda import CudaPath
 
-        if device == "cuda":
             self._report |= {"warp": warp.config.version, "cuda": "pixel kernels"}
-            return PixelPath(CudaStream())
+            return CudaPath(device)
+        from hoigs.rasterizers.warp.launchers import Cores
         from hoigs.rasterizers.warp.workers import make_workers
 
         workers, reason = make_workers(self.scheduler)
@@ -112,51 +135,9 @@ class WarpRasterizer(Rasterizer):
         }
         cores = Cores(workers, self.threads)
         if self.cpu_kernels == "portable":
+            from hoigs.rasterizers.warp.pixels import PixelPath
+
             return PixelPath(cores)
         from hoigs.rasterizers.warp.cpu import NativePath
 
         return NativePath(cores)
-
-
-def _prepare(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> tuple[Any, list]:
-    """Settings, and tensors in the order of `frame.Inputs`: contiguous, absent ones empty."""
-    from hoigs.rasterizers.warp.frame import Settings, check_addressable
-
-    like = gaussians.means
-    count, stored = gaussians.sh.shape[:2]
-    degree = request.sh_degree
-    settings = Settings(
-        width=camera.width,
-        height=camera.height,
-        bands=stored if degree is None else min(stored, (degree + 1) ** 2),
-        near=request.near,
-        low_pass=request.low_pass,
-        max_alpha=request.max_alpha,
-        min_alpha=request.min_alpha,
-        min_transmittance=request.min_transmittance,
-    )
-    if request.near < 0:
-        raise RenderError(f"WarpRasterizer: near is {request.near}, expected 0 or more (metres)")
-    channels = 0 if request.features is None else request.features.shape[1]
-    check_addressable(
-        camera.width * camera.height * max(3, channels),
-        f"{camera.width}x{camera.height} pixels with {channels} feature channels",
-    )
-    background = like.new_zeros(3) if request.background is None else request.background
-    features, offsets, subset = request.features, request.screen_offsets, request.subset
-    tensors = [
-        gaussians.means,
-        gaussians.quats,
-        gaussians.log_scales,
-        gaussians.opacity_logits,
-        gaussians.sh,
-        like.new_empty(count, 0) if features is None else features,
-        like.new_empty(0, 2) if offsets is None else offsets,
-        background,
-        camera.world_to_camera,
-        camera.K,
-    ]
-    tensors = [x.to(like).contiguous() for x in tensors]
-    subset = torch.empty(0, dtype=torch.bool) if subset is None else subset
-    tensors.append(subset.to(like.device).contiguous().view(torch.uint8))
-    return settings, tensors

@@ -1,0 +1,205 @@
+"""What is particular to Warp on CUDA: lists without waiting, one shared list, captured graphs."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+import torch
+from raster_scenes import RAW, a_camera, assert_close_gradient, images, random_scene
+from torch import Tensor
+
+from hoigs.core.camera import Camera
+from hoigs.core.errors import RenderError
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.rasterizer import RenderRequest
+from hoigs.rasterizers.warp import WarpRasterizer
+
+CUDA = torch.device("cuda", 0)
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
+]
+
+
+def scene(count: int = 3000, width: int = 150, height: int = 90) -> tuple[Gaussians, Camera]:
+    return random_scene(count).to(CUDA), a_camera(width, height).to(CUDA)
+
+
+def drawn(
+    rasterizer: WarpRasterizer, gaussians: Gaussians, camera: Camera, request: RenderRequest
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Images, and gradients of a fixed random weighting of them."""
+    leaves = gaussians.map(lambda x: x.detach().clone().requires_grad_())
+    output = images(rasterizer.render(leaves, camera, request))
+    generator = torch.Generator().manual_seed(1)
+    loss = torch.zeros((), device=CUDA)
+    for image in output.values():
+        loss = loss + (image * torch.randn(image.shape, generator=generator).to(CUDA)).sum()
+    loss.backward()
+    return (
+        {name: image.detach() for name, image in output.items()},
+        {name: getattr(leaves, name).grad for name in RAW},
+    )
+
+
+@pytest.mark.parametrize("channels", [0, 6])
+def test_where_pairs_do_not_fit_the_picture_is_the_same(channels: int) -> None:
+    gaussians, camera = scene()
+    request = RenderRequest(features=torch.randn(3000, channels, device=CUDA) if channels else None)
+    roomy, tight = WarpRasterizer(), WarpRasterizer()
+    wanted = drawn(roomy, gaussians, camera, request)
+    room = tight.path(CUDA).lists.room
+    room.measured(3000, 10**6, 0)  # as if only empty views had been drawn
+    room._room = 3000
+    actual = drawn(tight, gaussians, camera, request)
+    torch.cuda.synchronize()
+    assert int(room.told[0]) > 3000, "the pairs fitted: this tests nothing"
+    for name, image in wanted[0].items():
+        assert torch.equal(actual[0][name], image), name
+    for name, gradient in wanted[1].items():
+        assert_close_gradient(name, actual[1][name], gradient)
+    again = drawn(tight, gaussians, camera, request)  # there is room now
+    assert all(torch.equal(again[1][name], wanted[1][name]) for name in RAW)
+
+
+def test_long_lists_are_in_order() -> None:
+    """Thousands of splats in one tile: sorted in pieces, then merged."""
+    gaussians, camera = scene(20_000, 20, 20)
+    request = RenderRequest(min_transmittance=0.0)
+    faint = gaussians.replace(opacity_logits=gaussians.opacity_logits * 0.0 - 4.0)
+    path = WarpRasterizer().path(CUDA)
+    from hoigs.rasterizers.warp.frame import Inputs
+    from hoigs.rasterizers.warp.inputs import prepare
+
+    settings, tensors = prepare(WarpRasterizer(), faint, camera, request)
+    projected = path.project(Inputs(*tensors), settings)
+    lists = path.bin(projected, settings)
+    offsets = lists.offsets.tolist()
+    assert offsets[-1] == -1
+    assert max(b - a for a, b in pairwise(offsets[:-1])) > 5000
+    slots = []
+    for begin, end in pairwise(offsets[:-1]):
+        rows, here = lists.pairs[begin:end].long().unbind(1)
+        keys = projected.drawn_depths[rows].double() * 2**20 + rows.double() / 2**20
+        assert (keys[1:] > keys[:-1]).all()
+        assert (here >= lists.first[rows]).all()
+        assert (here < lists.first[rows] + lists.slots[rows]).all()
+        slots.append(here)
+    assert torch.equal(torch.cat(slots).sort().values, torch.arange(offsets[-2], device=CUDA))
+
+
+def test_a_steady_step_waits_for_nothing() -> None:
+    gaussians, camera = scene()
+    rasterizer = WarpRasterizer()
+
+    def step() -> Tensor:
+        leaves = gaussians.map(lambda x: x.detach().requires_grad_())
+        output = rasterizer.render(leaves, camera)
+        output.color.backward(torch.ones_like(output.color))
+        assert leaves.means.grad is not None
+        return leaves.means.grad
+
+    wanted = step()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        actual = step()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert torch.equal(actual, wanted)
+
+
+def test_a_whole_step_can_be_captured() -> None:
+    gaussians, camera = scene()
+    rasterizer = WarpRasterizer()
+    leaves = gaussians.map(lambda x: x.detach().clone().requires_grad_())
+    graph = torch.cuda.CUDAGraph()
+    with pytest.raises(RenderError, match="render once before"), torch.cuda.graph(graph):
+        rasterizer.render(leaves, camera)
+    side = torch.cuda.Stream()
+    with torch.cuda.stream(side):
+        rasterizer.render(leaves, camera).color.sum().backward()
+        leaves = leaves.map(lambda x: x.detach().requires_grad_())
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, stream=side):
+        rasterizer.render(leaves, camera).color.sum().backward()
+    with torch.no_grad():
+        leaves.means += 0.05
+    graph.replay()
+    wanted = leaves.map(lambda x: x.detach().clone().requires_grad_())
+    rasterizer.render(wanted, camera).color.sum().backward()
+    for name in RAW:
+        assert torch.equal(getattr(leaves, name).grad, getattr(wanted, name).grad), name
+
+
+def test_streams_do_not_disturb_each_other() -> None:
+    rasterizer = WarpRasterizer()
+    scenes = [random_scene(3000, seed=seed).to(CUDA) for seed in range(3)]
+    camera = a_camera(150, 90).to(CUDA)
+    alone = [rasterizer.render(x, camera).color for x in scenes]
+    streams = [torch.cuda.Stream() for _ in scenes]
+    torch.cuda.synchronize()
+    for _ in range(10):
+        together = []
+        for gaussians, stream in zip(scenes, streams):
+            with torch.cuda.stream(stream):
+                together.append(rasterizer.render(gaussians, camera).color)
+        torch.cuda.synchronize()
+        assert all(torch.equal(a, b) for a, b in zip(together, alone))
+
+
+def test_a_captured_render_follows_its_inputs() -> None:
+    gaussians, camera = scene()
+    rasterizer = WarpRasterizer()
+    features = torch.randn(3000, 2, device=CUDA)
+    request = RenderRequest(features=features, background=torch.rand(3, device=CUDA))
+    draw = rasterizer.capture(gaussians, camera, request)
+    moved = gaussians.replace(means=gaussians.means + 0.1)
+    turned = a_camera(150, 90).to(CUDA)
+    turned.world_to_camera[2, 3] += 0.4
+    other = request.replace(features=features.flip(0))
+    for given in (
+        {},
+        {"camera": turned},
+        {"gaussians": moved},
+        {"camera": camera, "request": other},
+    ):
+        actual = images(draw(**given))
+        now = {"gaussians": gaussians, "camera": camera, "request": request} | given
+        if "request" in given or given == {"gaussians": moved}:
+            now["camera"] = camera if "camera" in given else turned
+        if "request" in given:
+            now["gaussians"] = moved
+        wanted = images(rasterizer.render(**now))
+        for name, image in wanted.items():
+            assert torch.equal(actual[name], image), (list(given), name)
+    assert draw.captures == 1
+
+
+def test_a_captured_render_that_outgrows_its_room_is_right_and_grows() -> None:
+    gaussians, camera = scene()
+    small = gaussians.replace(log_scales=gaussians.log_scales - 3.0)
+    rasterizer = WarpRasterizer()
+    draw = rasterizer.capture(small, camera)
+    draw._path.lists.room._room = 3000
+    draw._capture()
+    wanted = WarpRasterizer().render(gaussians, camera).color
+    assert torch.equal(draw(gaussians=gaussians).color, wanted)
+    torch.cuda.synchronize()
+    captures = draw.captures
+    assert torch.equal(draw().color, wanted)
+    assert draw.captures == captures + 1
+
+
+def test_a_captured_render_refuses_other_sizes() -> None:
+    gaussians, camera = scene()
+    draw = WarpRasterizer().capture(gaussians, camera)
+    with pytest.raises(RenderError, match=r"captured with .*150.*called with .*151"):
+        draw(camera=a_camera(151, 90).to(CUDA))
+    with pytest.raises(RenderError, match=r"3000, 3.*100, 3"):
+        draw(gaussians=gaussians[:100])
+
+
+def test_there_is_nothing_to_capture_on_a_cpu() -> None:
+    with pytest.raises(RenderError, match="CUDA"):
+        WarpRasterizer().capture(random_scene(5), a_camera())
