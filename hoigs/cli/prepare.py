@@ -25,6 +25,10 @@ def prepare(
     focal: Annotated[
         float | None, typer.Option("--focal", help="Focal length in pixels of the video, if known.")
     ] = None,
+    keep_black: Annotated[
+        bool,
+        typer.Option("--keep-black", help="Learn flat black patches; default: they are ignored."),
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the clip.")] = False,
 ) -> None:
     """Turn a video and its priors into a clip folder, with a written report."""
@@ -33,8 +37,9 @@ def prepare(
     from hoigs.preparation.prepare import prepare as run
 
     options = PrepareOptions(
-        width=width, max_frames=max_frames, every=every, focal=focal, overwrite=overwrite
-    )
+        width=width, max_frames=max_frames, every=every, focal=focal, keep_black=keep_black,
+        overwrite=overwrite,
+    )  # fmt: skip
     body = default_registry().get("body:anny")()
     with progress_bar("preparing", 1.0) as bar:
         report = run(source, out, options=options, body=body, progress=bar.update)

@@ -31,6 +31,10 @@ class FrameStore(ABC):
     def depth(self, position: int) -> Float[Tensor, "H W"] | None:
         """Depth along z, metres; 0 where unknown (NaN and infinity are cleaned by the reader)."""
 
+    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
+        """Pixels that show no scene; None where all do."""
+        return None
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -39,6 +43,8 @@ class Frame:
     Attributes:
         position: its place in the clip's frame list. moment.index is the frame number.
         masks: by entity, visible pixels. depth: metres, 0 = unknown, or None.
+        ignored: pixels that show no scene (painted over, outside the lens image): nothing is
+            learned from them and nothing is scored there. None when there are none.
     """
 
     position: int
@@ -47,6 +53,7 @@ class Frame:
     image: UInt8[Tensor, "H W 3"]
     masks: dict[str, Bool[Tensor, "H W"]]
     depth: Float[Tensor, "H W"] | None
+    ignored: Bool[Tensor, "H W"] | None = None
 
     @property
     def rgb(self) -> Float[Tensor, "H W 3"]:
@@ -129,6 +136,7 @@ class Clip:
             image=self.store.image(position),
             masks={name: self.store.mask(name, position) for name in self.kinds},
             depth=self.store.depth(position),
+            ignored=self.store.ignored(position),
         )
 
     def __iter__(self) -> Iterator[Frame]:
@@ -187,6 +195,10 @@ class ResizedStore(FrameStore):
     def depth(self, position: int) -> Float[Tensor, "H W"] | None:
         depth = self.base.depth(position)
         return None if depth is None else self._nearest(depth, position)
+
+    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
+        ignored = self.base.ignored(position)
+        return None if ignored is None else self._nearest(ignored.float(), position) > 0.5
 
     def _nearest(self, image: Tensor, position: int) -> Tensor:
         width, height = self.sizes[position]

@@ -16,6 +16,7 @@ from hoigs.core.clip_format import (
     CAMERAS,
     DEPTH,
     HEADER,
+    IGNORED,
     IMAGE,
     MASK,
     OBJECT,
@@ -25,6 +26,7 @@ from hoigs.core.clip_format import (
     FileSpec,
     ViewsHeader,
     depth_path,
+    ignored_path,
     image_path,
     load_arrays,
     mask_path,
@@ -170,6 +172,7 @@ def _check_views(folder: Path, view: _View, header: ClipHeader) -> list[Problem]
         at = functools.partial(_mask_at, name)
         found = _each_frame(root, view, at, MASK, _mask_problem)
         problems += found or _check_mask_content(root, view, name)
+    problems += _each_frame(root, view, ignored_path, IGNORED, _mask_problem, optional=True)
     if header.depth_kind != "none":
         problems += _each_frame(root, view, depth_path, DEPTH, _depth_problem)
     return problems
@@ -185,12 +188,13 @@ def _each_frame(
     path_of: Callable[[Path, int], Path],
     spec: FileSpec,
     check: Callable[[Path, _View], str | None],
+    optional: bool = False,
 ) -> list[Problem]:
     def one(frame: int) -> Problem | None:
         path = path_of(root, frame)
         name = view.room + path.relative_to(root).as_posix()
         if not path.is_file():
-            return Problem(name, spec.maker, absent=True)
+            return None if optional else Problem(name, spec.maker, absent=True)
         message = check(path, view)
         return Problem(name, message) if message else None
 

@@ -27,6 +27,7 @@ from hoigs.core.clip_format import (
     SplitHeader,
     ViewsHeader,
     depth_path,
+    ignored_path,
     is_clip_folder,
     mask_path,
     stem,
@@ -47,6 +48,11 @@ def _array(values: Any, dtype: type = np.float32) -> np.ndarray:
     return np.asarray(values, dtype=dtype)
 
 
+def _save_mask(path: Path, mask: Mask) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(_array(mask, np.bool_).astype(np.uint8) * 255).save(path, compress_level=3)
+
+
 class _Views:
     """Frames of one room: the clip itself, or held_out."""
 
@@ -62,6 +68,7 @@ class _Views:
         masks: Mapping[str, Mask],
         depth: Depth | None,
         depth_dtype: type,
+        ignored: Mask | None = None,
     ) -> int:
         frame = len(self.cameras)
         pixels = _array(image, np.uint8)
@@ -74,11 +81,9 @@ class _Views:
             )
         self._save_image(pixels, frame)
         for name, mask in masks.items():
-            path = mask_path(self.root, name, frame)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(_array(mask, np.bool_).astype(np.uint8) * 255).save(
-                path, compress_level=3
-            )
+            _save_mask(mask_path(self.root, name, frame), mask)
+        if ignored is not None and _array(ignored, np.bool_).any():
+            _save_mask(ignored_path(self.root, frame), ignored)
         if depth is not None:
             path = depth_path(self.root, frame)
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -183,13 +188,19 @@ class ClipWriter:
         return len(self._main.cameras)
 
     def add_frame(
-        self, image: Image8, camera: Camera, masks: Mapping[str, Mask], depth: Depth | None = None
+        self,
+        image: Image8,
+        camera: Camera,
+        masks: Mapping[str, Mask],
+        depth: Depth | None = None,
+        ignored: Mask | None = None,
     ) -> int:
         """The next frame: RGB, its camera, visible pixels by entity, metres (0 = unknown).
 
-        Returns its number. Entities without a mask here are reported when the clip is finished.
+        `ignored` marks pixels that show no scene. Returns the frame's number. Entities without a
+        mask here are reported when the clip is finished.
         """
-        return self._main.add(image, camera, masks, depth, self.depth_dtype)
+        return self._main.add(image, camera, masks, depth, self.depth_dtype, ignored)
 
     def add_held_out(
         self,
@@ -198,10 +209,11 @@ class ClipWriter:
         camera: Camera,
         masks: Mapping[str, Mask],
         depth: Depth | None = None,
+        ignored: Mask | None = None,
     ) -> int:
         """A view never trained on, of the moment of main frame `frame`. Returns the view number."""
         self._held_out_frames.append(int(frame))
-        return self._held_out.add(image, camera, masks, depth, self.depth_dtype)
+        return self._held_out.add(image, camera, masks, depth, self.depth_dtype, ignored)
 
     def set_body(self, entity: str, track: BodyTrack) -> None:
         """Poses [F, …] and betas [B] of a human."""
@@ -289,10 +301,12 @@ def write_clip(clip: Clip, folder: str | Path, **options: Any) -> None:
     with ClipWriter(folder, fps=clip.fps, entities=entities, **options) as writer:
         for frame in clip:
             masks = {n: frame.masks[n] for n in entities}
-            writer.add_frame(frame.image, frame.camera, masks, frame.depth)
+            writer.add_frame(frame.image, frame.camera, masks, frame.depth, frame.ignored)
         for view in clip.held_out or ():
             masks = {n: view.masks[n] for n in entities}
-            writer.add_held_out(view.moment.index, view.image, view.camera, masks, view.depth)
+            writer.add_held_out(
+                view.moment.index, view.image, view.camera, masks, view.depth, view.ignored
+            )
         for name, body in clip.bodies.items():
             writer.set_body(name, body)
         for name, track in clip.objects.items():

@@ -157,6 +157,13 @@ DEPTH = FileSpec(
     (ArraySpec("depth", ("H", "W"), "float", "metres, 0 = unknown, never NaN or infinite"),),
     'depth_kind is not "none"',
 )
+IGNORED = FileSpec(
+    "ignored/{frame}.png",
+    "pixels that show no scene (painted over, outside the lens image), grey 8 bit, 255 = ignored: "
+    "left out of training and of every score",
+    "optional: frames without a file have no such pixels",
+    when="some pixels show no scene",
+)
 BODY = FileSpec(
     "bodies/{entity}.npz",
     "SMPL-X convention, axis-angle in radians, world coordinates",
@@ -197,8 +204,8 @@ POINTS = FileSpec(
         ArraySpec("colors", ("P", 3), "float", "RGB in [0, 1]"),
     ),
 )
-FILES = (CAMERAS, IMAGE, MASK, DEPTH, BODY, OBJECT, POINTS)
-HELD_OUT_FILES = (CAMERAS, IMAGE, MASK, DEPTH)  # with V views in place of F frames
+FILES = (CAMERAS, IMAGE, MASK, IGNORED, DEPTH, BODY, OBJECT, POINTS)
+HELD_OUT_FILES = (CAMERAS, IMAGE, MASK, IGNORED, DEPTH)  # with V views in place of F frames
 
 
 def stem(frame: int) -> str:
@@ -217,6 +224,10 @@ def image_path(folder: Path, frame: int) -> Path:
 
 def mask_path(folder: Path, entity: str, frame: int) -> Path:
     return folder / "masks" / entity / f"{stem(frame)}.png"
+
+
+def ignored_path(folder: Path, frame: int) -> Path:
+    return folder / "ignored" / f"{stem(frame)}.png"
 
 
 def depth_path(folder: Path, frame: int) -> Path:

@@ -111,6 +111,8 @@ def _protocol(
     positions = clip.split[split]
     camera = clip.cameras[positions[0]]
     first = camera.world_to_camera
+    ignored = [clip.store.ignored(p) for p in positions]
+    share = sum(float(m.float().mean()) for m in ignored if m is not None) / len(positions)
     fixed = all(torch.equal(c.world_to_camera, first) for c in clip.cameras)
     views = title if title == "held-out cameras" else "training cameras"
     return Protocol(
@@ -127,6 +129,7 @@ def _protocol(
         lpips_net=None if isinstance(lpips, NotComputed) else lpips.net,
         device=device_name(model.device),
         rasterizer=type(model.rasterizer).__name__,
+        ignored=share,
     )
 
 
@@ -145,6 +148,8 @@ def score_frame(
     color = output.color.clamp(0, 1)
     if protocol.pixels == "8-bit":
         color = (color * 255).round() / 255
+    if frame.ignored is not None:  # windows that reach into such pixels see the target there
+        color = torch.where(frame.ignored.to(device)[..., None], target, color)
     regions = region_masks(frame, clip.kinds, protocol.band)
     if not torch.isfinite(color).all():
         broken = dict.fromkeys(METRICS, NotComputed("the render is not finite"))
@@ -166,7 +171,7 @@ def score_frame(
             else float(perceptual[mask].mean()),
             "depth": _mean_depth(depth, mask),
         }
-    if not isinstance(lpips, NotComputed):
+    if not isinstance(lpips, NotComputed) and frame.ignored is None:
         # of whole images the published definition, which averages each layer before upsampling
         values["full"] = {**values["full"], "lpips": float(lpips(color, target))}
     return FrameScores(frame.position, frame.moment.index, values)

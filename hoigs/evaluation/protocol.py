@@ -38,6 +38,7 @@ class Protocol:
         width, height: of the scored images, pixels.
         lpips_net: "alex", "vgg", or None when LPIPS was not computed. lpips_range: of its input.
         device, rasterizer: what drew.
+        ignored: part of the scored pixels that the clip says show no scene, left out everywhere.
     """
 
     views: str
@@ -53,6 +54,7 @@ class Protocol:
     lpips_net: str | None
     device: str
     rasterizer: str
+    ignored: float = 0.0
     background: str = "black"
     lpips_range: str = "[-1, 1]"
     averages: str = "mean over frames of the metric of each frame"
@@ -73,11 +75,17 @@ class Protocol:
             if self.lpips_net
             else "LPIPS not computed"
         )
+        left_out = (
+            f"; {100 * self.ignored:.2f} % of the pixels show no scene and are left out"
+            if self.ignored
+            else ""
+        )
         return [
             f"{self.frames} frames of split {self.split!r} from {self.views}, "
             f"{self.unseen_times or 'none'} of them at times that were not trained on; "
             f"body poses: {self.test_pose}.",
             f"{self.width}x{self.height}, {self.pixels} pixels clamped to [0, 1] over "
-            f"{self.background}; {self.averages}; drawn by {self.rasterizer} on {self.device}.",
+            f"{self.background}; {self.averages}; drawn by {self.rasterizer} on {self.device}"
+            f"{left_out}.",
             f"SSIM: {self.ssim}. {lpips}. Interaction: within {self.band} px of human and object.",
         ]

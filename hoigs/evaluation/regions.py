@@ -14,7 +14,7 @@ from hoigs.core.interaction import EntityKind
 REGIONS = ("full", "human_object", "human", "object", "interaction", "background")
 
 MEANING = {
-    "full": "every pixel",
+    "full": "every pixel that shows the scene",
     "human_object": "visible pixels of any human or object",
     "human": "visible pixels of any human",
     "object": "visible pixels of any object",
@@ -27,6 +27,8 @@ def region_masks(
     frame: Frame, kinds: Mapping[str, EntityKind], band: int
 ) -> dict[str, Bool[Tensor, "H W"]]:
     """The mask of each of REGIONS; all False where a frame has none of it.
+
+    No region holds pixels that the frame says show no scene.
 
     Args:
         kinds: kind of each entity of the clip.
@@ -41,7 +43,7 @@ def region_masks(
         elif kinds[name] == "object":
             object_ |= mask
     either = human | object_
-    return {
+    regions = {
         "full": torch.ones_like(empty),
         "human_object": either,
         "human": human,
@@ -49,6 +51,9 @@ def region_masks(
         "interaction": dilate(human, band) & dilate(object_, band),
         "background": ~either,
     }
+    if frame.ignored is None:
+        return regions
+    return {name: mask & ~frame.ignored for name, mask in regions.items()}
 
 
 def default_band(width: int, height: int) -> int:

@@ -35,12 +35,16 @@ class PrepareOptions(ComponentConfig):
     )
     object_points: int = Field(default=4000, ge=8, description="points that start the object")
     scene_points: int = Field(
-        default=25_000, ge=100, description="points that start a static camera's background"
+        default=25_000, ge=100, description="points that start the background, about"
     )
     backdrop: float = Field(
         default=3.0,
         gt=1,
         description="distance of a static background, in distances of the person",
+    )
+    keep_black: bool = Field(
+        default=False,
+        description="learn flat black patches too; by default they show no scene and are ignored",
     )
     overwrite: bool = Field(default=False, description="replace an older clip at the target")
     overlay_width: int = Field(

@@ -15,6 +15,7 @@ from hoigs.core.clip_folder import ClipWriter, check_clip, refuse_to_overwrite
 from hoigs.core.clip_format import is_clip_folder
 from hoigs.core.errors import ClipError
 from hoigs.preparation.ball import BallTrack, load_ball, refine_ball
+from hoigs.preparation.blank import blank_pixels
 from hoigs.preparation.cameras import (
     CameraTrack,
     colmap_cameras,
@@ -110,6 +111,7 @@ class _Preparation:
             self.person = self._person()
         with self.stages.stage("masks"):
             self.human, self.things = self._masks()
+            self.blank = self._blank()
         with self.stages.stage("object"):
             self.object, self.spread = self._object()
         with self.stages.stage("scene"):
@@ -156,6 +158,20 @@ class _Preparation:
         self.provenance["masks"] = text
         return human, things
 
+    def _blank(self) -> MaskStack:
+        rows = zip(self.images(), self.human, self.things, strict=True)
+        if self.options.keep_black:
+            return MaskStack(np.zeros_like(human) for _, human, _ in rows)
+        blank = MaskStack(blank_pixels(image, human | thing) for image, human, thing in rows)
+        coverage = blank.coverage()
+        if coverage.any():
+            self.warnings.append(
+                f"{int((coverage > 0).sum())} frames have flat black patches, up to "
+                f"{100 * coverage.max():.1f} % of the image, which show no scene: they are left "
+                "out of training and scores (--keep-black if they are real)"
+            )
+        return blank
+
     def _silhouettes(self) -> MaskStack:
         pairs = zip(self.person.posed(self.body), self.cameras, strict=True)
         return MaskStack(silhouette(v, self.body.faces, c) for (v, _), c in pairs)
@@ -179,10 +195,13 @@ class _Preparation:
         return track, spread
 
     def _scene(self) -> ScenePoints:
-        masks = (self.human, self.things)
+        masks = (self.human, self.things, self.blank)
         if not self.source.static_camera:
             scale = self.person.scene_scale
-            scene = colmap_scene(self.track.points * scale, self.track.colors, masks, self.cameras)
+            scene = colmap_scene(
+                self.track.points * scale, self.track.colors, masks, self.cameras, self.images,
+                self.options.scene_points,
+            )  # fmt: skip
         else:
             scene = static_scene(
                 self.images, masks, self.cameras[0],
@@ -229,12 +248,15 @@ class _Preparation:
         )
         with overlay:
             bodies = self.person.posed(self.body)
-            rows = zip(self.images(), self.cameras, self.human, self.things, bodies, strict=True)
-            for i, (image, camera, human, thing, (vertices, _)) in enumerate(
+            rows = zip(
+                self.images(), self.cameras, self.human, self.things, self.blank, bodies,
+                strict=True,
+            )  # fmt: skip
+            for i, (image, camera, human, thing, blank, (vertices, _)) in enumerate(
                 self.stages.track(rows, len(self.video))
             ):
                 masks = {self.options.human: human, self.options.object: thing}
-                writer.add_frame(image, camera, masks)
+                writer.add_frame(image, camera, masks, ignored=blank)
                 points = self.object.points @ self.object.rotations[i].mT
                 points = points + self.object.translations[i]
                 overlay.add(image, camera, vertices, human, thing, points)

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.camera import Camera
+from hoigs.preparation.dense_points import densify, keyframes
 from hoigs.preparation.masks import MaskStack
 from hoigs.preparation.overlay import shrink, shrink_mask
 from hoigs.preparation.scene_points import (
@@ -38,10 +39,16 @@ def colmap_scene(
     colors: Float[Tensor, "P 3"],
     masks: Sequence[MaskStack],
     cameras: Sequence[Camera],
+    images: Images,
+    count: int,
 ) -> ScenePoints:
-    """COLMAP's points without those that lie on the person or the object.
+    """COLMAP's points without those that lie on the person or the object, and more between them.
 
     A point goes if, of the frames that see its place, at least half see it inside a mask.
+
+    Args:
+        masks: of everything that moves or shows no scene. images: gives the frames anew.
+        count: of points, about: the gaps are filled up to it (`dense_points.densify`).
     """
     inside = torch.zeros(len(points))
     visible = torch.zeros(len(points))
@@ -57,7 +64,13 @@ def colmap_scene(
     if not keep.any():
         raise SourceError("every COLMAP point lies on the person or the object")
     text = f"COLMAP points, {int((~keep).sum())} of {len(points)} on the person or object dropped"
-    return ScenePoints(points[keep], colors[keep], text)
+    points, colors = points[keep], colors[keep]
+    chosen = keyframes(len(cameras))
+    shown = {i: image for i, image in enumerate(images()) if i in chosen}
+    frames = [(shown[i], np.logical_or.reduce([m[i] for m in masks]), cameras[i]) for i in chosen]
+    more, more_colors = densify(points, frames, max(0, count - len(points)))
+    text += f"; {len(more)} more interpolated between them in {len(chosen)} frames"
+    return ScenePoints(torch.cat((points, more)), torch.cat((colors, more_colors)), text)
 
 
 def static_scene(

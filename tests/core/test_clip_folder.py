@@ -176,3 +176,27 @@ def test_size_and_empty_clip_errors(tmp_path: Path) -> None:
         ClipWriter(tmp_path / "clip", fps=24, entities={}),
     ):
         pass
+
+
+def test_ignored_pixels_travel_with_their_frames(tmp_path: Path) -> None:
+    folder = tmp_path / "clip"
+    blank = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    blank[:4] = True
+    with ClipWriter(folder, fps=24, entities={"box": "object"}) as writer:
+        for i in range(FRAMES):
+            image, masks, _ = pixels(i)
+            writer.add_frame(
+                image, camera(i), {"box": masks["box"]}, ignored=blank if i == 2 else None
+            )
+        writer.set_object("box", object_track())
+        writer.set_points(torch.rand(4, 3), torch.rand(4, 3))
+    clip = ClipFolderReader().read(folder)
+    assert clip[1].ignored is None
+    assert torch.equal(clip[2].ignored, torch.from_numpy(blank))
+    small = clip.resized(WIDTH // 2)[2].ignored
+    assert small is not None and small[:2].all() and not small[2:].any()
+    write_clip(clip, tmp_path / "again")
+    assert torch.equal(ClipFolderReader().read(tmp_path / "again")[2].ignored, clip[2].ignored)
+    (folder / "ignored" / "00003.png").write_bytes(b"no picture")
+    with pytest.raises(ClipError, match=r"ignored/00003.png: not a readable image"):
+        ClipFolderReader().read(folder)

@@ -24,6 +24,7 @@ from hoigs.core.clip_format import (
     ClipHeader,
     ViewsHeader,
     depth_path,
+    ignored_path,
     image_path,
     load_arrays,
     mask_path,
@@ -126,6 +127,12 @@ class FolderStore(FrameStore):
 
     def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
         return self._get(mask_path(self.root, entity, position), lambda p: _decode(p, "L") > 127)
+
+    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
+        path = ignored_path(self.root, position)
+        if not path.is_file():
+            return None
+        return self._get(path, lambda p: _decode(p, "L") > 127)
 
     def depth(self, position: int) -> Float[Tensor, "H W"] | None:
         if not self.has_depth:
