@@ -17,7 +17,7 @@ from hoigs.rasterizers.warp.arguments import (
     upstream_arguments,
 )
 from hoigs.rasterizers.warp.calls import flat
-from hoigs.rasterizers.warp.cpu_source import MAX_ROWS
+from hoigs.rasterizers.warp.cpu_vectors import MAX_ROWS
 from hoigs.rasterizers.warp.frame import Images, Inputs, Lists, Settings, check_addressable
 from hoigs.rasterizers.warp.launchers import Cores
 from hoigs.rasterizers.warp.projection import project, project_adjoint
