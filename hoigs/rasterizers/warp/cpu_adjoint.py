@@ -51,117 +51,117 @@ HEAD = r"""
 # The image and its gradient into blocks: 0 to 2 colour, 3 to 5 its gradient, 6 to 8 background,
 # 9 and 10 alpha, 11 and 12 depth.
 LOAD_BEGIN = r"""
-                    vec in[13], extra[EXTRA];
-                    if (columns < 8 || HIGH * (b + 1) > high) {
-                        for (int j = 0; j < 13; ++j) in[j] = same(0.0f);
-                        for (int j = 0; j < extras; ++j) extra[j] = same(0.0f);
-                    }
+    vec in[13], extra[EXTRA];
+    if (columns < 8 || HIGH * (b + 1) > high) {
+        for (int j = 0; j < 13; ++j) in[j] = same(0.0f);
+        for (int j = 0; j < extras; ++j) extra[j] = same(0.0f);
+    }
 """
 LOAD = r"""
-                        for (int i = 0; i < columns; ++i) {
-                            const int lane = HIGH * i + h;
-                            const float* back = background_ + (o + i) * background_stride;
-                            for (int j = 0; j < 3; ++j) {
-                                lane_of(in[j], lane) = color_[3 * (o + i) + j];
-                                lane_of(in[3 + j], lane) = v_color_[3 * (o + i) + j];
-                                lane_of(in[6 + j], lane) = back[j];
-                            }
-                            lane_of(in[9], lane) = alpha_[o + i];
-                            lane_of(in[10], lane) = v_alpha_[o + i];
-                            lane_of(in[11], lane) = depth_[o + i];
-                            lane_of(in[12], lane) = v_depth_[o + i];
-                            for (int j = 0; j < extras; ++j) {
-                                const long long e = (o + i) * channels + pass + j;
-                                lane_of(extra[j], lane) = extra_[e];
-                                lane_of(more[j][at], lane) = v_extra_[e];
-                            }
-                        }
+    for (int i = 0; i < columns; ++i) {
+        const int lane = HIGH * i + h;
+        const float* back = background_ + (o + i) * background_stride;
+        for (int j = 0; j < 3; ++j) {
+            lane_of(in[j], lane) = color_[3 * (o + i) + j];
+            lane_of(in[3 + j], lane) = v_color_[3 * (o + i) + j];
+            lane_of(in[6 + j], lane) = back[j];
+        }
+        lane_of(in[9], lane) = alpha_[o + i];
+        lane_of(in[10], lane) = v_alpha_[o + i];
+        lane_of(in[11], lane) = depth_[o + i];
+        lane_of(in[12], lane) = v_depth_[o + i];
+        for (int j = 0; j < extras; ++j) {
+            const long long e = (o + i) * channels + pass + j;
+            lane_of(extra[j], lane) = extra_[e];
+            lane_of(more[j][at], lane) = v_extra_[e];
+        }
+    }
 """
 LOAD_END = r"""
-                    veil[at] = same(0.0f);
-                    if (pass == 0) {
-                        p.red = in[3];
-                        p.green = in[4];
-                        p.blue = in[5];
-                        p.dist = in[12];
-                        const vec behind = in[3] * in[6] + in[4] * in[7] + in[5] * in[8];
-                        veil[at] = in[10] - behind;
-                        p.S = in[0] * in[3] + in[1] * in[4] + in[2] * in[5] - behind
-                            + in[9] * in[10] + in[11] * in[12];
-                    }
-                    for (int j = 0; j < extras; ++j) p.S += extra[j] * more[j][at];
+    veil[at] = same(0.0f);
+    if (pass == 0) {
+        p.red = in[3];
+        p.green = in[4];
+        p.blue = in[5];
+        p.dist = in[12];
+        const vec behind = in[3] * in[6] + in[4] * in[7] + in[5] * in[8];
+        veil[at] = in[10] - behind;
+        p.S = in[0] * in[3] + in[1] * in[4] + in[2] * in[5] - behind
+            + in[9] * in[10] + in[11] * in[12];
+    }
+    for (int j = 0; j < extras; ++j) p.S += extra[j] * more[j][at];
 """
 
 # Moments are taken about the middle row of the splat in this tile and along the slanted line there:
 # the shift from them to u and dy is then at most a tile's width, so little cancels.
 BEFORE = r"""
-                    vec m0[2], m1[2], m2[2], r0 = same(0.0f), r1 = r0, r2 = r0, r3 = r0;
-                    int from = first[0], upto = last[0];
-                    if (first[0] > last[0] || (first[1] <= last[1] && first[1] < from))
-                        from = first[1];
-                    if (last[1] > upto) upto = last[1];
-                    const float middle = 0.5f * HIGH * (float)(from + upto + 1) - cy;
-                    const float* off = off_ + 2 * BLOCKS - from - upto;
-                    const float* off_squared = off_squared_ + 2 * BLOCKS - from - upto;
-                    const vec* shade = veil;  // what each unit of weight brings besides colour
-                    if (extras > 0) {
-                        shade = shaded;
-                        for (int s = 0; s < 2; ++s)
-                            for (int b = s * BLOCKS + first[s]; b <= s * BLOCKS + last[s]; ++b) {
-                                shaded[b] = veil[b];
-                                for (int j = 0; j < extras; ++j) shaded[b] += f[j] * more[j][b];
-                            }
-                    }
+    vec m0[2], m1[2], m2[2], r0 = same(0.0f), r1 = r0, r2 = r0, r3 = r0;
+    int from = first[0], upto = last[0];
+    if (first[0] > last[0] || (first[1] <= last[1] && first[1] < from))
+        from = first[1];
+    if (last[1] > upto) upto = last[1];
+    const float middle = 0.5f * HIGH * (float)(from + upto + 1) - cy;
+    const float* off = off_ + 2 * BLOCKS - from - upto;
+    const float* off_squared = off_squared_ + 2 * BLOCKS - from - upto;
+    const vec* shade = veil;  // what each unit of weight brings besides colour
+    if (extras > 0) {
+        shade = shaded;
+        for (int s = 0; s < 2; ++s)
+            for (int b = s * BLOCKS + first[s]; b <= s * BLOCKS + last[s]; ++b) {
+                shaded[b] = veil[b];
+                for (int j = 0; j < extras; ++j) shaded[b] += f[j] * more[j][b];
+            }
+    }
 """
 STRIP = "vec g0 = same(0.0f), g1 = g0, g2 = g0;"
 COMPOSITE = r"""
-                                    vec value = g[6] * p.red + shade[s * BLOCKS + b];
-                                    value += g[7] * p.green;
-                                    value += g[8] * p.blue;
-                                    value += g[9] * p.dist;
-                                    r0 += weight * p.red;
-                                    r1 += weight * p.green;
-                                    r2 += weight * p.blue;
-                                    r3 += weight * p.dist;
-                                    p.S -= weight * value;
-                                    vec slope = p.S * reciprocal(1.0f - opaque);
-                                    slope = opaque * (before * value - slope);
-                                    slope = only(slope, drawn & (opaque < ceiling));
-                                    g0 += slope;
-                                    g1 += slope * off[2 * b];
-                                    g2 += slope * off_squared[2 * b];
+    vec value = g[6] * p.red + shade[s * BLOCKS + b];
+    value += g[7] * p.green;
+    value += g[8] * p.blue;
+    value += g[9] * p.dist;
+    r0 += weight * p.red;
+    r1 += weight * p.green;
+    r2 += weight * p.blue;
+    r3 += weight * p.dist;
+    p.S -= weight * value;
+    vec slope = p.S * reciprocal(1.0f - opaque);
+    slope = opaque * (before * value - slope);
+    slope = only(slope, drawn & (opaque < ceiling));
+    g0 += slope;
+    g1 += slope * off[2 * b];
+    g2 += slope * off_squared[2 * b];
 """
 STRIP_END = r"""
-                        m0[s] = g0;
-                        m1[s] = g1 + lift * g0;
-                        m2[s] = g2 + lift * (2.0f * g1 + lift * g0);
+    m0[s] = g0;
+    m1[s] = g1 + lift * g0;
+    m2[s] = g2 + lift * (2.0f * g1 + lift * g0);
 """
 AFTER = r"""
-                    float* o = partials_ + (long long)pairs_[2 * (batch + n) + 1] * stride;
-                    const vec u0 = lane_x - (cx + shear * middle), u1 = u0 + 8.0f;
-                    const vec mu0 = m0[0] * u0, mu1 = m0[1] * u1;
-                    const float m = total(m0[0] + m0[1]), mt = total(m1[0] + m1[1]);
-                    const float mtt = total(m2[0] + m2[1]), mu = total(mu0 + mu1);
-                    const float muu = total(mu0 * u0 + mu1 * u1);
-                    const float mut = total(m1[0] * u0 + m1[1] * u1);
-                    const float gu = mu - shear * mt;
-                    o[0] += m;
-                    o[1] += gu;
-                    o[2] += mt + middle * m;
-                    o[3] += muu - 2.0f * shear * mut + shear * shear * mtt;
-                    o[4] += mut - shear * mtt + middle * gu;
-                    o[5] += mtt + 2.0f * middle * mt + middle * middle * m;
-                    if (pass == 0) {
-                        o[6] = total(r0);
-                        o[7] = total(r1);
-                        o[8] = total(r2);
-                        o[9] = total(r3);
-                    }
-                    for (int j = 0; j < extras; ++j) {
-                        vec sum = same(0.0f);
-                        for (int s = 0; s < 2; ++s)
-                            for (int b = s * BLOCKS + first[s]; b <= s * BLOCKS + last[s]; ++b)
-                                sum += weights[b] * more[j][b];
-                        o[10 + pass + j] = total(sum);
-                    }
+    float* o = partials_ + (long long)pairs_[2 * (batch + n) + 1] * stride;
+    const vec u0 = lane_x - (cx + shear * middle), u1 = u0 + 8.0f;
+    const vec mu0 = m0[0] * u0, mu1 = m0[1] * u1;
+    const float m = total(m0[0] + m0[1]), mt = total(m1[0] + m1[1]);
+    const float mtt = total(m2[0] + m2[1]), mu = total(mu0 + mu1);
+    const float muu = total(mu0 * u0 + mu1 * u1);
+    const float mut = total(m1[0] * u0 + m1[1] * u1);
+    const float gu = mu - shear * mt;
+    o[0] += m;
+    o[1] += gu;
+    o[2] += mt + middle * m;
+    o[3] += muu - 2.0f * shear * mut + shear * shear * mtt;
+    o[4] += mut - shear * mtt + middle * gu;
+    o[5] += mtt + 2.0f * middle * mt + middle * middle * m;
+    if (pass == 0) {
+        o[6] = total(r0);
+        o[7] = total(r1);
+        o[8] = total(r2);
+        o[9] = total(r3);
+    }
+    for (int j = 0; j < extras; ++j) {
+        vec sum = same(0.0f);
+        for (int s = 0; s < 2; ++s)
+            for (int b = s * BLOCKS + first[s]; b <= s * BLOCKS + last[s]; ++b)
+                sum += weights[b] * more[j][b];
+        o[10 + pass + j] = total(sum);
+    }
 """

@@ -16,40 +16,40 @@ def _filled(text: str, **parts: object) -> str:
 
 
 _PIXELS = r"""
-                        const float* back = background_ + o * background_stride;
-                        float out[5][8] __attribute__((aligned(32)));
-                        *(f8*)out[0] = row_of(p.red, h);
-                        *(f8*)out[1] = row_of(p.green, h);
-                        *(f8*)out[2] = row_of(p.blue, h);
-                        *(f8*)out[3] = row_of(left, h);
-                        *(f8*)out[4] = row_of(p.dist, h);
-                        float* first = color_ + 3 * o;
-                        for (int i = 0; i < columns; ++i)
-                            for (int j = 0; j < 3; ++j)
-                                first[3 * i + j] = out[j][i]
-                                    + out[3][i] * back[i * background_stride + j];
-                        for (int i = 0; i < columns; ++i) alpha_[o + i] = 1.0f - out[3][i];
-                        for (int i = 0; i < columns; ++i) depth_[o + i] = out[4][i];
+    const float* back = background_ + o * background_stride;
+    float out[5][8] __attribute__((aligned(32)));
+    *(f8*)out[0] = row_of(p.red, h);
+    *(f8*)out[1] = row_of(p.green, h);
+    *(f8*)out[2] = row_of(p.blue, h);
+    *(f8*)out[3] = row_of(left, h);
+    *(f8*)out[4] = row_of(p.dist, h);
+    float* first = color_ + 3 * o;
+    for (int i = 0; i < columns; ++i)
+        for (int j = 0; j < 3; ++j)
+            first[3 * i + j] = out[j][i]
+                + out[3][i] * back[i * background_stride + j];
+    for (int i = 0; i < columns; ++i) alpha_[o + i] = 1.0f - out[3][i];
+    for (int i = 0; i < columns; ++i) depth_[o + i] = out[4][i];
 """
 _EXTRA_PIXELS = r"""
-                        for (int j = 0; j < extras; ++j) {
-                            const f8 row = row_of(more[j][at], h);
-                            for (int i = 0; i < columns; ++i)
-                                extra_[(o + i) * channels + pass + j] = row[i];
-                        }
-                        if (pass != 0) continue;
+    for (int j = 0; j < extras; ++j) {
+        const f8 row = row_of(more[j][at], h);
+        for (int i = 0; i < columns; ++i)
+            extra_[(o + i) * channels + pass + j] = row[i];
+    }
+    if (pass != 0) continue;
 """
 _COMPOSITE = r"""
-                                    p.red += weight * g[6];
-                                    p.green += weight * g[7];
-                                    p.blue += weight * g[8];
-                                    p.dist += weight * g[9];
+    p.red += weight * g[6];
+    p.green += weight * g[7];
+    p.blue += weight * g[8];
+    p.dist += weight * g[9];
 """
 _EXTRAS = r"""
-                    for (int j = 0; j < extras; ++j)
-                        for (int s = 0; s < 2; ++s)
-                            for (int b = s * BLOCKS + first[s]; b <= s * BLOCKS + last[s]; ++b)
-                                more[j][b] += weights[b] * f[j];
+    for (int j = 0; j < extras; ++j)
+        for (int s = 0; s < 2; ++s)
+            for (int b = s * BLOCKS + first[s]; b <= s * BLOCKS + last[s]; ++b)
+                more[j][b] += weights[b] * f[j];
 """
 _IMAGE = _filled(
     cpu_vectors.EACH_ROW,

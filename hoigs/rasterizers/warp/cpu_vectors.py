@@ -121,15 +121,15 @@ TILES = r"""
 # The parts of a tile's rows that lie in the image, eight pixels or fewer at a time. In $ROW, o
 # is the number of the first of `columns` pixels, which are lanes h, h + HIGH, .. of block `at`.
 EACH_ROW = r"""
-            for (int s = 0; 8 * s < wide; ++s)
-                for (int b = 0; b < deep; ++b) {
-                    const int at = s * BLOCKS + b, columns = wide - 8 * s < 8 ? wide - 8 * s : 8;
-                    Block& p = blocks[at];
-                    $BEFORE
-                    for (int h = 0; h < HIGH && HIGH * b + h < high; ++h) {
-                        const long long o = (long long)(Y + HIGH * b + h) * width + X + 8 * s;
-                        $ROW
-                    }
-                    $AFTER
-                }
+    for (int s = 0; 8 * s < wide; ++s)
+        for (int b = 0; b < deep; ++b) {
+            const int at = s * BLOCKS + b, columns = wide - 8 * s < 8 ? wide - 8 * s : 8;
+            Block& p = blocks[at];
+            $BEFORE
+            for (int h = 0; h < HIGH && HIGH * b + h < high; ++h) {
+                const long long o = (long long)(Y + HIGH * b + h) * width + X + 8 * s;
+                $ROW
+            }
+            $AFTER
+        }
 """
