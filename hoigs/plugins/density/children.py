@@ -66,13 +66,13 @@ def with_children(
     order = torch.arange(len(source), device=source.device)
     fresh, drawn = order >= len(stay), order >= len(stay) + len(clones)
     taken = rest[source]
-    offsets = drawn[:, None] * _drawn_from(taken, generator)
+    offsets = drawn[:, None] * drawn_offsets(taken, generator)
     shrink = drawn * (0.8 * (extra[source] + 1)).log()
     born = taken.replace(means=taken.means + offsets, log_scales=taken.log_scales - shrink[:, None])
     return TopologyChange(source, fresh, offsets), born
 
 
-def _drawn_from(gaussians: Gaussians, generator: torch.Generator) -> Float[Tensor, "N 3"]:
+def drawn_offsets(gaussians: Gaussians, generator: torch.Generator) -> Float[Tensor, "N 3"]:
     """An offset from the centre of each Gaussian, drawn from it."""
     means = gaussians.means
     normal = torch.randn(means.shape, generator=generator, device=means.device, dtype=means.dtype)

@@ -21,7 +21,7 @@ from hoigs.core.density import (
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.rotation import quats_to_matrices
 from hoigs.core.topology import TopologyChange
-from hoigs.plugins.density.children import Window, drawn_rows
+from hoigs.plugins.density.children import Window, drawn_offsets, drawn_rows
 from hoigs.plugins.density.relocation import MAX_COPIES, divided
 
 SHARPNESS = 100.0  # of the gate of the noise
@@ -36,6 +36,10 @@ class McmcDensityConfig(ComponentConfig):
         cap: most Gaussians there may be. growth: by which the count grows at each refinement.
         dead_opacity: at or below it, a Gaussian is relocated; it is also the middle of the noise's
             gate, and the least opacity that a division leaves.
+        spread: how far a copy stands from the place that it joins, in standard deviations of what
+            is there; published is 0. Short runs give the noise no time to part copies: after 400
+            steps on the built-in clip (128 px, 4000 Gaussians, static) half of them still coincide
+            and 0 scores 21.2 dB, 0.3 21.5, 1 21.6, where density:adc has 21.7.
         noise: of the exploration, times the learning rate of the positions; 0 is none. It has the
             unit 1 / m^2. Published is 5e5 with a rate of 1.6e-4 x extent; the default here is a
             fifth, because `train.rates.means` is five times theirs: the product is the same.
@@ -48,6 +52,7 @@ class McmcDensityConfig(ComponentConfig):
     cap: int = Field(60_000, ge=1)
     growth: float = Field(0.05, ge=0)
     dead_opacity: float = Field(0.005, gt=0, lt=1)
+    spread: float = Field(0.0, ge=0)
     noise: float = Field(1e5, ge=0)
     opacity_weight: float = Field(0.01, ge=0)
     scale_weight: float = Field(0.01, ge=0)
@@ -84,13 +89,15 @@ class McmcDensity(DensityControl):
         cap: int = 60_000,
         growth: float = 0.05,
         dead_opacity: float = 0.005,
+        spread: float = 0.0,
         noise: float = 1e5,
         opacity_weight: float = 0.01,
         scale_weight: float = 0.01,
         seed: int = 0,
     ) -> None:
         self.window = Window(start, stop, interval)
-        self.cap, self.growth, self.dead_opacity, self.noise = cap, growth, dead_opacity, noise
+        self.cap, self.growth, self.dead_opacity = cap, growth, dead_opacity
+        self.spread, self.noise = spread, noise
         self.regularizer_weights = {"opacity_l1": opacity_weight, "scale_l1": scale_weight}
         self.seed = seed
 
@@ -129,7 +136,7 @@ class McmcDensity(DensityControl):
         if dead.any() and not dead.all():
             living = torch.where(dead, 0.0, opacities)
             source[dead] = drawn_rows(living, int(dead.sum()), generator)
-        return self._shared(rest, source)
+        return self._shared(rest, source, generator)
 
     def _grown(
         self, change: TopologyChange, moved: Gaussians, generator: torch.Generator
@@ -140,25 +147,30 @@ class McmcDensity(DensityControl):
         if added == 0:
             return change, moved
         rows = torch.arange(count, device=change.source.device)
-        second, grown = self._shared(
-            moved, torch.cat((rows, drawn_rows(moved.opacities, added, generator)))
-        )
+        rows = torch.cat((rows, drawn_rows(moved.opacities, added, generator)))
+        second, grown = self._shared(moved, rows, generator)
         assert change.copies is not None
         assert second.copies is not None
         joined = TopologyChange(
             change.source[second.source],
             change.fresh[second.source] | second.fresh,
-            second.offsets,
+            change.offsets[second.source] + second.offsets,
             change.copies[second.source] * second.copies,
         )
         return joined, grown
 
-    def _shared(self, rest: Gaussians, source: Tensor) -> tuple[TopologyChange, Gaussians]:
+    def _shared(
+        self, rest: Gaussians, source: Tensor, generator: torch.Generator
+    ) -> tuple[TopologyChange, Gaussians]:
         """Rows of `rest` by `source`; those that are taken several times are divided."""
         taken = torch.bincount(source, minlength=len(rest))
         copies = taken[source].clamp_max(MAX_COPIES)
         shared = divided(rest[source], copies, self.dead_opacity)
         offsets = torch.zeros_like(shared.means)
+        if self.spread > 0:
+            joins = source != torch.arange(len(source), device=source.device)
+            offsets = self.spread * joins[:, None] * drawn_offsets(rest[source], generator)
+            shared = shared.replace(means=shared.means + offsets)
         return TopologyChange(source, copies > 1, offsets, copies), shared
 
     @torch.no_grad()

@@ -38,6 +38,21 @@ def test_dead_rows_move_to_the_living() -> None:
         assert torch.equal(getattr(new, field), getattr(old, field))
 
 
+def test_copies_may_stand_apart_but_sources_stay() -> None:
+    rest = varied(40)
+    dead = torch.arange(40) < 10
+    rest = rest.replace(opacity_logits=torch.where(dead, -6.0, rest.opacity_logits))
+    decision = refine(McmcDensity(growth=0.5, spread=0.5), rest)
+    source, offsets = decision.change.source, decision.change.offsets
+    assert (offsets[10:40] == 0).all()
+    joined = torch.cat((torch.arange(10), torch.arange(40, 60)))
+    assert float(offsets[joined].norm(dim=1).min()) > 0
+    torch.testing.assert_close(decision.rest.means, rest.means[source] + offsets)
+    # in standard deviations of the source: half of one, but for copies of copies
+    local = (quats_to_matrices(rest.quats[source]).mT @ offsets[..., None]).squeeze(-1)
+    assert 0.3 < float((local / rest.scales[source])[joined].square().mean().sqrt()) < 0.8
+
+
 def test_relocation_prefers_the_opaque() -> None:
     opacities = torch.full((1000,), 1e-3)
     opacities[:10], opacities[10:20] = 0.1, 0.9
