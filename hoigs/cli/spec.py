@@ -16,26 +16,33 @@ if TYPE_CHECKING:
 app = typer.Typer(help="List, check and show specs.", no_args_is_help=True)
 
 NameOrFile = Annotated[
-    str, typer.Argument(help="A built-in spec's name, or a .yaml or .toml file.")
+    str,
+    typer.Argument(help="A built-in spec's name, or a .yaml or .toml file; @PROFILE may follow."),
 ]
 
 
 @app.command("list")
 def list_specs() -> None:
-    """Names and summaries of the built-in specs."""
-    from hoigs.core.spec import builtin_specs, builtin_summary
+    """Names and summaries of the built-in specs, and their profiles besides the native one."""
+    from hoigs.core.spec import builtin_specs, builtin_summary, spec_profiles
 
     for name in builtin_specs():
-        typer.echo(f"{name:<24} {builtin_summary(name)}")
+        profiles = "".join(f" @{profile}" for profile in spec_profiles(name)[1:])
+        typer.echo(
+            f"{name:<24} {builtin_summary(name)}{f' [{profiles.strip()}]' if profiles else ''}"
+        )
 
 
 @app.command()
 def check(spec: NameOrFile, settings: SetOption = None, plugin: PluginOption = None) -> None:
-    """Say whether a spec can be used, and what its components are."""
-    loaded = _load(spec, settings, plugin)
-    typer.echo(f"{loaded.name}: ok")
-    for place, key in loaded.components().items():
-        typer.echo(f"  {place:<28} {key}")
+    """Say whether a spec and all its profiles can be used, and what its components are."""
+    from hoigs.core.spec import spec_profiles
+
+    profiles = [f"{spec}@{profile}" for profile in spec_profiles(spec)[1:]]
+    for loaded in [_load(one, settings, plugin) for one in (spec, *profiles)]:
+        typer.echo(f"{loaded.name}: ok")
+        for place, key in loaded.components().items():
+            typer.echo(f"  {place:<28} {key}")
 
 
 @app.command()

@@ -21,7 +21,7 @@ from hoigs.cli.common import (
 def train(
     clip: Annotated[Path, typer.Argument(help="Clip folder, as `hoigs prepare` makes it.")],
     spec: Annotated[
-        str, typer.Option("--spec", help="A built-in spec's name or a file.")
+        str, typer.Option("--spec", help="A built-in spec's name or a file; @PROFILE may follow.")
     ] = "hoigs",
     out: Annotated[
         Path | None, typer.Option("--out", help="Run folder; default runs/CLIP-SPEC.")

@@ -20,22 +20,29 @@ from pydantic import (
     ValidationError,
 )
 
-import hoigs
-from hoigs.core.errors import PluginError, SpecError, did_you_mean
+from hoigs.core.errors import PluginError, SpecError
 from hoigs.core.registry import Registry, default_registry
 from hoigs.core.spec_errors import explain
-from hoigs.core.spec_loader import (
-    Document,
-    Place,
-    dump_yaml,
-    load_overrides,
-    load_yaml,
-    read_document,
+from hoigs.core.spec_files import (
+    BUILTIN_SPECS,
+    builtin_specs,
+    builtin_summary,
+    extended,
+    read_spec,
+    spec_profiles,
 )
+from hoigs.core.spec_loader import Document, Place, dump_yaml, load_overrides, load_yaml
 from hoigs.core.train_spec import EvaluationSpec, TrainSpec
 
-BUILTIN_SPECS = Path(hoigs.__file__).parent / "plugins" / "specs"
-SUFFIXES = (".yaml", ".yml", ".toml")
+__all__ = [
+    "BUILTIN_SPECS",
+    "ComponentSpec",
+    "EntitySpec",
+    "Spec",
+    "builtin_specs",
+    "builtin_summary",
+    "spec_profiles",
+]
 
 # sections that decide which tensors a model has; a checkpoint belongs to these
 MODEL_SECTIONS = ("interaction", "entities", "model")
@@ -117,14 +124,15 @@ class Spec(_Strict):
         """Read, check and resolve a spec.
 
         Args:
-            source: a built-in spec's name, or a .yaml, .yml or .toml file.
+            source: a built-in spec's name, or a .yaml, .yml or .toml file; "@PROFILE" after it
+                asks for one of its profiles ("4dgs@matched").
             overrides: "a.b=value", laid over the file.
             registry: where components are looked up; by default what is installed.
 
         Raises:
             SpecError: everything that is wrong, a line each, with its position.
         """
-        document = _read(source, ())
+        document = read_spec(source)
         if overrides:
             document = document.merged(load_overrides(list(overrides)))
         return _resolve(document, registry or default_registry())
@@ -136,7 +144,7 @@ class Spec(_Strict):
         Raises:
             SpecError: as `load`.
         """
-        document = _extended(load_yaml(text, source), None, ())
+        document = extended(load_yaml(text, source))
         return _resolve(document, registry or default_registry())
 
     def block(self, name: str, kind: str) -> tuple[str, EntitySpec] | None:
@@ -189,60 +197,6 @@ class Spec(_Strict):
 
     def __hash__(self) -> int:
         return hash((self.name, self.hash()))
-
-
-def builtin_specs() -> list[str]:
-    """Names of the specs that come with hoigs."""
-    return sorted(path.stem for path in BUILTIN_SPECS.glob("*.yaml"))
-
-
-def builtin_summary(name: str) -> str:
-    """The summary line of a built-in spec, which is read but not checked."""
-    return str(read_document(BUILTIN_SPECS / f"{name}.yaml").data.get("summary", ""))
-
-
-def _find(source: str | Path, folder: Path | None) -> Path:
-    """The file that `source` means; relative ones start from `folder`, None allows names only."""
-    text = str(source)
-    if isinstance(source, str) and "/" not in text and not text.endswith(SUFFIXES):
-        if text in builtin_specs():
-            return BUILTIN_SPECS / f"{text}.yaml"
-        raise SpecError(
-            f'no spec "{text}"{did_you_mean(text, builtin_specs())} (built in: '
-            f"{', '.join(builtin_specs())}; a file ends in {', '.join(SUFFIXES)})"
-        )
-    if folder is None:
-        raise SpecError(f'"{text}": only the names of built-in specs can be extended here')
-    if not text.endswith(SUFFIXES):
-        raise SpecError(f"{text}: a spec file ends in {', '.join(SUFFIXES)}")
-    return folder / text
-
-
-def _read(source: str | Path, chain: tuple[Path, ...]) -> Document:
-    path = _find(source, Path())
-    resolved = path.resolve()
-    if resolved in chain:
-        names = " -> ".join(p.name for p in (*chain, resolved))
-        raise SpecError(f"{path}: extends itself: {names}")
-    document = read_document(path)
-    document.data.setdefault("name", path.stem)
-    return _extended(document, path.parent, (*chain, resolved))
-
-
-def _extended(document: Document, folder: Path | None, chain: tuple[Path, ...]) -> Document:
-    """`document` over what it extends; name and summary are never inherited."""
-    base_name = document.data.pop("extends", None)
-    if base_name is None:
-        return document
-    at = document.where(("extends",))
-    if not isinstance(base_name, str):
-        raise SpecError(f"{at} extends: expected a spec's name or file, got {base_name!r}")
-    try:
-        base = _read(_find(base_name, folder), chain)
-    except SpecError as error:
-        raise SpecError(f"{at} extends: {error}") from error
-    base.data = {k: v for k, v in base.data.items() if k not in ("name", "summary")}
-    return base.merged(document)
 
 
 def _resolve(document: Document, registry: Registry) -> Spec:

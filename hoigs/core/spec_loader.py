@@ -55,6 +55,42 @@ class Document:
         result.data = _lay_over(self.data, over.data, (), over, result)
         return result
 
+    def part(self, place: Place) -> Document:
+        """The block at `place` as a document of its own, positions kept."""
+        size = len(place)
+        keys, values = (
+            {p[size:]: at for p, at in positions.items() if p[:size] == place}
+            for positions in (self.keys, self.values)
+        )
+        return Document(self.source, self._block(place), keys, values)
+
+    def only(self, place: Place) -> Document:
+        """This document without all that is not at `place`, positions kept."""
+        size = len(place)
+        keys, values = (
+            {p: at for p, at in positions.items() if p[:size] == place[: len(p)]}
+            for positions in (self.keys, self.values)
+        )
+        data: Any = self._block(place[:-1])[str(place[-1])]
+        for key in reversed(place):
+            data = {key: data}
+        return Document(self.source, data, keys, values)
+
+    def remove(self, place: Place) -> None:
+        """Take away what stands at `place`, if anything does."""
+        try:
+            block = self._block(place[:-1])
+        except KeyError:
+            return
+        block.pop(str(place[-1]), None)
+        _forget(self, place)
+
+    def _block(self, place: Place) -> dict[str, Any]:
+        block: Any = self.data
+        for part in place:
+            block = block[part] if isinstance(block, dict) else {}
+        return block if isinstance(block, dict) else {}
+
 
 class Loader(yaml.SafeLoader):
     """Composes nodes; constructing is done by `_Builder`, so no tag can run anything."""

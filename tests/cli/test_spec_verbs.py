@@ -24,6 +24,7 @@ def test_what_is_shown_is_the_spec(hoigs, tmp_path):
 def test_check(hoigs, tmp_path):
     outcome = hoigs("spec", "check", "static")
     assert outcome.code == 0 and outcome.out.startswith("static: ok\n")
+    assert outcome.out.count(": ok") == 1
     assert "model.scene.deformation" in outcome.out
     path = tmp_path / "my.yaml"
     path.write_text("extends: static\nmodel: {scene: {pionts: 3}}\n")
@@ -38,3 +39,22 @@ def test_check(hoigs, tmp_path):
 def test_an_unknown_name(hoigs, verb):
     outcome = hoigs("spec", verb, "statik")
     assert outcome.code == 2 and 'did you mean "static"?' in outcome.err
+
+
+def test_profiles(hoigs, tmp_path):
+    lines = {line.split()[0]: line for line in hoigs("spec", "list").out.splitlines()}
+    assert lines["hoigs"].endswith(" [@matched]") and "@" not in lines["static"]
+    assert hoigs("spec", "show", "hoigs@matched").out.startswith("name: hoigs@matched\n")
+    checked = hoigs("spec", "check", "hoigs")
+    assert "hoigs: ok\n" in checked.out and "hoigs@matched: ok\n" in checked.out
+    assert "hoigs: ok\n" not in hoigs("spec", "check", "hoigs@matched").out
+    outcome = hoigs("spec", "check", "hoigs@mached")
+    assert outcome.code == 2 and 'did you mean "matched"?' in outcome.err
+    path = tmp_path / "my.yaml"
+    path.write_text("extends: hoigs\nprofiles: {quick: {train: {stps: 3}}}\n")
+    outcome = hoigs("spec", "check", path)  # all profiles are looked at
+    assert outcome.code == 2 and f"{path}:2:28 train.stps: unknown key" in outcome.err
+    # a run stores the resolved spec, whose name has the sign in it
+    copy = tmp_path / "copy.yaml"
+    copy.write_text(hoigs("spec", "show", "hoigs@matched").out)
+    assert hoigs("spec", "check", copy).out.startswith("hoigs@matched: ok\n")
