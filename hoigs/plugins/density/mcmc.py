@@ -186,9 +186,9 @@ class McmcDensity(DensityControl):
         generator = step_generator(self.seed, step, means.device, stream=1)
         eta = torch.randn(means.shape, generator=generator, device=means.device, dtype=means.dtype)
         gate = torch.sigmoid(SHARPNESS * (self.dead_opacity - rest.opacities))
-        axes = quats_to_matrices(rest.quats) * rest.scales[:, None, :]
-        eta = eta * (size * gate)[:, None]
-        return (axes @ (axes.mT @ eta[..., None])).squeeze(-1)
+        # Sigma eta = R S^2 R^T eta, and R^T eta is distributed as eta
+        local = eta * rest.scales.square() * (size * gate)[:, None]
+        return (quats_to_matrices(rest.quats) @ local[..., None]).squeeze(-1)
 
     def regularizers(self, current: Gaussians) -> dict[str, Tensor]:
         """ "opacity_l1", "scale_l1" (metres): means over Gaussians (eq. 10)."""
