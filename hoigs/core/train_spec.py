@@ -34,6 +34,8 @@ class LossSpec(_Strict):
             because the scene's gradients then reach density control at full strength.
         human, object, scene, depth: override one weight of the preset.
         lambda_dssim: (1 - l) L1 + l (1 - SSIM) in every image term.
+        ssim: "warp" computes SSIM with kernels, in float32 on a CPU or on CUDA; "torch" with
+            convolutions, many times slower on a CPU, for what the kernels do not take.
         lpips: weight of LPIPS (AlexNet) on the human crop; above 0 it needs weights on disk.
         scene_loss: "full" compares the composite with the whole image (the supplement's formula),
             "masked" draws the scene alone and leaves out the dilated masks (its text), "both".
@@ -48,6 +50,7 @@ class LossSpec(_Strict):
     scene: float | None = Field(None, ge=0)
     depth: float | None = Field(None, ge=0)
     lambda_dssim: float = Field(0.2, ge=0, le=1)
+    ssim: Literal["warp", "torch"] = "warp"
     lpips: float = Field(0.0, ge=0)
     scene_loss: Literal["full", "masked", "both"] = "full"
     background: Literal["random", "black"] = "random"

@@ -2,19 +2,24 @@
 
 Images are RGB in [0, 1] with channels last, as `RenderOutput.color` and `Frame.rgb` are. Nothing
 here clamps or rounds: whoever scores decides that, and writes it into the protocol.
+
+SSIM has two backends of one definition. "torch": convolutions, any floating type, differentiable in
+both arguments and twice. "warp": kernels, float32, one gradient, many times faster; training uses
+it at every step. Neither stands in for the other unasked.
 """
 
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-WINDOW, SIGMA = 11, 1.5  # Wang et al. 2004, and every Gaussian code base
-C1, C2 = 0.01**2, 0.03**2  # for a data range of 1
+from hoigs.rasterizers.warp.ssim.definition import C1, C2, WINDOW, window
+
+Backend = Literal["torch", "warp"]
 MSE_FLOOR = 1e-10  # two equal images score 100 dB rather than infinity
 
 
@@ -49,10 +54,25 @@ def psnr_from_mse(mse: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 
 def ssim(
-    image: Float[Tensor, "*batch H W C"], target: Float[Tensor, "*batch H W C"]
+    image: Float[Tensor, "*batch H W C"],
+    target: Float[Tensor, "*batch H W C"],
+    backend: Backend = "torch",
 ) -> Float[Tensor, ""]:
-    """Structural similarity: the mean of `ssim_map`; 1 - ssim is the D-SSIM loss."""
-    return ssim_map(image, target).mean()
+    """Structural similarity: the mean of `ssim_map`; 1 - ssim is the D-SSIM loss.
+
+    Raises:
+        ValueError: unequal shapes; with backend="warp" also what `rasterizers.warp.ssim` refuses,
+            such as float64 or a target that requires a gradient.
+        RenderError: backend="warp", and Warp is not installed.
+    """
+    if backend == "torch":
+        return ssim_map(image, target).mean()
+    if backend != "warp":
+        raise ValueError(f'backend is {backend!r}, expected "torch" or "warp"')
+    from hoigs.rasterizers.warp.ssim import mean_ssim
+
+    _check_pair(image, target)
+    return mean_ssim(image, target)
 
 
 def region_ssim(
@@ -125,9 +145,7 @@ class _Blur(torch.autograd.Function):
 
 @functools.lru_cache(maxsize=8)
 def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
-    offsets = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
-    weights = torch.exp(-offsets.square() / (2 * SIGMA**2))
-    return (weights / weights.sum()).to(device, dtype).reshape(1, 1, WINDOW, 1)
+    return torch.tensor(window(), dtype=dtype, device=device).reshape(1, 1, WINDOW, 1)
 
 
 def _check_pair(image: Tensor, target: Tensor) -> None:

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hoigs.core.train_spec import LossSpec
-from hoigs.evaluation.metrics import ssim
+from hoigs.evaluation.metrics import Backend, ssim
 from hoigs.training.regions import Crop
 
 # Supplement, "Objective Function Details"; the main text sums without weights
@@ -28,13 +28,19 @@ def term_weights(spec: LossSpec) -> dict[str, float]:
 
 
 def image_loss(
-    render: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], lambda_dssim: float
+    render: Float[Tensor, "H W 3"],
+    target: Float[Tensor, "H W 3"],
+    lambda_dssim: float,
+    backend: Backend = "warp",
 ) -> Float[Tensor, ""]:
-    """(1 - l) L1 + l (1 - SSIM), means over the image (3DGS Eq. 7)."""
+    """(1 - l) L1 + l (1 - SSIM), means over the image (3DGS Eq. 7).
+
+    `backend` is of SSIM, here and below: `LossSpec.ssim`.
+    """
     l1 = (render - target).abs().mean()
     if lambda_dssim == 0:
         return l1
-    return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim(render, target))
+    return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim(render, target, backend))
 
 
 def masked_loss(
@@ -42,6 +48,7 @@ def masked_loss(
     crop: Crop,
     background: Float[Tensor, "3"],
     lambda_dssim: float,
+    backend: Backend = "warp",
 ) -> Float[Tensor, ""]:
     """An entity drawn alone over `background` against the video composed over the same colour.
 
@@ -54,7 +61,7 @@ def masked_loss(
     l1 = (render - target).abs().sum() / (3.0 * crop.mask.sum())
     if lambda_dssim == 0:
         return l1
-    return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim(render, target))
+    return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim(render, target, backend))
 
 
 def scene_only_loss(
@@ -62,11 +69,12 @@ def scene_only_loss(
     target: Float[Tensor, "H W 3"],
     dynamic: Bool[Tensor, "H W"] | None,
     lambda_dssim: float,
+    backend: Backend = "warp",
 ) -> Float[Tensor, ""]:
     """The static scene alone, with the pixels of everything that moves left out."""
     if dynamic is not None:
         render = torch.where(dynamic[..., None], target, render)
-    return image_loss(render, target, lambda_dssim)
+    return image_loss(render, target, lambda_dssim, backend)
 
 
 def align_depth(

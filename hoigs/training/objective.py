@@ -107,9 +107,9 @@ class JointObjective:
         composite: RenderOutput,
     ) -> dict[str, Tensor]:
         terms = {}
-        l_dssim = self.spec.lambda_dssim
+        dssim = (self.spec.lambda_dssim, self.spec.ssim)
         if self.spec.scene_loss in ("full", "both"):
-            terms["scene"] = image_loss(composite.color, image, l_dssim)
+            terms["scene"] = image_loss(composite.color, image, *dssim)
         scenes = self.model.names("scene")
         if self.spec.scene_loss in ("masked", "both") and scenes:
             alone = self.model.rasterizer.render(state.joined(scenes), camera)
@@ -117,7 +117,7 @@ class JointObjective:
             dynamic = union(modelled)
             if dynamic is not None:
                 dynamic = dilate(dynamic, self.spec.dilate).to(image.device)
-            terms["scene/masked"] = scene_only_loss(alone.color, image, dynamic, l_dssim)
+            terms["scene/masked"] = scene_only_loss(alone.color, image, dynamic, *dssim)
         return terms
 
     def _entity(
@@ -139,9 +139,8 @@ class JointObjective:
         output = self.model.rasterizer.render(
             state.gaussians[name], crop.camera, RenderRequest(background=background)
         )
-        terms = {
-            f"{kind}/{name}": masked_loss(output.color, crop, background, self.spec.lambda_dssim)
-        }
+        dssim = (self.spec.lambda_dssim, self.spec.ssim)
+        terms = {f"{kind}/{name}": masked_loss(output.color, crop, background, *dssim)}
         if kind == "human" and self.lpips is not None and self.spec.lpips > 0:
             target = torch.where(crop.mask[..., None], crop.image, background)
             render = torch.where(crop.ignore[..., None], target, output.color)

@@ -7,7 +7,14 @@ import torch
 
 from hoigs.core.camera import Camera
 from hoigs.core.train_spec import LossSpec
-from hoigs.training.losses import align_depth, depth_loss, image_loss, masked_loss, term_weights
+from hoigs.training.losses import (
+    align_depth,
+    depth_loss,
+    image_loss,
+    masked_loss,
+    scene_only_loss,
+    term_weights,
+)
 from hoigs.training.regions import Crop, dilate
 
 
@@ -43,6 +50,28 @@ def test_masked_loss_is_normalised_by_the_mask_and_blind_to_hidden_pixels():
     ignore = torch.zeros_like(mask)
     ignore[5, 5] = True
     assert float(masked_loss(render, crop(mask, ignore), background, 0.0)) == pytest.approx(0.0)
+
+
+def test_ssim_by_kernels_and_by_convolutions_teach_the_same():
+    torch.manual_seed(0)
+    target, start = torch.rand(40, 50, 3), torch.rand(40, 50, 3)
+    mask = torch.zeros(40, 50, dtype=torch.bool)
+    mask[8:30, 10:35] = True
+    entity = crop(mask, torch.roll(mask, 15, 1))
+    found = {}
+    for backend in ("warp", "torch"):
+        render = start.clone().requires_grad_()
+        terms = (
+            image_loss(render, target, 0.3, backend),
+            scene_only_loss(render, target, mask, 0.3, backend),
+            masked_loss(render, entity, torch.rand(3, generator=torch.Generator()), 0.3, backend),
+        )
+        found[backend] = [torch.autograd.grad(term, render)[0] for term in terms]
+        found[backend] += [term.detach() for term in terms]
+    for warp, plain in zip(found["warp"], found["torch"], strict=True):
+        assert float((warp - plain).norm() / plain.norm()) < 1e-5
+    assert LossSpec().ssim == "warp"
+    assert LossSpec.model_validate({"ssim": "torch"}).ssim == "torch"
 
 
 def test_depth_loss_skips_what_is_unknown():

@@ -1,0 +1,176 @@
+"""C++ of the CUDA kernels of SSIM, and the same code for a CPU, so that tests can run it.
+
+A block of THREADS threads makes one tile of SIDE x SIDE pixels of one channel. Stages in shared
+memory, each a loop that the threads share out: fetch the tile with 5 more pixels around it, blur
+along its lines, blur across them; four pixels of a column to a thread, so that each line is read
+once for four. `forward` keeps the three images of `definition.FORMULA`, `backward` blurs them into
+the gradient (as fused-ssim does; Mallick et al. 2024, Taming 3DGS). There are no atomics: sums have
+the same order in every run.
+
+On a CPU one thread does the work of a block. Names of arguments stand in `tile_kernels`.
+"""
+
+from hoigs.rasterizers.warp.ssim.definition import FORMULA, WEIGHTS
+
+SIDE = 32
+THREADS = 256
+
+_HEAD = r"""
+#if defined(__CUDA_ARCH__)
+    #define HOIGS_SHARED __shared__
+    #define HOIGS_SYNC __syncthreads()
+    constexpr int STEP = %(THREADS)d;
+    const int block = thread / STEP, me = thread %% STEP;
+#else
+    #define HOIGS_SHARED
+    #define HOIGS_SYNC
+    constexpr int STEP = 1;
+    const int block = thread, me = 0;
+#endif
+    constexpr int SIDE = %(SIDE)d, WIDE = SIDE + 10, R = 4;
+    const float w[6] = %(WEIGHTS)s;
+    const int across = (width + SIDE - 1) / SIDE, down = (height + SIDE - 1) / SIDE;
+    // channel by channel, so that neighbours in time read the same lines of memory
+    const int channel = block %% channels, tile = block / channels;
+    const int X = tile %% across * SIDE, Y = tile / across %% down * SIDE;
+    const int picture = tile / across / down;
+    const long long first = (long long)picture * height * width;
+    const long long plane = first * channels + (long long)channel * height * width;
+    const float* image_ = (const float*)image.data;
+    const float* target_ = (const float*)target.data;
+    float* kept_ = (float*)kept.data;
+    const long long numbers = (long long)batch * height * width * channels;  // from kept to kept
+"""
+
+_FORWARD = r"""
+    float* map_ = (float*)map.data;
+    HOIGS_SHARED float in[2][WIDE][WIDE];
+    HOIGS_SHARED float lines[4][WIDE][SIDE];
+    HOIGS_SHARED float totals[STEP];
+    for (int i = me; i < WIDE * WIDE; i += STEP) {
+        const int r = i / WIDE, c = i % WIDE, y = Y + r - 5, x = X + c - 5;
+        float a = 0.0f, b = 0.0f;
+        if (y >= 0 && y < height && x >= 0 && x < width) {
+            const long long at = (first + (long long)y * width + x) * channels + channel;
+            a = image_[at];
+            b = target_[at];
+        }
+        in[0][r][c] = a + b;
+        in[1][r][c] = a - b;
+    }
+    HOIGS_SYNC;
+    for (int i = me; i < WIDE * SIDE; i += STEP) {
+        const int r = i / SIDE, c = i % SIDE;
+        #pragma unroll
+        for (int n = 0; n < 2; ++n) {
+            const float* at = in[n][r] + c + 5;
+            float mean = w[5] * at[0], square = mean * at[0];
+            #pragma unroll
+            for (int k = 0; k < 5; ++k) {
+                const float a = at[k - 5], b = at[5 - k];
+                mean += w[k] * (a + b);
+                square += w[k] * (a * a + b * b);
+            }
+            lines[n][r][c] = mean;
+            lines[2 + n][r][c] = square;
+        }
+    }
+    HOIGS_SYNC;
+    double sum = 0.0;  // on a CPU of all the tile
+    for (int i = me; i < SIDE * SIDE / R; i += STEP) {
+        const int c = i % SIDE, top = i / SIDE * R;
+        float m[4][R] = {};
+        #pragma unroll
+        for (int n = 0; n < 4; ++n)
+            #pragma unroll
+            for (int k = 0; k < R + 10; ++k) {
+                const float value = lines[n][top + k][c];
+                #pragma unroll
+                for (int j = 0; j < R; ++j) {
+                    const int tap = k - j;
+                    if (tap >= 0 && tap <= 10) m[n][j] += w[tap < 6 ? tap : 10 - tap] * value;
+                }
+            }
+        #pragma unroll
+        for (int j = 0; j < R; ++j) {
+            const int y = Y + top + j, x = X + c;
+            if (y >= height || x >= width) continue;
+            float by_mean, by_sum, by_difference;
+            const float value = similarity(
+                m[0][j], m[1][j], m[2][j], m[3][j], by_mean, by_sum, by_difference);
+            sum += value;
+            const long long pixel = (long long)y * width + x;
+            if (with_map) map_[(first + pixel) * channels + channel] = value;
+            if (!with_gradient) continue;
+            kept_[plane + pixel] = by_mean;
+            kept_[plane + pixel + numbers] = by_sum;
+            kept_[plane + pixel + 2 * numbers] = by_difference;
+        }
+    }
+    totals[me] = (float)sum;
+    HOIGS_SYNC;
+    for (int half = STEP / 2; half > 0; half /= 2) {
+        if (me < half) totals[me] += totals[me + half];
+        HOIGS_SYNC;
+    }
+    if (me == 0) ((float*)sums.data)[block] = totals[0];
+"""
+
+_BACKWARD = r"""
+    HOIGS_SHARED float in[3][WIDE][WIDE];
+    HOIGS_SHARED float lines[3][WIDE][SIDE];
+    for (int i = me; i < WIDE * WIDE; i += STEP) {
+        const int r = i / WIDE, c = i % WIDE, y = Y + r - 5, x = X + c - 5;
+        const bool inside = y >= 0 && y < height && x >= 0 && x < width;
+        const long long at = plane + (long long)y * width + x;
+        #pragma unroll
+        for (int n = 0; n < 3; ++n) in[n][r][c] = inside ? kept_[at + n * numbers] : 0.0f;
+    }
+    HOIGS_SYNC;
+    for (int i = me; i < WIDE * SIDE; i += STEP) {
+        const int r = i / SIDE, c = i % SIDE;
+        #pragma unroll
+        for (int n = 0; n < 3; ++n) {
+            const float* at = in[n][r] + c + 5;
+            float value = w[5] * at[0];
+            #pragma unroll
+            for (int k = 0; k < 5; ++k) value += w[k] * (at[k - 5] + at[5 - k]);
+            lines[n][r][c] = value;
+        }
+    }
+    HOIGS_SYNC;
+    const float scale = ((const float*)upstream.data)[0] / (float)numbers;
+    for (int i = me; i < SIDE * SIDE / R; i += STEP) {
+        const int c = i % SIDE, top = i / SIDE * R;
+        float g[3][R] = {};
+        #pragma unroll
+        for (int n = 0; n < 3; ++n)
+            #pragma unroll
+            for (int k = 0; k < R + 10; ++k) {
+                const float value = lines[n][top + k][c];
+                #pragma unroll
+                for (int j = 0; j < R; ++j) {
+                    const int tap = k - j;
+                    if (tap >= 0 && tap <= 10) g[n][j] += w[tap < 6 ? tap : 10 - tap] * value;
+                }
+            }
+        #pragma unroll
+        for (int j = 0; j < R; ++j) {
+            const int y = Y + top + j, x = X + c;
+            if (y >= height || x >= width) continue;
+            const long long at = (first + (long long)y * width + x) * channels + channel;
+            const float a = image_[at], b = target_[at];
+            ((float*)gradient.data)[at] = scale * (g[0][j] + (a + b) * g[1][j] + (a - b) * g[2][j]);
+        }
+    }
+"""
+
+_TAIL = r"""
+    HOIGS_SYNC;  // before the next tile of this block overwrites shared memory
+    #undef HOIGS_SHARED
+    #undef HOIGS_SYNC
+"""
+
+_SIZES = {"SIDE": SIDE, "THREADS": THREADS, "WEIGHTS": WEIGHTS}
+FORWARD = _HEAD % _SIZES + FORMULA + _FORWARD + _TAIL
+BACKWARD = _HEAD % _SIZES + _BACKWARD + _TAIL
