@@ -18,8 +18,9 @@ from hoigs.testing.rasterizer import RasterizerSubject
 BACKENDS: dict[str, Callable[[], Rasterizer]] = {
     "torch": TorchRasterizer,
     "oracle": lambda: OracleRasterizer(cutoffs=True),
-    "warp": WarpRasterizer,
-    "warp-portable": lambda: WarpRasterizer(cpu_kernels="portable"),  # CUDA's kernels, on the CPU
+    "warp": lambda: WarpRasterizer(threads=2),
+    # CUDA's kernels, on the CPU
+    "warp-portable": lambda: WarpRasterizer(cpu_kernels="portable", threads=2),
     "gsplat": GsplatRasterizer,
 }
 
@@ -41,3 +42,12 @@ def backend(request: pytest.FixtureRequest) -> RasterizerSubject:
     if name == "gsplat" and importlib.util.find_spec("gsplat") is None:
         pytest.skip("gsplat is not installed: pip install 'hoigs[gsplat]'")
     return RasterizerSubject(BACKENDS[name](), torch.device(device))
+
+
+@pytest.fixture(scope="module")
+def one_torch_thread() -> Iterator[None]:
+    """These pictures are so small that torch's second thread only waits."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

@@ -21,6 +21,8 @@ from hoigs.testing.checks import Check
 from hoigs.testing.rasterizer import CHECKS, RasterizerSubject
 from hoigs.testing.rasterizer.scenes import a_camera, random_gaussians
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 
 class OverTwin(GsplatRasterizer):
     """The adapter, allowed to draw on the CPU."""

@@ -118,7 +118,7 @@ def random_bits_cost_only_themselves(subject: RasterizerSubject) -> None:
 
 
 def _random_bits(subject: RasterizerSubject, seed: int, names: tuple[str, ...]) -> None:
-    count, generator = 120, torch.Generator().manual_seed(seed)
+    count, generator = 60, torch.Generator().manual_seed(seed)
     broken = torch.rand(count, generator=generator) < 0.5
 
     def damage(parts: dict[str, Tensor]) -> None:
@@ -134,7 +134,7 @@ def _random_bits(subject: RasterizerSubject, seed: int, names: tuple[str, ...]) 
     culled = torch.ones(count, dtype=torch.bool)
     culled[project(exact, scene.camera, scene.request).index] = False
     keep = culled | ~broken
-    require(int((culled & broken).sum()) > 20, "too few rows are broken")
+    require(int((culled & broken).sum()) > 10, "too few rows are broken")
     require_only_good_rows(subject, rows_of(scene, keep), ~broken[keep])
 
 

@@ -63,9 +63,9 @@ def gradients_of_each_image_alone(subject: RasterizerSubject) -> None:
 @CHECKS.check("R42", camera_gradients)
 def gradients_of_the_pose(subject: RasterizerSubject) -> None:
     """The camera's pose gets the oracle's gradient, through positions and through colours."""
-    for scene in (graded_scene(0), graded_scene(1, offset=0.0)):
-        for parts in (PARTS, ("color",), ("depth",)):
-            require_reference_gradients(subject, scene, parts, ("world_to_camera",))
+    moved, in_place = graded_scene(0), graded_scene(1, offset=0.0)
+    for scene, parts in ((moved, PARTS), (in_place, ("color",)), (in_place, ("depth",))):
+        require_reference_gradients(subject, scene, parts, ("world_to_camera",))
 
 
 @CHECKS.check("R43")

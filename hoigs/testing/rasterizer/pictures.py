@@ -112,7 +112,7 @@ def a_large_image(subject: RasterizerSubject) -> None:
 def harmonics_of_every_degree(subject: RasterizerSubject) -> None:
     """Spherical harmonics stored to degree 0 to 3, used to every degree."""
     for stored in range(4):
-        for active in (0, 1, 2, 3, None):
+        for active in (*range(stored), 3, None):
             scene = harmonic_scene(stored, active)
             output = require_reference_picture(subject, scene)
             if active is not None and active < stored:
