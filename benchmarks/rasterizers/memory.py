@@ -1,0 +1,75 @@
+"""Most bytes that a training step holds at once, told apart by Gaussian, pixel and pair."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import nnls
+from torch.profiler import ProfilerActivity, profile
+
+from benchmarks.rasterizers.peers import ours
+from benchmarks.rasterizers.scenes import Case
+from hoigs.core.camera import Camera
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.rasterizer import RenderRequest
+from hoigs.rasterizers.warp import WarpRasterizer
+from hoigs.rasterizers.warp.frame import Inputs
+from hoigs.rasterizers.warp.inputs import prepare
+
+
+def peak_bytes(gaussians: Gaussians, camera: Camera, rasterizer: WarpRasterizer) -> int:
+    """Most bytes of torch's CPU allocator in one forward and backward, the scene itself left out.
+
+    The gradients of the images and of the raw fields are counted.
+    """
+    round_ = ours(rasterizer)(gaussians, camera)
+    for _ in range(2):  # compiles; keeps the images' gradients
+        round_.forward()
+        round_.backward()
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
+        round_.forward()
+        round_.backward()
+    now = most = 0
+    events = profiler.profiler.kineto_results.events()
+    for event in sorted(events, key=lambda e: e.start_ns()):
+        if event.name() == "[memory]":
+            now += event.nbytes()
+            most = max(most, now)
+    return most + 20 * camera.width * camera.height  # the images' gradients, made before
+
+
+def measure(scenes: list[tuple[Case, Gaussians, Camera]]) -> dict[str, Any]:
+    """Bytes a Gaussian, a pixel and a pair (a Gaussian in a tile) that explain the peaks best.
+
+    Returns:
+        the three, the peaks, and `unexplained`: how far a peak is from what they say, at most, as
+        a fraction. Pairs are what grows where splats are large: see `pairs_per_gaussian`.
+    """
+    rasterizer, rows, table = WarpRasterizer(threads=2), [], []
+    for case, gaussians, camera in scenes:
+        settings, tensors = prepare(rasterizer, gaussians, camera, RenderRequest())
+        path = rasterizer.path(torch.device("cpu"))
+        lists = path.bin(path.project(Inputs(*tensors), settings), settings)
+        pairs, pixels = lists.pairs.shape[0], case.width * case.height
+        peak = peak_bytes(gaussians, camera, rasterizer)
+        table.append((len(gaussians), pixels, pairs, peak))
+        rows.append(
+            {
+                "case": str(case),
+                "peak_bytes": peak,
+                "pairs": pairs,
+                "pairs_per_gaussian": round(pairs / len(gaussians), 2),
+            }
+        )
+    numbers = np.array(table, dtype=np.float64)
+    found, _ = nnls(numbers[:, :3] / numbers[:, 3:], np.ones(len(numbers)))
+    explained = numbers[:, :3] @ found / numbers[:, 3]
+    return {
+        "bytes_per_gaussian": round(float(found[0]), 1),
+        "bytes_per_pixel": round(float(found[1]), 1),
+        "bytes_per_pair": round(float(found[2]), 1),
+        "unexplained": round(float(np.abs(1 - explained).max()), 4),
+        "cases": rows,
+    }

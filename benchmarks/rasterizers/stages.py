@@ -1,0 +1,132 @@
+"""Where the CPU's time goes, kernel by kernel, and what part of the machine's limits that is."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from typing import Any
+
+import torch
+
+from benchmarks.rasterizers.hits import count_hits
+from benchmarks.rasterizers.peers import ours
+from benchmarks.rasterizers.timing import once
+from hoigs.core.camera import Camera
+from hoigs.core.gaussians import Gaussians
+from hoigs.rasterizers.warp import WarpRasterizer
+from hoigs.rasterizers.warp.launchers import Cores
+from hoigs.rasterizers.warp.records import MOMENTS, RECORD
+
+# stages by kernel, in the order in which they run
+STAGES = {
+    "project": "project",
+    "sort_by_depth": "sort",
+    "count_pairs": "bin",
+    "place_pairs": "bin",
+    "scatter_pairs": "bin",
+    "forward_tiles": "forward",
+    "backward_tiles": "backward",
+    "project_adjoint": "project backward",
+}
+# Vector arithmetic of one block in `cpu_splats` and `cpu_adjoint`, additions, multiplications and
+# multiply-adds alike: alpha and its growth, weight, next, four channels | value, four sums, S,
+# the reciprocal (3), slope (3), three moments.
+FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 8, 24
+
+
+class TimedCores(Cores):
+    """Cores that write down how long each kernel took, all its launches together."""
+
+    def __init__(self, cores: Cores) -> None:
+        super().__init__(cores.workers, cores.threads)
+        self.seconds: dict[str, float] = {}
+
+    def _run(self, launches: list[Any]) -> None:
+        start = time.perf_counter()
+        super()._run(launches)
+        self._note(launches[0].kernel.key, start)
+
+    def once(self, kernel: Any, arguments: list[Any]) -> None:
+        start = time.perf_counter()
+        super().once(kernel, arguments)
+        self._note(kernel.key, start)
+
+    def _note(self, key: str, start: float) -> None:
+        self.seconds[key] = self.seconds.get(key, 0.0) + time.perf_counter() - start
+
+
+def measure(
+    gaussians: Gaussians, camera: Camera, limits: dict[str, float], rounds: int
+) -> dict[str, Any]:
+    """Median milliseconds of each stage, with bytes or hits a second against the limits.
+
+    A stage over Gaussians is held against the copy rate: the bytes that it must read and write at
+    least, once. Compositing is held against the multiply-adds: a full block of lanes for every hit,
+    no geometry, nothing wasted. What is in no kernel (allocation, autograd, Python) is "other".
+    """
+    device = torch.device("cpu")
+    rasterizer = WarpRasterizer()
+    path = rasterizer.path(device)
+    path.cores = cores = TimedCores(path.cores)
+    drawing = ours(rasterizer)(gaussians, camera)
+    times: dict[str, list[float]] = {name: [] for name in [*STAGES.values(), "other"]}
+    for number in range(rounds + 2):
+        cores.seconds = {}
+        forward, backward, _ = once(drawing, device)
+        stages = dict.fromkeys(times, 0.0)
+        for key, seconds in cores.seconds.items():
+            stages[STAGES[key]] += 1e3 * seconds
+        stages["other"] = forward + backward - sum(stages.values())
+        if number >= 2:
+            for name, milliseconds in stages.items():
+                times[name].append(milliseconds)
+    work = _work(gaussians, camera, rasterizer)
+    return {
+        "counts": {name: work[name] for name in ("gaussians", "visible", "pairs", "hits")},
+        "milliseconds": {name: round(statistics.median(x), 3) for name, x in times.items()},
+        "of_limit": {
+            name: _fraction(name, statistics.median(x) / 1e3, work, limits)
+            for name, x in times.items()
+            if name != "other"
+        },
+    }
+
+
+def _work(gaussians: Gaussians, camera: Camera, rasterizer: WarpRasterizer) -> dict[str, int]:
+    from hoigs.core.rasterizer import RenderRequest
+    from hoigs.rasterizers.warp.frame import Inputs
+    from hoigs.rasterizers.warp.inputs import prepare
+
+    settings, tensors = prepare(rasterizer, gaussians, camera, RenderRequest())
+    path, inputs = rasterizer.path(torch.device("cpu")), Inputs(*tensors)
+    projected = path.project(inputs, settings)
+    lists = path.bin(projected, settings)
+    return {
+        "gaussians": len(gaussians),
+        "visible": int((projected.drawn_depths > 0).sum()),
+        "pairs": lists.pairs.shape[0],
+        "pixels": camera.width * camera.height,
+        "hits": count_hits(gaussians, camera),
+        "raw": 4 * (3 + 4 + 3 + 1 + 3 * gaussians.sh.shape[1]),
+    }
+
+
+def _fraction(
+    stage: str, seconds: float, work: dict[str, int], limits: dict[str, float]
+) -> dict[str, Any]:
+    n, seen, pairs, raw = (work[name] for name in ("gaussians", "visible", "pairs", "raw"))
+    record, partial = 4 * RECORD, 4 * MOMENTS
+    if stage in ("forward", "backward"):
+        operations = FORWARD_OPERATIONS if stage == "forward" else BACKWARD_OPERATIONS
+        most = limits["multiply_adds"] * limits["lanes"] / operations
+        rate = work["hits"] / seconds
+        return {"hits_per_second": rate, "most": most, "fraction": round(rate / most, 4)}
+    least = {
+        "project": n * raw + seen * record + n * 4 * 5,
+        "sort": n * 4 + seen * (2 * 8 + 3 * 2 * 8),
+        "bin": 2 * seen * record + pairs * (8 + 2 * 12),
+        "project backward": n * 2 * raw + pairs * partial + n * 8,
+    }[stage]
+    rate = least / seconds
+    most = limits["copy_bytes"]
+    return {"bytes_per_second": rate, "most": most, "fraction": round(rate / most, 4)}
