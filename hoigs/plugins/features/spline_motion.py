@@ -15,25 +15,39 @@ from hoigs.core.deformation import DeformationModel, ProvidesVelocity
 from hoigs.core.features import FeatureExtractor, Tokens
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.moment import Moment
-from hoigs.core.spline import catmull_rom
+from hoigs.core.spline import catmull_rom, hermite_basis, keyframe_position, linear
 
 Embedding = Literal["per-gaussian", "shared", "low-rank"]
+Interpolation = Literal["catmull-rom", "zero-tangent", "linear"]
+Velocity = Literal["derivative", "keyframes"]
 
 
 class SplineMotionConfig(ComponentConfig):
     """The paper's object features.
 
     Attributes:
-        width: of the tokens; the main text has 32, the supplement 33 (methods A.5).
-        embedding: "per-gaussian" keeps e_k for each Gaussian and keyframe, 29 N K floats, which
-            is 73 % of a keyframed object (N = 20 000, K = 75: 174 MB, four times that with Adam);
-            "shared" one e_k for all, 29 K; "low-rank" `rank` shared ones mixed by N * rank.
+        width: of the tokens: 32 in the main text, the default; 33 in the supplement, which is the
+            width of the MLP's input 3 + 29 + 1. Attention projects either to its own width.
+        embedding: "per-gaussian", the default, keeps e_k for each Gaussian and keyframe, as the
+            supplement says ("for each keyframe Gaussian"): 29 N K floats, which is 73 % of a
+            keyframed object (N = 20 000, K = 75: 174 MB, four times that with Adam). "shared" is
+            one e_k for all, 29 K, as the main text may be read; "low-rank" mixes `rank` shared
+            ones by N * rank weights.
+        interpolation: of e. "Interpolated by CHS" needs tangents, which e has none of; by
+            default "catmull-rom" finite differences, smooth and free of parameters; or
+            "zero-tangent", or "linear".
+        velocity: tau(t). "derivative", the default, is the exact derivative of the position
+            spline; "keyframes" interpolates the learned tangents tau_k as e is, as the words say:
+            it equals the derivative at the keyframes alone, and needs a deformation that has
+            `tangents`.
         embedding_width: of e. hidden: of the MLP.
         keyframes: of the embedding; None takes the deformation's.
     """
 
     width: int = Field(32, ge=1)
     embedding: Embedding = "per-gaussian"
+    interpolation: Interpolation = "catmull-rom"
+    velocity: Velocity = "derivative"
     embedding_width: int = Field(29, ge=1)
     rank: int = Field(4, ge=1)
     hidden: int = Field(64, ge=1)
@@ -43,9 +57,8 @@ class SplineMotionConfig(ComponentConfig):
 class SplineMotionFeatures(FeatureExtractor):
     """f_o(t) = MLP([tau(t); e(t); t]), at each Gaussian's centre.
 
-    tau(t) is the exact derivative of the position spline, e(t) a cubic Hermite spline through the
-    learnable e_k with Catmull-Rom tangents ("interpolated by CHS"; the paper gives e no tangents).
-    Positions carry no gradient.
+    t is in [0, 1], tau in metres per keyframe interval. For readings of tau(t) and e(t) see
+    SplineMotionConfig. Positions carry no gradient.
     """
 
     requires = frozenset({"velocity"})
@@ -55,6 +68,8 @@ class SplineMotionFeatures(FeatureExtractor):
         self,
         width: int = 32,
         embedding: Embedding = "per-gaussian",
+        interpolation: Interpolation = "catmull-rom",
+        velocity: Velocity = "derivative",
         embedding_width: int = 29,
         rank: int = 4,
         hidden: int = 64,
@@ -63,6 +78,7 @@ class SplineMotionFeatures(FeatureExtractor):
         super().__init__()
         self.width, self.kind, self.rank = width, embedding, rank
         self.embedding_width, self.keyframes = embedding_width, keyframes
+        self.interpolation, self.tau = interpolation, velocity
         self.mlp = nn.Sequential(
             nn.Linear(3 + embedding_width + 1, hidden), nn.ReLU(), nn.Linear(hidden, width)
         )
@@ -73,6 +89,13 @@ class SplineMotionFeatures(FeatureExtractor):
         }[embedding]
 
     def bind(self, deformation: DeformationModel, rest: Gaussians) -> None:
+        if self.tau == "keyframes" and not isinstance(
+            getattr(deformation, "tangents", None), Tensor
+        ):
+            raise ValueError(
+                f"{type(deformation).__name__} has no learned tangents tau_k; set `velocity: "
+                "derivative` of features:spline-motion"
+            )
         keyframes = self.keyframes or getattr(deformation, "keyframes", None)
         if not isinstance(keyframes, int):
             raise ValueError(
@@ -87,14 +110,33 @@ class SplineMotionFeatures(FeatureExtractor):
 
     def embedded(self, count: int, time: float) -> Float[Tensor, "N E"]:
         """e(t) of each of `count` Gaussians."""
-        codes = catmull_rom(self.embedding, time)
+        codes = self._between(self.embedding, time)
         if self.kind == "low-rank":
             return self.mixture @ codes / self.rank**0.5
         return codes.expand(count, -1)
 
-    def forward(self, deformation: DeformationModel, rest: Gaussians, moment: Moment) -> Tokens:
+    def _between(self, values: Float[Tensor, "N K D"], time: float) -> Float[Tensor, "N D"]:
+        """Values of the keyframes at `time`."""
+        if self.interpolation == "linear":
+            return linear(values, time)
+        if self.interpolation == "zero-tangent":
+            k, r = keyframe_position(time, values.shape[1])
+            return torch.lerp(values[:, k], values[:, k + 1], hermite_basis(r)[2])
+        return catmull_rom(values, time)
+
+    def _velocity(
+        self, deformation: DeformationModel, rest: Gaussians, moment: Moment
+    ) -> Float[Tensor, "N 3"]:
+        """tau(t)."""
+        if self.tau == "keyframes":
+            tangents = deformation.tangents
+            assert isinstance(tangents, Tensor)
+            return self._between(tangents, moment.time)
         assert isinstance(deformation, ProvidesVelocity)
-        velocity = deformation.velocity(rest, moment)
+        return deformation.velocity(rest, moment)
+
+    def forward(self, deformation: DeformationModel, rest: Gaussians, moment: Moment) -> Tokens:
+        velocity = self._velocity(deformation, rest, moment)
         code = self.embedded(len(rest), moment.time)
         clock = velocity.new_full((len(rest), 1), moment.time)
         features = self.mlp(torch.cat((velocity, code, clock), dim=-1))

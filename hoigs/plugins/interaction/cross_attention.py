@@ -10,7 +10,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
-from hoigs.core.body import PART_NAMES
+from hoigs.core.body import BODY_JOINT_PARTS, PART_NAMES
 from hoigs.core.config import ComponentConfig
 from hoigs.core.features import Tokens
 from hoigs.core.interaction import EntityKind, InteractionModule, Residual, Role
@@ -19,21 +19,33 @@ from hoigs.plugins.interaction.gates import DistanceGate, GateKind, Granularity,
 
 Values = Literal["gated", "swapped"]
 ObjectResidual = Literal["per-gaussian", "rigid", "both"]
+PoseHead = Literal["flat", "per-part"]
 
 POSE_JOINTS = 51  # 21 of the body, 15 of each hand
+LEFT_HAND, RIGHT_HAND = 8, 9
+# part of each joint that has a correction; the root has none
+JOINT_PARTS = (*BODY_JOINT_PARTS[1:], *(LEFT_HAND,) * 15, *(RIGHT_HAND,) * 15)
 
 
 class CrossAttentionConfig(ComponentConfig):
     """The paper's module and its readings (methods A.6, A.7).
 
     Attributes:
-        width: d of queries, keys and values.
-        values: the printed products do not fit. "gated" is V_self + g A V_other, which keeps
-            the printed V_self; "swapped" is A V_other alone.
-        gate, granularity, reach_from, softness: see DistanceGate.
-        object_residual: "per-gaussian" (the paper), one "rigid" motion of the object, or "both".
-        hidden: of the two heads.
-        pose_bound: largest correction of a joint's axis-angle, radians an axis.
+        width: d of queries, keys and values; the paper's 32.
+        values: the printed products do not fit: softmax(Q_h K_o^T) is [16, N_o], V_h [16, d].
+            "swapped" reads A V_other, ordinary cross-attention; to exchange the two printed
+            outputs instead, the third way to make them fit, is the same thing. "gated", the
+            default, is V_self + g A V_other: it keeps the printed V_self, so that a token knows
+            of itself what it corrects.
+        gate, granularity, reach_from, reach, softness: see DistanceGate, with the reasons.
+        pose_head: how the 16 tokens become 51 corrections is left open. "flat", the default,
+            is one MLP of all of them, so that an elbow may follow from what the hand does;
+            "per-part" reads each joint from its own part's token, gated by that part's gate.
+        object_residual: "per-gaussian" (the paper, and the default for that: it can bend a rigid
+            thing), one "rigid" motion of the object, or "both".
+        hidden: of the two heads; sizes are not given.
+        pose_bound: largest correction of a joint's axis-angle, radians an axis: beyond small
+            ones, adding axis-angles is no composition, and unbounded ones run away.
         means_bound: largest displacement of an object's Gaussian, metres an axis.
     """
 
@@ -42,7 +54,9 @@ class CrossAttentionConfig(ComponentConfig):
     gate: GateKind = "soft"
     granularity: Granularity = "object"
     reach_from: ReachFrom = "nearest"
+    reach: float = Field(1.0, gt=0)
     softness: float = Field(0.05, gt=0)
+    pose_head: PoseHead = "flat"
     object_residual: ObjectResidual = "per-gaussian"
     hidden: int = Field(128, ge=1)
     pose_bound: float = Field(0.3, gt=0)
@@ -52,7 +66,8 @@ class CrossAttentionConfig(ComponentConfig):
 class CrossAttention(InteractionModule):
     """Humans attend to the tokens of all objects, and objects to the parts of all humans.
 
-    F'_H = V_h + g softmax(Q_h K_o^T / sqrt(d) + B) V_o, and the mirror image for objects; heads
+    F'_H = V_h + g softmax(Q_h K_o^T / sqrt(d) + B) V_o, and the mirror image for objects; one head,
+    no normalisation, no output projection, as none is mentioned. MLPs
     turn F'_H into the pose correction of body and hands, F'_O into displacements of the object's
     Gaussians. B is the logarithm of the distance gate; as a softmax ignores what all its entries
     share, the gate g (the widest of a row) also multiplies every residual: what is out of reach
@@ -69,7 +84,9 @@ class CrossAttention(InteractionModule):
         gate: GateKind = "soft",
         granularity: Granularity = "object",
         reach_from: ReachFrom = "nearest",
+        reach: float = 1.0,
         softness: float = 0.05,
+        pose_head: PoseHead = "flat",
         object_residual: ObjectResidual = "per-gaussian",
         hidden: int = 128,
         pose_bound: float = 0.3,
@@ -77,12 +94,14 @@ class CrossAttention(InteractionModule):
     ) -> None:
         super().__init__()
         self.width, self.gated = width, values == "gated"
-        self.gate = DistanceGate(gate, granularity, reach_from, softness)
+        self.gate = DistanceGate(gate, granularity, reach_from, softness, reach)
         self.per_gaussian = object_residual in ("per-gaussian", "both")
         self.rigid = object_residual in ("rigid", "both")
         self.pose_bound, self.means_bound = pose_bound, means_bound
         self.projections = nn.ModuleDict()
-        self.pose_head = zero_headed(len(PART_NAMES) * width, hidden, 3 * POSE_JOINTS)
+        self.local = pose_head == "per-part"
+        entry = width if self.local else len(PART_NAMES) * width
+        self.pose_head = zero_headed(entry, hidden, 3 * POSE_JOINTS)
         if self.per_gaussian:
             self.means_head = zero_headed(width, hidden, 3)
         if self.rigid:
@@ -146,7 +165,12 @@ class CrossAttention(InteractionModule):
     def _pose(
         self, attended: Float[Tensor, "M d"], gates: Float[Tensor, " M"]
     ) -> Float[Tensor, "51 3"]:
-        """delta theta: the tokens flattened through one MLP, bounded, gated."""
+        """delta theta: of all tokens flattened, or of each joint's own part; bounded, gated."""
+        if self.local:
+            parts = torch.tensor(JOINT_PARTS, device=attended.device)
+            every = self.pose_head(attended).unflatten(1, (POSE_JOINTS, 3))
+            raw = every[parts, torch.arange(POSE_JOINTS, device=parts.device)]
+            return gates[parts, None] * self.pose_bound * torch.tanh(raw)
         raw = self.pose_head(attended.flatten()).unflatten(0, (POSE_JOINTS, 3))
         return gates.max() * self.pose_bound * torch.tanh(raw)
 

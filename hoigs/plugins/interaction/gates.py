@@ -23,19 +23,27 @@ class DistanceGate:
     """How near a human an object must be to take part in the interaction.
 
     Attributes:
-        kind: "hard" is the paper's threshold at arm length, across which residuals pop; "soft"
-            is sigmoid((d_th - d) / softness); "none" lets everything through.
-        granularity: one distance for each "object" (the paper), each "gaussian", or each pair of
-            Gaussian and body "part".
-        reach_from: the "nearest" of pelvis, wrists and feet, or the "pelvis" (the paper: an
-            object in an outstretched hand is then out of reach).
+        kind: "hard" is the paper's B, -inf beyond d_th: residuals pop when the object crosses it;
+            hence the default, "soft": sigmoid((d_th - d) / softness). "none" lets everything
+            through.
+        granularity: B is indexed by token pairs but defined by one distance an object; so, by
+            default, "object" (the paper): the distance of its centre, the mean of its tokens, which
+            opens or shuts it as a whole. "gaussian" has one distance for each object token, "part"
+            one for each pair of object token and body part, from the part's centroid whatever
+            `reach_from` says.
+        reach_from: "nearest" of pelvis, wrists and feet, the default, or the "pelvis" (the paper).
+            Arm length from the pelvis is too short: the shoulder alone is 0.45 m above it, and what
+            is held high or far out is shut exactly while it is held.
         softness: metres.
+        reach: d_th in arm lengths, shoulder to middle fingertip, alpha included (whether the
+            paper's arm ends at the wrist is open: 0.75 is about that).
     """
 
     kind: GateKind = "soft"
     granularity: Granularity = "object"
     reach_from: ReachFrom = "nearest"
     softness: float = 0.05
+    reach: float = 1.0
 
     @torch.no_grad()
     def log(self, human: str, role: Role, parts: Tokens, thing: Tokens) -> Float[Tensor, "M N"]:
@@ -55,7 +63,7 @@ class DistanceGate:
         else:
             anchors = role.anchors if self.reach_from == "nearest" else role.anchors[:1]
             distances = torch.cdist(anchors, positions).amin(0, keepdim=True)
-        margin = role.reach - distances
+        margin = self.reach * role.reach - distances
         if self.kind == "soft":
             log = logsigmoid(margin / self.softness)
         else:

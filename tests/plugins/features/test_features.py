@@ -87,6 +87,59 @@ def test_spline_motion(kind):
     assert entity.deformation.tangents.grad.abs().max() > 0  # gradients reach the motion
 
 
+def test_readings_of_the_interpolated_embedding():
+    """e(t) between keyframes 2 and 3 against the formulas in float64."""
+    time, r = 0.6, 0.4  # of K = 5
+    made = {}
+    for kind in ("catmull-rom", "zero-tangent", "linear"):
+        config = SplineMotionConfig(interpolation=kind)
+        features = SplineMotionFeatures.from_config(config, BuildContext())
+        thing(features)
+        made[kind] = features.embedded(12, time)
+        e = features.embedding.double()
+        h00, h10, h01, h11 = (2 * r**3 - 3 * r**2 + 1, r**3 - 2 * r**2 + r,
+                              -2 * r**3 + 3 * r**2, r**3 - r**2)  # fmt: skip
+        expected = {
+            "catmull-rom": h00 * e[:, 2] + h10 * (e[:, 3] - e[:, 1]) / 2
+            + h01 * e[:, 3] + h11 * (e[:, 4] - e[:, 2]) / 2,
+            "zero-tangent": h00 * e[:, 2] + h01 * e[:, 3],
+            "linear": (1 - r) * e[:, 2] + r * e[:, 3],
+        }[kind]  # fmt: skip
+        torch.testing.assert_close(made[kind].double(), expected, atol=1e-6, rtol=0)
+    assert (made["linear"] - made["zero-tangent"]).abs().max() > 1e-3
+
+
+def test_velocity_is_the_derivative_or_the_interpolated_tangents():
+    entity = thing(SplineMotionFeatures(velocity="keyframes"))
+    model, features = entity.deformation, entity.features
+    with torch.no_grad():
+        model.tangents.normal_()
+    for k in range(5):  # the derivative at a keyframe is its tangent: both readings agree there
+        moment = Moment(k / 4)
+        torch.testing.assert_close(
+            features._velocity(model, entity.rest, moment), model.velocity(entity.rest, moment)
+        )
+    between = Moment(0.375)
+    tau = model.tangents.double()
+    ends = (tau[:, 2] - tau[:, 0]) / 2, (tau[:, 3] - tau[:, 1]) / 2
+    halfway = 0.5 * (tau[:, 1] + tau[:, 2]) + 0.125 * (ends[0] - ends[1])
+    read = features._velocity(model, entity.rest, between)
+    torch.testing.assert_close(read.double(), halfway, atol=1e-6, rtol=0)
+    assert (read - model.velocity(entity.rest, between)).abs().max() > 0.1
+    entity.tokens(between).features.square().sum().backward()
+    assert model.tangents.grad[:, 1:3].abs().max() > 0  # and no position is needed
+    assert model.keyframe_means.grad is None
+    with pytest.raises(ValueError, match="no learned tangents"):
+        thing(SplineMotionFeatures(velocity="keyframes"), tangents="finite-difference")
+
+
+@pytest.mark.parametrize("width", [32, 33])
+def test_both_widths_of_object_tokens(width):
+    entity = thing(SplineMotionFeatures(width=width))
+    assert entity.features.mlp[0].in_features == 33  # 3 + 29 + 1
+    assert entity.tokens(Moment(0.3)).features.shape == (12, width)
+
+
 @pytest.mark.parametrize("kind", ["per-gaussian", "shared", "low-rank"])
 def test_rows_of_the_embedding_follow(kind):
     entity = thing(SplineMotionFeatures(embedding=kind))

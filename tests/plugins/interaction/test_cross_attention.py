@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import pytest
 import torch
 
+from hoigs.core.body import PART_NAMES
 from hoigs.core.context import BuildContext
 from hoigs.core.entity import Entity
 from hoigs.core.features import Tokens
@@ -18,6 +20,7 @@ from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
 from hoigs.plugins.features.body_parts import BodyPartFeatures
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.plugins.interaction.cross_attention import CrossAttention, CrossAttentionConfig
+from hoigs.plugins.interaction.gates import DistanceGate
 from hoigs.plugins.interaction.none import NoInteraction
 
 ARM = 0.7
@@ -99,8 +102,13 @@ def test_equals_the_equation():
 @pytest.mark.parametrize("gate", ["hard", "soft"])
 @pytest.mark.parametrize("granularity", ["object", "gaussian", "part"])
 @pytest.mark.parametrize("object_residual", ["both", "per-gaussian"])
-def test_out_of_reach_is_zero_with_finite_gradients(gate, granularity, object_residual):  # F32
-    made = module(gate=gate, granularity=granularity, object_residual=object_residual)
+@pytest.mark.parametrize("pose_head", ["flat", "per-part"])
+def test_out_of_reach_is_zero_with_finite_gradients(
+    gate, granularity, object_residual, pose_head
+):  # F32
+    made = module(
+        gate=gate, granularity=granularity, object_residual=object_residual, pose_head=pose_head
+    )
     far = thing(place=(50.0, 0, 0))
     leaf = far.features.clone().requires_grad_()
     out = run(made, Tokens(leaf, far.positions))
@@ -176,6 +184,87 @@ def test_near_and_far_objects(gate):  # F39
     torch.testing.assert_close(both["ball"].means, alone["ball"].means)
     two = run(made, near, box=thing(25, seed=4))
     assert (two["human"].pose - alone["human"].pose).abs().max() > 1e-3  # both are attended to
+
+
+def part_of_joint() -> list[int]:
+    """By name: SMPL-X's joints 1..21, then 15 of each hand (methods C.9)."""
+    names = (
+        "left thigh", "right thigh", "belly", "left shin", "right shin", "belly", "left foot",
+        "right foot", "chest", "left foot", "right foot", "head", "chest", "chest", "head",
+        "left upper arm", "right upper arm", "left forearm", "right forearm", "left hand",
+        "right hand", *("left hand",) * 15, *("right hand",) * 15,
+    )  # fmt: skip
+    return [PART_NAMES.index(name) for name in names]
+
+
+def test_per_part_head_reads_each_joint_from_its_own_part():
+    made = module(pose_head="per-part", values="gated", gate="none")
+    tokens, role = person()
+    ball = thing()
+    plain = run(made, ball)["human"].pose
+    w_h, w_o = made.projections["human_96"].weight, made.projections["object_32"].weight
+    q_h, _, v_h = (tokens.features @ w_h.T).double().chunk(3, -1)
+    _, k_o, v_o = (ball.features @ w_o.T).double().chunk(3, -1)
+    f_h = v_h + torch.softmax(q_h @ k_o.T / 32**0.5, -1) @ v_o
+    head = made.pose_head.double()
+    rows = [
+        0.3 * torch.tanh(head(f_h[part]).view(51, 3)[joint])
+        for joint, part in enumerate(part_of_joint())
+    ]
+    torch.testing.assert_close(plain.double(), torch.stack(rows), atol=1e-5, rtol=0)
+    made.pose_head.float()
+    changed = tokens.features.clone()
+    changed[PART_NAMES.index("left hand")] += 1.0
+    roles = {"human": role, "ball": Role("object")}
+    other = made({"human": Tokens(changed, tokens.positions), "ball": ball}, roles)["human"].pose
+    moved = ((other - plain).abs().amax(1) > 1e-6).nonzero().squeeze(1).tolist()
+    assert moved == [19, *range(21, 36)]  # the left wrist and hand, nothing else
+    flat = module(gate="none")
+    before = run(flat, ball)["human"].pose
+    after = flat({"human": Tokens(changed, tokens.positions), "ball": ball}, roles)["human"].pose
+    assert ((after - before).abs().amax(1) > 1e-6).all()
+
+
+def test_per_part_head_is_gated_by_each_part():
+    made = module(pose_head="per-part", granularity="part", gate="hard")
+    tokens, _ = person()
+    hand = tokens.positions[PART_NAMES.index("left hand")]
+    near = thing(place=hand.tolist())
+    pose = run(made, near)["human"].pose
+    reached = torch.cdist(tokens.positions, near.positions).amin(1) < ARM
+    expected = reached[torch.tensor(part_of_joint())]
+    assert torch.equal(pose.abs().amax(1) > 0, expected)
+    assert expected.any() and not expected.all()
+
+
+@pytest.mark.parametrize("granularity", ["object", "gaussian", "part"])
+@pytest.mark.parametrize("reach_from", ["nearest", "pelvis"])
+def test_gate_equals_its_formula(granularity, reach_from):
+    """B_ij by the definition, pair by pair in float64, hard and soft."""
+    (tokens, role), ball = person(), thing(9, place=(0.9, 0.2, 0.4))
+    anchors, center = role.anchors.double(), ball.positions.double().mean(0)
+    for reach in (1.0, 0.75):
+        gates = {
+            kind: DistanceGate(kind, granularity, reach_from, 0.1, reach).log(
+                "human", role, tokens, ball
+            )
+            for kind in ("hard", "soft")
+        }
+        shut = 0
+        for i in range(16):
+            for j in range(9):
+                at = center if granularity == "object" else ball.positions[j].double()
+                start = anchors if reach_from == "nearest" else anchors[:1]
+                if granularity == "part":
+                    start = tokens.positions[i : i + 1].double()
+                distance = min(float((a - at).norm()) for a in start)
+                margin = reach * ARM - distance
+                soft = 1 / (1 + math.exp(-margin / 0.1))
+                assert float(gates["soft"][i, j].exp()) == pytest.approx(soft, rel=1e-4)
+                assert float(gates["hard"][i, j]) == (0.0 if margin > 0 else -math.inf)
+                shut += margin <= 0
+        if (granularity, reach) == ("part", 1.0):
+            assert 0 < shut < 16 * 9  # the only one that tells parts apart
 
 
 def test_two_humans():
