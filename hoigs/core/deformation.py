@@ -64,6 +64,7 @@ class DeformationModel(nn.Module, ABC):
         """
 
     def peak_opacity_logits(self, rest: Gaussians) -> Float[Tensor, " N"]:
+    progress: float = 1.0
         """The largest opacity logit of each Gaussian over time, by which density control judges it.
 
         The default is that at rest; a deformation that keys opacities knows better.
@@ -86,6 +87,10 @@ class ProvidesVelocity(Protocol):
     def velocity(self, rest: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
         """Time derivative of the means, metres per keyframe interval or per unit time."""
         ...
+    def set_progress(self, progress: float) -> None:
+        """Called before each training step, and with 1 after the last."""
+        self.progress = progress
+
 
 
 @runtime_checkable

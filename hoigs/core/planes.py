@@ -1,10 +1,13 @@
-"""Feature planes over space and time (HexPlane, Cao & Johnson 2023; HOIGS, Sec. "Human").
+"""Feature planes over space and time (HexPlane, Cao & Johnson 2023; HOIGS, Sec. "Human";
+K-Planes, Fridovich-Keil et al. 2023; 4DGS, Wu et al. 2024).
 
 Points are addressed in [-1, 1] per axis, border cells reaching to the edge (align_corners) and
 values held outside. Planes are stored channels last, so that one row is one cell's features.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -46,6 +49,14 @@ def sample_planes(
     return sampled.unflatten(0, (count, -1)).transpose(0, 1).flatten(1)
 
 
+def roughness(planes: Float[Tensor, "P H W C"]) -> Float[Tensor, ""]:
+    """Mean squared second difference along H, 0 with fewer than three rows (4DGS; K-Planes)."""
+    if planes.shape[1] < 3:
+        return planes.new_zeros(())
+    first = planes[:, 1:] - planes[:, :-1]
+    return (first[:, 1:] - first[:, :-1]).square().mean()
+
+
 class PairedPlanes(nn.Module):
     """Three space planes and, paired with them, three space-time planes.
 
@@ -84,11 +95,62 @@ class PairedPlanes(nn.Module):
 
     def time_smoothness(self) -> Float[Tensor, ""]:
         """Mean squared second difference of the time planes along time (4DGS)."""
-        if self.time.shape[1] < 3:
-            return self.time.new_zeros(())
-        first = self.time[:, 1:] - self.time[:, :-1]
-        return (first[:, 1:] - first[:, :-1]).square().mean()
+        return roughness(self.time)
 
     def time_sparsity(self) -> Float[Tensor, ""]:
         """Mean distance of the time planes from one (4DGS): no motion where none is needed."""
         return (self.time - 1).abs().mean()
+
+
+class ProductPlanes(nn.Module):
+    """Six planes xy, xz, yz, xt, yt, zt multiplied, several resolutions concatenated (4DGS).
+
+    Args:
+        channels: of each plane. resolution: cells along each space axis at the first scale.
+        time_resolution: along time, at every scale.
+        scales: multiples of `resolution`; time keeps its own.
+        spread: bounds of the uniform values at the start of space planes; time planes are one.
+    """
+
+    def __init__(
+        self,
+        channels: int = 16,
+        resolution: int = 64,
+        time_resolution: int = 150,
+        scales: Sequence[int] = (1, 2, 4),
+        spread: tuple[float, float] = (0.1, 0.5),
+    ) -> None:
+        super().__init__()
+        self.width = channels * len(scales)
+        sizes = [resolution * scale for scale in scales]
+        self.space = nn.ParameterList(
+            torch.empty(3, size, size, channels).uniform_(*spread) for size in sizes
+        )
+        self.time = nn.ParameterList(
+            torch.ones(3, time_resolution, size, channels) for size in sizes
+        )
+
+    def forward(self, points: Float[Tensor, "N 3"], clock: float) -> Float[Tensor, "N F"]:
+        """Features at points in [-1, 1] and a time in [-1, 1], both held outside."""
+        pairs = torch.stack([points[:, axes] for axes in SPACE_AXES])
+        when = points.new_full((len(points),), clock)
+        timed = torch.stack([torch.stack((points[:, axis], when), -1) for axis in range(3)])
+        scales = []
+        for space, time in zip(self.space, self.time, strict=True):
+            planes = torch.cat((sample_planes(space, pairs), sample_planes(time, timed)), 1)
+            scales.append(planes.unflatten(1, (6, -1)).prod(1))
+        return torch.cat(scales, dim=1)
+
+    def smoothness(self) -> dict[str, Float[Tensor, ""]]:
+        """4DGS's three penalties, each summed over planes and scales.
+
+        "plane_tv": `roughness` of the space planes, along one axis and of second order for all its
+        name. "time_smoothness": of the time planes along time. "l1_time_planes": their mean
+        distance from one.
+        """
+        sums = {
+            "plane_tv": [roughness(planes) for planes in self.space],
+            "time_smoothness": [roughness(planes) for planes in self.time],
+            "l1_time_planes": [(planes - 1).abs().mean() for planes in self.time],
+        }
+        return {name: 3 * torch.stack(terms).sum() for name, terms in sums.items()}

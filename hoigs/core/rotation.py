@@ -119,3 +119,24 @@ def slerp(
     wa = torch.where(near, 1 - r + torch.zeros_like(dot), torch.sin((1 - r) * angle) / sine)
     wb = torch.where(near, r + torch.zeros_like(dot), torch.sin(r * angle) / sine)
     return normalize_quats(wa * a + wb * b)
+
+
+def exp_se3(
+    turns: Float[Tensor, "*batch 3"], shifts: Float[Tensor, "*batch 3"]
+) -> tuple[Float[Tensor, "*batch 4"], Float[Tensor, "*batch 3"]]:
+    """Exponential map of se(3): quaternions R and translations of x -> R x + t, smooth at zero.
+
+    t = (I + (1 - cos a) / a^2 W + (a - sin a) / a^3 W^2) v with a = |w| and W = [w]_x (Nerfies,
+    Park et al. 2021, eq. 8-10, times a).
+
+    Args:
+        turns: w, axis-angle, radians. shifts: v, in the units of the translation.
+    """
+    squared = (turns * turns).sum(-1, keepdim=True)
+    small = squared < 1e-4
+    angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
+    first = torch.where(small, 0.5 - squared / 24, (1 - torch.cos(angle)) / angle**2)
+    second = torch.where(small, 1 / 6 - squared / 120, (angle - torch.sin(angle)) / angle**3)
+    once = torch.linalg.cross(turns, shifts)
+    twice = torch.linalg.cross(turns, once)
+    return axis_angle_to_quats(turns), shifts + first * once + second * twice

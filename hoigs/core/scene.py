@@ -120,5 +120,10 @@ class SceneModel(nn.Module):
             request = request.replace(background=background)
         return self.rasterizer.render(state.joined(), camera, request)
 
+    def set_progress(self, progress: float) -> None:
+        """Tell every deformation which share of the training run is done, in [0, 1]."""
+        for name in self.entities:
+            self.entity(name).deformation.set_progress(progress)
+
     def count(self) -> dict[str, int]:
         return {name: len(self.entity(name)) for name in self.entities}

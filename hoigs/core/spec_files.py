@@ -174,9 +174,11 @@ def _with_profile(document: Document, profile: str | None, source: str) -> Docum
 def _like_another(document: Document, shared: Document) -> Document:
     """`document` with the places that a shared profile lists as they are in the spec it names.
 
-    What that spec leaves to its default is left to its default here too.
+    What that spec leaves to its default is left to its default here too; places that the profile
+    keeps stay the document's own.
     """
     model = read_spec(shared.data["like"])
+    own = [document.only(p) for d in shared.data["keep"] if document.has(p := tuple(d.split(".")))]
     for dotted in shared.data["take"]:
         place = tuple(dotted.split("."))
         document.remove(place)
@@ -185,4 +187,6 @@ def _like_another(document: Document, shared: Document) -> Document:
             taken = taken.get(part, {})
         if place[-1] in taken:
             document = document.merged(model.only(place))
+    for kept in own:
+        document = document.merged(kept)
     return document

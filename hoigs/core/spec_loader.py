@@ -76,14 +76,18 @@ class Document:
             data = {key: data}
         return Document(self.source, data, keys, values)
 
+    def has(self, place: Place) -> bool:
+        """Whether anything stands at `place`."""
+        try:
+            return place[-1] in self._block(place[:-1])
+        except KeyError:
+            return False
+
     def remove(self, place: Place) -> None:
         """Take away what stands at `place`, if anything does."""
-        try:
-            block = self._block(place[:-1])
-        except KeyError:
-            return
-        block.pop(str(place[-1]), None)
-        _forget(self, place)
+        if self.has(place):
+            del self._block(place[:-1])[str(place[-1])]
+            _forget(self, place)
 
     def _block(self, place: Place) -> dict[str, Any]:
         block: Any = self.data

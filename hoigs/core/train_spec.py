@@ -59,7 +59,7 @@ class LossSpec(_Strict):
 
 
 class RatesSpec(_Strict):
-    """Adam's learning rates at the start; those marked * are multiplied by the scene's extent.
+    """Adam's learning rates at the start; those in `by_extent` are multiplied by the extent.
 
     Sources: 3DGS (Kerbl 2023) for the Gaussian fields, ExAvatar (Moon 2024) for networks and
     poses, 4DGS (Wu 2024) for planes, E-D3DGS (Bae 2024) for embeddings; methods A.10, D.4. Those
@@ -68,11 +68,16 @@ class RatesSpec(_Strict):
     1e-3 they gain 0.7 dB (full frame) and 0.4 dB (human and object) in 1500 steps on the built-in
     clip (docs/results/README.md).
     `*_final` rates are reached log-linearly at the last step.
+
+    Attributes:
+        by_extent: rates in units of the entity's extent (3DGS: means; 4DGS: planes and networks
+            too). sh_rest: rate of the harmonics above the first, as a share of `sh` (3DGS: 1/20).
     """
 
-    means: float = Field(8e-4, ge=0)  # *
-    means_final: float = Field(8e-6, ge=0)  # *
+    means: float = Field(8e-4, ge=0)
+    means_final: float = Field(8e-6, ge=0)
     sh: float = Field(1e-2, ge=0)
+    sh_rest: float = Field(1.0, ge=0, le=1)
     opacity: float = Field(0.05, ge=0)
     scale: float = Field(5e-3, ge=0)
     rotation: float = Field(1e-3, ge=0)
@@ -86,6 +91,7 @@ class RatesSpec(_Strict):
     embedding: float = Field(2.5e-3, ge=0)
     pose: float = Field(1e-4, ge=0)
     shape: float = Field(1e-4, ge=0)
+    by_extent: tuple[str, ...] = ("means",)
 
 
 class TrainSpec(_Strict):
@@ -95,6 +101,8 @@ class TrainSpec(_Strict):
         steps: optimizer steps, one frame each.
         seed: of everything random.
         width: train and score at this image width; None is the clip's own.
+        sh_interval: steps after which one more degree of harmonics is trained (3DGS: 1000); None
+            trains all from the start.
         checkpoint_every, log_every, preview_every: steps; the last step always writes both.
             preview_every scores a few test frames for the curve in the report (0 = never).
     """
@@ -102,6 +110,7 @@ class TrainSpec(_Strict):
     steps: int = Field(2000, ge=1)
     seed: int = Field(0, ge=0)
     width: int | None = Field(None, ge=16)
+    sh_interval: int | None = Field(None, ge=1)
     warmup: WarmupSpec = WarmupSpec()
     loss: LossSpec = LossSpec()
     rates: RatesSpec = RatesSpec()

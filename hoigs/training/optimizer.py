@@ -85,7 +85,7 @@ class GroupedAdam:
                 known = sorted(RatesSpec.model_fields)
                 raise ValueError(f"{name} asks for the rate {rate!r}; train.rates has {known}")
             final = getattr(rates, f"{rate}_final", start)
-            if rate == "means" and entity is not None:
+            if rate in rates.by_extent and entity is not None:
                 extent = entity_extent(entity, scene_extent)
                 start, final = start * extent, final * extent
             begin = getattr(warmup, WAITING[rate]) if rate in WAITING else 0.0
@@ -95,6 +95,7 @@ class GroupedAdam:
             groups.append({"params": [parameter], "lr": start})
         # eps as in 3DGS: gradients of single Gaussians are tiny, the default would damp them
         self.adam = torch.optim.Adam(groups, lr=1e-3, eps=1e-15, fused=True)
+        self.sh_rest = rates.sh_rest
 
     def set_progress(self, progress: float) -> None:
         for group, schedule in zip(self.adam.param_groups, self.schedules, strict=True):
@@ -117,8 +118,18 @@ class GroupedAdam:
             return float(mine["means"][1])
         return max((float(rate) for role, rate in mine.values() if role == "keyframes"), default=0)
 
-    def step(self) -> None:
+    def step(self, sh_degree: int | None = None) -> None:
+        """One update; harmonics above `sh_degree` wait, None waits for nothing."""
+        colors = [p for p, r in zip(self.names.values(), self.roles, strict=True) if r == "sh"]
+        if sh_degree is not None:
+            for parameter in colors:
+                if parameter.grad is not None:
+                    parameter.grad[:, (sh_degree + 1) ** 2 :] = 0
+        slowed = [p for p in colors if p.shape[1] > 1] if self.sh_rest != 1 else []
+        before = [parameter.detach()[:, 1:].clone() for parameter in slowed]
         self.adam.step()
+        for parameter, old in zip(slowed, before, strict=True):  # Adam's step is linear in its rate
+            parameter.data[:, 1:].lerp_(old, 1 - self.sh_rest)
 
     def zero_grad(self) -> None:
         self.adam.zero_grad(set_to_none=True)

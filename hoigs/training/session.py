@@ -164,4 +164,5 @@ class LoadedRun:
         checkpoint = load_checkpoint(latest_checkpoint(run.checkpoints))
         restore_model(model, checkpoint, spec.model_hash())
         model.eval()
+        model.set_progress(min(1.0, checkpoint.meta["step"] / spec.train.steps))
         return cls(spec, source, model, checkpoint.meta["step"], provenance)

@@ -106,6 +106,7 @@ class Trainer:
 
     def _step(self) -> dict[str, float] | None:
         """One optimizer step: its loss terms and their "total"; None when the guard skipped it.
+        self.model.set_progress(1.0)
 
         Nothing of the graph may outlive this call: autograd remembers the shape of a parameter as
         long as any graph that used it lives, and refinement changes shapes.
@@ -117,6 +118,7 @@ class Trainer:
         frame = self.clip[self.sampler.next()]
         camera = frame.camera.to(self.model.device)
         result = self.objective(frame, camera, self.generator)
+        self.model.set_progress(progress)
         self.optimizer.zero_grad()
         result.total.backward()
         if not gradients_finite(self.optimizer.names):
@@ -125,7 +127,9 @@ class Trainer:
             self.optimizer.zero_grad()
             return None
         self.guard.passed()
-        self.optimizer.step()
+        interval = self.spec.sh_interval
+        self.optimizer.step(None if interval is None else self.step // interval)
+        self._evolve(result, frame.moment, camera)
         self._refine(result, camera.width, camera.height)
         terms = {name: float(term.detach()) for name, term in result.terms.items()}
         return {**terms, "total": float(result.total.detach())}

@@ -56,9 +56,9 @@ def test_positional_encoding_by_hand():
 
 def test_mlp_is_d3dgs_by_default():
     model = MlpDeformation()
-    assert len(model.trunk) == 8
-    assert model.trunk[0].in_features == 63 + 21
-    assert [layer.in_features for layer in model.trunk].index(256 + 84) == 4
+    assert len(model.trunk.layers) == 8
+    assert model.trunk.layers[0].in_features == 63 + 21
+    assert [layer.in_features for layer in model.trunk.layers].index(256 + 84) == 5  # after layer 4
 
 
 def test_mlp_starts_at_rest_and_learns():
