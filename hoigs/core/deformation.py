@@ -4,18 +4,41 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hoigs.core.camera import Camera
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.moment import BodyPose, Moment
-from hoigs.core.topology import TopologyChange, reindex
+from hoigs.core.topology import AxisChange, TopologyChange, reindex
 
 if TYPE_CHECKING:
     from hoigs.core.context import BuildContext
     from hoigs.core.interaction import Residual
+
+
+@dataclass(frozen=True)
+class StepEvidence:
+    """What training saw of one entity at one step, for deformations that grow or shrink.
+
+    Attributes:
+        moment, camera: of the frame drawn.
+        error: image loss there: the entity's own term if it has one, else the scene's.
+        screen_gradient: of the loss by each Gaussian's place on the screen, or None.
+        radii: on the screen, pixels; 0 where not drawn.
+        step, total_steps: the number of this step, from 1, and of all.
+    """
+
+    moment: Moment
+    camera: Camera
+    error: float
+    screen_gradient: Float[Tensor, "N 2"] | None
+    radii: Float[Tensor, " N"]
+    step: int
+    total_steps: int
 
 
 class DeformationModel(nn.Module, ABC):
@@ -64,7 +87,6 @@ class DeformationModel(nn.Module, ABC):
         """
 
     def peak_opacity_logits(self, rest: Gaussians) -> Float[Tensor, " N"]:
-    progress: float = 1.0
         """The largest opacity logit of each Gaussian over time, by which density control judges it.
 
         The default is that at rest; a deformation that keys opacities knows better.
@@ -74,6 +96,27 @@ class DeformationModel(nn.Module, ABC):
     def on_topology(self, change: TopologyChange) -> None:
         """Follow a change of Gaussian count; the default reindexes `per_gaussian` parameters."""
         reindex((self.get_parameter(name) for name in self.per_gaussian), change)
+
+    def axis_changes(self, change: TopologyChange) -> Mapping[str, AxisChange]:
+        """How parameters that hold rows of only some Gaussians will follow, by name.
+
+        Asked before `on_topology`, for the optimizer's moments.
+        """
+        del change
+        return {}
+
+    def evolve(self, rest: Gaussians, evidence: StepEvidence) -> Mapping[str, AxisChange]:
+        """Called after every step, before density control: a chance to change its own size.
+
+        A deformation that inserts knots or promotes Gaussians gives the parameters their new
+        values here (`parameter.data`, with `grad` None; the Parameter objects stay) and returns,
+        by parameter name, how the optimizer's moments follow.
+
+        What it remembers from step to step belongs in persistent buffers, and what it decides
+        must not be random, so that a resumed run equals an unbroken one.
+        """
+        del rest, evidence
+        return {}
 
     def regularizers(self) -> dict[str, Tensor]:
         """Named scalar penalties, unweighted, of the current parameters."""
@@ -87,10 +130,6 @@ class ProvidesVelocity(Protocol):
     def velocity(self, rest: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
         """Time derivative of the means, metres per keyframe interval or per unit time."""
         ...
-    def set_progress(self, progress: float) -> None:
-        """Called before each training step, and with 1 after the last."""
-        self.progress = progress
-
 
 
 @runtime_checkable

@@ -49,6 +49,31 @@ class TopologyChange:
         return self.source.shape[0]
 
 
+@dataclass(frozen=True)
+class AxisChange:
+    """How a parameter's entries along one axis come from its old ones: knots, or rows of a subset.
+
+    Attributes:
+        axis: that changed its length.
+        source: old entry of each new one; of fresh entries it is not read and may be anything.
+        fresh: True for an entry whose optimizer moments start at 0.
+    """
+
+    axis: int
+    source: Int[Tensor, " M"]
+    fresh: Bool[Tensor, " M"]
+
+    def follow(self, values: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+        """Old values, such as Adam's moments, at the new entries; zero where these are fresh."""
+        shape = list(values.shape)
+        shape[self.axis] = len(self.source)
+        followed = values.new_zeros(shape)
+        kept = (~self.fresh).nonzero().squeeze(1)
+        return followed.index_copy(
+            self.axis, kept, values.index_select(self.axis, self.source[kept])
+        )
+
+
 def share_opacity(
     logits: Float[Tensor, "M *rest"], copies: Int[Tensor, " M"]
 ) -> Float[Tensor, "M *rest"]:

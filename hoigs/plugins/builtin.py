@@ -33,6 +33,8 @@ PARTS = (
      "a field of rigid motions as in Nerfies, with HyperNeRF's slices if asked for"),
     ("deformation:chs", f"{DEFORMATION}.chs", "CubicHermite", "CubicHermiteConfig",
      "a cubic Hermite spline per Gaussian, tangents learned or finite differences"),
+    ("deformation:rigid-spline", f"{DEFORMATION}.rigid_spline", "RigidSpline", "RigidSplineConfig",
+     "one SE(3) spline moves a whole object, knots uniform or adaptive"),
     ("deformation:hexplane-skinning", f"{DEFORMATION}.hexplane_skinning", "HexPlaneSkinning",
      "HexPlaneSkinningConfig", "a skinned body whose looks come from space-time planes"),
     ("features:body-parts", f"{FEATURES}.body_parts", "BodyPartFeatures", "BodyPartConfig",

@@ -10,7 +10,7 @@ from torch import nn
 
 from hoigs.core.entity import Entity
 from hoigs.core.scene import SceneModel
-from hoigs.core.topology import TopologyChange
+from hoigs.core.topology import AxisChange, TopologyChange
 from hoigs.core.train_spec import RatesSpec, WarmupSpec
 
 FIELD_RATES = {
@@ -135,13 +135,14 @@ class GroupedAdam:
         self.adam.zero_grad(set_to_none=True)
 
     @torch.no_grad()
-    def follow(self, parameter: nn.Parameter, change: TopologyChange) -> None:
-        """Rows of the moments follow a topology change; fresh rows start from zero."""
+    def follow(self, parameter: nn.Parameter, change: TopologyChange | AxisChange) -> None:
+        """Moments follow a change of rows or of another axis; fresh entries start from zero."""
+        if isinstance(change, TopologyChange):
+            change = AxisChange(0, change.source, change.fresh)
         state = self.adam.state.get(parameter, {})
         for key in ("exp_avg", "exp_avg_sq"):
             if key in state:
-                state[key] = state[key][change.source].contiguous()
-                state[key][change.fresh] = 0.0
+                state[key] = change.follow(state[key])
 
     @torch.no_grad()
     def forget(self, parameter: nn.Parameter) -> None:

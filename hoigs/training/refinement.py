@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 
+from hoigs.core.deformation import StepEvidence
 from hoigs.core.density import DensityControl, DensityStatistics, Refinement
 from hoigs.core.entity import Entity
 from hoigs.core.gaussians import Gaussians
+from hoigs.core.topology import AxisChange
 from hoigs.training.optimizer import GroupedAdam
 
 
@@ -63,11 +67,25 @@ class EntityDensity:
 
 
 @torch.no_grad()
+def evolve(entity: Entity, evidence: StepEvidence, optimizer: GroupedAdam) -> None:
+    """Let an entity's deformation change its own size, and the optimizer's moments with it."""
+    changes = entity.deformation.evolve(entity.rest.detach(), evidence)
+    follow_axes(entity, changes, optimizer)
+
+
+def follow_axes(entity: Entity, changes: Mapping[str, AxisChange], optimizer: GroupedAdam) -> None:
+    """Moments of a deformation's parameters follow, by parameter name."""
+    for name, change in changes.items():
+        optimizer.follow(entity.deformation.get_parameter(name), change)
+
+
+@torch.no_grad()
 def apply_refinement(entity: Entity, decision: Refinement, optimizer: GroupedAdam) -> None:
     """Carry out one decision on an entity and on the optimizer's moments of its parameters."""
     if decision.change is not None and decision.rest is not None:
         for _, parameter in entity.per_gaussian():
             optimizer.follow(parameter, decision.change)
+        follow_axes(entity, entity.deformation.axis_changes(decision.change), optimizer)
         entity.apply_topology(decision.change, decision.rest)
     if decision.reset_opacity is not None:
         ceiling = float(torch.logit(torch.tensor(decision.reset_opacity)))

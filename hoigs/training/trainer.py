@@ -9,8 +9,11 @@ from typing import Any
 
 import torch
 
+from hoigs.core.camera import Camera
 from hoigs.core.clip import Clip
+from hoigs.core.deformation import DeformationModel, StepEvidence
 from hoigs.core.density import DensityControl, DensityStatistics, check_rasterizer
+from hoigs.core.moment import Moment
 from hoigs.core.scene import SceneModel
 from hoigs.core.train_spec import TrainSpec
 from hoigs.evaluation.lpips import Lpips
@@ -19,7 +22,7 @@ from hoigs.training.checkpoint import Checkpoint, restore_model
 from hoigs.training.guard import NanGuard, first_not_finite, gradients_finite
 from hoigs.training.objective import JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
-from hoigs.training.refinement import EntityDensity
+from hoigs.training.refinement import EntityDensity, evolve
 from hoigs.training.run_folder import RunFolder
 from hoigs.training.sampler import EpochSampler
 
@@ -106,7 +109,6 @@ class Trainer:
 
     def _step(self) -> dict[str, float] | None:
         """One optimizer step: its loss terms and their "total"; None when the guard skipped it.
-        self.model.set_progress(1.0)
 
         Nothing of the graph may outlive this call: autograd remembers the shape of a parameter as
         long as any graph that used it lives, and refinement changes shapes.
@@ -118,7 +120,6 @@ class Trainer:
         frame = self.clip[self.sampler.next()]
         camera = frame.camera.to(self.model.device)
         result = self.objective(frame, camera, self.generator)
-        self.model.set_progress(progress)
         self.optimizer.zero_grad()
         result.total.backward()
         if not gradients_finite(self.optimizer.names):
@@ -127,12 +128,32 @@ class Trainer:
             self.optimizer.zero_grad()
             return None
         self.guard.passed()
-        interval = self.spec.sh_interval
-        self.optimizer.step(None if interval is None else self.step // interval)
+        self.optimizer.step()
         self._evolve(result, frame.moment, camera)
         self._refine(result, camera.width, camera.height)
         terms = {name: float(term.detach()) for name, term in result.terms.items()}
         return {**terms, "total": float(result.total.detach())}
+
+    def _evolve(self, result: ObjectiveResult, moment: Moment, camera: Camera) -> None:
+        """Deformations that change their own size get what this step has shown."""
+        gradient, radii = result.screen_offsets.grad, result.composite.info["radii"]
+        for name, row in result.state.slices().items():
+            entity = self.model.entity(name)
+            if type(entity.deformation).evolve is DeformationModel.evolve:
+                continue
+            own = result.terms.get(f"{entity.kind}/{name}")
+            if own is None:
+                own = result.terms.get("scene", result.terms.get("scene/masked"))
+            evidence = StepEvidence(
+                moment.to(self.model.device),
+                camera,
+                float(own.detach()) if own is not None else 0.0,
+                gradient[row] if gradient is not None else None,
+                radii[row],
+                self.step,
+                self.spec.steps,
+            )
+            evolve(entity, evidence, self.optimizer)
 
     def _refine(self, result: ObjectiveResult, width: int, height: int) -> None:
         gradient, absolute = result.screen_offsets.grad, None

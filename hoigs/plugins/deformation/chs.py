@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import torch
 from jaxtyping import Float
@@ -17,12 +17,15 @@ from hoigs.core import spline
 from hoigs.core.clip import ObjectTrack
 from hoigs.core.config import ComponentConfig
 from hoigs.core.context import BuildContext
-from hoigs.core.deformation import DeformationModel
+from hoigs.core.deformation import DeformationModel, StepEvidence
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.interaction import Residual
 from hoigs.core.moment import Moment
-from hoigs.core.rotation import multiply_quats, normalize_quats, quats_to_matrices, slerp
-from hoigs.core.topology import TopologyChange, reindex
+from hoigs.core.rotation import multiply_quats, normalize_quats, quats_to_matrices
+from hoigs.core.topology import AxisChange, TopologyChange, reindex
+from hoigs.plugins.deformation.knot_schedule import AdaptiveKnotsConfig, KnotSchedule, probe_rows
+from hoigs.plugins.deformation.knots import Knots
+from hoigs.plugins.deformation.resizing import Resizing
 from hoigs.plugins.deformation.rigid_track import RigidTrack
 
 Tangents = Literal["learned", "finite-difference"]
@@ -35,21 +38,24 @@ class CubicHermiteConfig(ComponentConfig):
     """The paper's object motion and its ablations.
 
     Attributes:
-        keyframes: number of knots; None derives it from `keyframe_step` and the clip's length.
+        keyframes: number of knots; None derives it from `keyframe_step` and the clip's length;
+            "adaptive" starts from that and lets training insert and remove knots.
         keyframe_step: frames between knots (the paper's 4).
         tangents: "learned" velocities (the paper) or "finite-difference" of neighbouring knots.
         opacity: "keyed" over time, linear between knots (the paper), or "constant".
         track: start from the object's rigid track, where it has one, else at rest.
+        adaptive: when and how knots change, if `keyframes` is "adaptive".
     """
 
-    keyframes: int | None = Field(None, ge=2)
+    keyframes: Annotated[int, Field(ge=2)] | Literal["adaptive"] | None = None
     keyframe_step: int = Field(4, ge=1)
     tangents: Tangents = "learned"
     opacity: Opacity = "keyed"
     track: bool = True
+    adaptive: AdaptiveKnotsConfig = Field(default_factory=AdaptiveKnotsConfig)
 
 
-class CubicHermite(DeformationModel):
+class CubicHermite(Resizing, DeformationModel):
     """M(t) = CHS(t, m) for each Gaussian, plus the interaction's displacement.
 
     Rotations are slerped between knots, opacity logits are linear, scales and colours constant
@@ -66,6 +72,8 @@ class CubicHermite(DeformationModel):
         track: rest is then the canonical object; knots and tangents start as the spline nearest
             to R_f p + t_f over all frames, knot rotations as the track's at the knot's real-valued
             time. Without a track every knot starts at rest.
+        schedule: lets knots come and go in training (at least 4), the same for all Gaussians;
+            tangents and `velocity` stay per interval of the knots at the start. None keeps them.
     """
 
     provides = frozenset({"velocity"})
@@ -75,6 +83,8 @@ class CubicHermite(DeformationModel):
         "keyframe_quats": "keyframe_rotation",
         "opacity_logits": "opacity",
     }
+
+    resizes: ClassVar[Mapping[str, int]] = dict.fromkeys(rates, 1)
 
     regularizer_weights: ClassVar[Mapping[str, float]] = {"tangent": 0.01}
 
@@ -89,6 +99,7 @@ class CubicHermite(DeformationModel):
         tangents: Tangents = "learned",
         opacity: Opacity = "keyed",
         track: ObjectTrack | None = None,
+        schedule: KnotSchedule | None = None,
     ) -> None:
         super().__init__()
         if keyframes is None:
@@ -100,28 +111,31 @@ class CubicHermite(DeformationModel):
             keyframes = spline.keyframe_count(frames, keyframe_step)
         if keyframes < 2:
             raise ValueError(f"CubicHermite needs at least 2 keyframes, got {keyframes}")
-        self.keyframes, self.learned, self.keyed = (
-            keyframes,
-            tangents == "learned",
-            opacity == "keyed",
-        )
+        if schedule is not None:
+            keyframes = max(keyframes, schedule.config.minimum)
+        self.knots, self.schedule = Knots(keyframes, movable=schedule is not None), schedule
+        self.keyframes = keyframes  # at the start: features take the size of their own from it
+        self.learned, self.keyed = tangents == "learned", opacity == "keyed"
         names = ["keyframe_means", "keyframe_quats"]
         names += ["tangents"] if self.learned else []
         names += ["opacity_logits"] if self.keyed else []
         self.per_gaussian = tuple(names)
+        self.knot_axes: Mapping[str, int] = dict.fromkeys(names, 1)
         self.owns = frozenset({"means", "quats"} | ({"opacity_logits"} if self.keyed else set()))
         self.rest_space = "canonical" if track is not None else "world"
         self._track = track
 
     @classmethod
     def from_config(cls, config: CubicHermiteConfig, context: BuildContext) -> Self:
+        adaptive = config.keyframes == "adaptive"
         return cls(
-            config.keyframes,
+            None if config.keyframes == "adaptive" else config.keyframes,
             keyframe_step=config.keyframe_step,
             num_frames=context.clip.num_frames if context.clip is not None else None,
             tangents=config.tangents,
             opacity=config.opacity,
             track=context.object_track if config.track else None,
+            schedule=KnotSchedule.from_context(config.adaptive, context) if adaptive else None,
         )
 
     def bind(self, rest: Gaussians) -> None:
@@ -165,24 +179,59 @@ class CubicHermite(DeformationModel):
         means = self._means(moment.time)
         if residual is not None and residual.means is not None:
             means = means + residual.means
-        k, r = spline.keyframe_position(moment.time, self.keyframes)
-        pair = self.keyframe_quats[:, k : k + 2]
-        moved = replace(rest, means=means, quats=slerp(pair[:, 0], pair[:, 1], r))
+        quats = self.knots.slerp(self.keyframe_quats, moment.time)
+        moved = replace(rest, means=means, quats=quats)
         if self.keyed:
-            moved = replace(moved, opacity_logits=spline.linear(self.opacity_logits, moment.time))
+            logits = self.knots.linear(self.opacity_logits, moment.time)
+            moved = replace(moved, opacity_logits=logits)
         return moved
 
     def _means(self, time: float, *, derivative: bool = False) -> Float[Tensor, "N 3"]:
         if self.learned:
-            return spline.cubic_hermite(
+            return self.knots.hermite(
                 self.keyframe_means, self.tangents, time, derivative=derivative
             )
-        return spline.catmull_rom(self.keyframe_means, time, derivative=derivative)
+        return self.knots.catmull_rom(self.keyframe_means, time, derivative=derivative)
 
     def velocity(self, rest: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
         """tau(t): exact derivative of the spline, metres per keyframe interval."""
         del rest
         return self._means(moment.time, derivative=True)
+
+    def evolve(self, rest: Gaussians, evidence: StepEvidence) -> Mapping[str, AxisChange]:
+        return {} if self.schedule is None else self.schedule.step(self, rest, evidence)
+
+    @torch.no_grad()
+    def traced(self, rest: Gaussians, times: Sequence[float]) -> Float[Tensor, "T P 3"]:
+        """World positions of some Gaussians at some times, metres (MovingCurve)."""
+        rows = probe_rows(len(rest)).to(self.keyframe_means.device)
+        values = self.keyframe_means[rows]
+        if not self.learned:
+            return torch.stack([self.knots.catmull_rom(values, time) for time in times])
+        tangents = self.tangents[rows]
+        return torch.stack([self.knots.hermite(values, tangents, time) for time in times])
+
+    @torch.no_grad()
+    def resampled(self, times: Sequence[float], fit: Sequence[float]) -> dict[str, Tensor]:
+        """Parameters of this motion with knots at `times` (MovingCurve)."""
+        means = torch.stack([self._means(time) for time in times], 1)
+        tangents = torch.stack([self._means(time, derivative=True) for time in times], 1)
+        if fit:
+            knots = Knots(self.keyframes, movable=True).to(means.device)
+            knots.place(times)
+            samples = torch.stack([self._means(time) for time in fit]).flatten(1)
+            refitted = knots.refit(samples, fit, free_tangents=self.learned)
+            means, tangents = (x.unflatten(1, (-1, 3)).transpose(0, 1) for x in refitted)
+        quats = [self.knots.slerp(self.keyframe_quats, time) for time in times]
+        found = {
+            "keyframe_means": means,
+            "tangents": tangents,
+            "keyframe_quats": torch.stack(quats, 1),
+        }
+        if self.keyed:
+            logits = [self.knots.linear(self.opacity_logits, time) for time in times]
+            found["opacity_logits"] = torch.stack(logits, 1)
+        return {name: found[name] for name in self.knot_axes}
 
     def peak_opacity_logits(self, rest: Gaussians) -> Float[Tensor, " N"]:
         return self.opacity_logits.amax(1) if self.keyed else rest.opacity_logits
@@ -204,19 +253,19 @@ class CubicHermite(DeformationModel):
         offsets = torch.einsum("nkij,nj->nki", quats_to_matrices(turns), change.offsets.to(quats))
         self.keyframe_means.data += offsets
         if self.learned:
-            self.tangents.data += spline.catmull_rom_tangents(offsets)
+            self.tangents.data += self.knots.differences(offsets)
 
     def regularizers(self) -> dict[str, Tensor]:
         """Squared, per Gaussian and knot, in metres per interval.
 
-        "acceleration": second difference of the knots. "tangent": learned tangents against the
+        "acceleration": second difference of uniform knots. "tangent": learned tangents against the
         finite differences, which an interval's few frames cannot pin down alone (methods A.3).
         """
         penalties: dict[str, Tensor] = {}
-        if self.keyframes > 2:
+        if len(self.knots) > 2 and not self.knots.movable:
             jerks = spline.accelerations(self.keyframe_means)
             penalties["acceleration"] = jerks.square().sum(-1).mean()
         if self.learned:
-            difference = self.tangents - spline.catmull_rom_tangents(self.keyframe_means)
+            difference = self.tangents - self.knots.differences(self.keyframe_means)
             penalties["tangent"] = difference.square().sum(-1).mean()
         return penalties

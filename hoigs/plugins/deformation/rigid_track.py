@@ -69,6 +69,32 @@ class RigidTrack(nn.Module):
         )
         return knots, tangents
 
+    def rigid_knots(
+        self, keyframes: int, *, free_tangents: bool
+    ) -> tuple[
+        Float[Tensor, "K 3"], Float[Tensor, "K 3"], Float[Tensor, "K 4"], Float[Tensor, "K 3"]
+    ]:
+        """Translations, their tangents, rotations (wxyz) and angular velocities at the knots of
+        the splines fitted to all frames of the track; per keyframe interval, the angular ones in
+        the object's frame.
+
+        As `knots`, the twelve entries of the pose are fitted; each knot's 3x3 block is then
+        brought to the nearest rotation, and its velocity to that rotation's own.
+        """
+        matrices = quats_to_matrices(self.quats)
+        entries = torch.cat((matrices.flatten(1), self.translations), dim=1)
+        values, tangents = spline.fit(
+            entries, keyframes, free_tangents=free_tangents, weights=0.1 + 0.9 * self.observed
+        )
+        u, _, vh = torch.linalg.svd(values[:, :9].unflatten(1, (3, 3)))
+        flip = torch.ones_like(values[:, :3])
+        flip[:, 2] = torch.linalg.det(u @ vh)
+        turns = (u * flip[:, None, :]) @ vh
+        speed = turns.mT @ tangents[:, :9].unflatten(1, (3, 3))
+        skew = 0.5 * (speed - speed.mT)
+        angular = torch.stack((skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]), -1)
+        return values[:, 9:], tangents[:, 9:], matrices_to_quats(turns), angular
+
     def largest_step(self, keyframes: int) -> float:
         """Largest rotation between neighbouring keyframes of a uniform spline, radians."""
         knots = torch.stack([self.at(k / (keyframes - 1))[0] for k in range(keyframes)])

@@ -1,0 +1,162 @@
+"""Knots of a spline over time: uniform, or placed where the motion needs them (methods G.3)."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.core import spline
+from hoigs.core.rotation import slerp
+from hoigs.plugins.deformation.resizing import Resizing
+
+
+class Knots(Resizing):
+    """When the knots of one entity stand, and interpolation of values kept at them.
+
+    Tangents are displacements per reference interval, 1 / (count - 1) of the clip, whatever the
+    distance of the knots: with uniform knots that is the paper's displacement per keyframe
+    interval, and inserting or removing a knot leaves the tangents of the others as they are.
+    Times outside [0, 1] are held at the ends.
+
+    Args:
+        count: K at the start, uniform over [0, 1].
+        movable: knots may be inserted and removed; their times are then part of checkpoints.
+    """
+
+    resizes: ClassVar[Mapping[str, int]] = {"times": 0}
+
+    times: Tensor
+
+    def __init__(self, count: int, *, movable: bool = False) -> None:
+        super().__init__()
+        if count < 2:
+            raise ValueError(f"a spline needs at least 2 keyframes, got {count}")
+        self.reference, self.movable = 1.0 / (count - 1), movable
+        times = [k / (count - 1) for k in range(count)]
+        self.register_buffer("times", torch.tensor(times, dtype=torch.float64), persistent=movable)
+        self._times = times
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def tolist(self) -> list[float]:
+        return list(self._times)
+
+    def place(self, times: Sequence[float]) -> None:
+        """Move to other knots, increasing from 0 to 1."""
+        if not self.movable:
+            raise ValueError("these knots are uniform; make them with movable=True")
+        self._times = list(times)
+        self.times = self.times.new_tensor(self._times)
+
+    def _load_from_state_dict(self, *args: Any) -> None:
+        super()._load_from_state_dict(*args)
+        if self.movable:
+            self._times = self.times.tolist()
+
+    def at(self, time: float) -> tuple[int, float, float]:
+        """First knot k, position r in [0, 1] within [k, k + 1], and that interval's length in
+        reference intervals."""
+        if not self.movable:
+            return *spline.keyframe_position(time, len(self)), 1.0
+        time = min(max(time, 0.0), 1.0)
+        k = min(max(bisect_right(self._times, time) - 1, 0), len(self) - 2)
+        length = self._times[k + 1] - self._times[k]
+        return k, (time - self._times[k]) / length, length / self.reference
+
+    def hermite(
+        self,
+        values: Float[Tensor, "N K D"],
+        tangents: Float[Tensor, "N K D"],
+        time: float,
+        *,
+        derivative: bool = False,
+    ) -> Float[Tensor, "N D"]:
+        """Cubic Hermite spline with explicit tangents; its derivative is per reference interval."""
+        k, r, h = self.at(time)
+        return _hermite(values[:, k : k + 2], tangents[:, k : k + 2], r, h, derivative)
+
+    def catmull_rom(
+        self, values: Float[Tensor, "N K D"], time: float, *, derivative: bool = False
+    ) -> Float[Tensor, "N D"]:
+        """`hermite` with `differences` for tangents, from the four knots about `time` alone."""
+        k, r, h = self.at(time)
+        first, last = max(k - 1, 0), min(k + 3, len(self))
+        window = values[:, first:last]
+        tangents = self._differences(window, self._times[first:last])[:, k - first : k - first + 2]
+        return _hermite(values[:, k : k + 2], tangents, r, h, derivative)
+
+    def differences(self, values: Float[Tensor, "N K D"]) -> Float[Tensor, "N K D"]:
+        """Finite differences of the knots, one-sided at the ends; exact for parabolas between.
+
+        With uniform knots (m_{k+1} - m_{k-1}) / 2, as `spline.catmull_rom_tangents`.
+        """
+        return self._differences(values, self._times)
+
+    def _differences(self, values: Tensor, times: Sequence[float]) -> Tensor:
+        if not self.movable:
+            return spline.catmull_rom_tangents(values)
+        t = values.new_tensor(times) / self.reference
+        h = (t[1:] - t[:-1])[:, None]
+        slopes = (values[:, 1:] - values[:, :-1]) / h
+        inner = (h[1:] * slopes[:, :-1] + h[:-1] * slopes[:, 1:]) / (h[1:] + h[:-1])
+        return torch.cat((slopes[:, :1], inner, slopes[:, -1:]), dim=1)
+
+    def linear(self, values: Float[Tensor, "N K ..."], time: float) -> Float[Tensor, "N ..."]:
+        k, r, _ = self.at(time)
+        return torch.lerp(values[:, k], values[:, k + 1], r)
+
+    def slerp(self, quats: Float[Tensor, "N K 4"], time: float) -> Float[Tensor, "N 4"]:
+        k, r, _ = self.at(time)
+        return slerp(quats[:, k], quats[:, k + 1], r)
+
+    def refit(
+        self,
+        samples: Float[Tensor, "S D"],
+        sample_times: Sequence[float],
+        *,
+        free_tangents: bool,
+    ) -> tuple[Float[Tensor, "K D"], Float[Tensor, "K D"]]:
+        """Values and tangents at these knots of the spline nearest to samples: least squares.
+
+        The tangents are faintly tied to finite differences, which decides what samples leave open.
+        """
+        count, kind = len(self), {"dtype": torch.float64, "device": samples.device}
+        rows = torch.zeros(len(sample_times), 2 * count, **kind)
+        for i, time in enumerate(sample_times):
+            k, r, h = self.at(time)
+            weights = spline.hermite_basis(r)
+            columns = (k, count + k, k + 1, count + k + 1)
+            for column, weight, unit in zip(columns, weights, (1.0, h, 1.0, h), strict=True):
+                rows[i, column] += unit * weight
+        eye = torch.eye(count, **kind)
+        differences = self.differences(eye[None])[0]
+        whole = torch.cat((eye, differences))  # values to values and their difference tangents
+        target = samples.to(torch.float64)
+        if not free_tangents:
+            solution = whole @ torch.linalg.lstsq(rows @ whole, target).solution
+        else:
+            ties = 1e-4 * torch.cat((differences, -eye), dim=1)
+            target = torch.cat((target, target.new_zeros(count, target.shape[1])))
+            solution = torch.linalg.lstsq(torch.cat((rows, ties)), target).solution
+        values, tangents = solution.to(samples.dtype).split(count)
+        return values, tangents
+
+
+def _hermite(values: Tensor, tangents: Tensor, r: float, h: float, derivative: bool) -> Tensor:
+    """One interval of length h: two values, two tangents."""
+    if derivative:
+        w = [x / h for x in spline.hermite_basis_derivative(r)]
+    else:
+        w = list(spline.hermite_basis(r))
+    return (
+        w[0] * values[:, 0]
+        + (w[1] * h) * tangents[:, 0]
+        + w[2] * values[:, 1]
+        + (w[3] * h) * tangents[:, 1]
+    )
