@@ -64,6 +64,7 @@ class DeformationModel(nn.Module, ABC):
     rates: ClassVar[Mapping[str, str]] = {}
     regularizer_weights: ClassVar[Mapping[str, float]] = {}
     rest_space: Literal["canonical", "world"] = "canonical"
+    progress: float = 1.0
 
     @classmethod
     def from_config(cls, config: Any, context: BuildContext) -> Self:
@@ -85,6 +86,10 @@ class DeformationModel(nn.Module, ABC):
             moment: time, and the body pose of this entity if it has one.
             residual: correction from the interaction module; None is no correction.
         """
+
+    def set_progress(self, progress: float) -> None:
+        """Called before each training step, and with 1 after the last."""
+        self.progress = progress
 
     def peak_opacity_logits(self, rest: Gaussians) -> Float[Tensor, " N"]:
         """The largest opacity logit of each Gaussian over time, by which density control judges it.

@@ -106,6 +106,7 @@ class Trainer:
             if self.run is not None and (last or self.step % self.spec.checkpoint_every == 0):
                 self.checkpoint().save(self.run.checkpoints)
         self.model.eval()
+        self.model.set_progress(1.0)
 
     def _step(self) -> dict[str, float] | None:
         """One optimizer step: its loss terms and their "total"; None when the guard skipped it.
@@ -117,6 +118,7 @@ class Trainer:
         self.step += 1
         self.model.interaction_enabled = progress >= self.spec.warmup.interaction
         self.optimizer.set_progress(progress)
+        self.model.set_progress(progress)
         frame = self.clip[self.sampler.next()]
         camera = frame.camera.to(self.model.device)
         result = self.objective(frame, camera, self.generator)
@@ -128,7 +130,8 @@ class Trainer:
             self.optimizer.zero_grad()
             return None
         self.guard.passed()
-        self.optimizer.step()
+        interval = self.spec.sh_interval
+        self.optimizer.step(None if interval is None else self.step // interval)
         self._evolve(result, frame.moment, camera)
         self._refine(result, camera.width, camera.height)
         terms = {name: float(term.detach()) for name, term in result.terms.items()}
