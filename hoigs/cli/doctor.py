@@ -18,9 +18,9 @@ def doctor() -> None:
     registry = default_registry()
     failed = False
     for key in registry.keys("rasterizer"):
-        verdict = _try_rasterizer(registry.get(key))
+        verdict, note = _try_rasterizer(registry.get(key))
         failed |= not verdict.startswith("ok")
-        rows.append((key, verdict, ""))
+        rows.append((key, verdict, note))
     found = find_weights()
     rows.append(("LPIPS weights", found.location or "none", found.reason))
     print_table("hoigs doctor", ("what", "found", "note"), rows)
@@ -40,8 +40,8 @@ def _devices() -> list[tuple[str, str, str]]:
     return rows
 
 
-def _try_rasterizer(backend: type) -> str:
-    """Draw one Gaussian and look at the pixel in its middle."""
+def _try_rasterizer(backend: type) -> tuple[str, str]:
+    """Draw one Gaussian and look at the pixel in its middle; and what the backend runs on."""
     import torch
 
     from hoigs.core.camera import Camera
@@ -50,8 +50,11 @@ def _try_rasterizer(backend: type) -> str:
     points = torch.tensor([[0.0, 0.0, 2.0]])
     red = Gaussians.from_points(points, torch.tensor([[1.0, 0.0, 0.0]]), scales=0.2, opacity=0.9)
     K = torch.tensor([[32.0, 0, 8.5], [0, 32.0, 8.5], [0, 0, 1]])
-    output = backend().render(red, Camera(K, torch.eye(4), 17, 17))
+    rasterizer = backend()
+    output = rasterizer.render(red, Camera(K, torch.eye(4), 17, 17))
+    report: dict[str, str] = getattr(rasterizer, "backend_report", dict)()
+    note = ", ".join(f"{name.replace('_', ' ')}: {value}" for name, value in report.items())
     middle = output.color[8, 8]
     if abs(float(middle[0]) - 0.9) < 1e-3 and float(middle[1:].abs().max()) < 1e-3:
-        return "ok: drew a test splat"
-    return f"wrong: test splat is {middle.tolist()}, expected [0.9, 0, 0]"
+        return "ok: drew a test splat", note
+    return f"wrong: test splat is {middle.tolist()}, expected [0.9, 0, 0]", note

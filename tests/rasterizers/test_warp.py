@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import gc
 import pickle
+import platform
 import subprocess
 import sys
 import threading
@@ -191,6 +192,7 @@ def test_report_names_what_runs() -> None:
     report = WarpRasterizer(scheduler="threads").backend_report()
     assert report["scheduler"] == "threads"
     assert report["cpu_kernels"] == "native"
+    assert "vectors of" in report["cpu_kernels_reason"]
     assert report["warp"]
 
 
@@ -206,6 +208,59 @@ def test_without_openmp_threads_take_over_and_it_is_said(monkeypatch: pytest.Mon
     assert "no libgomp in sight" in report["scheduler_reason"]
     with pytest.raises(RenderError, match=r"no libgomp in sight.*threads"):
         WarpRasterizer(scheduler="openmp").backend_report()
+
+
+def test_where_native_kernels_do_not_compile_portable_ones_say_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from hoigs.rasterizers.warp import capability
+
+    def fail() -> int:
+        raise Exception("CPU kernel build failed with error code -1")
+
+    monkeypatch.setattr(capability, "vector_lanes", fail)
+    rasterizer = WarpRasterizer()
+    with pytest.warns(UserWarning, match="build failed.*portable"):
+        report = rasterizer.backend_report()
+    assert report["cpu_kernels"] == "portable"
+    assert "build failed" in report["cpu_kernels_reason"]
+    with pytest.raises(RenderError, match=r"build failed.*cpu_kernels=\"portable\""):
+        WarpRasterizer(cpu_kernels="native").backend_report()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("processor", "lanes"), [("haswell", 8), ("x86-64", 8)])
+def test_native_kernels_run_without_avx512(processor: str, lanes: int, tmp_path: Path) -> None:
+    """The same picture and gradients from kernels compiled for older processors."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        pytest.skip("processors of another family")
+    code = f"""
+import sys, torch, warp
+warp.config.cpu_compiler_flags = "-target-cpu {processor}"
+warp.config.kernel_cache_dir = {str(tmp_path)!r}
+sys.path.insert(0, "tests/rasterizers")
+from raster_scenes import a_camera, random_scene
+from hoigs.rasterizers.warp import WarpRasterizer
+rasterizer = WarpRasterizer()
+scene = random_scene(700).map(lambda x: x.requires_grad_())
+output = rasterizer.render(scene, a_camera(150, 90))
+(output.color.square().sum() + output.depth.sum()).backward()
+print(rasterizer.backend_report()["cpu_kernels_reason"])
+torch.save((output.color.detach(), scene.means.grad), {str(tmp_path / "found.pt")!r})
+"""
+    root = Path(__file__).parents[2]
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=root, check=False)
+    assert done.returncode == 0, done.stderr
+    assert f"vectors of {lanes} floats" in done.stdout
+    color, gradient = torch.load(tmp_path / "found.pt")
+    scene = random_scene(700).map(lambda x: x.requires_grad_())
+    output = WarpRasterizer().render(scene, a_camera(150, 90))
+    (output.color.square().sum() + output.depth.sum()).backward()
+    clear = clear_of_cutoffs(scene.detach(), a_camera(150, 90), RenderRequest())
+    torch.testing.assert_close(color[clear], output.color.detach()[clear], atol=1e-5, rtol=0)
+    assert scene.means.grad is not None
+    assert (gradient - scene.means.grad).norm() < 1e-3 * gradient.norm()  # cut-offs included
 
 
 def test_config_and_arguments_are_checked() -> None:

@@ -307,3 +307,13 @@ def queue_address(address: U64):
 @wp.kernel
 def sum_numbers(total: I32):
     total[0] = total[0] + wp.tid()
+
+
+@wp.func_native(cpu_source.LANES)
+def write_lanes(lanes: I32): ...
+
+
+@wp.kernel
+def count_lanes(lanes: I32):
+    """How many floats a vector of the tile loops has on this machine."""
+    write_lanes(lanes)

@@ -65,9 +65,11 @@ def _splats(prefetch: str, composite: str, **parts: str) -> str:
     return _filled(cpu_splats.SPLATS, **parts, GEOMETRY=geometry, ALPHA=alpha)
 
 
+_SIZES = {"MAX_ROWS": cpu_vectors.MAX_ROWS, "EXTRA": cpu_vectors.EXTRA}
+
+
 def _kernel(state: str, head: str, body: str) -> str:
-    sizes = {"MAX_ROWS": cpu_vectors.MAX_ROWS, "EXTRA": cpu_vectors.EXTRA}
-    vectors = _filled(cpu_vectors.VECTORS, **sizes)
+    vectors = _filled(cpu_vectors.VECTORS, **_SIZES)
     start = vectors + cpu_vectors.ARGUMENTS + cpu_splats.LIMITS
     return start + state + head + _filled(cpu_vectors.TILES, BODY=body)
 
@@ -95,6 +97,8 @@ BACKWARD = _kernel(
         AFTER=cpu_adjoint.AFTER,
     ),
 )
+
+LANES = _filled(cpu_vectors.VECTORS, **_SIZES) + "*(int*)lanes.data = LANES;"
 
 PREFETCH = r"""__builtin_prefetch((const float*)array.data + index);"""
 

@@ -19,7 +19,7 @@ from hoigs.rasterizers.warp.inputs import prepare
 class WarpConfig(ComponentConfig):
     """Settings of WarpRasterizer; see there."""
 
-    cpu_kernels: Literal["native", "portable"] = "native"
+    cpu_kernels: Literal["auto", "native", "portable"] = "auto"
     scheduler: Literal["threads", "openmp", "auto", "serial"] = "threads"
     threads: int | None = None
 
@@ -32,8 +32,9 @@ class WarpRasterizer(Rasterizer):
     agree bit for bit, whatever the scheduler and the number of threads.
 
     Args:
-        cpu_kernels: "native", the fast ones, or "portable", the very kernels that CUDA runs, as
-            scalar code (about ten times slower; for testing them without a GPU).
+        cpu_kernels: "native", the fast ones; "portable", the very kernels that CUDA runs, as scalar
+            code (about ten times slower; also for testing them without a GPU); "auto", native where
+            they compile, else portable with a warning.
         scheduler: how CPU work is spread over cores. "threads": Python threads. "openmp": torch's
             own pool, 5 to 15 % faster where nothing else runs (more for small images) and slower
             where the cores are shared, since its workers wait by spinning; it reaches into private
@@ -42,7 +43,8 @@ class WarpRasterizer(Rasterizer):
         threads: CPU cores to use; torch.get_num_threads() when None.
 
     Raises:
-        RenderError: Warp is not installed, or the scheduler asked for cannot be used here.
+        RenderError: Warp is not installed, or the kernels or the scheduler asked for cannot be used
+            here.
     """
 
     capabilities = Capabilities(
@@ -54,7 +56,7 @@ class WarpRasterizer(Rasterizer):
 
     def __init__(
         self,
-        cpu_kernels: Literal["native", "portable"] = "native",
+        cpu_kernels: Literal["auto", "native", "portable"] = "auto",
         scheduler: Literal["threads", "openmp", "auto", "serial"] = "threads",
         threads: int | None = None,
     ) -> None:
@@ -123,18 +125,21 @@ class WarpRasterizer(Rasterizer):
 
             self._report |= {"warp": warp.config.version, "cuda": "pixel kernels"}
             return CudaPath(device)
+        from hoigs.rasterizers.warp.capability import choose_kernels
         from hoigs.rasterizers.warp.launchers import Cores
         from hoigs.rasterizers.warp.workers import make_workers
 
+        kernels, why = choose_kernels(self.cpu_kernels)
         workers, reason = make_workers(self.scheduler)
         self._report |= {
             "warp": warp.config.version,
-            "cpu_kernels": self.cpu_kernels,
+            "cpu_kernels": kernels,
+            "cpu_kernels_reason": why,
             "scheduler": workers.name,
             "scheduler_reason": reason,
         }
         cores = Cores(workers, self.threads)
-        if self.cpu_kernels == "portable":
+        if kernels == "portable":
             from hoigs.rasterizers.warp.pixels import PixelPath
 
             return PixelPath(cores)
