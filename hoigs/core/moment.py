@@ -10,7 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.rotation import axis_angle_to_quats, multiply_quats, quats_to_axis_angle
+
 HandConvention = Literal["flat", "mean"]
+ResidualRule = Literal["add", "compose"]
 
 
 @dataclass(frozen=True)
@@ -49,14 +52,22 @@ class BodyPose:
             (self.global_orient[..., None, :], self.body, self.left_hand, self.right_hand), -2
         )
 
-    def with_residual(self, pose: Float[Tensor, "51 3"]) -> BodyPose:
-        """theta + delta theta on body and hands, as the paper adds it (HOIGS, Eq. of A.7)."""
-        return replace(
-            self,
-            body=self.body + pose[..., :21, :],
-            left_hand=self.left_hand + pose[..., 21:36, :],
-            right_hand=self.right_hand + pose[..., 36:51, :],
-        )
+    def with_residual(self, pose: Float[Tensor, "51 3"], rule: ResidualRule = "add") -> BodyPose:
+        """theta + delta theta on body and hands (HOIGS, Sec. "Interaction Module").
+
+        Args:
+            pose: delta theta, radians.
+            rule: "add" axis-angles, as the paper prints it, which is close to composing while
+                corrections are small; "compose" turns by delta theta after theta.
+        """
+        theta = torch.cat((self.body, self.left_hand, self.right_hand), -2)
+        if rule == "add":
+            theta = theta + pose
+        else:
+            after, before = axis_angle_to_quats(pose), axis_angle_to_quats(theta)
+            theta = quats_to_axis_angle(multiply_quats(after.expand_as(before), before))
+        body, left, right = theta.split((21, 15, 15), -2)
+        return replace(self, body=body, left_hand=left, right_hand=right)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> BodyPose:
         changed: dict[str, Any] = {

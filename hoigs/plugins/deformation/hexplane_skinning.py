@@ -4,25 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
-from hoigs.core.body import PART_NAMES, PELVIS, BodyModel, BodySurface
+from hoigs.core.body import PELVIS, BodyModel, BodySurface
 from hoigs.core.config import ComponentConfig
 from hoigs.core.context import BuildContext
 from hoigs.core.gaussians import SH_C0, GaussianDelta, Gaussians
 from hoigs.core.interaction import Residual
-from hoigs.core.moment import BodyPose, Moment
-from hoigs.core.planes import PairedPlanes
+from hoigs.core.moment import BodyPose, Moment, ResidualRule
 from hoigs.core.rotation import multiply_quats
 from hoigs.core.topology import TopologyChange
+from hoigs.plugins.deformation.body_planes import Fusion, body_planes, field_subset
 from hoigs.plugins.deformation.canonical_head import CanonicalAttributes, CanonicalHead, HeadKind
 from hoigs.plugins.deformation.skinned_body import ScaleAbout, SkinnedBody
 from hoigs.plugins.deformation.skinning import skin_points, skin_quats
+from hoigs.plugins.deformation.surface_laplacian import (
+    LaplacianOn,
+    mesh_edges,
+    mesh_roughness,
+    nearest,
+    point_roughness,
+)
+
+FieldAt = Literal["posed", "canonical"]
 
 OPAQUE = 4.6  # logit of 0.99
 APART = 0.05  # metres; rest made with another seed is decimetres off, a padded one centimetres
@@ -32,17 +41,31 @@ class HexPlaneSkinningConfig(ComponentConfig):
     """The paper's human; sizes that it leaves open are ExAvatar's (methods A.4).
 
     Attributes:
+        fusion: how six planes give 96. "paired" multiplies each space plane with the time plane
+            of the other axis and concatenates the three (HexPlane's own fusion); by default, as it
+            gives the time-invariant f, 3 x 32, and phi from the same planes. "product" multiplies
+            all six, at three resolutions (4DGS, K-Planes).
         resolution, channels: of the feature planes. time_resolution: None is half the frames.
         box: side of the cube about the pelvis that the planes cover, metres.
         width: of psi_h. head: what psi_h predicts, see CanonicalHead.
         free_attributes: train each point's own colour, opacity and scale too, which psi_h then
             adds to; they converge sooner. False is the paper: all comes from the planes.
         refine_poses: learn per-frame corrections of pose and translation, and one of shape.
-        scale_about: the fixed point of alpha: the "pelvis", or the "camera", seen from which
-            alpha changes depth but not the image.
+        scale_about: the fixed point of alpha, which the paper leaves open (the world's origin would
+            carry the person off). "pelvis", the default, changes their size, which images can tell;
+            the "camera" changes depth but not the image, so that only L_depth moves alpha.
         field_points: body points at which phi is read, spread over the 16 parts.
+        field_at: "posed" reads phi where the body is (the supplement's "dynamic coordinates",
+            taken relative to the pelvis, as planes over the world would waste their cells);
+            "canonical" on the body at rest, so that time alone changes a token.
+        residual_rule: how delta theta joins theta: "add" axis-angles, as the paper prints it, or
+            "compose" rotations, which differs for large angles.
+        laplacian: L_reg of psi_h over neighbouring "points", the Gaussians, which costs nothing
+            more; or over the vertices of the body's "mesh" (the paper): a second pass of psi_h, but
+            its neighbours never reach from one thigh to the other.
     """
 
+    fusion: Fusion = "paired"
     resolution: int = Field(128, ge=2)
     channels: int = Field(32, ge=1)
     time_resolution: int | None = Field(None, ge=1)
@@ -53,6 +76,9 @@ class HexPlaneSkinningConfig(ComponentConfig):
     refine_poses: bool = True
     scale_about: ScaleAbout = "pelvis"
     field_points: int = Field(1536, ge=16)
+    field_at: FieldAt = "posed"
+    residual_rule: ResidualRule = "add"
+    laplacian: LaplacianOn = "points"
 
 
 class HexPlaneSkinning(SkinnedBody):
@@ -94,6 +120,7 @@ class HexPlaneSkinning(SkinnedBody):
     faces: Tensor
     barycentric: Tensor
     neighbours: Tensor | None
+    edges: Tensor | None
 
     def __init__(
         self,
@@ -106,6 +133,7 @@ class HexPlaneSkinning(SkinnedBody):
         num_frames: int | None = None,
         trained_frames: Sequence[int] | None = None,
         camera_centers: Float[Tensor, "F 3"] | None = None,
+        fusion: Fusion = "paired",
         resolution: int = 128,
         channels: int = 32,
         time_resolution: int | None = None,
@@ -116,6 +144,9 @@ class HexPlaneSkinning(SkinnedBody):
         refine_poses: bool = False,
         scale_about: ScaleAbout = "pelvis",
         field_points: int = 1536,
+        field_at: FieldAt = "posed",
+        residual_rule: ResidualRule = "add",
+        laplacian: LaplacianOn = "points",
     ) -> None:
         super().__init__(
             body,
@@ -130,9 +161,12 @@ class HexPlaneSkinning(SkinnedBody):
         self._surface = surface
         self.seed, self.half_box = seed, box / 2
         self.opaque = head == "exavatar"
+        self.field_posed, self.residual_rule = field_at == "posed", residual_rule
+        edges = mesh_edges(body.faces) if laplacian == "mesh" else None
+        self.register_buffer("edges", edges, persistent=False)
         if time_resolution is None:
             time_resolution = max(8, (num_frames or 64) // 2)
-        self.planes = PairedPlanes(channels, resolution, time_resolution)
+        self.planes = body_planes(fusion, channels, resolution, time_resolution)
         self.head = CanonicalHead(self.planes.width, len(body.parents), width, head)
         owned = {"means", "quats"} | ({"opacity_logits"} if self.opaque else set())
         self.owns = frozenset(
@@ -193,7 +227,7 @@ class HexPlaneSkinning(SkinnedBody):
         attributes, weights = self._attributes(rest)
         pose = self.pose(moment)
         if residual is not None and residual.pose is not None:
-            pose = pose.with_residual(residual.pose)
+            pose = pose.with_residual(residual.pose, self.residual_rule)
         transforms = self.body.skinning_transforms(pose)
         canonical = self._canonical(rest, attributes, pose)
         means = skin_points(canonical.means, weights, transforms)
@@ -214,7 +248,7 @@ class HexPlaneSkinning(SkinnedBody):
         they are kept between frames in eval mode (fused optimizers change parameters without a
         trace, hence not in training mode)."""
         keep = not self.training and not torch.is_grad_enabled()
-        sources = (rest.means, self.planes.space, self.log_weights, *self.head.parameters())
+        sources = (rest.means, self.log_weights, *self.planes.parameters(), *self.head.parameters())
         state = [(x.data_ptr(), x._version) for x in sources] if keep else []
         if keep and self._cached is not None and self._cached[0] == state:
             return self._cached[1], self._cached[2]
@@ -272,7 +306,7 @@ class HexPlaneSkinning(SkinnedBody):
     def posed_field(
         self, rest: Gaussians, moment: Moment
     ) -> tuple[Float[Tensor, "V F"], Float[Tensor, "V 3"]]:
-        """phi at the posed body, relative to its pelvis and before alpha, and its world places.
+        """phi at the body, relative to its pelvis and before alpha, and its world places.
 
         The body points are vertices of the template, so every part is described however few
         Gaussians it has. Features have gradients in the planes alone, not in the pose: what moves
@@ -287,7 +321,8 @@ class HexPlaneSkinning(SkinnedBody):
             posed = skin_points(points, weights, transforms)
             pelvis = self.posed_joints(pose, transforms, [PELVIS])[0]
             places = self.scaled(posed, pelvis, moment)
-        return self.planes((posed - pelvis) / self.half_box, moment.time), places
+        read = posed - pelvis if self.field_posed else points - self.rest_joints[PELVIS]
+        return self.planes(read / self.half_box, moment.time), places
 
     def field_parts(self) -> Int[Tensor, " V"]:
         """Body part (0..15) of each point of `posed_field`."""
@@ -310,8 +345,10 @@ class HexPlaneSkinning(SkinnedBody):
         """Means over points (or cells) of squared quantities, but for the sparsity.
 
         "offset": canonical offsets, m^2. "laplacian": offset against its neighbours' mean, m^2
-        (the paper's L_reg). "skinning": distance to the template's weights (HUGS). "scale": of
-        log-scales from the template's. "time_smoothness", "time_sparsity": see PairedPlanes.
+        (the paper's L_reg); "laplacian_scale", "laplacian_color": log-scale and RGB likewise
+        (ExAvatar's, off by default). "skinning": distance to the template's weights (HUGS).
+        "scale": of log-scales from the template's. "time_smoothness", "time_sparsity": see
+        PairedPlanes.
 
         Those of points are of the last forward pass, whose graph they share: add them to the
         same loss.
@@ -328,35 +365,24 @@ class HexPlaneSkinning(SkinnedBody):
             if attributes.weights is not None:
                 drift = weights - self.log_weights.softmax(-1)
                 penalties["skinning"] = drift.square().sum(-1).mean()
-            if self.neighbours is not None:
-                roughness = offsets - offsets[self.neighbours].mean(1)
-                penalties["laplacian"] = roughness.square().sum(-1).mean()
+            penalties |= self._roughness(attributes)
         return penalties
 
-
-def nearest(points: Float[Tensor, "N 3"], count: int = 4) -> Int[Tensor, "N k"] | None:
-    """Indices of each point's nearest neighbours, or None when there are too few points."""
-    from scipy.spatial import cKDTree  # on use: scipy takes a while to import
-
-    if len(points) <= count:
-        return None
-    array = points.cpu().double().numpy()
-    _, indices = cKDTree(array).query(array, k=count + 1)
-    return torch.as_tensor(indices[:, 1:], dtype=torch.int64, device=points.device)
-
-
-def field_subset(vertex_parts: Int[Tensor, " V"], count: int) -> Int[Tensor, " S"]:
-    """About `count` vertices, equally many of each of the 16 parts, evenly over its indices.
-
-    Raises:
-        ValueError: a part without vertices; the human would lack a token.
-    """
-    chosen = []
-    for part, name in enumerate(PART_NAMES):
-        rows = (vertex_parts == part).nonzero().squeeze(1)
-        if len(rows) == 0:
-            raise ValueError(f"the body has no vertex of part {part} ({name})")
-        wanted = min(len(rows), -(-count // len(PART_NAMES)))
-        picks = torch.linspace(0, len(rows) - 1, wanted, device=rows.device).round().long()
-        chosen.append(rows[picks])
-    return torch.cat(chosen)
+    def _roughness(self, attributes: CanonicalAttributes) -> dict[str, Tensor]:
+        """The Laplacian penalties, over points or over the mesh."""
+        if self.edges is not None:
+            points = (self.rest_vertices - self.rest_joints[PELVIS]) / self.half_box
+            attributes = self.head(self.planes(points))
+        elif self.neighbours is None:
+            return {}
+        penalties = {}
+        for name, values in {
+            "laplacian": attributes.offsets,
+            "laplacian_scale": attributes.log_scales,
+            "laplacian_color": attributes.colors,
+        }.items():
+            if self.edges is not None:
+                penalties[name] = mesh_roughness(values, self.edges)
+            elif self.neighbours is not None:
+                penalties[name] = point_roughness(values, self.neighbours)
+        return penalties

@@ -1,0 +1,49 @@
+"""How rough something is over a body's surface: the paper's L_reg (ExAvatar, Moon et al. 2024)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+LaplacianOn = Literal["points", "mesh"]
+
+
+def nearest(points: Float[Tensor, "N 3"], count: int = 4) -> Int[Tensor, "N k"] | None:
+    """Indices of each point's nearest neighbours, or None when there are too few points."""
+    from scipy.spatial import cKDTree  # on use: scipy takes a while to import
+
+    if len(points) <= count:
+        return None
+    array = points.cpu().double().numpy()
+    _, indices = cKDTree(array).query(array, k=count + 1)
+    return torch.as_tensor(indices[:, 1:], dtype=torch.int64, device=points.device)
+
+
+def point_roughness(
+    values: Float[Tensor, "N D"], neighbours: Int[Tensor, "N k"]
+) -> Float[Tensor, ""]:
+    """Mean over points of |x_i - mean of its neighbours' x|^2."""
+    return (values - values[neighbours].mean(1)).square().sum(-1).mean()
+
+
+def mesh_edges(faces: Int[Tensor, "F 3"]) -> Int[Tensor, "E 2"]:
+    """Every edge of a mesh once in each direction."""
+    pairs = torch.cat((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+    return torch.unique(torch.cat((pairs, pairs.flip(1))), dim=0)
+
+
+def mesh_roughness(values: Float[Tensor, "V D"], edges: Int[Tensor, "E 2"]) -> Float[Tensor, ""]:
+    """Mean over vertices of |x_v - mean over its edges' other ends|^2: the uniform Laplacian.
+
+    Vertices without an edge count as smooth.
+
+    Args:
+        edges: `mesh_edges` of the mesh.
+    """
+    degree = torch.bincount(edges[:, 0], minlength=len(values))
+    sums = torch.zeros_like(values).index_add(0, edges[:, 0], values[edges[:, 1]])
+    means = torch.where(degree[:, None] > 0, sums / degree.clamp_min(1)[:, None].to(values), values)
+    return (values - means).square().sum(-1).mean()
