@@ -81,12 +81,14 @@ class JointObjective:
             RenderRequest(screen_offsets=offsets, absolute_gradients=absolutes),
         )
         image = frame.image.to(device).float() / 255.0
+        blank = None if frame.ignored is None else frame.ignored.to(device)
         terms: dict[str, Tensor] = {}
-        terms.update(self._scene(frame, camera, image, state, composite))
+        terms.update(self._scene(frame, camera, image, blank, state, composite))
         if frame.depth is not None and self.weights["depth"] > 0:
-            depth = depth_loss(
-                composite.depth, composite.alpha, frame.depth.to(device), self.depth_kind
-            )
+            prior = frame.depth.to(device)
+            if blank is not None:
+                prior = prior.masked_fill(blank, 0.0)  # 0 = unknown
+            depth = depth_loss(composite.depth, composite.alpha, prior, self.depth_kind)
             if depth is not None:
                 terms["depth"] = depth
         for kind in ("human", "object"):
@@ -103,13 +105,17 @@ class JointObjective:
         frame: Frame,
         camera: Camera,
         image: Tensor,
+        blank: Tensor | None,
         state: SceneState,
         composite: RenderOutput,
     ) -> dict[str, Tensor]:
         terms = {}
         dssim = (self.spec.lambda_dssim, self.spec.ssim)
         if self.spec.scene_loss in ("full", "both"):
-            terms["scene"] = image_loss(composite.color, image, *dssim)
+            drawn = composite.color
+            if blank is not None:
+                drawn = torch.where(blank[..., None], image, drawn)
+            terms["scene"] = image_loss(drawn, image, *dssim)
         scenes = self.model.names("scene")
         if self.spec.scene_loss in ("masked", "both") and scenes:
             alone = self.model.rasterizer.render(state.joined(scenes), camera)
@@ -117,7 +123,8 @@ class JointObjective:
             dynamic = union(modelled)
             if dynamic is not None:
                 dynamic = dilate(dynamic, self.spec.dilate).to(image.device)
-            terms["scene/masked"] = scene_only_loss(alone.color, image, dynamic, *dssim)
+            hidden = union(m for m in (dynamic, blank) if m is not None)
+            terms["scene/masked"] = scene_only_loss(alone.color, image, hidden, *dssim)
         return terms
 
     def _entity(

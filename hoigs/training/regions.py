@@ -20,7 +20,7 @@ class Crop:
     Attributes:
         camera: of the crop alone. image: RGB in [0, 1].
         mask: the entity's visible pixels. ignore: pixels where something else that moves hides
-            it, so that nothing is known of the entity there.
+            it, or that show no scene, so that nothing is known of the entity there.
     """
 
     camera: Camera
@@ -64,6 +64,8 @@ def crop_around(
     others = union(m[box] for name, m in frame.masks.items() if name != entity)
     inside = mask[box]
     ignore = torch.zeros_like(inside) if others is None else others & ~inside
+    if frame.ignored is not None:
+        ignore = ignore | frame.ignored[box]
     return Crop(
         camera=camera.cropped(left, top, right - left, bottom - top),
         image=frame.image[box].to(device).float() / 255.0,

@@ -1,0 +1,79 @@
+"""Pixels that show no scene teach nothing and are not scored."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from small_clip import small_clip
+
+from hoigs.core.clip import Clip, Frame
+from hoigs.core.entity import Entity
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.scene import SceneModel
+from hoigs.core.train_spec import LossSpec
+from hoigs.evaluation.evaluate import evaluate
+from hoigs.plugins.deformation.static import Static
+from hoigs.rasterizers.torch_tiles import TorchRasterizer
+from hoigs.training.objective import JointObjective
+
+
+def model(clip: Clip) -> SceneModel:
+    points = Gaussians.from_points(clip.points, clip.point_colors, scales=0.12, opacity=0.6)
+    return SceneModel({"scene": Entity(points, Static())}, rasterizer=TorchRasterizer())
+
+
+def gradient(scene: SceneModel, frame: Frame, loss: str) -> torch.Tensor:
+    scene.zero_grad()
+    objective = JointObjective(scene, LossSpec(scene_loss=loss, ssim="torch"), "none")  # type: ignore[arg-type]
+    objective(frame, frame.camera, torch.Generator()).total.backward()
+    return torch.cat([p.grad.flatten() for p in scene.parameters() if p.grad is not None])
+
+
+def test_what_is_painted_there_changes_no_gradient() -> None:
+    clip = small_clip()
+    scene, frame = model(clip), clip[2]
+    ignored = torch.zeros(frame.image.shape[:2], dtype=torch.bool)
+    ignored[:24, 10:50] = True
+    painted = frame.image.clone()
+    painted[ignored] = 0
+    for loss in ("full", "masked", "both"):
+        clean = gradient(scene, replace(frame, ignored=ignored), loss)
+        # SSIM windows beside the patch see its pixels in both images: fill them alike
+        dirty = gradient(scene, replace(frame, image=painted, ignored=ignored), loss)
+        blind = gradient(scene, replace(frame, image=painted), loss)
+        near = torch.nn.functional.cosine_similarity
+        assert near(clean, dirty, dim=0) > 0.97
+        assert near(clean, dirty, dim=0) > near(clean, blind, dim=0) + 0.05
+
+
+def test_scores_leave_them_out_and_say_so() -> None:
+    clip = small_clip()
+    scene = model(clip)
+    clip = replace(clip, split={"train": [0, 1], "test": [2, 3]})
+    ignored = torch.zeros(64, 64, dtype=torch.bool)
+    ignored[:24, 10:50] = True
+    base = clip.store
+
+    class Painted(type(base)):  # type: ignore[misc]
+        def image(self, position: int) -> torch.Tensor:
+            return base.image(position).masked_fill(ignored[..., None], 0)
+
+        def ignored(self, position: int) -> torch.Tensor:
+            del position
+            return ignored
+
+    class Known(type(base)):  # type: ignore[misc]
+        def ignored(self, position: int) -> torch.Tensor:
+            del position
+            return ignored
+
+    def score(store: object) -> tuple[float, float]:
+        judged = evaluate(scene, replace(clip, store=store), timing_frames=0)  # type: ignore[arg-type]
+        view = judged.views[0]
+        return view.mean("full", "psnr"), view.protocol.ignored  # type: ignore[return-value]
+
+    painted, known = score(Painted(base.images)), score(Known(base.images))
+    assert painted == known
+    assert abs(painted[1] - 24 * 40 / 64**2) < 1e-6
+    assert score(base)[1] == 0
