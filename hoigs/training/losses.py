@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -9,6 +11,8 @@ from torch import Tensor
 from hoigs.core.train_spec import LossSpec
 from hoigs.evaluation.metrics import Backend, ssim
 from hoigs.training.regions import Crop
+
+DepthFit = Literal["auto", "scale", "affine"]
 
 # Supplement, "Objective Function Details"; the main text sums without weights
 PRESETS = {
@@ -78,16 +82,32 @@ def scene_only_loss(
 
 
 def align_depth(
-    depth: Float[Tensor, " P"], prior: Float[Tensor, " P"], kind: str
+    depth: Float[Tensor, " P"], prior: Float[Tensor, " P"], kind: str, fit: DepthFit = "auto"
 ) -> Float[Tensor, " P"]:
     """A prior brought to the units of the render, robustly.
 
-    "metric" is taken as it stands; "affine-disparity" is fitted by scale and shift in disparity
-    (medians first, then reweighted least squares), which scaling by COLMAP points could not do.
+    "auto" takes a metric prior as it stands and fits scale and shift in disparity to a relative
+    one (medians first, then reweighted least squares), which scaling by COLMAP points could not
+    do. "affine" does so to a metric prior too; "scale" multiplies either by one factor, the median
+    of the ratios. What is fitted is told the render's own depth, so that only its shape teaches.
+
+    Args:
+        kind: "metric", metres along z, or "affine-disparity", larger is nearer.
     """
     if kind == "metric":
-        return prior
+        if fit == "auto":
+            return prior
+        prior = 1.0 / prior.clamp_min(1e-3)
     inverse = 1.0 / depth.detach().clamp_min(1e-3)
+    if fit == "scale":
+        return 1.0 / (prior * (inverse / prior.clamp_min(1e-9)).median()).clamp_min(1e-3)
+    return _affine_disparity(inverse, prior)
+
+
+def _affine_disparity(
+    inverse: Float[Tensor, " P"], prior: Float[Tensor, " P"]
+) -> Float[Tensor, " P"]:
+    """Depth from a disparity whose scale and shift are fitted to the render's, robustly."""
     center, middle = prior.median(), inverse.median()
     spread = (prior - center).abs().median().clamp_min(1e-9)
     slope = (inverse - middle).abs().median() / spread  # median fit: outliers have no leverage
@@ -106,6 +126,7 @@ def depth_loss(
     alpha: Float[Tensor, "H W"],
     prior: Float[Tensor, "H W"],
     kind: str,
+    fit: DepthFit = "auto",
 ) -> Float[Tensor, ""] | None:
     """|D_render - D|_1 of the composite, alpha-normalised, over the scene's median depth.
 
@@ -118,5 +139,5 @@ def depth_loss(
     if int(valid.sum()) < 16:
         return None
     expected = depth[valid] / alpha[valid].clamp_min(1e-6)
-    target = align_depth(expected, prior[valid], kind)
+    target = align_depth(expected, prior[valid], kind, fit)
     return (expected - target).abs().mean() / target.median()

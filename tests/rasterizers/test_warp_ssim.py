@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -267,6 +268,42 @@ assert "warp" not in sys.modules
     assert done.returncode == 0
 
 
+def test_where_the_cpu_kernel_does_not_compile_others_say_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from hoigs.rasterizers.warp.ssim import strips, tiles
+
+    def fail(*arguments: object) -> Tensor:
+        raise Exception("CPU kernel build failed with error code -1")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(strips, "_run", fail)
+        with pytest.warns(UserWarning, match=r"build failed.*slower.*train\.loss\.ssim: torch"):
+            path = function._cpu_path()
+    assert isinstance(path, tiles.TilePath)
+    assert isinstance(function._cpu_path(), strips.StripPath)
+
+
+@pytest.mark.slow
+def test_the_cpu_kernel_runs_without_avx512(tmp_path: Path) -> None:
+    """The same figures from the kernel compiled for a processor with AVX2."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        pytest.skip("processors of another family")
+    code = f"""
+import sys, torch, warp
+warp.config.cpu_compiler_flags = "-target-cpu haswell"
+warp.config.kernel_cache_dir = {str(tmp_path)!r}
+sys.path.insert(0, "tests/rasterizers")
+from test_warp_ssim import assert_agrees, noisy
+for shape in ((300, 260, 3), (7, 400, 3), (2, 33, 65, 1)):
+    assert_agrees(*noisy(*shape), torch.device("cpu"))
+"""
+    root = Path(__file__).parents[2]
+    command = [sys.executable, "-W", "error::UserWarning", "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=root, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.slow
 def test_kernels_compile_for_cuda(tmp_path: Path) -> None:
     """No GPU is needed to compile; to run them see the tests on "cuda"."""
@@ -280,7 +317,7 @@ def test_kernels_compile_for_cuda(tmp_path: Path) -> None:
 @pytest.mark.gpu
 @NO_CUDA
 def test_cuda_follows_the_current_stream_and_never_waits() -> None:
-    image, target = (x.cuda() for x in noisy(300, 400, 3))
+    image, target = (x.to("cuda") for x in noisy(300, 400, 3))
     x = image.clone().requires_grad_()
     wanted = torch.autograd.grad(kernels.mean_ssim(x, target), x)[0]
     torch.cuda.synchronize()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import warnings
 from typing import Any, Protocol
 
 import torch
@@ -38,7 +39,8 @@ def mean_ssim(
     """Mean SSIM (Wang et al. 2004; methods D.5) of float32 images in [0, 1].
 
     Window 11x11, Gaussian of sigma 1.5, zero padding. Twice run it gives the same bits, whatever
-    the number of cores. Differentiable once, and in `image` only.
+    the number of cores. Differentiable once, and in `image` only. Where the fast CPU kernel does
+    not compile, slower ones take its place with a warning.
 
     Raises:
         ValueError: unequal shapes, no pixels, no float32, a device without kernels, or a target
@@ -105,9 +107,26 @@ def _path(device: str) -> Path:
         from hoigs.rasterizers.warp.ssim.tiles import TilePath
 
         return TilePath()
+    return _cpu_path()
+
+
+def _cpu_path() -> Path:
+    """The fast kernel where it compiles; else those of CUDA as scalar code, and a warning."""
     from hoigs.rasterizers.warp.ssim.strips import StripPath
 
-    return StripPath()
+    path, trial = StripPath(), torch.ones(1, 1, 1, 1)
+    try:
+        path.map(trial, trial)
+    except Exception as error:  # Warp raises nothing narrower when a build fails
+        from hoigs.rasterizers.warp.ssim.tiles import TilePath
+
+        warnings.warn(
+            f"the CPU kernel of SSIM does not run here: {error}; scalar kernels, slower, take its "
+            f"place. Or {OTHERWISE}",
+            stacklevel=2,
+        )
+        return TilePath()
+    return path
 
 
 def _planes(images: Tensor, path: Path) -> Tensor:
