@@ -46,7 +46,7 @@ class DeformationModel(nn.Module, ABC):
 
     Attributes:
         provides: what features may ask of it: "velocity" (ProvidesVelocity), "field"
-            (ProvidesField), "skeleton" (ProvidesSkeleton).
+            (ProvidesField), "skeleton" (ProvidesSkeleton), "face" (ProvidesFace).
         owns: names of Gaussians fields that this model computes from parameters of its own; the
             entity does not train its rest values of those fields.
         per_gaussian: names of this module's parameters whose first axis is the Gaussian.
@@ -174,4 +174,13 @@ class ProvidesSkeleton(Protocol):
 
     def arm_length(self) -> Float[Tensor, ""]:
         """Shoulder to middle fingertip in world units (the learnable alpha included)."""
+        ...
+
+
+@runtime_checkable
+class ProvidesFace(Protocol):
+    """Deformations with "face" in `provides`: a body that has a face."""
+
+    def face_points(self) -> tuple[Tensor, Float[Tensor, "F 3"]]:
+        """Rows of the Gaussians on the face, int64 [F], and their outward unit normals at rest."""
         ...

@@ -33,10 +33,20 @@ class LossSpec(_Strict):
             1.0 depth (the supplement). On the built-in clip "main" scores higher in every region,
             because the scene's gradients then reach density control at full strength.
         human, object, scene, depth: override one weight of the preset.
-        lambda_dssim: (1 - l) L1 + l (1 - SSIM) in every image term.
+        lambda_dssim: (1 - l) L1 + l (1 - SSIM) in every image term. The supplement and 3DGS have
+            l = 0.2; the main text's plain sum L1 + D-SSIM is l = 0.5 at twice the term's weight.
         ssim: "warp" computes SSIM with kernels, in float32 on a CPU or on CUDA; "torch" with
             convolutions, many times slower on a CPU, for what the kernels do not take.
-        lpips: weight of LPIPS (AlexNet) on the human crop; above 0 it needs weights on disk.
+        human_image: what of the human is compared on the crop of its mask. "alone" draws it over a
+            colour in place of all else, which teaches the outline; "composite" is the whole scene's
+            render in that box (the paper's "cropped human region"); "both" is ExAvatar's sum.
+        lpips: weight of LPIPS in those terms; above 0 it needs weights on disk. The paper sums L1,
+            D-SSIM and LPIPS unweighted while following ExAvatar, which has 0.8, 0.2 and 0.2.
+        lpips_net: "vgg" (ExAvatar) or "alex"; None takes what is found.
+        face: weight of L_face, the textured face mesh against the video (hoigs/training/face.py).
+        depth_fit: how the depth prior meets the render in L_depth. "auto" takes metric depth as it
+            stands and fits scale and shift to relative disparity; "scale" fits one factor to either
+            ("scaled via COLMAP points", which cannot mend a shift), "affine" both.
         scene_loss: "full" compares the composite with the whole image (the supplement's formula),
             "masked" draws the scene alone and leaves out the dilated masks (its text), "both".
         background: colour behind masked terms. "random" is drawn anew at each step.
@@ -51,7 +61,11 @@ class LossSpec(_Strict):
     depth: float | None = Field(None, ge=0)
     lambda_dssim: float = Field(0.2, ge=0, le=1)
     ssim: Literal["warp", "torch"] = "warp"
+    human_image: Literal["alone", "composite", "both"] = "alone"
     lpips: float = Field(0.0, ge=0)
+    lpips_net: Literal["alex", "vgg"] | None = None
+    face: float = Field(0.0, ge=0)
+    depth_fit: Literal["auto", "scale", "affine"] = "auto"
     scene_loss: Literal["full", "masked", "both"] = "full"
     background: Literal["random", "black"] = "random"
     dilate: int = Field(3, ge=0, le=64)

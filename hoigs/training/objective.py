@@ -17,6 +17,7 @@ from hoigs.core.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.scene import SceneModel, SceneState
 from hoigs.core.train_spec import LossSpec
 from hoigs.evaluation.lpips import Lpips
+from hoigs.training.face import FaceTexture, face_loss, visible
 from hoigs.training.losses import (
     depth_loss,
     image_loss,
@@ -24,7 +25,7 @@ from hoigs.training.losses import (
     scene_only_loss,
     term_weights,
 )
-from hoigs.training.regions import crop_around, dilate, union
+from hoigs.training.regions import Crop, crop_around, dilate, inside, union
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,8 @@ class ObjectiveResult:
 class JointObjective:
     """L = w_h L_human + w_o L_object + w_s L_scene + w_d L_depth + regularisers.
 
-    L_human and L_object draw the entity alone over a random background, on the crop of its mask;
+    L_human and L_object draw the entity alone over a random background, on the crop of its mask
+    (L_human may compare the composite there instead or too, and adds L_face where asked: LossSpec);
     L_scene compares the composite (or the scene alone); L_depth compares the composite's depth.
     """
 
@@ -61,9 +63,11 @@ class JointObjective:
         depth_kind: str,
         lpips: Lpips | None = None,
         density: Mapping[str, DensityControl] | None = None,
+        faces: Mapping[str, FaceTexture] | None = None,
     ) -> None:
         self.model, self.spec, self.depth_kind, self.lpips = model, spec, depth_kind, lpips
         self.density = dict(density or {})  # whose regularisers count too
+        self.faces = dict(faces or {})
         self.weights = term_weights(spec)
 
     def __call__(self, frame: Frame, camera: Camera, generator: torch.Generator) -> ObjectiveResult:
@@ -88,12 +92,22 @@ class JointObjective:
             prior = frame.depth.to(device)
             if blank is not None:
                 prior = prior.masked_fill(blank, 0.0)  # 0 = unknown
-            depth = depth_loss(composite.depth, composite.alpha, prior, self.depth_kind)
+            depth = depth_loss(
+                composite.depth, composite.alpha, prior, self.depth_kind, self.spec.depth_fit
+            )
             if depth is not None:
                 terms["depth"] = depth
         for kind in ("human", "object"):
             for name in self.model.names(kind):
-                terms.update(self._entity(name, kind, frame, camera, state, generator))
+                crop = None
+                if name in frame.masks:
+                    crop = crop_around(frame, camera, name, device)
+                if crop is None:  # not seen in this frame: the terms are skipped, not zero
+                    continue
+                if kind == "object" or self.spec.human_image != "composite":
+                    terms.update(self._alone(name, kind, crop, state, generator))
+                if kind == "human":
+                    terms.update(self._human(name, frame, crop, camera, image, state, composite))
         weights = {name: self.weights[name.partition("/")[0]] for name in terms}
         for name in self.model.entities:
             self._regularize(name, state.gaussians[name], terms, weights)
@@ -127,18 +141,10 @@ class JointObjective:
             terms["scene/masked"] = scene_only_loss(alone.color, image, hidden, *dssim)
         return terms
 
-    def _entity(
-        self,
-        name: str,
-        kind: str,
-        frame: Frame,
-        camera: Camera,
-        state: SceneState,
-        generator: torch.Generator,
+    def _alone(
+        self, name: str, kind: str, crop: Crop, state: SceneState, generator: torch.Generator
     ) -> dict[str, Tensor]:
-        crop = crop_around(frame, camera, name, camera.K.device) if name in frame.masks else None
-        if crop is None:  # not seen in this frame: the term is skipped, not zero
-            return {}
+        """An entity over a colour in place of everything else."""
         background = torch.zeros(3)
         if self.spec.background == "random":
             background = torch.rand(3, generator=generator)
@@ -152,6 +158,36 @@ class JointObjective:
             target = torch.where(crop.mask[..., None], crop.image, background)
             render = torch.where(crop.ignore[..., None], target, output.color)
             terms[f"{kind}/{name}/lpips"] = self.spec.lpips * self.lpips(render, target)
+        return terms
+
+    def _human(
+        self,
+        name: str,
+        frame: Frame,
+        crop: Crop,
+        camera: Camera,
+        image: Tensor,
+        state: SceneState,
+        composite: RenderOutput,
+    ) -> dict[str, Tensor]:
+        """What L_human has beyond the human drawn alone."""
+        terms = {}
+        if self.spec.human_image != "alone":
+            render = inside(composite.color, crop, camera)
+            if frame.ignored is not None:
+                hidden = inside(frame.ignored[..., None].to(image.device), crop, camera)
+                render = torch.where(hidden, crop.image, render)
+            dssim = (self.spec.lambda_dssim, self.spec.ssim)
+            terms[f"human/{name}/composite"] = image_loss(render, crop.image, *dssim)
+            if self.lpips is not None and self.spec.lpips > 0:
+                perceived = self.spec.lpips * self.lpips(render, crop.image)
+                terms[f"human/{name}/composite/lpips"] = perceived
+        if name in self.faces and self.spec.face > 0:
+            mask = visible(frame, name).to(image.device)
+            entity, posed = self.model.entity(name), state.gaussians[name]
+            face = face_loss(self.faces[name], entity, posed, camera, image, mask)
+            if face is not None:
+                terms[f"human/{name}/face"] = self.spec.face * face
         return terms
 
     def _regularize(

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from hoigs.core.camera import Camera
@@ -72,3 +72,9 @@ def crop_around(
         mask=inside.to(device),
         ignore=ignore.to(device),
     )
+
+
+def inside(image: Shaped[Tensor, "H W C"], crop: Crop, camera: Camera) -> Shaped[Tensor, "h w C"]:
+    """The part of a whole image that a crop of this camera shows."""
+    left, top = (camera.K[:2, 2] - crop.camera.K[:2, 2]).round().long().tolist()
+    return image[top : top + crop.camera.height, left : left + crop.camera.width]

@@ -119,10 +119,14 @@ def _perceptual(spec: Spec, weights: Path | None, device: str) -> Lpips | None:
     """The LPIPS term if the spec asks for it; asking without weights is an error, not a skip."""
     if spec.train.loss.lpips == 0:
         return None
-    found = find_weights(weights)
+    net = spec.train.loss.lpips_net
+    found = find_weights(weights, net or "alex")
     if found.location is None:
         raise HoigsError(f"train.loss.lpips is {spec.train.loss.lpips}, but {found.reason}")
-    return Lpips.load(found).to(device)
+    loaded = Lpips.load(found)
+    if net not in (None, loaded.net):
+        raise HoigsError(f"train.loss.lpips_net is {net}, but {found.location} is {loaded.net}")
+    return loaded.to(device)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from hoigs.core.train_spec import TrainSpec
 from hoigs.evaluation.lpips import Lpips
 from hoigs.evaluation.metrics import psnr
 from hoigs.training.checkpoint import Checkpoint, restore_model
+from hoigs.training.face import unwrap_faces
 from hoigs.training.guard import NanGuard, first_not_finite, gradients_finite
 from hoigs.training.objective import JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
@@ -76,7 +77,9 @@ class Trainer:
         self.sampler = EpochSampler(clip.split["train"], self.generator)
         for control in (density or {}).values():
             check_rasterizer(control, model.rasterizer)
-        self.objective = JointObjective(model, spec.loss, clip.depth_kind, lpips, density)
+        # unwrapped from the model as composed, so that a resumed run has the same texture
+        faces = unwrap_faces(model, clip) if spec.loss.face > 0 else None
+        self.objective = JointObjective(model, spec.loss, clip.depth_kind, lpips, density, faces)
         scene_extent = clip.extent()
         self.optimizer = GroupedAdam(model, spec.rates, spec.warmup, scene_extent)
         self.density = {

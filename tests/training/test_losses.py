@@ -7,6 +7,7 @@ import torch
 
 from hoigs.core.camera import Camera
 from hoigs.core.train_spec import LossSpec
+from hoigs.evaluation.metrics import ssim
 from hoigs.training.losses import (
     align_depth,
     depth_loss,
@@ -93,6 +94,64 @@ def test_affine_disparity_is_recovered_through_outliers():
     prior[:20] += 3.0
     aligned = align_depth(depth, prior, "affine-disparity")
     assert float((aligned[20:] - depth[20:]).abs().median()) < 0.02
+
+
+def scene_depth() -> tuple[torch.Tensor, torch.Tensor]:
+    """Depths of a render, and a disparity with another scale and a shift, both metres-like."""
+    g = torch.Generator().manual_seed(3)
+    depth = 1.0 + 3.0 * torch.rand(500, generator=g)
+    return depth, (1.0 / depth - 0.1) / 0.7
+
+
+def test_how_a_depth_prior_meets_the_render():
+    """Each fit against its formula in float64: factors and lines in disparity."""
+    depth, relative = scene_depth()
+    metric = 1.3 * depth  # a scale is wrong, nothing else
+    torch.testing.assert_close(align_depth(depth, metric, "metric"), metric)  # auto: as it stands
+    torch.testing.assert_close(align_depth(depth, metric, "metric", "scale"), depth)
+    torch.testing.assert_close(
+        align_depth(depth, metric, "metric", "affine"), depth, rtol=1e-3, atol=0
+    )
+    factor = ((1 / depth.double()) / relative.double()).median()
+    scaled = align_depth(depth, relative, "affine-disparity", "scale").double()
+    torch.testing.assert_close(scaled, 1 / (factor * relative.double()), rtol=1e-4, atol=0)
+    # scaling cannot mend a shift of disparity; scale and shift can
+    assert ((scaled - depth) / depth).abs().max() > 0.15
+    for fit in ("auto", "affine"):
+        line = align_depth(depth, relative, "affine-disparity", fit)
+        torch.testing.assert_close(line, depth, rtol=1e-3, atol=0)
+    shifted = 1.0 / (0.7 / depth + 0.1)  # metres, but wrong by a shift in disparity
+    assert (align_depth(depth, shifted, "metric", "scale") - depth).abs().max() > 0.2
+    line = align_depth(depth, shifted, "metric", "affine")
+    torch.testing.assert_close(line, depth, rtol=1e-3, atol=0)
+
+
+def test_depth_loss_equals_its_formula():
+    """Mean |D_render / alpha - D| over known, opaque pixels, over the median of D."""
+    g = torch.Generator().manual_seed(0)
+    alpha = torch.rand(9, 11, generator=g)
+    depth = alpha * (2 + torch.rand(9, 11, generator=g))
+    prior = (1 + torch.rand(9, 11, generator=g)) * (torch.rand(9, 11, generator=g) > 0.2)
+    pairs = [
+        (float(d) / float(a), float(p))
+        for d, a, p in zip(depth.flatten(), alpha.flatten(), prior.flatten(), strict=True)
+        if a > 0.5 and p > 0
+    ]
+    middle = sorted(p for _, p in pairs)[(len(pairs) - 1) // 2]
+    expected = sum(abs(d - p) for d, p in pairs) / len(pairs) / middle
+    leaf = depth.clone().requires_grad_()
+    found = depth_loss(leaf, alpha, prior, "metric")
+    assert float(found.detach()) == pytest.approx(expected, rel=1e-5)
+    found.backward()
+    assert (leaf.grad[(alpha <= 0.5) | (prior == 0)] == 0).all() and leaf.grad.abs().max() > 0
+    assert depth_loss(depth, alpha, prior, "metric", "scale") < found
+
+
+def test_main_texts_plain_sum_is_half_and_half_doubled():
+    torch.manual_seed(0)
+    a, b = torch.rand(20, 24, 3), torch.rand(20, 24, 3)
+    plain = (a - b).abs().mean() + 1 - ssim(a, b)
+    torch.testing.assert_close(2 * image_loss(a, b, 0.5, "torch"), plain)
 
 
 def test_dilate_grows_by_a_square():

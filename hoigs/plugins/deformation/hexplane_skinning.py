@@ -21,6 +21,7 @@ from hoigs.core.rotation import multiply_quats
 from hoigs.core.topology import TopologyChange
 from hoigs.plugins.deformation.body_planes import Fusion, body_planes, field_subset
 from hoigs.plugins.deformation.canonical_head import CanonicalAttributes, CanonicalHead, HeadKind
+from hoigs.plugins.deformation.face_points import HEAD_JOINT, face_points
 from hoigs.plugins.deformation.skinned_body import ScaleAbout, SkinnedBody
 from hoigs.plugins.deformation.skinning import skin_points, skin_quats
 from hoigs.plugins.deformation.surface_laplacian import (
@@ -99,7 +100,7 @@ class HexPlaneSkinning(SkinnedBody):
         The others are HexPlaneSkinningConfig's.
     """
 
-    provides = frozenset({"field", "skeleton"})
+    provides = frozenset({"field", "skeleton", "face"})
     rates: ClassVar[Mapping[str, str]] = {
         "planes": "planes",
         "refinement": "pose",
@@ -334,6 +335,10 @@ class HexPlaneSkinning(SkinnedBody):
 
     def point_parts(self) -> Int[Tensor, " N"]:
         return self.parts
+
+    def face_points(self) -> tuple[Int[Tensor, " F"], Float[Tensor, "F 3"]]:
+        triangles, head = self.body.faces[self.faces], self.rest_joints[HEAD_JOINT]
+        return face_points(self.rest_vertices, head, triangles, self.parts, self.barycentric)
 
     def on_topology(self, change: TopologyChange) -> None:
         """Rows of the surface follow; a child keeps its parent's weights, part and face."""
