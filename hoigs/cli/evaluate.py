@@ -29,7 +29,7 @@ LpipsOption = Annotated[
 def evaluate(
     run: Annotated[Path, typer.Argument(help="Run folder, as `hoigs train` makes it.")],
     clip: Annotated[
-        Path | None, typer.Option("--clip", help="The clip, if it has moved since training.")
+        Path | None, typer.Option("--clip", help="The clip, if it has moved; builtin:NAME too.")
     ] = None,
     rasterizer: RasterizerOption = None,
     lpips_weights: LpipsOption = None,

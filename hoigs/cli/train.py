@@ -19,7 +19,9 @@ from hoigs.cli.common import (
 
 
 def train(
-    clip: Annotated[Path, typer.Argument(help="Clip folder, as `hoigs prepare` makes it.")],
+    clip: Annotated[
+        Path, typer.Argument(help="Clip folder, as `hoigs prepare` makes it, or builtin:NAME.")
+    ],
     spec: Annotated[
         str, typer.Option("--spec", help="A built-in spec's name or a file; @PROFILE may follow.")
     ] = "hoigs",

@@ -46,6 +46,9 @@ __all__ = [
 
 # sections that decide which tensors a model has; a checkpoint belongs to these
 MODEL_SECTIONS = ("interaction", "entities", "model")
+# settings of an entity that decide no tensor's existence: how training changes the count, and where
+# opacities start. `points` is not among them: penalties between neighbours want the first points.
+TRAINING_ONLY = ("density", "opacity")
 
 
 class _Strict(BaseModel):
@@ -75,6 +78,7 @@ class EntitySpec(_Strict):
         deformation: how it moves. features: how others see it; None leaves it out of interaction.
         density: when it gains and loses Gaussians.
         body: settings of a human's body model; by default those of the one that the clip names.
+        prior: where an object's first points and its track come from; None takes the clip's own.
         sh_degree: spherical-harmonics degree of its colours.
         points: Gaussians at the start; scene and objects have fewer where the clip has fewer
             points for them.
@@ -85,6 +89,7 @@ class EntitySpec(_Strict):
     features: ComponentSpec | None = None
     density: ComponentSpec = ComponentSpec(use="density:none")
     body: ComponentSpec | None = None
+    prior: ComponentSpec | None = None
     sh_degree: int = Field(0, ge=0, le=3)
     points: int = Field(10_000, ge=1)
     opacity: float = Field(0.1, gt=0, lt=1)
@@ -163,7 +168,7 @@ class Spec(_Strict):
         yield ("rasterizer",), self.rasterizer
         yield ("interaction",), self.interaction
         for name, block in self.model.items():
-            for field in ("deformation", "features", "density", "body"):
+            for field in ("deformation", "features", "density", "body", "prior"):
                 part = getattr(block, field)
                 if part is not None:
                     yield ("model", name, field), part
@@ -185,11 +190,15 @@ class Spec(_Strict):
         return self._digest([f for f in type(self).model_fields if f not in ("name", "summary")])
 
     def model_hash(self) -> str:
-        """SHA-256 of what decides which tensors the model has; checkpoints carry it."""
-        return self._digest(MODEL_SECTIONS)
+        """SHA-256 of what decides which tensors the model has; checkpoints carry it.
 
-    def _digest(self, sections: Sequence[str]) -> str:
-        data = self.model_dump(mode="json", include=set(sections))
+        Density control and first opacities are left out: a run may go on with another cap.
+        """
+        without = {"model": {name: set(TRAINING_ONLY) for name in self.model}}
+        return self._digest(MODEL_SECTIONS, without)
+
+    def _digest(self, sections: Sequence[str], without: dict[str, Any] | None = None) -> str:
+        data = self.model_dump(mode="json", include=set(sections), exclude=without)
         return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
     def __eq__(self, other: object) -> bool:

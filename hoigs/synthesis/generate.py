@@ -151,6 +151,7 @@ def generate(knobs: SceneKnobs, body: BodyModel) -> SyntheticScene:
     script = MOTIONS[knobs.object.motion](knobs).script()
     person = Choreographer(body, knobs)
     poses = person.perform(script, knobs)
+    script = script.in_world()
     room, atlas = _furnished(script.stands, knobs.seed)
     sides = crate_faces(np.random.default_rng(knobs.seed + 1), 256, knobs.object.textured)
     columns = 24 if knobs.object.motion == "bending" else 1

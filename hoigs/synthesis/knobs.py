@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from hoigs.core.config import ComponentConfig
 
 CameraPathName = Literal["orbit", "pan", "static"]
-ObjectMotionName = Literal["held", "thrown", "pushed", "bending", "static"]
+ObjectMotionName = Literal["held", "thrown", "pushed", "bending", "static", "carried"]
 
 
 class CameraKnobs(ComponentConfig):

@@ -14,11 +14,24 @@ from hoigs.synthesis.ik import about
 from hoigs.synthesis.knobs import SceneKnobs
 from hoigs.synthesis.meshes import TexturedMesh
 from hoigs.synthesis.room import Stand
+from hoigs.synthesis.walking import Walk, standing, walking
 
 Array = np.ndarray
 GRAVITY = 9.81
 STAND_RADIUS = 0.60  # from the person's axis to the middle of what the object stands on, metres
 RELEASED = 0.12  # how far a waiting hand is off the surface, metres
+# of a carrying walk: u, heading in degrees (0 faces the camera), share of the way
+WINDING = np.array(
+    [
+        [0.00, -8, 0.00],
+        [0.08, -4, 0.00],
+        [0.30, 90, 0.26],
+        [0.50, 172, 0.50],
+        [0.62, 168, 0.63],
+        [0.90, 55, 1.00],
+        [1.00, 50, 1.00],
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -39,6 +52,7 @@ class ObjectScript:
         grip: 1 where the hands touch, 0 where they are away, smooth between.
         bend: end-to-end angle, radians; 0 for a rigid object.
         stands: furniture that it needs.
+        walk: of the person. track and hold are in the person's frame until `in_world`.
     """
 
     track: Track
@@ -46,6 +60,16 @@ class ObjectScript:
     grip: Float[Array, " F"]
     bend: Float[Array, " F"]
     stands: tuple[Stand, ...]
+    walk: Walk
+
+    def in_world(self) -> ObjectScript:
+        """The same script with track and hold in the world; it is in the person's frame before."""
+        turn, walk = self.walk.rotations, self.walk
+        return replace(
+            self,
+            track=Track(turn @ self.track.rotations, walk.to_world(self.track.translations)),
+            hold=Track(turn @ self.hold.rotations, walk.to_world(self.hold.translations)),
+        )
 
 
 class ObjectMotion(ABC):
@@ -114,8 +138,12 @@ class ObjectMotion(ABC):
     def lift_grip(self) -> Array:
         return self.ramp((0, 0), (0.085, 1), (0.905, 1), (1, 0))
 
-    def rigid(self) -> Array:
-        return np.zeros(len(self.u))
+    def scripted(
+        self, track: Track, hold: Track, grip: Array, stands: tuple[Stand, ...] = ()
+    ) -> ObjectScript:
+        """The script of a rigid object and a person who stands."""
+        frames = len(self.u)
+        return ObjectScript(track, hold, grip, np.zeros(frames), stands, standing(frames))
 
 
 class Held(ObjectMotion):
@@ -125,7 +153,7 @@ class Held(ObjectMotion):
         track = self.path(self.swing_keys(1.0))
         s = self.object.swing_degrees
         stands = (self.stand(-s), self.stand(s))
-        return ObjectScript(track, track, self.lift_grip(), self.rigid(), stands)
+        return self.scripted(track, track, self.lift_grip(), stands)
 
 
 class Thrown(ObjectMotion):
@@ -155,7 +183,7 @@ class Thrown(ObjectMotion):
         turned = hold.rotations @ about(np.array([1, 0, 0]), -2 * np.pi * r)
         track = Track(turned, hold.translations + rise[:, None] * np.array([0, 1.0, 0]))
         free = self.ramp((0, 1), (up, 1), (0.5 * (up + down), 0.25), (down, 1), (1, 1))
-        return ObjectScript(track, hold, self.lift_grip() * free, self.rigid(), (self.stand(0),))
+        return self.scripted(track, hold, self.lift_grip() * free, (self.stand(0),))
 
 
 class Pushed(ObjectMotion):
@@ -173,9 +201,7 @@ class Pushed(ObjectMotion):
         )
         track = self.path(keys)
         track.translations[:, 2] = STAND_RADIUS
-        return ObjectScript(
-            track, track, self.lift_grip(), self.rigid(), (self.stand(0, width=1.15),)
-        )
+        return self.scripted(track, track, self.lift_grip(), (self.stand(0, width=1.15),))
 
 
 class Bending(ObjectMotion):
@@ -190,7 +216,34 @@ class Bending(ObjectMotion):
             (0, 0), (0.16, 0), (0.3, 1), (0.66, 1), (0.80, 0), (1, 0)
         )  # fmt: skip
         s = 0.6 * self.object.swing_degrees
-        return ObjectScript(held, held, self.lift_grip(), bend, (self.stand(-s), self.stand(s)))
+        script = self.scripted(held, held, self.lift_grip(), (self.stand(-s), self.stand(s)))
+        return replace(script, bend=bend)
+
+
+class Carried(ObjectMotion):
+    """Carried in both hands on a winding walk across the view.
+
+    The person comes with the box before the chest, turns away, so that the back hides the box, and
+    turns out again.
+    """
+
+    def script(self) -> ObjectScript:
+        t, height = self.object.tilt_degrees, 0.86 * self.object.lift_height
+        held = np.array(
+            [
+                # u, yaw, radius, height, pitch, roll
+                [0.00, 0, 0.47, height, 0, 0],
+                [0.12, 0, 0.47, height, 0, 0],
+                [0.30, -9, 0.50, height + 0.10, -0.4 * t, 0.5 * t],
+                [0.48, 8, 0.47, height + 0.02, 0.1 * t, -0.4 * t],
+                [0.66, -8, 0.49, height + 0.14, -0.5 * t, 0.3 * t],
+                [0.84, 9, 0.47, height + 0.03, 0, -0.5 * t],
+                [1.00, 0, 0.47, height, 0, 0],
+            ]
+        )
+        track = self.path(held)
+        script = self.scripted(track, track, np.ones(len(self.u)))
+        return replace(script, walk=walking(len(self.u), WINDING, 1.9, (-0.06, -0.1)))
 
 
 class Static(ObjectMotion):
@@ -205,11 +258,12 @@ class Static(ObjectMotion):
         place = np.array([stand.x, self.rest_height, stand.z])
         rotation = about(np.array([0, 1, 0]), np.full(1, stand.yaw))
         track = Track(np.repeat(rotation, count, 0), np.repeat(place[None], count, 0))
-        return ObjectScript(track, hold, np.zeros(count), self.rigid(), (stand,))
+        return self.scripted(track, hold, np.zeros(count), (stand,))
 
 
 MOTIONS: dict[str, type[ObjectMotion]] = {
     "held": Held, "thrown": Thrown, "pushed": Pushed, "bending": Bending, "static": Static,
+    "carried": Carried,
 }  # fmt: skip
 
 

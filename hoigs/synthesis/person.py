@@ -1,4 +1,4 @@
-"""Choreography of the person: planted feet, a torso that follows the object, hands by IK."""
+"""Choreography of the person: feet stand or walk, the torso follows the object, hands by IK."""
 
 from __future__ import annotations
 
@@ -24,15 +24,14 @@ from hoigs.synthesis.ik import (
 )
 from hoigs.synthesis.knobs import SceneKnobs
 from hoigs.synthesis.objects import RELEASED, ObjectScript, bend_points
+from hoigs.synthesis.walking import SIDES, Walk
 
 Array = np.ndarray
 X, Y, Z = np.eye(3)
 HIPS, KNEES, ANKLES = (1, 2), (4, 5), (7, 8)
 SPINE, NECK, HEAD, COLLARS = (3, 6, 9), 12, 15, (13, 14)
 SHOULDERS, ELBOWS, WRISTS, MIDDLES = (16, 17), (18, 19), (20, 21), (25, 40)
-STANCE, TOE_OUT = 0.155, np.radians(12)  # ankles off the middle, metres; turn of each foot
 COMFORT = 0.955  # share of the arm's length that is asked for at most
-SIDES = (1.0, -1.0)  # left is +x
 
 
 @dataclass(frozen=True)
@@ -134,10 +133,11 @@ class Choreographer:
             p - np.einsum("fij,j->fi", self._hand_rotation(k, f), self.palms[k].offset)
             for k, (p, f) in enumerate(zip(targets.points, targets.frames, strict=True))
         ]
-        object_yaw, lean = self._lean(script, wrists)
-        local, root = self._torso(object_yaw, lean)
+        drop = self._stride_drop(script.walk)
+        object_yaw, lean = self._lean(script, wrists, drop)
+        local, root = self._torso(object_yaw, lean, drop)
         self._look(local, root, script.track.translations)
-        self._legs(local, root)
+        self._legs(local, root, script.walk)
         missed = self._arms(local, root, wrists, targets)
         self._fingers(local, script.grip)
         if missed.max() > 0.01:
@@ -147,17 +147,29 @@ class Choreographer:
                 "the person cannot reach it; make object.size smaller, or bring "
                 "object.stand_height and object.lift_height nearer to the chest"
             )
-        return self._pose(local, root)
+        local[:, 0] = script.walk.rotations @ local[:, 0]
+        return self._pose(local, script.walk.to_world(root))
+
+    def _stride_drop(self, walk: Walk) -> Array:
+        """How much lower the pelvis is so that the feet of a stride are in reach, metres."""
+        leg = 0.5 * sum(
+            float(np.linalg.norm(self.rest[b] - self.rest[a]))
+            for a, b in (*zip(HIPS, KNEES, strict=True), *zip(KNEES, ANKLES, strict=True))
+        )
+        drop = leg - np.sqrt(leg**2 - np.minimum(walk.reach(), 0.7 * leg) ** 2)
+        return gaussian_filter1d(drop, max(0.5, 0.012 * len(drop)), mode="nearest")
 
     def _hand_rotation(self, hand: int, frames: Array) -> Array:
         return frames @ self.palms[hand].frame.T
 
-    def _lean(self, script: ObjectScript, wrists: list[Array]) -> tuple[Array, Array]:
+    def _lean(self, script: ObjectScript, wrists: list[Array], drop: Array) -> tuple[Array, Array]:
         """Yaw of the object, and the least forward lean from which both hands reach."""
         place = script.hold.translations
         yaw = np.arctan2(place[:, 0], place[:, 2])
         choices = np.radians(np.arange(2, 82, 2.0))
-        short = np.stack([self._shortfall(yaw, np.full(len(yaw), c), wrists) for c in choices])
+        short = np.stack(
+            [self._shortfall(yaw, np.full(len(yaw), c), wrists, drop) for c in choices]
+        )
         # where no lean suffices the best one goes on, and `perform` measures what is missing
         least = np.where((short <= 0).any(0), (short <= 0).argmax(0), short.argmin(0))
         lean = choices[least]
@@ -165,9 +177,9 @@ class Choreographer:
         lean = maximum_filter1d(lean, 2 * width + 1, mode="nearest")
         return yaw, gaussian_filter1d(lean, max(0.5, 0.045 * len(yaw)), mode="nearest")
 
-    def _shortfall(self, yaw: Array, lean: Array, wrists: list[Array]) -> Array:
+    def _shortfall(self, yaw: Array, lean: Array, wrists: list[Array], drop: Array) -> Array:
         """Metres that the farther hand is beyond comfort."""
-        local, root = self._torso(yaw, lean)
+        local, root = self._torso(yaw, lean, drop)
         _, places = forward_kinematics(local, self.rest, self.parents, root)
         gaps = [
             np.linalg.norm(wrists[k] - places[:, SHOULDERS[k]], axis=-1) - COMFORT * self.arm[k]
@@ -175,7 +187,7 @@ class Choreographer:
         ]
         return np.maximum(*gaps)
 
-    def _torso(self, yaw: Array, lean: Array) -> tuple[Array, Array]:
+    def _torso(self, yaw: Array, lean: Array, stride_drop: Array) -> tuple[Array, Array]:
         """Pelvis, spine and collars that turn and lean towards the object."""
         count = len(yaw)
         local = np.broadcast_to(np.eye(3), (count, len(self.rest), 3, 3)).copy()
@@ -185,7 +197,7 @@ class Choreographer:
             local[:, joint] = about(Y, turn) @ about(X, share * lean)
         for joint, side in zip(COLLARS, SIDES, strict=True):
             local[:, joint] = about(Y, np.full(count, -side * 0.16))
-        drop = 0.035 + 0.21 * (1 - np.cos(np.minimum(lean, 1.2)))
+        drop = 0.035 + 0.21 * (1 - np.cos(np.minimum(lean, 1.2))) + stride_drop
         back = -0.16 * np.sin(lean)
         height = self.rest[0, 1] - self.sole - drop
         ahead = np.stack((np.sin(hip_yaw), np.zeros(count), np.cos(hip_yaw)), -1)
@@ -204,18 +216,15 @@ class Choreographer:
         for joint, share in ((NECK, 0.35), (HEAD, 0.45)):
             local[:, joint] = about(Y, share * yaw) @ about(X, share * pitch)
 
-    def _legs(self, local: Array, root: Array) -> None:
-        """Feet stay where they stand; knees bend forward over the toes."""
+    def _legs(self, local: Array, root: Array, walk: Walk) -> None:
+        """Feet are where the walk has them; knees bend forward over the toes."""
         rotations, places = forward_kinematics(local, self.rest, self.parents, root)
-        count = len(root)
-        for hip, knee, ankle, side in zip(HIPS, KNEES, ANKLES, SIDES, strict=True):
-            foot = about(Y, np.full(count, side * TOE_OUT))
-            spot = np.array([side * STANCE, self.rest[ankle, 1] - self.sole, -0.04])
+        for k, (hip, knee, ankle) in enumerate(zip(HIPS, KNEES, ANKLES, strict=True)):
+            side, foot = SIDES[k], about(Y, walk.turns[k])
+            spot = walk.spots[k] + (self.rest[ankle, 1] - self.sole) * Y
             pole = foot[:, :, 2] + 0.12 * side * X
             bones = (self.rest[knee] - self.rest[hip], self.rest[ankle] - self.rest[knee])
-            thigh, shin, _ = two_bone(
-                places[:, hip], np.broadcast_to(spot, (count, 3)), pole, bones, X
-            )
+            thigh, shin, _ = two_bone(places[:, hip], spot, pole, bones, X)
             local[:, hip] = transposed(rotations[:, 0]) @ thigh
             local[:, knee] = transposed(thigh) @ shin
             local[:, ankle] = transposed(shin) @ foot

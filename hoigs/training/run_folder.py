@@ -74,6 +74,14 @@ class RunFolder:
             shutil.rmtree(self.path)
         temporary.replace(self.path)
 
+    def go_on(self, spec_text: str, spec_hash: str) -> None:
+        """A resumed run is from now on one of this spec: more steps, another density cap."""
+        record = self.read_provenance() | {"spec_hash": spec_hash}
+        for path, text in ((self.spec, spec_text), (self.provenance, json.dumps(record, indent=1))):
+            temporary = path.with_name(f".{path.name}.part")
+            temporary.write_text(text)
+            temporary.replace(path)
+
     def log(self, record: dict[str, Any]) -> None:
         with self.metrics.open("a") as file:
             file.write(json.dumps(record) + "\n")

@@ -17,6 +17,7 @@ from hoigs.core.scene import SceneModel
 from hoigs.core.spec import Spec
 from hoigs.evaluation.lpips import Lpips, find_weights
 from hoigs.training.checkpoint import latest_checkpoint, load_checkpoint, restore_model
+from hoigs.training.clip_source import clip_folder, clip_name
 from hoigs.training.run_folder import RunFolder, versions
 from hoigs.training.trainer import StepReport, Trainer
 
@@ -27,14 +28,16 @@ def read_clip(
     """The clip in `folder`, by the first reader that knows its layout, at a training width.
 
     Args:
-        folder: as `hoigs prepare` makes it, or any layout that an installed reader knows.
+        folder: as `hoigs prepare` makes it, any layout that an installed reader knows, or
+            "builtin:NAME".
         registry: where readers are looked up; by default what is installed.
         width: resize to this image width, aspect kept; None leaves the clip as it is.
 
     Raises:
         ClipError: no reader knows it, or the reader found it incomplete.
     """
-    folder, registry = Path(folder), registry or default_registry()
+    registry = registry or default_registry()
+    folder = clip_folder(folder, registry)
     if not folder.is_dir():
         raise ClipError(f"{folder}: no such folder; `hoigs prepare VIDEO --out {folder}` makes one")
     for key in registry.keys("reader"):
@@ -60,7 +63,7 @@ class Session:
     @classmethod
     def open(
         cls,
-        clip_folder: Path,
+        clip: Path | str,
         spec: str | Path | Spec,
         *,
         out: Path | None = None,
@@ -80,36 +83,38 @@ class Session:
         if not isinstance(spec, Spec):
             spec = Spec.load(spec, overrides=overrides, registry=registry)
         torch.manual_seed(spec.train.seed)
-        clip = read_clip(clip_folder, registry, spec.train.width)
-        run = RunFolder(out or Path("runs") / f"{clip_folder.resolve().name}-{spec.name}")
+        folder = clip_folder(clip, registry)
+        source = read_clip(folder, registry, spec.train.width)
+        run = RunFolder(out or Path("runs") / f"{clip_name(clip)}-{spec.name}")
         if resume:
             run.require()
         else:
             run.refuse_existing(overwrite)
-        model = compose(spec, clip, registry).to(device)
+        model = compose(spec, source, registry).to(device)
         trainer = Trainer(
             model,
-            clip,
+            source,
             spec.train,
-            density=compose_density(spec, clip, registry),
+            density=compose_density(spec, source, registry),
             run=run,
             identity={"spec_name": spec.name, "model_hash": spec.model_hash()},
             lpips=_perceptual(spec, lpips_weights, device),
         )
         if resume:
             trainer.resume(load_checkpoint(latest_checkpoint(run.checkpoints)))
+            run.go_on(spec.dump(), spec.hash())
         else:
             provenance = {
                 "versions": versions(),
                 "components": registry.provenance(spec)
-                | {f"body of {n}": registry.origin(t.model) for n, t in clip.bodies.items()},
+                | {f"body of {n}": registry.origin(t.model) for n, t in source.bodies.items()},
                 "spec_hash": spec.hash(),
-                "clip": {"name": clip.name, "path": run.relative(clip_folder)},
-                "clip_provenance": dict(clip.provenance),
+                "clip": {"name": source.name, "path": run.relative(folder)},
+                "clip_provenance": dict(source.provenance),
                 "device": device,
             }
             run.create(spec.dump(), provenance, overwrite)
-        return cls(spec, clip, run, trainer)
+        return cls(spec, source, run, trainer)
 
     def train(self, on_step: Callable[[StepReport], None] | None = None) -> None:
         self.trainer.train(on_step)
@@ -144,7 +149,7 @@ class LoadedRun:
         cls,
         path: Path,
         *,
-        clip: Path | None = None,
+        clip: Path | str | None = None,
         rasterizer: str | None = None,
         device: str = "cpu",
         plugins: Sequence[Path] = (),
@@ -159,7 +164,8 @@ class LoadedRun:
             changes.append(f"rasterizer.use={key}")
         spec = Spec.load(run.spec, overrides=changes, registry=registry)
         provenance = run.read_provenance()
-        folder = clip or path / provenance["clip"]["path"]
+        own = path / provenance["clip"]["path"]
+        folder = own if clip is None else clip_folder(clip, registry)
         if not folder.is_dir():
             raise HoigsError(f"{folder}: the clip of this run is not there; give --clip FOLDER")
         torch.manual_seed(spec.train.seed)

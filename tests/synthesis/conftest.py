@@ -12,7 +12,8 @@ install_import_hook(
     [
         f"hoigs.synthesis.{name}"
         for name in ("builtin", "clothes", "designs", "generate", "ik", "meshes", "noise",
-                     "objects", "paths", "person", "raycast", "room", "textures")
+                     "named", "objects", "paths", "person", "raycast", "room", "textures",
+                     "walking")
     ],
     "shapecheck.check",
 )  # fmt: skip

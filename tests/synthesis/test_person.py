@@ -29,7 +29,8 @@ def _contact_errors(
     errors = []
     for side, (wrist, palm) in enumerate(zip(WRISTS, palms(body, poses.betas), strict=True)):
         place = joints[:, wrist] + turn[:, wrist] @ palm.offset
-        errors.append(np.linalg.norm(place - targets.points[side], axis=-1))
+        target = script.walk.to_world(targets.points[side])
+        errors.append(np.linalg.norm(place - target, axis=-1))
     return np.stack(errors)
 
 

@@ -1,0 +1,97 @@
+"""Built-in clips by name: "builtin:carry", "builtin:carry?width=128&frames=40"."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from hoigs.core.body import BodyModel
+from hoigs.core.errors import ClipError, did_you_mean
+from hoigs.synthesis.builtin import Progress, builtin_clip
+from hoigs.synthesis.knobs import SceneKnobs
+
+PREFIX = "builtin:"
+
+# what each clip sets; the rest is SceneKnobs' default
+CLIPS: Mapping[str, Mapping[str, Any]] = {
+    "lift-and-swing": {},
+    "carry": {
+        "frames": 80,
+        "object": {"motion": "carried", "size": (0.36, 0.30, 0.26)},
+        "camera": {
+            "azimuth_degrees": 0.0,
+            "arc_degrees": 30.0,
+            "distance": 3.7,
+            "target": (0.0, 0.88, -0.1),
+        },
+    },
+    "throw-and-catch": {"object": {"motion": "thrown"}},
+}
+
+
+def is_named(clip: str | Path) -> bool:
+    """Whether a CLIP argument asks for a built-in clip."""
+    return str(clip).startswith(PREFIX)
+
+
+def clip_knobs(name: str) -> SceneKnobs:
+    """The knobs behind "builtin:NAME", or "builtin:NAME?knob=value&knob.of=value".
+
+    A width alone keeps the aspect.
+
+    Raises:
+        ClipError: no clip of that name, no such knob, or a value that it cannot take.
+    """
+    short, _, query = name.removeprefix(PREFIX).partition("?")
+    if short not in CLIPS:
+        known = [PREFIX + n for n in CLIPS]
+        near = did_you_mean(PREFIX + short, known)
+        raise ClipError(
+            f"{name}: no built-in clip of that name; there are {', '.join(known)}{near}"
+        )
+    settings: dict[str, Any] = {
+        k: dict(v) if isinstance(v, Mapping) else v for k, v in CLIPS[short].items()
+    }
+    for part in filter(None, query.split("&")):
+        key, equals, value = part.partition("=")
+        if not equals:
+            raise ClipError(f"{name}: {part!r} is no knob=value; write {PREFIX}{short}?width=128")
+        *groups, last = key.split(".")
+        place = settings
+        for group in groups:
+            place = place.setdefault(group, {})
+            if not isinstance(place, dict):
+                raise ClipError(f"{name}: {group} has no settings of its own")
+        place[last] = value
+    if "width" in settings and "height" not in settings:
+        settings["height"] = settings["width"]
+    try:
+        return SceneKnobs.model_validate(settings)
+    except ValidationError as error:
+        raise ClipError("\n".join(_told(name, error))) from error
+
+
+def _told(name: str, error: ValidationError) -> list[str]:
+    lines = []
+    for problem in error.errors():
+        place = [str(step) for step in problem["loc"]]
+        near = ""
+        if problem["type"] == "extra_forbidden":
+            model: Any = SceneKnobs
+            for step in place[:-1]:
+                model = model.model_fields[step].annotation
+            near = did_you_mean(place[-1], model.model_fields)
+        lines.append(f"{name}: {'.'.join(place)}: {problem['msg']}{near}")
+    return lines
+
+
+def named_clip(name: str, body: BodyModel, *, progress: Progress | None = None) -> Path:
+    """The folder of a built-in clip, generated unless it is cached (`builtin_clip`).
+
+    Raises:
+        ClipError: as `clip_knobs`.
+    """
+    return builtin_clip(body, clip_knobs(name), progress=progress)

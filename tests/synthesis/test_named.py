@@ -1,0 +1,55 @@
+"""builtin:NAME?knob=value."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hoigs.core.errors import ClipError
+from hoigs.plugins.bodies.anny import AnnyBody
+from hoigs.synthesis import SceneKnobs, builtin_clip
+from hoigs.synthesis.named import CLIPS, clip_knobs, is_named, named_clip
+
+
+def test_the_default_clip_is_lift_and_swing() -> None:
+    assert clip_knobs("builtin:lift-and-swing") == SceneKnobs()
+    assert len({clip_knobs(f"builtin:{name}").digest() for name in CLIPS}) == 3
+
+
+def test_knobs_follow_a_question_mark() -> None:
+    knobs = clip_knobs("builtin:carry?width=128&frames=24&camera.distance=3&seed=4")
+    assert (knobs.width, knobs.height, knobs.frames, knobs.seed) == (128, 128, 24, 4)
+    assert knobs.camera.distance == 3 and knobs.camera.arc_degrees == 30
+    assert knobs.object.motion == "carried"
+    assert clip_knobs("builtin:carry?width=128&height=64").height == 64
+    assert clip_knobs("builtin:carry").frames == 80, "names stay as they are"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("builtin:cary", ['did you mean "builtin:carry"?', "builtin:throw-and-catch"]),
+        ("builtin:", ["builtin:lift-and-swing"]),
+        ("builtin:carry?widht=3", ["widht", 'did you mean "width"?']),
+        ("builtin:carry?camera.distanc=3", ["camera.distanc", 'did you mean "distance"?']),
+        ("builtin:carry?width=3", ["width", "greater than or equal to 16"]),
+        ("builtin:carry?width", ["is no knob=value"]),
+        ("builtin:carry?frames.of=3", ["frames has no settings"]),
+    ],
+)
+def test_mistakes_are_told(name: str, words: list[str]) -> None:
+    with pytest.raises(ClipError) as told:
+        clip_knobs(name)
+    for word in (name, *words):
+        assert word in str(told.value)
+
+
+def test_it_is_generated_once(
+    body: AnnyBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOIGS_CACHE", str(tmp_path))
+    name = "builtin:throw-and-catch?frames=4&width=16&held_out_views=0"
+    folder = named_clip(name, body)
+    assert folder == named_clip(name, body) == builtin_clip(body, clip_knobs(name))
+    assert is_named(name) and is_named(Path(name)) and not is_named(folder)
