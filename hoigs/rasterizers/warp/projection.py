@@ -67,6 +67,8 @@ def row_is_finite(
     logit: float,
     sh: VEC3,
     stored: int,
+    bands: int,
+    color: wp.vec3,
     features: F32,
     channels: int,
     offset: wp.vec2,
@@ -78,8 +80,13 @@ def row_is_finite(
         + (log_scale[0] * 0.0 + log_scale[1] * 0.0 + log_scale[2] * 0.0)
         + (offset[0] * 0.0 + offset[1] * 0.0 + logit * 0.0)
     )
-    zeros = wp.vec3(zero, zero, zero)
-    for k in range(stored):
+    # a finite colour proves its coefficients finite, and takes less time than looking at each
+    zeros = 0.0 * color
+    first = bands
+    if zeros[0] + zeros[1] + zeros[2] != 0.0:
+        zeros = wp.vec3(0.0, 0.0, 0.0)
+        first = 0
+    for k in range(first, stored):
         zeros += 0.0 * sh[row * stored + k]
     for k in range(channels):
         zero += 0.0 * features[row * channels + k]
@@ -159,12 +166,14 @@ def project(
     )
     if hidden and min_alpha > 0.0:
         return
-    if not row_is_finite(row, mean, quat, log_scale, logit, sh, stored, features, channels, offset):
-        return
     direction = wp.vec3(0.0, 0.0, 0.0)
     if bands > 1:
         direction = wp.normalize(mean - camera_center(view))
     color = sh_color(sh, row, stored, bands, direction)
+    if not row_is_finite(
+        row, mean, quat, log_scale, logit, sh, stored, bands, color, features, channels, offset
+    ):
+        return
 
     means2d[2 * row] = s.u
     means2d[2 * row + 1] = s.v
@@ -240,12 +249,12 @@ def project_adjoint(
         for j in range(slots):
             total += partials[begin + j * stride + MOMENTS_C + k]
         v_features[row * channels + k] = total
-    for k in range(stored):
-        v_sh[row * stored + k] = zero3
     if has_pose != 0:
         for k in range(POSE_C):
             v_pose[row * POSE_C + k] = 0.0
     if slots == 0:
+        for k in range(stored):
+            v_sh[row * stored + k] = zero3
         v_means[row] = zero3
         v_quats[row] = wp.vec4(0.0, 0.0, 0.0, 0.0)
         v_log_scales[row] = zero3
@@ -301,6 +310,8 @@ def project_adjoint(
     for k in range(3):
         if records[row * RECORD_C + RED + k] <= 0.0:
             v_color[k] = 0.0
+    for k in range(bands, stored):
+        v_sh[row * stored + k] = zero3
     v_center = wp.vec3(0.0, 0.0, 0.0)
     if bands > 1:
         toward = mean - camera_center(view)
