@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Literal, Self
@@ -19,10 +20,11 @@ from hoigs.core.interaction import Residual
 from hoigs.core.moment import BodyPose, Moment, ResidualRule
 from hoigs.core.rotation import multiply_quats
 from hoigs.core.topology import TopologyChange
+from hoigs.plugins.deformation.alpha_start import AlphaStart, depth_ratio
 from hoigs.plugins.deformation.body_planes import Fusion, body_planes, field_subset
 from hoigs.plugins.deformation.canonical_head import CanonicalAttributes, CanonicalHead, HeadKind
 from hoigs.plugins.deformation.face_points import HEAD_JOINT, face_points
-from hoigs.plugins.deformation.skinned_body import ScaleAbout, SkinnedBody
+from hoigs.plugins.deformation.skinned_body import ScaleAbout, SkinnedBody, clip_settings
 from hoigs.plugins.deformation.skinning import skin_points, skin_quats
 from hoigs.plugins.deformation.surface_laplacian import (
     LaplacianOn,
@@ -55,6 +57,8 @@ class HexPlaneSkinningConfig(ComponentConfig):
         scale_about: the fixed point of alpha, which the paper leaves open (the world's origin would
             carry the person off). "pelvis", the default, changes their size, which images can tell;
             the "camera" changes depth but not the image, so that only L_depth moves alpha.
+        alpha_start: alpha at the start, "one", or the ratio of the clip's metric "depth" to the
+            body's own, which suits the scale about the camera.
         field_points: body points at which phi is read, spread over the 16 parts.
         field_at: "posed" reads phi where the body is (the supplement's "dynamic coordinates",
             taken relative to the pelvis, as planes over the world would waste their cells);
@@ -76,6 +80,7 @@ class HexPlaneSkinningConfig(ComponentConfig):
     free_attributes: bool = True
     refine_poses: bool = True
     scale_about: ScaleAbout = "pelvis"
+    alpha_start: AlphaStart = "one"
     field_points: int = Field(1536, ge=16)
     field_at: FieldAt = "posed"
     residual_rule: ResidualRule = "add"
@@ -185,19 +190,18 @@ class HexPlaneSkinning(SkinnedBody):
                 "deformation:hexplane-skinning needs a body; it suits entities of kind human"
             )
         clip, track = context.clip, context.body_track
-        settings: dict[str, Any] = config.model_dump()
+        settings: dict[str, Any] = config.model_dump(exclude={"alpha_start"})
         if track is not None:
             betas = track.poses.betas
             settings["betas"] = betas if betas.dim() == 1 else betas.mean(0)
             settings["num_frames"] = len(track.poses.transl)
         if clip is not None:
-            settings["num_frames"] = clip.num_frames
-            train = {clip.moments[i].index for i in clip.split.get("train", range(len(clip)))}
-            settings["trained_frames"] = sorted(train)
-            by_frame = {m.index: c for m, c in zip(clip.moments, clip.cameras, strict=True)}
-            centers = [by_frame[i].center for i in sorted(by_frame)]
-            settings["camera_centers"] = torch.stack(centers)
-        return cls(context.body, entity=context.entity, seed=context.seed, **settings)
+            settings |= clip_settings(clip)
+        made = cls(context.body, entity=context.entity, seed=context.seed, **settings)
+        if config.alpha_start == "depth" and clip is not None and track is not None:
+            ratio = depth_ratio(clip, context.entity, context.body, track)
+            nn.init.constant_(made.log_alpha, math.log(ratio))
+        return made
 
     def bind(self, rest: Gaussians) -> None:
         surface = self._surface or self.body.surface(len(rest), self.betas, self.seed)

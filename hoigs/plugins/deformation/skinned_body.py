@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from hoigs.core.body import LEFT_FOOT, LEFT_WRIST, PELVIS, RIGHT_FOOT, RIGHT_WRIST, BodyModel
+from hoigs.core.clip import Clip
 from hoigs.core.deformation import DeformationModel
 from hoigs.core.moment import BodyPose, Moment
 from hoigs.plugins.deformation.pose_refinement import PoseRefinement
@@ -145,3 +146,14 @@ class SkinnedBody(DeformationModel):
         if self._arm is None or not torch.equal(self._arm[0], betas):
             self._arm = (betas.clone(), self.body.arm_length(betas))
         return self._arm[1] * self.log_alpha.exp()
+
+
+def clip_settings(clip: Clip) -> dict[str, Any]:
+    """What a clip says of the arguments of SkinnedBody."""
+    train = {clip.moments[i].index for i in clip.split.get("train", range(len(clip)))}
+    by_frame = {m.index: c for m, c in zip(clip.moments, clip.cameras, strict=True)}
+    return {
+        "num_frames": clip.num_frames,
+        "trained_frames": sorted(train),
+        "camera_centers": torch.stack([by_frame[i].center for i in sorted(by_frame)]),
+    }

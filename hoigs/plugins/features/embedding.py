@@ -16,6 +16,7 @@ from hoigs.core.deformation import DeformationModel, ProvidesField
 from hoigs.core.features import FeatureExtractor, Tokens
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.moment import Moment
+from hoigs.core.spline import linear
 from hoigs.plugins.features.body_parts import part_averages
 
 
@@ -25,14 +26,17 @@ class EmbeddingConfig(ComponentConfig):
     Attributes:
         tokens: how many; None is one a body part where the deformation knows them, else one a
             Gaussian. width: of each.
+        keyframes: None is one embedding for all time; else as many, uniform over the clip and
+            linear between. The paper says neither; None, the default, is the plainer ablation.
     """
 
     tokens: int | None = Field(None, ge=1)
     width: int = Field(96, ge=1)
+    keyframes: int | None = Field(None, ge=2)
 
 
 class EmbeddingFeatures(FeatureExtractor):
-    """Tokens that know nothing of place or time.
+    """Tokens that know nothing of place, and of time only with `keyframes`.
 
     Their positions, which the interaction measures its distances from, are the centroids of the
     16 body parts, or each Gaussian's centre, or, for any other number of tokens, the entity's
@@ -42,9 +46,11 @@ class EmbeddingFeatures(FeatureExtractor):
     rates: ClassVar[Mapping[str, str]] = {"embedding": "embedding"}
     averages: Tensor | None
 
-    def __init__(self, tokens: int | None = None, width: int = 96) -> None:
+    def __init__(
+        self, tokens: int | None = None, width: int = 96, keyframes: int | None = None
+    ) -> None:
         super().__init__()
-        self.tokens, self.width = tokens, width
+        self.tokens, self.width, self.keyframes = tokens, width, keyframes
         self.per_gaussian = ()
 
     def bind(self, deformation: DeformationModel, rest: Gaussians) -> None:
@@ -55,7 +61,10 @@ class EmbeddingFeatures(FeatureExtractor):
             averages = part_averages(deformation.field_parts()).to(rest.means)
         self.register_buffer("averages", averages, persistent=False)
         count = self.tokens or (len(PART_NAMES) if parts else len(rest))
-        self.embedding = nn.Parameter(0.1 * torch.randn(count, self.width).to(rest.means))
+        shape = (
+            (count, self.width) if self.keyframes is None else (count, self.keyframes, self.width)
+        )
+        self.embedding = nn.Parameter(0.1 * torch.randn(shape).to(rest.means))
         if self.tokens is None and not parts:
             self.per_gaussian = ("embedding",)
 
@@ -70,4 +79,7 @@ class EmbeddingFeatures(FeatureExtractor):
         return means if self.per_gaussian else means.mean(0).expand(len(self.embedding), 3)
 
     def forward(self, deformation: DeformationModel, rest: Gaussians, moment: Moment) -> Tokens:
-        return Tokens(self.embedding, self._positions(deformation, rest, moment))
+        features: Tensor = self.embedding
+        if self.keyframes is not None:
+            features = linear(features, moment.time)
+        return Tokens(features, self._positions(deformation, rest, moment))

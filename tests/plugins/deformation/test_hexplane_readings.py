@@ -7,6 +7,8 @@ import torch
 from torch.nn.functional import grid_sample
 
 from hoigs.core.body import PELVIS
+from hoigs.core.camera import Camera
+from hoigs.core.clip import BodyTrack, Clip, FrameStore
 from hoigs.core.context import BuildContext
 from hoigs.core.entity import Entity
 from hoigs.core.interaction import Residual
@@ -205,3 +207,78 @@ def test_laplacian_of_a_human(toy_body, toy_pose, over):
     assert model.planes.space.grad.abs().max() > 0
     assert all(p.grad.abs().max() > 0 for p in list(model.head.parameters())[:2])
     assert not any("edges" in name for name in entity.state_dict())
+
+
+class DepthOnly(FrameStore):
+    """Depth `factor` times that of the posed body, which the mask shows whole."""
+
+    def __init__(self, bodies: list[torch.Tensor], cameras: list[Camera], factor: float) -> None:
+        self.shots = []
+        for vertices, camera in zip(bodies, cameras, strict=True):
+            xy, z = camera.project(vertices)
+            at = xy.floor().long()
+            depth = torch.full((camera.height * camera.width,), torch.inf)
+            depth.scatter_reduce_(0, at[:, 1] * camera.width + at[:, 0], z, "amin")
+            depth = depth.view(camera.height, camera.width)
+            self.shots.append(torch.where(torch.isfinite(depth), factor * depth, 0.0))
+
+    def image(self, position: int) -> torch.Tensor:
+        return torch.zeros((*self.shots[position].shape, 3), dtype=torch.uint8)
+
+    def mask(self, entity: str, position: int) -> torch.Tensor:
+        return self.shots[position] > 0
+
+    def depth(self, position: int) -> torch.Tensor | None:
+        return self.shots[position]
+
+
+def clip_of(body, factor: float, kind: str = "metric") -> Clip:
+    frames = 3
+    poses = BodyPose.zeros(frames, betas=2)
+    poses = poses.replace(transl=torch.tensor([[-0.1, 0, 0], [0, 0, 0], [0.1, 0, 0.0]]))
+    eye, target = torch.tensor([0.0, 0, -4]), torch.zeros(3)
+    cameras = [Camera.look_at(eye, target, width=80, height=80, fov_y=0.8)] * frames
+    bodies = [body(poses.frame(i)).vertices for i in range(frames)]
+    return Clip(
+        "still", DepthOnly(bodies, cameras, factor), cameras,
+        [Moment(i / 2, i, {"human": poses.frame(i)}) for i in range(frames)],
+        kinds={"human": "human"}, bodies={"human": BodyTrack("body:toy", poses)}, objects={},
+        points=torch.zeros(0, 3), point_colors=torch.zeros(0, 3),
+        split={"train": [0, 1, 2], "test": []}, depth_kind=kind,
+    )  # fmt: skip
+
+
+def built(body, clip: Clip, **settings) -> HexPlaneSkinning:
+    config = HexPlaneSkinningConfig(
+        resolution=8, channels=4, width=16, field_points=160, **settings
+    )
+    context = BuildContext("human", clip, body, clip.bodies["human"])
+    return HexPlaneSkinning.from_config(config, context)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.25])
+def test_alpha_starts_at_the_ratio_of_depths(toy_body, factor):  # F16
+    clip = clip_of(toy_body, factor)
+    model = built(toy_body, clip, alpha_start="depth", scale_about="camera")
+    assert float(model.log_alpha.detach().exp()) == pytest.approx(factor, rel=0.03)
+    assert float(built(toy_body, clip).log_alpha.detach()) == 0
+    for unknown in (clip_of(toy_body, factor, "affine-disparity"), clip_of(toy_body, 0.0)):
+        with pytest.raises(ValueError, match='needs metric depth under the mask of "human"'):
+            built(toy_body, unknown, alpha_start="depth")
+
+
+@pytest.mark.parametrize(("about", "seen"), [("camera", False), ("pelvis", True)])
+def test_what_moves_alpha(toy_body, about, seen):  # F17
+    """About the camera only depth depends on alpha; about the pelvis the image does too."""
+    clip = clip_of(toy_body, 1.0)
+    model = built(toy_body, clip, scale_about=about, refine_poses=False)
+    entity = Entity(toy_body.rest(200, model.betas, model.seed), model)
+    camera, moment = clip.cameras[1], clip.moments[1]
+    xy, depth = camera.project(entity(moment).means)
+    torch.manual_seed(0)
+    of_image = torch.autograd.grad((xy * torch.randn_like(xy)).sum(), model.log_alpha,
+                                   retain_graph=True)[0]  # fmt: skip
+    of_depth = torch.autograd.grad(depth.sum(), model.log_alpha)[0]
+    assert (of_image.abs() > 1.0) if seen else (of_image.abs() < 1e-2)
+    if about == "camera":  # d (alpha z) / d log alpha = alpha z
+        torch.testing.assert_close(of_depth, depth.sum().detach())

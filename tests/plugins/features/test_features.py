@@ -192,3 +192,16 @@ def test_embedding_of_an_object_is_one_a_gaussian():
     tokens = few.tokens(Moment(0.0))
     assert tokens.features.shape == (3, 5)
     torch.testing.assert_close(tokens.positions, few.means.mean(0).expand(3, 3))
+
+
+def test_embedding_over_keyframes_is_linear_between_them(toy_body):
+    entity = human(toy_body, EmbeddingFeatures.from_config(
+        EmbeddingConfig(keyframes=5), BuildContext()))  # fmt: skip
+    table = entity.features.embedding
+    assert table.shape == (16, 5, 96)
+    still = {"human": BodyPose.zeros(betas=2)}
+    tokens = entity.tokens(Moment(0.35, poses=still)).features
+    expected = 0.6 * table.double()[:, 1] + 0.4 * table.double()[:, 2]
+    torch.testing.assert_close(tokens.double(), expected, atol=1e-6, rtol=0)
+    tokens.sum().backward()
+    assert (table.grad[:, [0, 3, 4]] == 0).all() and (table.grad[:, 1:3] > 0).all()
