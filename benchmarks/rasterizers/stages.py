@@ -92,20 +92,31 @@ def measure(
     }
 
 
-def _work(gaussians: Gaussians, camera: Camera, rasterizer: WarpRasterizer) -> dict[str, int]:
-    from hoigs.core.rasterizer import RenderRequest
-    from hoigs.rasterizers.warp.frame import Inputs
-    from hoigs.rasterizers.warp.inputs import prepare
+def tile_lists(gaussians: Gaussians, camera: Camera, rasterizer: WarpRasterizer) -> tuple[int, int]:
+    """How many Gaussians are drawn, and in how many pairs with a tile."""
+    path = rasterizer.path(torch.device("cpu"))
+    found: list[tuple[int, int]] = []
+    make = path.bin
 
-    settings, tensors = prepare(rasterizer, gaussians, camera, RenderRequest())
-    path, inputs = rasterizer.path(torch.device("cpu")), Inputs(*tensors)
-    projected = path.project(inputs, settings)
-    lists = path.bin(projected, settings)
+    def watched(projected: Any, settings: Any) -> Any:
+        lists = make(projected, settings)
+        found.append((int((projected.drawn_depths > 0).sum()), lists.pairs.shape[0]))
+        return lists
+
+    path.bin = watched
+    try:
+        rasterizer.render(gaussians, camera)
+    finally:
+        path.bin = make
+    return found[0]
+
+
+def _work(gaussians: Gaussians, camera: Camera, rasterizer: WarpRasterizer) -> dict[str, int]:
+    visible, pairs = tile_lists(gaussians, camera, rasterizer)
     return {
         "gaussians": len(gaussians),
-        "visible": int((projected.drawn_depths > 0).sum()),
-        "pairs": lists.pairs.shape[0],
-        "pixels": camera.width * camera.height,
+        "visible": visible,
+        "pairs": pairs,
         "hits": count_hits(gaussians, camera),
         "raw": 4 * (3 + 4 + 3 + 1 + 3 * gaussians.sh.shape[1]),
     }

@@ -117,6 +117,9 @@ class NativePath:
 
 
 def tile_rows(settings: Settings) -> int:
-    """Height of a tile: tall ones make fewer pairs, low ones spread better over cores."""
+    """Height of a tile: tall ones make fewer pairs, low ones spread better over cores.
+
+    It must not depend on the number of cores, for results do not.
+    """
     pixels = settings.width * settings.height
-    return 16 if pixels <= 128 * 128 else 32 if pixels <= 256 * 256 else MAX_ROWS
+    return 16 if pixels <= 96 * 96 else 32 if pixels <= 160 * 160 else MAX_ROWS
