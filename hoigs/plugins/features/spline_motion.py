@@ -38,8 +38,8 @@ class SplineMotionConfig(ComponentConfig):
             "zero-tangent", or "linear".
         velocity: tau(t). "derivative", the default, is the exact derivative of the position
             spline; "keyframes" interpolates the learned tangents tau_k as e is, as the words say:
-            it equals the derivative at the keyframes alone, and needs a deformation that has
-            `tangents`.
+            it equals the derivative at the keyframes alone, and needs learned tangents of every
+            Gaussian at keyframes that stay.
         embedding_width: of e. hidden: of the MLP.
         keyframes: of the embedding; None takes the deformation's.
     """
@@ -89,13 +89,15 @@ class SplineMotionFeatures(FeatureExtractor):
         }[embedding]
 
     def bind(self, deformation: DeformationModel, rest: Gaussians) -> None:
-        if self.tau == "keyframes" and not isinstance(
-            getattr(deformation, "tangents", None), Tensor
-        ):
-            raise ValueError(
-                f"{type(deformation).__name__} has no learned tangents tau_k; set `velocity: "
-                "derivative` of features:spline-motion"
-            )
+        if self.tau == "keyframes":
+            tangents = getattr(deformation, "tangents", None)
+            movable = getattr(getattr(deformation, "knots", None), "movable", False)
+            each = isinstance(tangents, Tensor) and tangents.shape[:-2] == (len(rest),)
+            if movable or not each:
+                raise ValueError(
+                    f"{type(deformation).__name__} has no learned tangents tau_k for each Gaussian "
+                    "at keyframes that stay; set `velocity: derivative` of features:spline-motion"
+                )
         keyframes = self.keyframes or getattr(deformation, "keyframes", None)
         if not isinstance(keyframes, int):
             raise ValueError(

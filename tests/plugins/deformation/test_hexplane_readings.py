@@ -78,13 +78,13 @@ def test_both_fusions_are_96_wide_and_start_still(fusion):
     assert planes.width == 96
     x = 1.8 * torch.rand(2000, 3) - 0.9
     torch.testing.assert_close(planes(x, 0.7), planes(x))  # phi = f before anything is learned
-    assert float(planes.time_smoothness()) == 0 == float(planes.time_sparsity())
+    assert float(planes.time_smoothness().detach()) == 0 == float(planes.time_sparsity().detach())
     assert 0.02 < float(planes(x).std()) < 0.2  # either reading feeds psi_h alike
     with torch.no_grad():
         for parameter in planes.parameters():
             parameter += 0.1 * torch.randn_like(parameter)
     assert (planes(x, 0.7) - planes(x)).abs().max() > 1e-3
-    assert float(planes.time_smoothness()) > 0 < float(planes.time_sparsity())
+    assert float(planes.time_smoothness().detach()) > 0 < float(planes.time_sparsity().detach())
     planes(x, 0.4).square().sum().backward()
     assert all(p.grad.abs().max() > 0 for p in planes.parameters())
 

@@ -131,6 +131,9 @@ def test_velocity_is_the_derivative_or_the_interpolated_tangents():
     assert model.keyframe_means.grad is None
     with pytest.raises(ValueError, match="no learned tangents"):
         thing(SplineMotionFeatures(velocity="keyframes"), tangents="finite-difference")
+    model.knots.movable = True
+    with pytest.raises(ValueError, match="at keyframes that stay"):
+        features.bind(model, entity.rest)
 
 
 @pytest.mark.parametrize("width", [32, 33])
