@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,7 +18,13 @@ from hoigs.core.moment import BodyPose, Moment
 
 
 class FrameStore(ABC):
-    """Pixels on demand; implementations decode lazily and may cache. Positions, not names."""
+    """Pixels on demand; implementations decode lazily and may cache. Positions, not names.
+
+    Attributes:
+        root: the folder that the pixels come from, where they come from one.
+    """
+
+    root: Path | None = None
 
     @abstractmethod
     def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
@@ -179,6 +186,7 @@ class ResizedStore(FrameStore):
 
     def __init__(self, base: FrameStore, sizes: Sequence[tuple[int, int]]) -> None:
         self.base, self.sizes = base, sizes
+        self.root = base.root
         self._images: dict[int, Tensor] = {}
 
     def image(self, position: int) -> UInt8[Tensor, "H W 3"]:

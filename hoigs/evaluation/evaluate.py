@@ -15,6 +15,7 @@ from hoigs.core.errors import did_you_mean
 from hoigs.core.interaction import EntityKind
 from hoigs.core.rasterizer import RenderOutput
 from hoigs.core.scene import SceneModel
+from hoigs.evaluation.geometry import measure_geometry
 from hoigs.evaluation.lpips import Lpips, find_weights
 from hoigs.evaluation.measure import device_name, model_size, render_time
 from hoigs.evaluation.metrics import region_psnr, ssim_map
@@ -86,6 +87,8 @@ def evaluate(
             done += 1
             report((1 - TIMING_SHARE) * done / work, title)
         views.append(ViewScores(title, protocol, frames))
+    report(1 - TIMING_SHARE, "geometry")
+    geometry = measure_geometry(model, clip, clip.split[split])
     report(1 - TIMING_SHARE, "render time")
     timing = NotComputed("timing_frames is 0") if timing_frames == 0 else render_time(
         model, clip, list(clip.split[split]), frames=timing_frames, warmup=timing_warmup,
@@ -94,7 +97,7 @@ def evaluate(
     report(1.0, "")
     model.train(was_training)
     created = datetime.now(UTC).isoformat(timespec="seconds")
-    return Evaluation(clip.name, views, timing, model_size(model), created)
+    return Evaluation(clip.name, views, timing, model_size(model), created, geometry)
 
 
 def _protocol(

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import did_you_mean
+from hoigs.evaluation.geometry import GEOMETRY
+from hoigs.evaluation.geometry import NOTES as GEOMETRY_NOTES
 from hoigs.evaluation.protocol import NotComputed, Protocol, Value
 from hoigs.evaluation.regions import REGIONS
 
@@ -102,13 +104,14 @@ class PartSize:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A judged model."""
+    """A judged model. geometry: the measures of `geometry.GEOMETRY` on the scored frames."""
 
     clip: str
     views: list[ViewScores]
     timing: Timing | NotComputed
     sizes: list[PartSize]
     created: str
+    geometry: Mapping[str, Value] = field(default_factory=dict)
 
     def view(self, name: str) -> ViewScores:
         for view in self.views:
@@ -125,8 +128,10 @@ class Evaluation:
         return self.view(view).mean(region, metric)[0]
 
     def tables(self) -> list[Table]:
-        """One table a view, then times and sizes."""
+        """One table a view, then geometry, times and sizes."""
         tables = [score_table(view) for view in self.views]
+        if self.geometry:
+            tables.append(geometry_table(self.geometry))
         return [*tables, timing_table(self.timing), size_table(self.sizes)]
 
     def to_dict(self) -> dict[str, Any]:
@@ -160,6 +165,7 @@ class Evaluation:
             "clip": self.clip,
             "created": self.created,
             "scores": scores,
+            "geometry": {name: _plain(value) for name, value in self.geometry.items()},
             "timing": _plain(timing) if isinstance(timing, NotComputed) else asdict(timing),
             "size": [asdict(part) for part in self.sizes],
             "frames": frames,
@@ -190,6 +196,20 @@ def score_table(view: ViewScores) -> Table:
         rows.append((region.replace("_", " + "), str(view.mean(region, "psnr")[1]), *cells))
     columns = ("region", "frames", *(TITLES[m] for m in shown))
     return Table(view.name, columns, rows, [*notes.values(), *view.protocol.footnotes()])
+
+
+def geometry_table(geometry: Mapping[str, Value]) -> Table:
+    """Those that there are, a row each; why the others are not there, in notes."""
+    rows: list[tuple[str, ...]] = []
+    reasons: dict[str, list[str]] = {}
+    for name, title in GEOMETRY.items():
+        value = geometry[name]
+        if isinstance(value, NotComputed):
+            reasons.setdefault(str(value), []).append(title.rpartition(" ")[0].rpartition(" ")[0])
+        else:
+            rows.append((title, f"{value:.6f}" if name == "cd_best" else f"{value:.2f}"))
+    notes = [f"{', '.join(titles)}: {reason}" for reason, titles in reasons.items()]
+    return Table("geometry", ("measure", "mean"), rows, [*notes, *(GEOMETRY_NOTES if rows else ())])
 
 
 def timing_table(timing: Timing | NotComputed) -> Table:

@@ -148,6 +148,7 @@ def write_scene(
     save_truth(scene, folder / "truth.npz")
 
 
+@torch.no_grad()
 def save_truth(scene: SyntheticScene, path: Path) -> None:
     """Exact geometry, free of the noise that the clip may carry.
 
@@ -155,7 +156,7 @@ def save_truth(scene: SyntheticScene, path: Path) -> None:
     `object_faces` about the object's centre, `object_rotations`, `object_translations`,
     `object_bend` (end-to-end angle, radians); `grip` (1 while the hands hold it);
     `dressed_vertices` and `dressed_faces`: the clothed body in the zero pose, to be skinned with
-    the body model's weights.
+    `skinning_weights` and, a frame, `skinning_transforms`.
     """
     poses, track = scene.poses, scene.script.track
     arrays = {
@@ -175,6 +176,8 @@ def save_truth(scene: SyntheticScene, path: Path) -> None:
         "grip": scene.script.grip,
         "dressed_vertices": scene.dressed.vertices.astype(np.float32),
         "dressed_faces": scene.dressed.faces,
+        "skinning_weights": scene.dressed.weights,
+        "skinning_transforms": scene.dressed.body.skinning_transforms(poses).numpy(),
     }
     np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
 

@@ -165,8 +165,9 @@ def test_json_holds_a_protocol_with_every_score(
 
 def test_tables_are_rectangular_and_explain_gaps(model: SceneModel, clip: Clip) -> None:
     alone = replace(clip, kinds={"man": "human"}, held_out=None)
-    scores, times, sizes = evaluate(model, alone, timing_frames=3, timing_warmup=0).tables()
-    for table in (scores, times, sizes):
+    judged = evaluate(model, alone, timing_frames=3, timing_warmup=0)
+    scores, geometry, times, sizes = judged.tables()
+    for table in (scores, geometry, times, sizes):
         assert all(len(row) == len(table.columns) for row in table.rows)
     assert "LPIPS ↓" not in scores.columns and any("lpips" in note for note in scores.notes)
     row = next(row for row in scores.rows if row[0] == "object")

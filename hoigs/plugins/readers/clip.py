@@ -115,6 +115,8 @@ class FolderStore(FrameStore):
     Safe to read from several threads.
     """
 
+    root: Path
+
     def __init__(self, root: Path, has_depth: bool, cache_mb: int = 512) -> None:
         self.root, self.has_depth = Path(root), has_depth
         self.budget = cache_mb * 2**20
