@@ -28,10 +28,10 @@ from hoigs.plugins.deformation.skinned_body import ScaleAbout, SkinnedBody, clip
 from hoigs.plugins.deformation.skinning import skin_points, skin_quats
 from hoigs.plugins.deformation.surface_laplacian import (
     LaplacianOn,
+    Smoothed,
+    laplacians,
     mesh_edges,
-    mesh_roughness,
     nearest,
-    point_roughness,
 )
 
 FieldAt = Literal["posed", "canonical"]
@@ -68,6 +68,7 @@ class HexPlaneSkinningConfig(ComponentConfig):
         laplacian: L_reg of psi_h over neighbouring "points", the Gaussians, which costs nothing
             more; or over the vertices of the body's "mesh" (the paper): a second pass of psi_h, but
             its neighbours never reach from one thigh to the other.
+        laplacian_of: what L_reg smooths: ExAvatar's "offset", "scale" and "color", or fewer.
     """
 
     fusion: Fusion = "paired"
@@ -85,6 +86,7 @@ class HexPlaneSkinningConfig(ComponentConfig):
     field_at: FieldAt = "posed"
     residual_rule: ResidualRule = "add"
     laplacian: LaplacianOn = "points"
+    laplacian_of: tuple[Smoothed, ...] = ("offset",)
 
 
 class HexPlaneSkinning(SkinnedBody):
@@ -115,6 +117,8 @@ class HexPlaneSkinning(SkinnedBody):
     regularizer_weights: ClassVar[Mapping[str, float]] = {
         "offset": 1.0,
         "laplacian": 10.0,
+        "laplacian_scale": 0.1,
+        "laplacian_color": 0.1,
         "skinning": 1.0,
         "time_smoothness": 0.01,
         "time_sparsity": 1e-4,
@@ -153,6 +157,7 @@ class HexPlaneSkinning(SkinnedBody):
         field_at: FieldAt = "posed",
         residual_rule: ResidualRule = "add",
         laplacian: LaplacianOn = "points",
+        laplacian_of: Sequence[Smoothed] = ("offset",),
     ) -> None:
         super().__init__(
             body,
@@ -170,6 +175,7 @@ class HexPlaneSkinning(SkinnedBody):
         self.field_posed, self.residual_rule = field_at == "posed", residual_rule
         edges = mesh_edges(body.faces) if laplacian == "mesh" else None
         self.register_buffer("edges", edges, persistent=False)
+        self.smoothed = tuple(laplacian_of)
         if time_resolution is None:
             time_resolution = max(8, (num_frames or 64) // 2)
         self.planes = body_planes(fusion, channels, resolution, time_resolution)
@@ -355,7 +361,7 @@ class HexPlaneSkinning(SkinnedBody):
 
         "offset": canonical offsets, m^2. "laplacian": offset against its neighbours' mean, m^2
         (the paper's L_reg); "laplacian_scale", "laplacian_color": log-scale and RGB likewise
-        (ExAvatar's, off by default). "skinning": distance to the template's weights (HUGS).
+        (`laplacian_of`). "skinning": distance to the template's weights (HUGS).
         "scale": of log-scales from the template's. "time_smoothness", "time_sparsity": see
         PairedPlanes.
 
@@ -382,16 +388,4 @@ class HexPlaneSkinning(SkinnedBody):
         if self.edges is not None:
             points = (self.rest_vertices - self.rest_joints[PELVIS]) / self.half_box
             attributes = self.head(self.planes(points))
-        elif self.neighbours is None:
-            return {}
-        penalties = {}
-        for name, values in {
-            "laplacian": attributes.offsets,
-            "laplacian_scale": attributes.log_scales,
-            "laplacian_color": attributes.colors,
-        }.items():
-            if self.edges is not None:
-                penalties[name] = mesh_roughness(values, self.edges)
-            elif self.neighbours is not None:
-                penalties[name] = point_roughness(values, self.neighbours)
-        return penalties
+        return laplacians(attributes, self.smoothed, self.neighbours, self.edges)

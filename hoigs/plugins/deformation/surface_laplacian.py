@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from hoigs.plugins.deformation.canonical_head import CanonicalAttributes
+
 LaplacianOn = Literal["points", "mesh"]
+Smoothed = Literal["offset", "scale", "color"]
 
 
 def nearest(points: Float[Tensor, "N 3"], count: int = 4) -> Int[Tensor, "N k"] | None:
@@ -47,3 +51,28 @@ def mesh_roughness(values: Float[Tensor, "V D"], edges: Int[Tensor, "E 2"]) -> F
     sums = torch.zeros_like(values).index_add(0, edges[:, 0], values[edges[:, 1]])
     means = torch.where(degree[:, None] > 0, sums / degree.clamp_min(1)[:, None].to(values), values)
     return (values - means).square().sum(-1).mean()
+
+
+def laplacians(
+    said: CanonicalAttributes,
+    smoothed: Sequence[Smoothed],
+    neighbours: Int[Tensor, "N k"] | None,
+    edges: Int[Tensor, "E 2"] | None,
+) -> dict[str, Tensor]:
+    """The penalties "laplacian" (of offsets), "laplacian_scale", "laplacian_color", if asked for.
+
+    Args:
+        said: psi_h, at the vertices if there are edges, else at the points that neighbours index.
+    """
+    choices = {
+        "offset": ("laplacian", said.offsets),
+        "scale": ("laplacian_scale", said.log_scales),
+        "color": ("laplacian_color", said.colors),
+    }
+    penalties = {}
+    for name, values in (choices[what] for what in smoothed):
+        if edges is not None:
+            penalties[name] = mesh_roughness(values, edges)
+        elif neighbours is not None:
+            penalties[name] = point_roughness(values, neighbours)
+    return penalties
