@@ -297,6 +297,35 @@ def test_rigid_residual_keeps_distances():
     )
 
 
+@pytest.mark.parametrize("kind", ["per-gaussian", "rigid", "both"])
+def test_object_residual_equals_its_formula(kind):
+    """delta G from the module's own F'_O, in float64: heads, bounds, a turn about the centre."""
+    made = module(object_residual=kind, gate="soft", granularity="gaussian")
+    ball = thing(11)
+    tokens, role = person()
+    found = run(made, ball)["ball"].means
+    made = made.double()
+    w_h, w_o = made.projections["human_96"].weight, made.projections["object_32"].weight
+    _, k_h, v_h = (tokens.features.double() @ w_h.T).chunk(3, -1)
+    q_o, _, v_o = (ball.features.double() @ w_o.T).chunk(3, -1)
+    distance = torch.cdist(role.anchors, ball.positions).amin(0).double()
+    gate = torch.sigmoid((ARM - distance) / 0.05)  # the same for every part of a row
+    attended = v_o + gate[:, None] * (torch.softmax(q_o @ k_h.T / 32**0.5, -1) @ v_h)
+    expected = torch.zeros(11, 3, dtype=torch.float64)
+    if kind != "rigid":
+        expected += gate[:, None] * 0.1 * torch.tanh(made.means_head(attended))
+    if kind != "per-gaussian":
+        twist = gate.max() * torch.tanh(made.twist_head(attended.mean(0)))
+        x, y, z = 0.3 * twist[:3]
+        cross = torch.zeros(3, 3, dtype=torch.float64)
+        cross[0, 1], cross[0, 2], cross[1, 2] = -z, y, -x
+        turn = torch.matrix_exp(cross - cross.T)
+        arms = ball.positions.double() - ball.positions.double().mean(0)
+        expected += arms @ turn.T - arms + 0.1 * twist[3:]
+    torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=1e-4)
+    assert found.abs().max() > 1e-3
+
+
 def test_every_parameter_learns_and_gates_do_not():
     made = module(object_residual="both", granularity="gaussian")
     tokens, role = person()
