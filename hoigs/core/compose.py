@@ -18,6 +18,8 @@ from hoigs.core.entity import Entity
 from hoigs.core.errors import HoigsError, PluginError, SpecError, did_you_mean
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.interaction import EntityKind
+from hoigs.core.prior import check_track
+from hoigs.core.rasterizer import Rasterizer
 from hoigs.core.registry import Registry, default_registry
 from hoigs.core.scene import SceneModel
 from hoigs.core.spec import ComponentSpec, EntitySpec, Spec
@@ -38,12 +40,12 @@ def compose(spec: Spec, clip: Clip, registry: Registry | None = None) -> SceneMo
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(spec.train.seed)
         context = BuildContext(clip=clip, seed=spec.train.seed)
+        rasterizer = builder.part(("rasterizer",), spec.rasterizer, context)
         entities = {
-            name: builder.entity(name, kind, place, block)
+            name: builder.entity(name, kind, place, block, rasterizer)
             for name, kind, place, block in builder.chosen()
         }
         interaction = builder.part(("interaction",), spec.interaction, context)
-        rasterizer = builder.part(("rasterizer",), spec.rasterizer, context)
         with _blaming(spec, "interaction"):
             return SceneModel(entities, interaction=interaction, rasterizer=rasterizer)
 
@@ -102,12 +104,25 @@ class _Builder:
         with _blaming(self.spec, *place) if place else nullcontext():
             return component.from_config(config, context)
 
-    def entity(self, name: str, kind: EntityKind, place: str, block: EntitySpec) -> Entity:
+    def entity(
+        self,
+        name: str,
+        kind: EntityKind,
+        place: str,
+        block: EntitySpec,
+        rasterizer: Rasterizer,
+    ) -> Entity:
         context = BuildContext(entity=name, clip=self.clip, seed=self.spec.train.seed)
         if kind == "human":
             context = self._with_body(context, place, block)
         elif kind == "object":
-            context = replace(context, object_track=self.clip.objects[name])
+            context = replace(context, object_track=self.clip.objects.get(name))
+        if kind == "object" and context.object_track is None and block.prior is None:
+            raise SpecError(
+                f"{self.spec.at('model', place)}: the clip has no track of {name}; give a `prior`"
+            )
+        if block.prior is not None:
+            context = self._with_prior(context, kind, place, block.prior, rasterizer)
         deformation = self.part(("model", place, "deformation"), block.deformation, context)
         features = None
         if block.features is not None:
@@ -131,6 +146,23 @@ class _Builder:
             )
         return replace(context, body=self.part(("model", place, "body"), block.body, context))
 
+    def _with_prior(
+        self,
+        context: BuildContext,
+        kind: EntityKind,
+        place: str,
+        part: ComponentSpec,
+        rasterizer: Rasterizer,
+    ) -> BuildContext:
+        """`context` with the track that a prior makes, in place of the clip's."""
+        where, name = ("model", place, "prior"), context.entity
+        if kind != "object":
+            raise SpecError(f"{self.spec.at(*where)}: priors make objects; {name} is a {kind}")
+        prior = self.part(where, part, replace(context, rasterizer=rasterizer))
+        with _blaming(self.spec, *where, why=f"{name}: "):
+            track = check_track(prior.initialise(self.clip, name), len(self.clip))
+        return replace(context, object_track=track)
+
     def _default_body(self, key: str) -> ComponentSpec:
         """The body without settings, if it can do without."""
         fields = self.registry.config_class(key).model_fields.items()
@@ -147,7 +179,8 @@ def initial_gaussians(
     """Rest Gaussians of an entity, in the space that its deformation expects.
 
     The scene starts from the clip's points; a human from points spread evenly over its body; an
-    object from the points of its track. Scales follow the spacing of the points (3DGS's rule).
+    object from the points of its track (the clip's, or its prior's). Scales follow the spacing of
+    the points (3DGS's rule).
     """
     looks: dict[str, Any] = {"opacity": block.opacity, "sh_degree": block.sh_degree}
     clip = context.clip

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from hoigs.core.body import BodyModel
     from hoigs.core.clip import BodyTrack, Clip, ObjectTrack
+    from hoigs.core.rasterizer import Rasterizer
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,7 @@ class BuildContext:
         entity: name of the entity being built ("" for scene-wide parts).
         clip: the clip being reconstructed.
         body, body_track: for a human. object_track: for an object.
+        rasterizer: the spec's, for priors that draw.
         seed: for anything random.
     """
 
@@ -26,4 +28,5 @@ class BuildContext:
     body: BodyModel | None = None
     body_track: BodyTrack | None = None
     object_track: ObjectTrack | None = None
+    rasterizer: Rasterizer | None = None
     seed: int = 0

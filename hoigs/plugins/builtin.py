@@ -10,6 +10,7 @@ from hoigs.core.hookspecs import hookimpl
 DEFORMATION = "hoigs.plugins.deformation"
 FEATURES = "hoigs.plugins.features"
 INTERACTION = "hoigs.plugins.interaction"
+PRIORS = "hoigs.plugins.priors"
 
 # key, module, class, config class, summary
 PARTS = (
@@ -63,6 +64,14 @@ PARTS = (
      "exactly as many as asked for, grown where it matters (Taming 3DGS)"),
     ("density:none", "hoigs.plugins.density.none", "NoDensity", "NoDensityConfig",
      "the number of Gaussians stays"),
+    ("prior:depth", f"{PRIORS}.depth", "DepthPrior", "DepthPriorConfig",
+     "an object's masked depth, back-projected and carried by its track"),
+    ("prior:points", f"{PRIORS}.points", "PointsPrior", "PointsPriorConfig",
+     "points of any generator, aligned by scale and world transform"),
+    ("prior:mesh", f"{PRIORS}.mesh", "MeshPrior", "MeshPriorConfig",
+     "a mesh, sampled evenly with its colours and aligned"),
+    ("prior:sfm", f"{PRIORS}.sfm", "SfmPrior", "SfmPriorConfig",
+     "scene points within the mask of a thing that stands still"),
 )  # fmt: skip
 EXTRAS = {"rasterizer:gsplat": "gsplat"}  # parts that need an optional dependency
 

@@ -1,0 +1,1 @@
+"""Object initialisers: first points of an object, and its pose in every frame."""
