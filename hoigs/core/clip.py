@@ -87,6 +87,8 @@ class ObjectTrack:
         rotations: object to world, per frame. translations: object centre in the world, metres.
         observed: frames in which the object was seen; the others are interpolated.
         provenance: who made the track, for reports.
+        moving: of an object in two parts, the points that belong to the moving one; None if
+            that is not known, or there are no parts.
     """
 
     points: Float[Tensor, "P 3"]
@@ -95,6 +97,7 @@ class ObjectTrack:
     translations: Float[Tensor, "F 3"]
     observed: Bool[Tensor, " F"]
     provenance: str = "unknown"
+    moving: Bool[Tensor, " P"] | None = None
 
 
 @dataclass(frozen=True)

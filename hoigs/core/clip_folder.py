@@ -362,8 +362,10 @@ def _save_body(path: Path, track: BodyTrack) -> None:
 
 def _save_object(path: Path, track: ObjectTrack) -> None:
     path.parent.mkdir(exist_ok=True)
+    parts = {} if track.moving is None else {"moving": _array(track.moving, np.bool_)}
     np.savez_compressed(
         path,
+        **parts,
         points=_array(track.points),
         colors=_array(track.colors),
         rotations=_array(track.rotations),

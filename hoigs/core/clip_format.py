@@ -191,6 +191,13 @@ OBJECT = FileSpec(
         ArraySpec("rotations", ("F", 3, 3), "float", "object to world"),
         ArraySpec("translations", ("F", 3), "float", "object centre in the world, metres"),
         ArraySpec("observed", ("F",), "bool", "seen in that frame; the others are interpolated"),
+        ArraySpec(
+            "moving",
+            ("P",),
+            "bool",
+            "of an object in two parts: points of the moving one",
+            optional=True,
+        ),
         _PROVENANCE,
     ),
     "an object",

@@ -89,6 +89,8 @@ class GroupedAdam:
                 extent = entity_extent(entity, scene_extent)
                 start, final = start * extent, final * extent
             begin = getattr(warmup, WAITING[rate]) if rate in WAITING else 0.0
+            # fused Adam on a CPU walks memory as if it were dense, and misses a view's elements
+            parameter.data = parameter.data.contiguous()
             self.names[name] = parameter
             self.roles.append(rate)
             self.schedules.append(Schedule(start, final, begin))

@@ -115,6 +115,37 @@ class Knots(Resizing):
         k, r, _ = self.at(time)
         return slerp(quats[:, k], quats[:, k + 1], r)
 
+    def hermite_at(
+        self,
+        values: Float[Tensor, "K D"],
+        tangents: Float[Tensor, "K D"],
+        times: Sequence[float],
+        *,
+        derivative: bool = False,
+    ) -> Float[Tensor, "T D"]:
+        """`hermite` of one curve at many times."""
+        k, r, h = self.spans(times, values)
+        if derivative:
+            w = [x / h for x in spline.hermite_basis_derivative(r)]
+        else:
+            w = list(spline.hermite_basis(r))
+        return (
+            w[0] * values[k]
+            + w[1] * h * tangents[k]
+            + w[2] * values[k + 1]
+            + (w[3] * h * tangents[k + 1])
+        )
+
+    def spans(self, times: Sequence[float], like: Tensor) -> tuple[Tensor, Any, Any]:
+        """`at` of many times: first knots [T], positions and lengths [T, 1] in the kind of `like`.
+
+        Positions and lengths are typed loosely because the bases take numbers and tensors alike.
+        """
+        found = [self.at(time) for time in times]
+        k = torch.tensor([f[0] for f in found], device=like.device)
+        r, h = (like.new_tensor([f[i] for f in found])[:, None] for i in (1, 2))
+        return k, r, h
+
     def refit(
         self,
         samples: Float[Tensor, "S D"],
@@ -126,7 +157,8 @@ class Knots(Resizing):
 
         The tangents are faintly tied to finite differences, which decides what samples leave open.
         """
-        count, kind = len(self), {"dtype": torch.float64, "device": samples.device}
+        count = len(self)
+        kind: dict[str, Any] = {"dtype": torch.float64, "device": samples.device}
         rows = torch.zeros(len(sample_times), 2 * count, **kind)
         for i, time in enumerate(sample_times):
             k, r, h = self.at(time)

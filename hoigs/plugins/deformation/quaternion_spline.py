@@ -47,13 +47,13 @@ def angular_differences(
 
 
 def hermite_quats(
-    a: Float[Tensor, " 4"],
-    b: Float[Tensor, " 4"],
-    velocity_a: Float[Tensor, " 3"],
-    velocity_b: Float[Tensor, " 3"],
-    r: float,
-    length: float = 1.0,
-) -> tuple[Float[Tensor, " 4"], Float[Tensor, " 3"]]:
+    a: Float[Tensor, "*batch 4"],
+    b: Float[Tensor, "*batch 4"],
+    velocity_a: Float[Tensor, "*batch 3"],
+    velocity_b: Float[Tensor, "*batch 3"],
+    r: Float[Tensor, "*batch 1"] | float,
+    length: Float[Tensor, "*batch 1"] | float = 1.0,
+) -> tuple[Float[Tensor, "*batch 4"], Float[Tensor, "*batch 3"]]:
     """Rotation and angular velocity at r in [0, 1] of an interval from a to b.
 
     q(r) = a exp(w1 B1) exp(w2 B2) exp(w3 B3) with the cumulative Bernstein polynomials B, w1 and
@@ -82,4 +82,4 @@ def hermite_quats(
 
 
 def _into(quat: Tensor, vector: Tensor) -> Tensor:
-    return quats_to_matrices(quat).mT @ vector
+    return (quats_to_matrices(quat).mT @ vector[..., None]).squeeze(-1)

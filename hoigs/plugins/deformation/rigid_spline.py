@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 from jaxtyping import Float
@@ -87,9 +87,14 @@ class RigidSpline(Resizing, DeformationModel):
         "angular_tangents": "keyframe_rotation",
     }
     resizes: ClassVar[Mapping[str, int]] = dict.fromkeys(rates, 0)
-    regularizer_weights: ClassVar[Mapping[str, float]] = {"tangent": 0.01}
+    # a hundredth of chs's: here all Gaussians together speak for each tangent
+    regularizer_weights: ClassVar[Mapping[str, float]] = {"tangent": 1e-4}
 
     center: Tensor
+    keyframe_translations: nn.Parameter
+    translation_tangents: nn.Parameter
+    keyframe_quats: nn.Parameter
+    angular_tangents: nn.Parameter
 
     def __init__(
         self,
@@ -129,7 +134,7 @@ class RigidSpline(Resizing, DeformationModel):
         return cls(**cls._arguments(config, context))
 
     @staticmethod
-    def _arguments(config: RigidSplineConfig, context: BuildContext) -> dict[str, object]:
+    def _arguments(config: RigidSplineConfig, context: BuildContext) -> dict[str, Any]:
         """Constructor arguments of the motion."""
         adaptive = config.keyframes == "adaptive"
         return {
@@ -146,7 +151,7 @@ class RigidSpline(Resizing, DeformationModel):
         means = rest.means.detach()
         values = self._initial(means)
         for name in self.knot_axes:
-            setattr(self, name, nn.Parameter(values[name].to(means)))
+            setattr(self, name, nn.Parameter(values[name].to(means).contiguous()))
         center = torch.zeros(3) if self._track is not None or len(means) == 0 else means.mean(0)
         self.register_buffer("center", center.to(means).clone())
         self._track = None
@@ -181,29 +186,33 @@ class RigidSpline(Resizing, DeformationModel):
             "angular_tangents": turns,
         }
 
+    def poses(
+        self, times: Sequence[float]
+    ) -> tuple[
+        Float[Tensor, "T 4"], Float[Tensor, "T 3"], Float[Tensor, "T 3"], Float[Tensor, "T 3"]
+    ]:
+        """Rotations (wxyz), translations, and their velocities per keyframe interval: the angular
+        ones in the object's frame, radians, the linear ones in the world, metres."""
+        values = self.keyframe_translations
+        tangents = (
+            self.translation_tangents if self.learned else self.knots.differences(values[None])[0]
+        )
+        places = self.knots.hermite_at(values, tangents, times)
+        speeds = self.knots.hermite_at(values, tangents, times, derivative=True)
+        k, r, h = self.knots.spans(times, values)
+        a, b = self.keyframe_quats[k], self.keyframe_quats[k + 1]
+        if not self.smooth:
+            return slerp(a, b, r), places, turn_between(a, b) / h, speeds
+        velocities = self.angular_tangents if self.learned else self._angular_differences()
+        quats, turning = hermite_quats(a, b, velocities[k], velocities[k + 1], r, h)
+        return quats, places, turning, speeds
+
     def pose(
         self, time: float
     ) -> tuple[Float[Tensor, " 4"], Float[Tensor, " 3"], Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-        """Rotation (wxyz), translation, and their velocities per keyframe interval: the angular
-        one in the object's frame, radians, the linear one in the world, metres."""
-        values = self.keyframe_translations[None]
-        if self.learned:
-            tangents = self.translation_tangents[None]
-            place = self.knots.hermite(values, tangents, time)
-            speed = self.knots.hermite(values, tangents, time, derivative=True)
-        else:
-            place = self.knots.catmull_rom(values, time)
-            speed = self.knots.catmull_rom(values, time, derivative=True)
-        quat, turning = self._rotation(time)
-        return quat, place[0], turning, speed[0]
-
-    def _rotation(self, time: float) -> tuple[Tensor, Tensor]:
-        k, r, h = self.knots.at(time)
-        a, b = self.keyframe_quats[k], self.keyframe_quats[k + 1]
-        if not self.smooth:
-            return slerp(a, b, r), turn_between(a, b) / h
-        velocities = self.angular_tangents if self.learned else self._angular_differences()
-        return hermite_quats(a, b, velocities[k], velocities[k + 1], r, h)
+        """`poses` at one time."""
+        quats, places, turning, speeds = self.poses([time])
+        return quats[0], places[0], turning[0], speeds[0]
 
     def _angular_differences(self) -> Float[Tensor, "K 3"]:
         lengths = self.knots.times.to(self.keyframe_quats).diff() / self.knots.reference
@@ -249,20 +258,18 @@ class RigidSpline(Resizing, DeformationModel):
     def traced(self, rest: Gaussians, times: Sequence[float]) -> Float[Tensor, "T P 3"]:
         """World positions of some Gaussians at some times, metres."""
         rows = probe_rows(len(rest)).to(rest.means.device)
-        poses = [self.pose(time)[:2] for time in times]
-        turns = quats_to_matrices(torch.stack([quat for quat, _ in poses]))
-        places = torch.stack([place for _, place in poses]) + self.center
-        return (rest.means[rows] - self.center) @ turns.mT + places[:, None]
+        quats, places, _, _ = self.poses(times)
+        turned = (rest.means[rows] - self.center) @ quats_to_matrices(quats).mT
+        return turned + (places + self.center)[:, None]
 
     @torch.no_grad()
     def resampled(self, times: Sequence[float], fit: Sequence[float]) -> dict[str, Tensor]:
         """Parameters of this motion with knots at `times` (MovingCurve)."""
-        reads = [self.pose(time) for time in times]
-        quats, places, turns, speeds = (torch.stack(column) for column in zip(*reads, strict=True))
+        quats, places, turns, speeds = self.poses(times)
         if fit:
             knots = Knots(self.keyframes, movable=True).to(places.device)
             knots.place(times)
-            samples = torch.stack([self.pose(time)[1] for time in fit])
+            samples = self.poses(fit)[1]
             places, speeds = knots.refit(samples, fit, free_tangents=self.learned)
         found = {
             "keyframe_translations": places,

@@ -202,7 +202,9 @@ def _read_object(path: Path) -> ObjectTrack:
     provenance = str(load_arrays(path).get("provenance", "unknown"))
     fields = ("points", "colors", "rotations", "translations", "observed")
     tensors = _tensors(path)
-    return ObjectTrack(**{f: tensors[f] for f in fields}, provenance=provenance)
+    return ObjectTrack(
+        **{f: tensors[f] for f in fields}, provenance=provenance, moving=tensors.get("moving")
+    )
 
 
 def _moment(index: int, count: int, bodies: Mapping[str, BodyTrack]) -> Moment:
