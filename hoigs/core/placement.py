@@ -12,6 +12,7 @@ paper, its rotation R_obj^t and the axes C of the generator.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -25,6 +26,8 @@ from hoigs.core.clip import ObjectTrack
 
 Reduce = Literal["median", "mean"]
 Frames = Literal["whole", "all"]
+
+HALF_ALPHA = (2 * math.log(2)) ** 0.5  # standard deviations at which a Gaussian is at one half
 
 # Camera axes of OpenGL (y up, looking along -z), in which DreamGaussian and its kin generate,
 # to those of OpenCV: `canonical_to_camera` of shapes from there
@@ -57,25 +60,33 @@ def mask_box(mask: Bool[Tensor, "H W"]) -> tuple[int, int, int, int] | None:
 
 
 def projected_area(
-    points: Float[Tensor, "P 3"], camera: Camera, quantile: float = 0.001
+    points: Float[Tensor, "P 3"],
+    camera: Camera,
+    quantile: float = 0.001,
+    sigmas: Float[Tensor, " P"] | None = None,
 ) -> float | None:
-    """A_proj: area of the box around projected centres, pixels squared.
+    """A_proj: area of the box around the projected object, pixels squared.
 
-    The paper does not say whether it boxes centres or splats. Centres it is, without the `quantile`
-    outermost at each side, as generators leave stray Gaussians about; 0 takes all of them. A
-    larger share cuts the thing itself: 0.01 makes S 4 % too large on a ball, 10 % on an L.
+    The paper does not say whether it boxes centres or splats. Centres by default, as most shapes
+    come as points; with `sigmas` the discs in which an opaque splat's alpha is above one half. Both
+    without the `quantile` outermost at each side, as generators leave stray Gaussians about; 0
+    takes all of them. A larger share cuts the thing itself: 0.01 makes S 4 % too large on a ball,
+    10 % on an L.
 
     Args:
-        points: in *camera* space, metres.
+        points: in *camera* space, metres. sigmas: standard deviations there, metres.
 
     Returns:
         None when a point is not in front of the camera: there is no box then.
     """
     if not bool((points[:, 2] > 1e-6).all()):
         return None
-    xy = points[:, :2] / points[:, 2:] * torch.stack((camera.K[0, 0], camera.K[1, 1]))
-    ends = torch.quantile(xy, xy.new_tensor((quantile, 1 - quantile)), dim=0)
-    return float((ends[1] - ends[0]).prod())
+    per_metre = torch.stack((camera.K[0, 0], camera.K[1, 1])) / points[:, 2:]
+    xy = points[:, :2] * per_metre
+    radius = torch.zeros_like(xy) if sigmas is None else HALF_ALPHA * sigmas[:, None] * per_metre
+    low = torch.quantile(xy - radius, quantile, dim=0)
+    high = torch.quantile(xy + radius, 1 - quantile, dim=0)
+    return float((high - low).prod())
 
 
 def fit_scale(
@@ -89,6 +100,7 @@ def fit_scale(
     frames: Frames = "whole",
     iterations: int = 3,
     quantile: float = 0.001,
+    sigmas: Float[Tensor, " P"] | None = None,
 ) -> ScaleFit:
     """S of the paper, and its readings.
 
@@ -107,7 +119,7 @@ def fit_scale(
             as large as the median one; "all" counts every mask.
         iterations: evaluations. One places the object unscaled, as the paper does; more start
             from the size that a flat object at v_t would have.
-        quantile: see `projected_area`.
+        quantile, sigmas: see `projected_area`; sigmas in canonical units.
 
     Raises:
         ValueError: no frame counts, or, with one iteration, the unscaled object reaches behind
@@ -122,7 +134,12 @@ def fit_scale(
     ratios, used = areas, counted
     for _ in range(iterations):
         found = [
-            projected_area(scale * turned[i] + shifts[i], camera, quantile)
+            projected_area(
+                scale * turned[i] + shifts[i],
+                camera,
+                quantile,
+                None if sigmas is None else scale * sigmas,
+            )
             for i, camera in enumerate(cameras)
         ]
         projected = torch.tensor([float("nan") if a is None else a for a in found])

@@ -51,7 +51,9 @@ class LossSpec(_Strict):
             "masked" draws the scene alone and leaves out the dilated masks (its text), "both".
         background: colour behind masked terms. "random" is drawn anew at each step.
         dilate: pixels by which masks grow before they cut a hole into the scene term.
-        regularizers: weight by name of the penalties that components offer, over their defaults.
+        regularizers: weight by name of the penalties that components offer, over their defaults;
+            and of "residual_pose" and "residual_means", the mean squared corrections by the
+            interaction, which m, tau and theta could explain as well (methods A.7); off by default.
     """
 
     weights: Literal["supp", "main"] = "main"

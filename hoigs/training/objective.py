@@ -13,6 +13,7 @@ from hoigs.core.camera import Camera
 from hoigs.core.clip import Frame
 from hoigs.core.density import DensityControl
 from hoigs.core.gaussians import Gaussians
+from hoigs.core.interaction import Residual
 from hoigs.core.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.scene import SceneModel, SceneState
 from hoigs.core.train_spec import LossSpec
@@ -111,6 +112,8 @@ class JointObjective:
         weights = {name: self.weights[name.partition("/")[0]] for name in terms}
         for name in self.model.entities:
             self._regularize(name, state.gaussians[name], terms, weights)
+        for name, residual in state.residuals.items():
+            self._restrain(name, residual, terms, weights)
         total = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
         return ObjectiveResult(terms, total, state, composite, offsets, weights, absolutes)
 
@@ -189,6 +192,16 @@ class JointObjective:
             if face is not None:
                 terms[f"human/{name}/face"] = self.spec.face * face
         return terms
+
+    def _restrain(
+        self, name: str, residual: Residual, terms: dict[str, Tensor], weights: dict[str, float]
+    ) -> None:
+        """Penalties of what the interaction asked for: mean squared, radians or metres."""
+        for key, value in (("residual_pose", residual.pose), ("residual_means", residual.means)):
+            weight = self.spec.regularizers.get(key, 0.0)
+            if weight > 0 and value is not None:
+                terms[f"regularizer/{name}/{key}"] = value.square().sum(-1).mean()
+                weights[f"regularizer/{name}/{key}"] = weight
 
     def _regularize(
         self, name: str, current: Gaussians, terms: dict[str, Tensor], weights: dict[str, float]

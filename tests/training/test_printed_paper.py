@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 from portrait import SIZE, Shots, portrait
 from torch import Tensor
@@ -13,6 +14,7 @@ from torch import Tensor
 from hoigs.core.clip import Clip, ObjectTrack
 from hoigs.core.compose import compose
 from hoigs.core.spec import Spec
+from hoigs.training.objective import JointObjective
 from hoigs.training.trainer import Trainer
 
 PAGE = Path(__file__).parents[2] / "docs" / "design" / "hoigs-equations.md"
@@ -20,7 +22,7 @@ SMALL = (
     'rasterizer={use: "rasterizer:torch"}',
     'model.scene.density={use: "density:none"}',
     "model.scene.points=200",
-    "model.human.points=3500",
+    "model.human.points=1800",
     "model.object.points=60",
     "model.human.deformation.resolution=8",
     "model.human.deformation.width=16",
@@ -66,6 +68,29 @@ def drinking() -> Clip:
         point_colors=torch.rand(200, 3),
         depth_kind="metric",
     )
+
+
+def test_residuals_are_restrained_where_asked():
+    clip = drinking()
+    found = {}
+    for weight in (0.0, 3.0):
+        wanted = [f"train.loss.regularizers.residual_{part}={weight}" for part in ("pose", "means")]
+        spec = Spec.load("hoigs", overrides=[*SMALL, *wanted, "interaction.gate=none"])
+        model = compose(spec, clip)
+        torch.manual_seed(0)
+        with torch.no_grad():
+            for parameter in model.interaction.parameters():
+                parameter += 0.1 * torch.randn_like(parameter)
+        objective = JointObjective(model, spec.train.loss, clip.depth_kind)
+        frame = clip[1]
+        found[weight] = objective(frame, frame.camera, torch.Generator().manual_seed(0))
+    names = {"regularizer/human/residual_pose", "regularizer/cup/residual_means"}
+    assert set(found[3.0].terms) - set(found[0.0].terms) == names
+    residuals = found[3.0].state.residuals
+    pose = residuals["human"].pose.double().square().sum() / 51
+    means = residuals["cup"].means.double().square().sum() / 60
+    added = float((found[3.0].total - found[0.0].total).detach())
+    assert added == pytest.approx(3 * float((pose + means).detach()), rel=1e-3) and added > 1e-4
 
 
 def test_all_printed_readings_train_together():
