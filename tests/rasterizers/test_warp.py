@@ -188,6 +188,34 @@ def test_copies_carry_the_settings() -> None:
         assert torch.equal(copied.render(random_scene(20), a_camera()).color, before.color)
 
 
+def test_a_batch_is_its_views() -> None:
+    rasterizer, scene = WarpRasterizer(), random_scene(50)
+    cameras = [a_camera(), a_camera(33, 20)]
+    for camera, output in zip(cameras, rasterizer.render_batch(scene, cameras), strict=True):
+        assert torch.equal(output.color, rasterizer.render(scene, camera).color)
+
+
+def test_there_is_nothing_to_capture_on_a_cpu() -> None:
+    with pytest.raises(RenderError, match="are on cpu, expected a CUDA device"):
+        WarpRasterizer().capture(random_scene(5), a_camera())
+
+
+def test_what_passed_once_is_still_checked() -> None:
+    """Inputs are known again by shapes, types and numbers; none of these may be missed."""
+    rasterizer, scene, camera = WarpRasterizer(), random_scene(5), a_camera()
+    rasterizer.render(scene, camera)
+    for wrong in (
+        (forged(scene, quats=scene.quats[:4]), camera, RenderRequest()),
+        (forged(scene, quats=scene.quats.double()), camera, RenderRequest()),
+        (scene, forged(camera, K=camera.K[:2]), RenderRequest()),
+        (scene, forged(camera, width=0), RenderRequest()),
+        (scene, camera, RenderRequest(near=-1.0)),
+        (scene, camera, RenderRequest(features=torch.zeros(6, 2))),
+    ):
+        with pytest.raises(RenderError):
+            rasterizer.render(*wrong)
+
+
 def test_report_names_what_runs() -> None:
     report = WarpRasterizer(scheduler="threads").backend_report()
     assert report["scheduler"] == "threads"

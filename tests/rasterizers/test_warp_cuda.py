@@ -68,25 +68,25 @@ def test_long_lists_are_in_order() -> None:
     gaussians, camera = scene(20_000, 20, 20)
     request = RenderRequest(min_transmittance=0.0)
     faint = gaussians.replace(opacity_logits=gaussians.opacity_logits * 0.0 - 4.0)
-    path = WarpRasterizer().path(CUDA)
+    rasterizer = WarpRasterizer()
+    path = rasterizer.path(CUDA)
     from hoigs.rasterizers.warp.frame import Inputs
-    from hoigs.rasterizers.warp.inputs import prepare
 
-    settings, tensors = prepare(WarpRasterizer(), faint, camera, request)
+    settings, tensors = rasterizer.door.prepare(rasterizer, faint, camera, request)
     projected = path.project(Inputs(*tensors), settings)
     lists = path.bin(projected, settings)
-    offsets = lists.offsets.tolist()
-    assert offsets[-1] == -1
-    assert max(b - a for a, b in pairwise(offsets[:-1])) > 5000
+    offsets, shared = lists.offsets[: lists.tiles + 1].tolist(), lists.offsets[lists.tiles + 1]
+    assert shared == -1
+    assert max(b - a for a, b in pairwise(offsets)) > 5000
     slots = []
-    for begin, end in pairwise(offsets[:-1]):
+    for begin, end in pairwise(offsets):
         rows, here = lists.pairs[begin:end].long().unbind(1)
         keys = projected.drawn_depths[rows].double() * 2**20 + rows.double() / 2**20
         assert (keys[1:] > keys[:-1]).all()
         assert (here >= lists.first[rows]).all()
         assert (here < lists.first[rows] + lists.slots[rows]).all()
         slots.append(here)
-    assert torch.equal(torch.cat(slots).sort().values, torch.arange(offsets[-2], device=CUDA))
+    assert torch.equal(torch.cat(slots).sort().values, torch.arange(offsets[-1], device=CUDA))
 
 
 def test_a_steady_step_waits_for_nothing() -> None:
@@ -114,7 +114,7 @@ def test_a_whole_step_can_be_captured() -> None:
     rasterizer = WarpRasterizer()
     leaves = gaussians.map(lambda x: x.detach().clone().requires_grad_())
     graph = torch.cuda.CUDAGraph()
-    with pytest.raises(RenderError, match="render once before"), torch.cuda.graph(graph):
+    with pytest.raises(RenderError, match="once before the capture"), torch.cuda.graph(graph):
         rasterizer.render(leaves, camera)
     side = torch.cuda.Stream()
     with torch.cuda.stream(side):
@@ -124,7 +124,7 @@ def test_a_whole_step_can_be_captured() -> None:
     with torch.cuda.graph(graph, stream=side):
         rasterizer.render(leaves, camera).color.sum().backward()
     with torch.no_grad():
-        leaves.means += 0.05
+        leaves.means.add_(0.05)
     graph.replay()
     wanted = leaves.map(lambda x: x.detach().clone().requires_grad_())
     rasterizer.render(wanted, camera).color.sum().backward()
@@ -177,18 +177,15 @@ def test_a_captured_render_follows_its_inputs() -> None:
 
 
 def test_a_captured_render_that_outgrows_its_room_is_right_and_grows() -> None:
-    gaussians, camera = scene()
+    gaussians, camera = scene(20_000, 300, 200)
     small = gaussians.replace(log_scales=gaussians.log_scales - 3.0)
-    rasterizer = WarpRasterizer()
-    draw = rasterizer.capture(small, camera)
-    draw._path.lists.room._room = 3000
-    draw._capture()
+    draw = WarpRasterizer().capture(small, camera)
     wanted = WarpRasterizer().render(gaussians, camera).color
     assert torch.equal(draw(gaussians=gaussians).color, wanted)
     torch.cuda.synchronize()
-    captures = draw.captures
+    assert draw.captures == 1
     assert torch.equal(draw().color, wanted)
-    assert draw.captures == captures + 1
+    assert draw.captures == 2, "the pairs fitted: this tests nothing"
 
 
 def test_a_captured_render_refuses_other_sizes() -> None:
@@ -198,8 +195,3 @@ def test_a_captured_render_refuses_other_sizes() -> None:
         draw(camera=a_camera(151, 90).to(CUDA))
     with pytest.raises(RenderError, match=r"3000, 3.*100, 3"):
         draw(gaussians=gaussians[:100])
-
-
-def test_there_is_nothing_to_capture_on_a_cpu() -> None:
-    with pytest.raises(RenderError, match="CUDA"):
-        WarpRasterizer().capture(random_scene(5), a_camera())

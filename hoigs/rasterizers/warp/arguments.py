@@ -80,7 +80,7 @@ class Gradients:
         self.log_scales = torch.empty_like(inputs.log_scales)
         self.opacity_logits = torch.empty_like(inputs.opacity_logits)
         self.sh = torch.empty_like(inputs.sh)
-        self.features = torch.empty_like(inputs.features)
+        self.features = torch.empty_like(inputs.features) if inputs.channels else inputs.features
         self.offsets = inputs.means.new_empty(inputs.count, 2)
         self.pose = inputs.means.new_empty(inputs.count if pose else 0, POSE)
 

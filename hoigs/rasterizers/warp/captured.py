@@ -11,7 +11,6 @@ from hoigs.core.errors import RenderError
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.rasterizer import RenderOutput, RenderRequest
 from hoigs.rasterizers.warp.frame import Inputs
-from hoigs.rasterizers.warp.inputs import prepare
 
 
 class CapturedRender:
@@ -21,7 +20,7 @@ class CapturedRender:
     stream. The output is the graph's own memory too: the next call draws over it.
 
     Should a view have so many splats in tiles that there is no room for, it is still drawn right,
-    only slower (see `list_source`); the next call then captures anew, with more room.
+    only slower (see `lists`); the next call then captures anew, with more room.
 
     Attributes:
         captures: how often the graph was captured, 1 as long as there was room.
@@ -31,7 +30,7 @@ class CapturedRender:
         self, rasterizer: Any, gaussians: Gaussians, camera: Camera, request: RenderRequest
     ) -> None:
         self._rasterizer = rasterizer
-        self._settings, tensors = prepare(rasterizer, gaussians, camera, request)
+        self._settings, tensors = rasterizer.door.prepare(rasterizer, gaussians, camera, request)
         self._buffers = [x.detach().clone() for x in tensors]
         self._path = rasterizer.path(gaussians.means.device)
         self._gaussians, self._camera, self._request = gaussians, camera, request
@@ -69,7 +68,9 @@ class CapturedRender:
     ) -> None:
         camera, gaussians = camera or self._camera, gaussians or self._gaussians
         request = request or self._request
-        settings, tensors = prepare(self._rasterizer, gaussians, camera, request)
+        settings, tensors = self._rasterizer.door.prepare(
+            self._rasterizer, gaussians, camera, request
+        )
         if settings != self._settings:
             raise RenderError(
                 f"CapturedRender: captured with {self._settings}, called with {settings}; "

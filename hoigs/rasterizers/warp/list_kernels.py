@@ -1,30 +1,34 @@
 # mypy: ignore-errors
 # (Warp's arrays annotate as values)
-"""Kernels that list the splats of each tile on CUDA; their C++ stands in `list_source`."""
+"""Kernels that list the splats of each tile on CUDA; see `lists`.
 
-from hoigs.rasterizers.warp import list_source as source
+Their C++ stands in `list_source` and `order_source`.
+"""
+
+from hoigs.rasterizers.warp import list_source, order_source
 from hoigs.rasterizers.warp.records import F32, I32, I64
 from hoigs.rasterizers.warp.runtime import wp
 from hoigs.rasterizers.warp.tile_spans import TILE_WIDTH
 
 wp.set_module_options({"enable_backward": False})
 
+SORT_BLOCK = wp.constant(order_source.SORT_BLOCK)
 _SIZES = {
     "WIDTH": TILE_WIDTH,
-    "BLOCK": source.BLOCK,
-    "PLAN_BLOCK": source.PLAN_BLOCK,
-    "SORTED_AT_ONCE": source.SORTED_AT_ONCE,
+    "BLOCK": list_source.BLOCK,
+    "PLAN_BLOCK": order_source.PLAN_BLOCK,
+    "SORT_BLOCK": order_source.SORT_BLOCK,
 }
 
 
-@wp.func_native(source.COUNT % _SIZES)
+@wp.func_native(list_source.COUNT % _SIZES)
 def count_native(
     row: int, records: F32, drawn_depths: F32, count: int, rows: int, across: int, down: int,
     width: int, counts: I32, first: I32, slots: I32, sums: I32,
 ): ...  # fmt: skip
 
 
-@wp.kernel(launch_bounds=source.BLOCK)
+@wp.kernel(launch_bounds=list_source.BLOCK)
 def count_pairs(
     records: F32,
     drawn_depths: F32,  # [N], negative where nothing is drawn
@@ -44,14 +48,14 @@ def count_pairs(
     )  # fmt: skip
 
 
-@wp.func_native(source.PLAN % _SIZES)
+@wp.func_native(order_source.PLAN % _SIZES)
 def plan_native(
     drawn_depths: F32, count: int, tiles: int, capacity: int, measuring: int, counts: I32,
     sums: I32, offsets: I32, keys: I64, pairs: I32, seen: I64, told: I64,
 ): ...  # fmt: skip
 
 
-@wp.kernel(launch_bounds=source.PLAN_BLOCK)
+@wp.kernel(launch_bounds=order_source.PLAN_BLOCK)
 def plan_lists(
     drawn_depths: F32,
     count: int,
@@ -60,7 +64,9 @@ def plan_lists(
     measuring: int,  # 1: there is no room yet; 0: what does not fit becomes one list
     counts: I32,
     sums: I32,  # becomes the number of pairs before each block
-    offsets: I32,  # [tiles + 2]; the last is the length of the one list, -1 if there is none
+    # [2 tiles + 3]: where each list begins; the number of pairs; the length of the one list, -1 if
+    # there is none; the number of long lists; the tiles, those with long lists first
+    offsets: I32,
     keys: I64,
     pairs: I32,
     seen: I64,  # [1] the most pairs so far
@@ -72,7 +78,7 @@ def plan_lists(
     )  # fmt: skip
 
 
-@wp.func_native(source.PLACE % _SIZES)
+@wp.func_native(list_source.PLACE % _SIZES)
 def place_native(
     row: int, records: F32, drawn_depths: F32, count: int, rows: int, across: int, down: int,
     width: int, counts: I32, first: I32, slots: I32, sums: I32, offsets: I32, keys: I64,
@@ -80,7 +86,7 @@ def place_native(
 ): ...  # fmt: skip
 
 
-@wp.kernel(launch_bounds=source.BLOCK)
+@wp.kernel(launch_bounds=list_source.BLOCK)
 def place_pairs(
     records: F32,
     drawn_depths: F32,
@@ -103,34 +109,19 @@ def place_pairs(
     )  # fmt: skip
 
 
-@wp.func_native(source.SORT % _SIZES)
+@wp.func_native(order_source.SORT % _SIZES)
 def sort_native(
-    tile: int, tiles: int, offsets: I32, keys: I64, owners: I32, pairs: I32
+    block: int, blocks: int, tiles: int, offsets: I32, keys: I64, owners: I32, pairs: I32
 ): ...  # fmt: skip
 
 
-@wp.kernel(launch_bounds=source.SORT_BLOCK)
+@wp.kernel(launch_bounds=(order_source.SORT_BLOCK, 3))
 def sort_lists(
+    blocks: int,  # of the launch
     tiles: int,
     offsets: I32,
     keys: I64,
     owners: I32,
     pairs: I32,  # [capacity, 2]: row and slot
 ):
-    sort_native(wp.tid() // wp.block_dim(), tiles, offsets, keys, owners, pairs)
-
-
-@wp.kernel
-def clear_partials(
-    tiles: int,
-    stride: int,
-    offsets: I32,
-    partials: F32,
-    base: int,
-    count: int,
-):
-    """Zeros for the sums of each row, where all tiles share one list."""
-    row = wp.tid() + base
-    if row < count and offsets[tiles + 1] >= 0:
-        for k in range(stride):
-            partials[row * stride + k] = 0.0
+    sort_native(wp.tid() // SORT_BLOCK, blocks, tiles, offsets, keys, owners, pairs)

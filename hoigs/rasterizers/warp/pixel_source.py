@@ -6,7 +6,7 @@ sums over the tile are made by halving: each exchange of lanes also halves how m
 keeps, so ten take 12 shuffles, and lanes write their sums side by side. There are no barriers
 beyond the warp, no atomics, and sums have the same order in every run.
 
-On CUDA there may be one list for all tiles instead (see `list_source`): the warp then takes those
+On CUDA there may be one list for all tiles instead (see `lists`): the warp then takes those
 of each 32 whose box touches its tile, and adds its sums to the row's by atomics.
 
 On a CPU the lanes run one after the other, and each adds its own share to the partials.
@@ -22,14 +22,19 @@ WARPS = 4  # of a block
 
 _HEAD = r"""
     constexpr int P = %(PIXELS)d, STEP = 32 / %(TILE_WIDTH)d;  // rows between a lane's pixels
-    const int lane = thread & 31, tile = thread >> 5;
+    const int* offsets_ = (const int*)offsets.data;
+    const int lane = thread & 31;
+#if defined(__CUDA_ARCH__)
+    const int tile = offsets_[tiles + 3 + (thread >> 5)];
+#else
+    const int tile = thread >> 5;
+#endif
     const int left = tile %% across * %(TILE_WIDTH)d, top = tile / across * %(TILE_ROWS)d;
     const int x = left + lane %% %(TILE_WIDTH)d, y = top + lane / %(TILE_WIDTH)d;
     const float* records_ = (const float*)records.data;
     const float* features_ = (const float*)features.data;
     const float* background_ = (const float*)background.data;
     const int* pairs_ = (const int*)pairs.data;
-    const int* offsets_ = (const int*)offsets.data;
     float* color_ = (float*)color.data;
     float* alpha_ = (float*)alpha.data;
     float* depth_ = (float*)depth.data;
@@ -56,8 +61,10 @@ _HEAD = r"""
     auto exp2_of = [](float e) -> float { return wp::exp(e * 0.693147180559945309f); };
     auto quotient = [](float a, float b) -> float { return a / b; };
 #endif
-    for (int block = 0; block == 0 || 4 * (block - 1) < channels; ++block) {
-        const int channel = 4 * (block - 1);  // first feature of this block; block 0 is colour
+"""
+
+# One pass over the pairs: colour and depth, or four feature channels from `channel` on.
+_STATE = r"""
         float T[P];
         bool inside[P];
         #pragma unroll
@@ -67,97 +74,92 @@ _HEAD = r"""
         }
 """
 
-# The loop over the pairs of the tile, as long as some pixel goes on. It opens two blocks on CUDA
-# (32 pairs at a time, one pair) and one on a CPU; DONE closes them. `at` is the first pair not yet
-# taken when it ends.
+# The loop over the pairs of the tile, as long as some pixel goes on. It opens blocks that DONE
+# closes; `continue` leaves a pair. `exponent[i]` is log2 of alpha before the clamp, `on[i]` whether
+# pixel i is hit. `at` is the first pair not yet taken when the loop ends.
 _EACH = r"""
         int at = begin;
 #if defined(__CUDA_ARCH__)
         #define DONE } at += 32; }
+        int2 pair;
+        float4 first, second, third;
+        auto fetch = [&](int from) {
+            if (from + lane >= end) return;
+            pair = ((const int2*)pairs_)[from + lane];
+            const float4* record = (const float4*)records_ + 4ll * pair.x;
+            first = record[0];
+            second = record[1];
+            third = record[2];
+        };
+        fetch(at);
         while (at < end) {
             bool running = false;
             #pragma unroll
             for (int i = 0; i < P; ++i) running |= T[i] > 0.0f;
             if (!any(running)) break;
-            __syncwarp();  // the records before these have been read
-            int2 pair;
-            float4 first, third;
             bool mine = at + lane < end;
-            if (mine) {
-                pair = ((const int2*)pairs_)[at + lane];
-                first = ((const float4*)records_)[4ll * pair.x];
-                third = ((const float4*)records_)[4ll * pair.x + 2];
-                if (shared_list)  // one pixel more than the box: rounding loses nothing
-                    mine = first.x + third.z > (float)left - 1.0f
-                        && first.x - third.z < (float)(left + %(TILE_WIDTH)d) + 1.0f
-                        && first.y + third.w > (float)top - 1.0f
-                        && first.y - third.w < (float)(top + %(TILE_ROWS)d) + 1.0f;
-            }
+            if (shared_list && mine)  // one pixel more than the box: rounding loses nothing
+                mine = first.x + third.z > (float)left - 1.0f
+                    && first.x - third.z < (float)(left + %(TILE_WIDTH)d) + 1.0f
+                    && first.y + third.w > (float)top - 1.0f
+                    && first.y - third.w < (float)(top + %(TILE_ROWS)d) + 1.0f;
             const unsigned taken = __ballot_sync(ALL, mine);
+            __syncwarp();  // the records before these have been read
             if (mine) {
                 float4* to = stage + 3 * __popc(taken & ((1u << lane) - 1u));
-                third.z = __int_as_float(pair.x);
-                third.w = __int_as_float(pair.y);
                 to[0] = first;
-                to[1] = ((const float4*)records_)[4ll * pair.x + 1];
-                to[2] = third;
+                to[1] = second;
+                to[2] = make_float4(third.x, third.y, __int_as_float(pair.x),
+                                    __int_as_float(pair.y));
             }
             __syncwarp();
+            fetch(at + 32);  // on their way while these are drawn
             const int number = __popc(taken);
             for (int k = 0; k < number; ++k) {
                 const float4 g0 = stage[3 * k], g1 = stage[3 * k + 1], g2 = stage[3 * k + 2];
                 const int row = __float_as_int(g2.z), slot = __float_as_int(g2.w);
-                const float center_x = g0.x, center_y = g0.y, a = g0.z, shear = g0.w;
-                const float c = g1.x, log2_opacity = g1.y;
-                const float shown[4] = {g1.z, g1.w, g2.x, g2.y};
 #else
         #define DONE }
+        struct Four { float x, y, z, w; };
         for (; at < end; ++at) {
                 bool running = false;
                 for (int i = 0; i < P; ++i) running |= T[i] > 0.0f;
                 if (!running) break;
                 const int row = pairs_[2 * at], slot = pairs_[2 * at + 1];
                 const float* g = records_ + 16ll * row;
-                const float center_x = g[0], center_y = g[1], a = g[2], shear = g[3];
-                const float c = g[4], log2_opacity = g[5];
-                const float shown[4] = {g[6], g[7], g[8], g[9]};
-                (void)slot;
+                const Four g0 = {g[0], g[1], g[2], g[3]}, g1 = {g[4], g[5], g[6], g[7]};
+                const Four g2 = {g[8], g[9], 0.0f, 0.0f};
 #endif
-"""
-
-# One pair: `continue` leaves it. `exponent[i]` is log2 of alpha before the clamp, far below any
-# limit where pixel i is not hit.
-_PAIR = r"""
-                const float dx = (float)x + 0.5f - center_x, dy0 = (float)y + 0.5f - center_y;
+                (void)slot;
+                const float dx = (float)x + 0.5f - g0.x, dy0 = (float)y + 0.5f - g0.y;
+                const float a = g0.z, shear = g0.w, c = g1.x, log2_opacity = g1.y;
                 float exponent[P], u[P];
-                bool hit = false;
+                bool on[P], hit = false;
                 #pragma unroll
                 for (int i = 0; i < P; ++i) {
                     const float dy = dy0 + (float)(i * STEP);
                     u[i] = dx - shear * dy;
                     exponent[i] = log2_opacity - c * dy * dy - a * u[i] * u[i];
-                    if (!(exponent[i] >= log2_min_alpha && T[i] > 0.0f)) exponent[i] = -1e30f;
-                    hit |= exponent[i] > -1e30f;
+                    on[i] = exponent[i] >= log2_min_alpha && T[i] > 0.0f;
+                    hit |= on[i];
                 }
                 if (!any(hit)) {
                     %(MISS)s
                     continue;
                 }
-                float f[4];
-                for (int j = 0; j < 4; ++j) {
-                    if (block == 0) f[j] = shown[j];
-                    else f[j] = channel + j < channels ? features_[row * channels + channel + j]
-                                                       : 0.0f;
-                }
+                float f[4] = {g1.z, g1.w, g2.x, g2.y};
+                if (!COLOR)
+                    for (int j = 0; j < 4; ++j)
+                        f[j] = channel + j < channels ? features_[row * channels + channel + j]
+                                                      : 0.0f;
 """
 
 _FORWARD = r"""
         float sums[P][4] = {};
         %(EACH)s
-            %(PAIR)s
                 #pragma unroll
                 for (int i = 0; i < P; ++i) {
-                    if (exponent[i] == -1e30f) continue;
+                    if (!on[i]) continue;
                     const float raw = exp2_of(exponent[i]);
                     const float weight = T[i] * (raw < max_alpha ? raw : max_alpha);
                     const float next = T[i] - weight;
@@ -174,7 +176,7 @@ _FORWARD = r"""
         for (int i = 0; i < P; ++i) {
             if (!inside[i]) continue;
             const int p = (y + i * STEP) * width + x;
-            if (block == 0) {
+            if (COLOR) {
                 const float through = T[i] < 0.0f ? -T[i] : T[i];
                 const float* back = background_ + p * background_stride;
                 for (int j = 0; j < 3; ++j) color_[3 * p + j] = sums[i][j] + through * back[j];
@@ -185,7 +187,6 @@ _FORWARD = r"""
                     extra_[p * channels + channel + j] = sums[i][j];
             }
         }
-    }
 """
 
 # S: what the splats not yet passed still add, sum of w (channels . v + veil); see `cpu_source`.
@@ -198,7 +199,7 @@ _BACKWARD = r"""
             for (int j = 0; j < 4; ++j) v[i][j] = 0.0f;
             if (!inside[i]) continue;
             const int p = (y + i * STEP) * width + x;
-            if (block == 0) {
+            if (COLOR) {
                 const float* back = background_ + p * background_stride;
                 veil[i] = v_alpha_[p];
                 v[i][3] = v_depth_[p];
@@ -216,11 +217,10 @@ _BACKWARD = r"""
             }
         }
         %(EACH)s
-            %(PAIR)s
                 float sums[10] = {};  // six moments, four channels
                 #pragma unroll
                 for (int i = 0; i < P; ++i) {
-                    if (exponent[i] == -1e30f) continue;
+                    if (!on[i]) continue;
                     const float raw = exp2_of(exponent[i]);
                     const float opaque = raw < max_alpha ? raw : max_alpha;
                     const float weight = T[i] * opaque, next = T[i] - weight;
@@ -233,15 +233,14 @@ _BACKWARD = r"""
                         S[i] -= weight * value;
                         const float clear = 1.0f - opaque > 1e-7f ? 1.0f - opaque : 1e-7f;
                         const float slope = opaque * (T[i] * value - quotient(S[i], clear));
-                        if (raw <= max_alpha) {
-                            const float dy = dy0 + (float)(i * STEP);
-                            sums[0] += slope;
-                            sums[1] += slope * u[i];
-                            sums[2] += slope * dy;
-                            sums[3] += slope * u[i] * u[i];
-                            sums[4] += slope * u[i] * dy;
-                            sums[5] += slope * dy * dy;
-                        }
+                        const float g = raw <= max_alpha ? slope : 0.0f;
+                        const float dy = dy0 + (float)(i * STEP), gu = g * u[i], gy = g * dy;
+                        sums[0] += g;
+                        sums[1] += gu;
+                        sums[2] += gy;
+                        sums[3] += gu * u[i];
+                        sums[4] += gu * dy;
+                        sums[5] += gy * dy;
                         T[i] = next;
                     } else {
                         T[i] = -T[i];
@@ -274,17 +273,17 @@ _BACKWARD = r"""
                 const float given = in1 ? sums[0] : sums[1], kept = in1 ? sums[1] : sums[0];
                 float total = kept + __shfl_xor_sync(ALL, given, 2);
                 total += __shfl_xor_sync(ALL, total, 1);
-                if (sum_of_lane >= 0 && (block == 0 || sum_of_lane < 6
+                if (sum_of_lane >= 0 && (COLOR || sum_of_lane < 6
                                          || channel + sum_of_lane - 6 < channels)) {
                     float* to = out + sum_of_lane;
-                    if (block > 0 && sum_of_lane >= 6) to += 4 + channel;
+                    if (!COLOR && sum_of_lane >= 6) to += 4 + channel;
                     if (shared_list) atomicAdd(to, total);
-                    else if (block > 0 && sum_of_lane < 6) *to += total;
+                    else if (!COLOR && sum_of_lane < 6) *to += total;
                     else *to = total;
                 }
 #else
                 for (int j = 0; j < 10; ++j) {
-                    if (j < 6 || block == 0) out[j] += sums[j];
+                    if (j < 6 || COLOR) out[j] += sums[j];
                     else if (channel + j - 6 < channels) out[10 + channel + j - 6] += sums[j];
                 }
 #endif
@@ -294,7 +293,7 @@ _BACKWARD = r"""
         if (!shared_list) {  // all pixels have stopped: the rest of the list got nothing
             for (at += lane; at < end; at += 32) {
                 float* out = partials_ + (long long)pairs_[2 * at + 1] * (10 + channels);
-                if (block == 0) {
+                if (COLOR) {
                     for (int j = 0; j < 10; ++j) out[j] = 0.0f;
                 } else {
                     for (int j = 0; j < 4 && channel + j < channels; ++j)
@@ -303,15 +302,14 @@ _BACKWARD = r"""
             }
         }
 #endif
-    }
 """
 
 # a missed pair of CUDA
 _CLEAR = r"""
 #if defined(__CUDA_ARCH__)
-                    if (!shared_list && lane < (block == 0 ? 10 : min(4, channels - channel)))
+                    if (!shared_list && lane < (COLOR ? 10 : min(4, channels - channel)))
                         partials_[(long long)slot * (10 + channels)
-                                  + (block == 0 ? 0 : 10 + channel) + lane] = 0.0f;
+                                  + (COLOR ? 0 : 10 + channel) + lane] = 0.0f;
 #endif
 """
 
@@ -338,8 +336,19 @@ _SIZES = {
 
 
 def _filled(body: str, miss: str) -> str:
-    parts = {"EACH": _EACH % _SIZES, "PAIR": _PAIR % {"MISS": miss}}
-    return _HEAD % _SIZES + body % parts
+    one = _STATE + body % {"EACH": _EACH % {**_SIZES, "MISS": miss}}
+    return f"""{_HEAD % _SIZES}
+    {{
+        constexpr bool COLOR = true;
+        constexpr int channel = 0;
+        (void)channel;
+        {one}
+    }}
+    for (int channel = 0; channel < channels; channel += 4) {{
+        constexpr bool COLOR = false;
+        {one}
+    }}
+"""
 
 
 FORWARD = _filled(_FORWARD, "")

@@ -13,7 +13,7 @@ from hoigs.core.gaussians import Gaussians
 from hoigs.core.rasterizer import Capabilities, Rasterizer, RenderOutput, RenderRequest
 from hoigs.rasterizers.warp.autograd import Render
 from hoigs.rasterizers.warp.captured import CapturedRender
-from hoigs.rasterizers.warp.inputs import prepare
+from hoigs.rasterizers.warp.inputs import Door
 
 
 class WarpConfig(ComponentConfig):
@@ -30,6 +30,15 @@ class WarpRasterizer(Rasterizer):
     The first render on a machine compiles its kernels (some seconds) into Warp's cache
     (`WARP_CACHE_PATH`); later processes load them in milliseconds. Two renders of the same input
     agree bit for bit, whatever the scheduler and the number of threads.
+
+    On CUDA everything happens on torch's current stream, and nothing waits for the device but a
+    render with more Gaussians or more pixels than any before it on this rasterizer, for its number
+    of splats in tiles ("pairs"). Later renders make room for 1.5 times the most pairs seen. A view
+    that has more is still drawn right, with the same picture, but some times slower, and its
+    gradients then sum in no fixed order; the next one finds more room. A render holds 20 bytes a
+    pair of room (12 of them shared by all renders of a stream), its backward 4 (10 + feature
+    channels) more, and 128 bytes a Gaussian. Steps can be captured in a CUDA graph after a first
+    one; `capture` does that for rendering.
 
     Args:
         cpu_kernels: "native", the fast ones; "portable", the very kernels that CUDA runs, as scalar
@@ -63,6 +72,7 @@ class WarpRasterizer(Rasterizer):
         if threads is not None and threads < 1:
             raise RenderError(f"WarpRasterizer: threads is {threads}, expected at least 1")
         self.cpu_kernels, self.scheduler, self.threads = cpu_kernels, scheduler, threads
+        self.door = Door()
         self._paths: dict[torch.device, Any] = {}
         self._report: dict[str, str] = {}
 
@@ -70,7 +80,7 @@ class WarpRasterizer(Rasterizer):
         self, gaussians: Gaussians, camera: Camera, request: RenderRequest | None = None
     ) -> RenderOutput:
         request = request or RenderRequest()
-        settings, tensors = prepare(self, gaussians, camera, request)
+        settings, tensors = self.door.prepare(self, gaussians, camera, request)
         path = self.path(gaussians.means.device)
         color, alpha, depth, extra, means2d, depths, radii = Render.apply(path, settings, *tensors)
         info = {"radii": radii, "means2d": means2d, "depths": depths}
@@ -110,6 +120,11 @@ class WarpRasterizer(Rasterizer):
     def path(self, device: torch.device) -> Any:
         """What draws on a device: its kernels, brought up once."""
         if device not in self._paths:
+            if device.type == "cuda" and torch.cuda.is_current_stream_capturing():
+                raise RenderError(
+                    "WarpRasterizer: its first render must not be captured in a CUDA graph: render "
+                    "once before the capture, backward included if that is captured too"
+                )
             self._paths[device] = self._make_path(device)
         return self._paths[device]
 

@@ -11,7 +11,8 @@ With d = (dx, dy) from its centre, u = dx - shear dy, and the screen covariance 
 One *pair* is (row of the Gaussian, slot): a Gaussian in the list of a tile. Slots number the pairs
 so that those of one Gaussian are neighbours. One *partial* of MOMENTS + F floats per slot holds
 what one tile says about one Gaussian's gradient; each is written by one tile only and they are
-summed in a fixed order, so no atomics are needed and results do not depend on the schedule.
+summed in a fixed order, so no atomics are needed and results do not depend on the schedule. (On
+CUDA there is one exception, where pairs do not fit: see `lists`.)
 """
 
 import math
