@@ -21,6 +21,7 @@ CHECKED = (
     "hoigs.rasterizers.torch_tiles",
     "hoigs.evaluation",
     "hoigs.training",
+    "hoigs.studies",
     "hoigs.testing",
 )
 install_import_hook(list(CHECKED), "shapecheck.check")

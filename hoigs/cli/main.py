@@ -7,7 +7,7 @@ import sys
 import typer
 
 from hoigs import __version__
-from hoigs.cli import demo, doctor, evaluate, plugins, prepare, render, spec, train
+from hoigs.cli import demo, doctor, evaluate, plugins, prepare, render, spec, tables, train
 from hoigs.core.errors import HoigsError
 
 app = typer.Typer(
@@ -22,6 +22,7 @@ app.command("prepare")(prepare.prepare)
 app.command("train")(train.train)
 app.command("eval")(evaluate.evaluate)
 app.command("render")(render.render)
+app.command("tables")(tables.tables)
 app.command("plugins")(plugins.plugins)
 app.add_typer(spec.app, name="spec")
 app.command("doctor")(doctor.doctor)

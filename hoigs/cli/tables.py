@@ -1,0 +1,91 @@
+"""`hoigs tables`: the paper's ablations and comparisons, job by job, on clips of one's own."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hoigs.cli.common import DeviceOption, PluginOption, SetOption, pick_device
+from hoigs.cli.evaluate import LpipsOption
+
+
+def tables(
+    clips: Annotated[
+        str, typer.Option("--clips", help="Clip folders or builtin:NAME, with commas between.")
+    ],
+    table: Annotated[
+        list[str] | None,
+        typer.Option("--table", help="A named table set; default all. Repeatable."),
+    ] = None,
+    specs: Annotated[
+        str, typer.Option("--specs", help="Also, or instead, a table of these: hoigs,4dgs@matched.")
+    ] = "",
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Runs of each, seeds 0, 1 …")] = 3,
+    steps: Annotated[
+        int | None, typer.Option("--steps", min=1, help="Of every run; default each spec's own.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder of runs and tables.")] = Path(
+        "runs/tables"
+    ),
+    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Runs at a time.")] = 1,
+    threads: Annotated[
+        int | None, typer.Option("--threads", min=1, help="Of each run; default cores / jobs.")
+    ] = None,
+    settings: SetOption = None,
+    device: DeviceOption = "auto",
+    lpips_weights: LpipsOption = None,
+    plugin: PluginOption = None,
+) -> None:
+    """Run tables of methods on clips; what is done stays done, what failed is tried again.
+
+    Sets: comparison, ablation-object-motion, ablation-interaction, ablation-human-feature,
+    object-prior, mask-depth-source. Writes tables.md, tables.csv and tables.json.
+    """
+    from hoigs.studies.job import Job
+    from hoigs.studies.table_sets import choose_sets
+    from hoigs.studies.tables import Study, protocols, run_study
+    from hoigs.studies.write_tables import write_tables
+    from hoigs.training.run_folder import versions
+
+    study = Study(
+        clips=_split(clips),
+        sets=choose_sets(table or (), _split(specs)),
+        out=out.resolve(),
+        seeds=seeds,
+        steps=steps,
+        settings=tuple(settings or ()),
+        device=pick_device(device),
+        lpips_weights=lpips_weights.resolve() if lpips_weights else None,
+        plugins=tuple(p.resolve() for p in plugin or ()),
+    )
+    each = threads or max(1, (os.cpu_count() or 1) // jobs)
+    ended = 0
+
+    def report(job: Job, word: str) -> None:
+        nonlocal ended
+        ended += word != "started"
+        typer.echo(f"[{ended:>3}] {job.clip_label}/{job.folder.name}: {word}")
+
+    results = run_study(study, workers=jobs, threads=each, report=report)
+    about: dict[str, object] = {
+        "clips": ", ".join(study.clips),
+        "seeds": seeds,
+        "steps": "each spec's own" if steps is None else steps,
+        "settings": " ".join(study.settings) or "none",
+        "spread": "sample standard deviation over seeds (± in the tables)",
+        "times": f"measured beside {jobs - 1} other runs, {each} threads each, on {study.device}",
+        "versions": ", ".join(f"{name} {value}" for name, value in versions().items()),
+    }
+    for clip, sentences in protocols(study, results).items():
+        about[f"protocol of {clip}"] = " ".join(sentences)
+    for path in write_tables(results, study.out, about):
+        typer.echo(f"wrote {path}")
+    if any(r.missing and r.row.spec for t in results for rows in t.rows.values() for r in rows):
+        typer.echo("some rows are not computed; the tables say why")
+
+
+def _split(names: str) -> list[str]:
+    return [name.strip() for name in names.split(",") if name.strip()]

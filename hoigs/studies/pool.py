@@ -1,0 +1,80 @@
+"""A few jobs at a time, each in a process with its own number of threads."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from hoigs.studies.job import Job, JobState
+
+POLL_S = 0.05
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+Report = Callable[[Job, str], None]
+
+
+def run_jobs(
+    jobs: Sequence[Job], *, workers: int = 1, threads: int = 1, report: Report | None = None
+) -> Mapping[str, str]:
+    """Run what is not done yet; a job that fails stops no other.
+
+    Args:
+        workers: processes at a time. threads: of each, by OMP_NUM_THREADS.
+        report: called with a job and "done before", "started", "done" or "failed: why".
+
+    Returns:
+        Why a job failed, by run folder; those that are not there are done. Processes are ended
+        when this is interrupted; the next call goes on from their last checkpoints.
+    """
+    tell = report or (lambda job, word: None)
+    waiting: list[Job] = []
+    for job in jobs:
+        if job.state() is JobState.done:
+            tell(job, "done before")
+        else:
+            waiting.append(job)
+    failed: dict[str, str] = {}
+    running: list[tuple[Job, subprocess.Popen[bytes]]] = []
+    try:
+        while waiting or running:
+            while waiting and len(running) < workers:
+                job = waiting.pop(0)
+                tell(job, "started")
+                running.append((job, _start(job, threads)))
+            time.sleep(POLL_S)
+            for job, process in [pair for pair in running if pair[1].poll() is not None]:
+                running.remove((job, process))
+                if job.state() is JobState.done:
+                    tell(job, "done")
+                else:
+                    failed[job.run] = _why(job.log, process.returncode)
+                    tell(job, f"failed: {failed[job.run]}")
+    finally:
+        for _, process in running:
+            process.terminate()
+        for _, process in running:
+            process.wait()
+    return failed
+
+
+def _start(job: Job, threads: int) -> subprocess.Popen[bytes]:
+    job.log.parent.mkdir(parents=True, exist_ok=True)
+    environment = os.environ | dict.fromkeys(THREADS, str(threads))
+    command = [sys.executable, "-m", "hoigs.studies.worker", job.dump()]
+    with job.log.open("wb") as log:
+        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
+
+
+def _why(log: Path, code: int) -> str:
+    """The error that a job's log ends with: what follows "error: ", else its last line."""
+    if code < 0:
+        return f"ended by signal {-code}"
+    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    marked = [i for i, line in enumerate(lines) if line.startswith("error: ")]
+    if marked:
+        return " ".join(lines[marked[-1] :]).removeprefix("error: ")
+    return lines[-1].strip() if lines else f"exit code {code}, and it said nothing"

@@ -1,0 +1,68 @@
+"""One job in a process of its own: `python -m hoigs.studies.worker JOB_AS_JSON`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from hoigs.core.errors import HoigsError
+from hoigs.studies.job import SCORES, Job, JobState, write_record
+
+TIMED_FRAMES, TIMING_BUDGET_S = 30, 15.0  # other jobs run beside: a rough number is what there is
+
+
+def run_job(job: Job) -> None:
+    """Train and score, from where an interrupted run of the same job stopped.
+
+    Raises:
+        HoigsError: the spec does not fit the clip, or the training failed.
+    """
+    from hoigs.evaluation.evaluate import evaluate
+    from hoigs.training.session import LoadedRun, Session
+
+    state = job.state()
+    if state is JobState.done:
+        return
+    weights = Path(job.lpips_weights) if job.lpips_weights else None
+    plugins = [Path(p) for p in job.plugins]
+    session = Session.open(
+        Path(job.clip),
+        job.spec,
+        out=job.folder,
+        overrides=job.settings,
+        device=job.device,
+        resume=state is JobState.started,
+        overwrite=state is JobState.absent,
+        plugins=plugins,
+        lpips_weights=weights,
+    )
+    if session.spec.hash() != job.spec_hash:
+        raise HoigsError(f"{job.spec} has changed since the tables were begun; start them again")
+    write_record(job.folder, job.identity)
+    session.train()
+    loaded = LoadedRun.open(job.folder, clip=job.clip, device=job.device, plugins=plugins)
+    settings = loaded.spec.evaluation
+    evaluation = evaluate(
+        loaded.model,
+        loaded.clip,
+        lpips_weights=weights,
+        held_out=settings.held_out,
+        test_pose=settings.test_pose,
+        timing_frames=TIMED_FRAMES,
+        timing_warmup=3,
+        timing_budget_s=TIMING_BUDGET_S,
+    )
+    evaluation.save(job.folder / SCORES)
+
+
+def main() -> None:
+    """Exit code 2 and one message for what a user can mend, as the command line does."""
+    try:
+        run_job(Job.parse(sys.argv[1]))
+    except HoigsError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
