@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from hoigs.core.errors import did_you_mean
 
 
 class _Strict(BaseModel):
@@ -108,6 +110,15 @@ class RatesSpec(_Strict):
     pose: float = Field(1e-4, ge=0)
     shape: float = Field(1e-4, ge=0)
     by_extent: tuple[str, ...] = ("means",)
+
+    @field_validator("by_extent")
+    @classmethod
+    def _are_rates(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        rates = [name for name, field in cls.model_fields.items() if field.annotation is float]
+        for name in names:
+            if name not in rates:
+                raise ValueError(f'no rate "{name}"{did_you_mean(name, rates)}')
+        return names
 
 
 class TrainSpec(_Strict):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 
-from hoigs.core.planes import PairedPlanes, sample_planes
+from hoigs.core.planes import PairedPlanes, ProductPlanes, roughness, sample_planes
 
 
 def test_equals_grid_sample():
@@ -78,3 +78,37 @@ def test_penalties_by_hand():
     assert planes.time_smoothness().item() == 16  # (1 - 6 + 1)^2
     torch.testing.assert_close(planes.time_sparsity(), torch.tensor(2 / 3))
     assert PairedPlanes(1, 2, 2).time_smoothness() == 0
+
+
+def test_product_planes_are_4dgs_field():
+    """Against grid_sample on six planes xy, xz, xt, yz, yt, zt, multiplied, scales concatenated."""
+    torch.manual_seed(0)
+    field = ProductPlanes(3, 4, 5, (1, 2)).double()
+    for parameter in field.parameters():
+        torch.nn.init.uniform_(parameter, 0.2, 1.5)
+    points = torch.rand(20, 3, dtype=torch.float64) * 2.4 - 1.2
+    clock = 0.3
+    four = torch.cat((points, torch.full((20, 1), clock, dtype=torch.float64)), 1)
+    scales = []
+    for space, time in zip(field.space, field.time, strict=True):
+        product = torch.ones(20, 3, dtype=torch.float64)
+        for plane, axes in zip(
+            (*space, *time), ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3)), strict=True
+        ):
+            sampled = F.grid_sample(
+                plane.permute(2, 0, 1)[None],
+                four[None, None, :, axes],
+                align_corners=True,
+                padding_mode="border",
+            )
+            product = product * sampled[0, :, 0].T
+        scales.append(product)
+    torch.testing.assert_close(field(points, clock), torch.cat(scales, 1))
+    assert field.width == 6 and field.space[1].shape == (3, 8, 8, 3)
+    assert field.time[1].shape == (3, 5, 8, 3)  # time keeps its resolution
+
+
+def test_roughness():
+    line = torch.arange(4.0).view(1, 4, 1, 1)
+    assert roughness(line) == 0 and roughness(line[:, :2]) == 0
+    assert roughness(line**2) == 4  # second difference 2, squared

@@ -140,3 +140,27 @@ class TestSlerp:
         r = torch.tensor([[0.3]], dtype=torch.float64, requires_grad=True)
         a, b = random_quats(1), random_quats(1, seed=2)
         assert torch.autograd.gradcheck(lambda r: R.slerp(a, b, r), (r,))
+
+
+def test_exp_se3_is_the_matrix_exponential():
+    generator = torch.Generator().manual_seed(2)
+    turns = torch.randn(30, 3, generator=generator, dtype=torch.float64)
+    turns = torch.cat((turns, 1e-3 * turns[:5], 1e-9 * turns[:5], 0 * turns[:2]))
+    shifts = torch.randn(len(turns), 3, generator=generator, dtype=torch.float64)
+    quats, moved = R.exp_se3(turns, shifts)
+    for w, v, quat, shift in zip(turns, shifts, quats, moved, strict=True):
+        generator_matrix = torch.zeros(4, 4, dtype=torch.float64)
+        x, y, z = w
+        generator_matrix[:3, :3] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        generator_matrix[:3, 3] = v
+        expected = torch.linalg.matrix_exp(generator_matrix)
+        torch.testing.assert_close(R.quats_to_matrices(quat), expected[:3, :3])
+        torch.testing.assert_close(shift, expected[:3, 3])
+
+
+def test_exp_se3_has_gradients_at_rest():
+    turns = torch.zeros(3, 3, dtype=torch.float64, requires_grad=True)
+    shifts = torch.randn(3, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(R.exp_se3, (turns, shifts))
+    big = torch.randn(3, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(R.exp_se3, (big, shifts))

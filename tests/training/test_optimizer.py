@@ -81,3 +81,50 @@ def test_moments_follow_rows_and_fresh_rows_start_at_zero():
     assert torch.equal(new[:2], old[[3, 1]])
     assert torch.equal(new[2], torch.zeros(3))
     assert float(old[1].abs().min()) > 0
+
+
+def test_which_rates_are_in_units_of_the_extent():
+    model = make_model()
+    rates = RatesSpec(means=1e-3, opacity=0.05, by_extent=("opacity",))
+    adam = GroupedAdam(model, rates, WarmupSpec(), scene_extent=5.0)
+    adam.set_progress(0.0)
+    rate = {n: g["lr"] for n, g in zip(adam.names, adam.adam.param_groups, strict=True)}
+    assert rate["entities.scene.means"] == pytest.approx(1e-3)
+    assert rate["entities.scene.opacity_logits"] == pytest.approx(0.25)
+    with pytest.raises(ValueError, match='no rate "opacit"; did you mean "opacity"'):
+        RatesSpec(by_extent=("opacit",))
+
+
+def with_bands(sh_rest: float) -> tuple[GroupedAdam, torch.nn.Parameter]:
+    rest = Gaussians.from_points(torch.randn(6, 3), sh_degree=2)
+    model = SceneModel({"scene": Entity(rest, Static())}, rasterizer=TorchRasterizer())
+    adam = GroupedAdam(model, RatesSpec(sh_rest=sh_rest), WarmupSpec(), scene_extent=1.0)
+    adam.set_progress(0.0)
+    return adam, adam.names["entities.scene.sh"]
+
+
+def test_higher_harmonics_have_a_share_of_the_rate():
+    torch.manual_seed(0)
+    gradient = torch.randn(6, 9, 3)
+    steps = []
+    for share in (1.0, 0.05):
+        adam, sh = with_bands(share)
+        before = sh.detach().clone()
+        for _ in range(3):  # moments are the same in both
+            sh.grad = gradient.clone()
+            adam.step()
+        steps.append(sh.detach() - before)
+    torch.testing.assert_close(steps[1][:, :1], steps[0][:, :1])
+    torch.testing.assert_close(steps[1][:, 1:], 0.05 * steps[0][:, 1:], rtol=1e-3, atol=1e-7)
+
+
+def test_harmonics_wait_for_their_degree():
+    adam, sh = with_bands(1.0)
+    before = sh.detach().clone()
+    sh.grad = torch.ones_like(sh)
+    adam.step(sh_degree=1)
+    moved = (sh.detach() - before).abs().amax((0, 2)) > 0
+    assert moved.tolist() == [True] * 4 + [False] * 5
+    sh.grad = torch.ones_like(sh)
+    adam.step()
+    assert ((sh.detach() - before).abs().amax((0, 2)) > 0).all()

@@ -331,7 +331,7 @@ def test_embedded_penalties_by_hand():
         model.embedding.copy_(torch.tensor([[0.0, 0], [3, 4], [9, 9]]))
         model.time_table.copy_(torch.tensor([[0.0], [1], [3], [6]]).expand(4, 3))
     entity(Moment(0.0))
-    found = {k: float(v) for k, v in entity.regularizers().items()}
+    found = {k: v.item() for k, v in entity.regularizers().items()}
     near = 5 * math.sqrt(math.exp(-2000 * 1e-4))  # the third is too far to count
     assert found["embedding_smoothness"] == pytest.approx(2 * near / 3, rel=1e-4)
     assert found["table_smoothness"] == pytest.approx(1.0)
