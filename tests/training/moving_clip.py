@@ -56,7 +56,7 @@ class Thing:
 
 
 def speckled_box(count: int = 80, size: float = 0.5, seed: int = 0) -> Gaussians:
-    """Opaque spots in a cube about the origin, coloured smoothly, so that poses have a wide basin."""
+    """Opaque spots in a cube, coloured smoothly, so that poses have a wide basin."""
     generator = torch.Generator().manual_seed(seed)
     points = size * (torch.rand(count, 3, generator=generator) - 0.5)
     waves = 9 * torch.randn(3, 3, generator=generator) / 3**0.5

@@ -1,4 +1,4 @@
-"""deformation:ex4dgs: static Gaussians on lines, dynamic ones on keyframes (Ex4DGS; methods B.4)."""
+"""deformation:ex4dgs: static Gaussians on lines, dynamic ones on keyframes (methods B.4)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""deformation:rigid-residual: a rigid motion and a small one of each Gaussian's own (methods G.5)."""
+"""deformation:rigid-residual: a rigid motion, and a small one of each Gaussian's own."""
 
 from __future__ import annotations
 

@@ -277,7 +277,7 @@ class RigidSpline(Resizing, DeformationModel):
             "translation_tangents": speeds,
             "angular_tangents": turns,
         }
-        return {name: found[name] for name in self.knot_axes}
+        return {name: value for name, value in found.items() if name in self.knot_axes}
 
     def regularizers(self) -> dict[str, Tensor]:
         """Squared, per knot.
