@@ -84,7 +84,10 @@ def run(options: argparse.Namespace, device: torch.device) -> dict[str, Any]:
             for what, cases in (("gaussians", MORE_GAUSSIANS), ("pixels", MORE_PIXELS))
         }
         for what, factors in report["growth"].items():
-            say(f"twice the {what}: " + ", ".join(str(x["factor"]) for x in factors))
+            say(
+                f"twice the {what}: "
+                + ", ".join(f"{x['factor']} ({x['factor_cores']})" for x in factors)
+            )
     if device.type == "cpu" and {"stages", "memory"} & set(options.only):
         report |= inside(options)
     return report

@@ -72,11 +72,11 @@ def measure(
     times: dict[str, list[float]] = {name: [] for name in [*STAGES.values(), "other"]}
     for number in range(rounds + 2):
         cores.seconds = {}
-        forward, backward, _ = once(drawing, device)
+        sample, _ = once(drawing, device)
         stages = dict.fromkeys(times, 0.0)
         for key, seconds in cores.seconds.items():
             stages[STAGES[key]] += 1e3 * seconds
-        stages["other"] = forward + backward - sum(stages.values())
+        stages["other"] = sample.total - sum(stages.values())
         if number >= 2:
             for name, milliseconds in stages.items():
                 times[name].append(milliseconds)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,14 +24,28 @@ def clock(device: torch.device) -> float:
     return 1e3 * time.perf_counter()
 
 
-def once(round_: Round, device: torch.device) -> tuple[float, float, Tensor]:
-    """Milliseconds forward and backward, and the picture."""
+class Sample(NamedTuple):
+    """Milliseconds of one round: by the clock, and of all cores together (spinning included)."""
+
+    forward: float
+    backward: float
+    cores: float
+
+    @property
+    def total(self) -> float:
+        return self.forward + self.backward
+
+
+def once(round_: Round, device: torch.device) -> tuple[Sample, Tensor]:
+    """Times of one forward and one backward, and the picture."""
+    cores = time.process_time()
     start = clock(device)
     picture = round_.forward()
     middle = clock(device)
     if round_.backward is not None:
         round_.backward()
-    return middle - start, clock(device) - middle, picture
+    end = clock(device)
+    return Sample(middle - start, end - middle, 1e3 * (time.process_time() - cores)), picture
 
 
 def spread(samples: list[float]) -> dict[str, Any]:
@@ -68,54 +83,63 @@ def compare(
         try:
             round_ = peer.prepare(gaussians, camera)
             once(round_, device)  # compiles, fills caches
-            forward, backward, picture = once(round_, device)
+            sample, picture = once(round_, device)
         except NotMeasuredError as reason:
             rows[peer.name]["not_measured"] = str(reason)
             say(f"{case!s:18} {peer.name:14} not measured: {reason}")
             continue
         ready[peer.name], pictures[peer.name] = round_, picture
-        if forward + backward > 100 * seconds:
+        if sample.total > 100 * seconds:
             slow.add(peer.name)
-    samples: dict[str, list[tuple[float, float]]] = {name: [] for name in ready}
+    samples: dict[str, list[Sample]] = {name: [] for name in ready}
     began = time.perf_counter()
     for number in range(rounds):
         if number >= 3 and time.perf_counter() - began > seconds:
             break
         for name, round_ in ready.items():
             if number < 3 or name not in slow:
-                samples[name].append(once(round_, device)[:2])
+                samples[name].append(once(round_, device)[0])
     first = next(iter(ready), None)
     for name, times in samples.items():
-        totals = [sum(x) for x in times]
-        base = [sum(x) for x in samples[first]] if first else []
+        totals = [x.total for x in times]
+        base = [x.total for x in samples[first]] if first else []
         rows[name] |= {
-            "forward_ms": spread([x[0] for x in times]),
-            "backward_ms": spread([x[1] for x in times]) if ready[name].backward else None,
+            "forward_ms": spread([x.forward for x in times]),
+            "backward_ms": spread([x.backward for x in times]) if ready[name].backward else None,
             "total_ms": spread(totals),
+            "cores_ms": spread([x.cores for x in times]),
             f"times_{first}": round(statistics.median(totals) / statistics.median(base), 4),
             f"times_{first}_least": round(min(totals) / min(base), 4),
+            f"times_{first}_cores": round(
+                min(x.cores for x in times) / min(x.cores for x in samples[first or name]), 4
+            ),
             "difference": float((pictures[name] - pictures[first]).abs().double().mean()),
         }
         row = rows[name]
         say(
             f"{case!s:18} {name:14} forward {row['forward_ms']['median']:9.2f}  total "
             f"{row['total_ms']['median']:9.2f} ms (least {row['total_ms']['least']:.2f})  "
-            f"{row[f'times_{first}']:7.2f} x {first} (least: {row[f'times_{first}_least']:.2f})  "
+            f"{row[f'times_{first}']:7.2f} x {first} (least {row[f'times_{first}_least']:.2f}, "
+            f"cores {row[f'times_{first}_cores']:.2f})  "
             f"difference {row['difference']:.1e}"
         )
     return list(rows.values())
 
 
 def growth(rows: list[dict[str, Any]], peer: str) -> list[dict[str, Any]]:
-    """Factors of time from each case to the next, for rows of a series that doubles each time."""
-    times = [row["total_ms"] for row in rows if row["peer"] == peer and "total_ms" in row]
-    cases = [row["case"] for row in rows if row["peer"] == peer and "total_ms" in row]
+    """Factors of time from each case to the next, for rows of a series that doubles each time.
+
+    `factor` is of the medians by the clock, `factor_cores` of the least time of all cores together,
+    which says the same on a busy machine.
+    """
+    mine = [row for row in rows if row["peer"] == peer and "total_ms" in row]
     return [
         {
-            "from": cases[i],
-            "to": cases[i + 1],
-            "factor": round(times[i + 1]["median"] / times[i]["median"], 3),
-            "factor_least": round(times[i + 1]["least"] / times[i]["least"], 3),
+            "from": small["case"],
+            "to": large["case"],
+            "factor": round(large["total_ms"]["median"] / small["total_ms"]["median"], 3),
+            "factor_least": round(large["total_ms"]["least"] / small["total_ms"]["least"], 3),
+            "factor_cores": round(large["cores_ms"]["least"] / small["cores_ms"]["least"], 3),
         }
-        for i in range(len(times) - 1)
+        for small, large in itertools.pairwise(mine)
     ]

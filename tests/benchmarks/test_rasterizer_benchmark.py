@@ -96,9 +96,15 @@ def test_growth_is_the_factor_from_case_to_case() -> None:
     from benchmarks.rasterizers.timing import growth, spread
 
     rows = [
-        {"case": f"8x8/{n}", "peer": peer, "total_ms": spread([time, time, 3 * time])}
+        {
+            "case": f"8x8/{n}",
+            "peer": peer,
+            "total_ms": spread([time, time, 3 * time]),
+            "cores_ms": spread([2 * time, time, time]),
+        }
         for n, time in ((10, 2.0), (20, 3.0), (40, 6.0))
         for peer in ("warp", "torch")
     ]
     assert [x["factor"] for x in growth(rows, "warp")] == [1.5, 2.0]
+    assert [x["factor_cores"] for x in growth(rows, "warp")] == [1.5, 2.0]
     assert growth(rows, "warp")[0]["to"] == "8x8/20"
