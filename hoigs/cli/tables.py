@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -33,6 +34,10 @@ def tables(
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="Runs at a time.")] = 1,
     threads: Annotated[
         int | None, typer.Option("--threads", min=1, help="Of each run; default cores / jobs.")
+    ] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option("--minutes", help="Stop then, write what there is; the same command goes on."),
     ] = None,
     settings: SetOption = None,
     device: DeviceOption = "auto",
@@ -66,10 +71,18 @@ def tables(
 
     def report(job: Job, word: str) -> None:
         nonlocal ended
-        ended += word != "started"
+        ended += word not in ("started", "stopped")
         typer.echo(f"[{ended:>3}] {job.clip_label}/{job.folder.name}: {word}")
 
-    results = run_study(study, workers=jobs, threads=each, report=report)
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt  # so that a plain kill ends the runs too
+
+    limit = None if minutes is None else 60 * minutes
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        results = run_study(study, workers=jobs, threads=each, limit_s=limit, report=report)
+    finally:
+        signal.signal(signal.SIGTERM, before)
     about: dict[str, object] = {
         "clips": ", ".join(study.clips),
         "seeds": seeds,

@@ -14,22 +14,32 @@ from hoigs.studies.job import Job, JobState
 POLL_S = 0.05
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
+OUT_OF_TIME = "the time limit came first; run the same command again"
+
 Report = Callable[[Job, str], None]
+Running = tuple[Job, subprocess.Popen[bytes]]
 
 
 def run_jobs(
-    jobs: Sequence[Job], *, workers: int = 1, threads: int = 1, report: Report | None = None
+    jobs: Sequence[Job],
+    *,
+    workers: int = 1,
+    threads: int = 1,
+    limit_s: float | None = None,
+    report: Report | None = None,
 ) -> Mapping[str, str]:
     """Run what is not done yet; a job that fails stops no other.
 
     Args:
         workers: processes at a time. threads: of each, by OMP_NUM_THREADS.
-        report: called with a job and "done before", "started", "done" or "failed: why".
+        limit_s: stop after so many seconds; the next call goes on.
+        report: called with a job and "done before", "started", "done", "stopped" or "failed: why".
 
     Returns:
         Why a job failed, by run folder; those that are not there are done. Processes are ended
         when this is interrupted; the next call goes on from their last checkpoints.
     """
+    deadline = None if limit_s is None else time.monotonic() + limit_s
     tell = report or (lambda job, word: None)
     waiting: list[Job] = []
     for job in jobs:
@@ -38,9 +48,12 @@ def run_jobs(
         else:
             waiting.append(job)
     failed: dict[str, str] = {}
-    running: list[tuple[Job, subprocess.Popen[bytes]]] = []
+    running: list[Running] = []
     try:
         while waiting or running:
+            if deadline is not None and time.monotonic() > deadline:
+                _stop(running, tell)
+                return failed | {job.run: OUT_OF_TIME for job in (*waiting, *_jobs(running))}
             while waiting and len(running) < workers:
                 job = waiting.pop(0)
                 tell(job, "started")
@@ -59,6 +72,16 @@ def run_jobs(
         for _, process in running:
             process.wait()
     return failed
+
+
+def _jobs(running: Sequence[Running]) -> list[Job]:
+    return [job for job, _ in running]
+
+
+def _stop(running: Sequence[Running], tell: Report) -> None:
+    for job, process in running:
+        process.terminate()
+        tell(job, "stopped")
 
 
 def _start(job: Job, threads: int) -> subprocess.Popen[bytes]:

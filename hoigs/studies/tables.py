@@ -121,12 +121,19 @@ class _ClipFolders:
 
 
 def run_study(
-    study: Study, *, workers: int = 1, threads: int = 1, report: Report | None = None
+    study: Study,
+    *,
+    workers: int = 1,
+    threads: int = 1,
+    limit_s: float | None = None,
+    report: Report | None = None,
 ) -> list[TableResult]:
-    """Run what is not done yet, and gather all tables."""
+    """Run what is not done yet, and gather all tables; see `pool.run_jobs`."""
     cells = plan(study)
     jobs = {cell.job.run: cell.job for cell in cells if cell.job is not None}
-    failed = run_jobs(list(jobs.values()), workers=workers, threads=threads, report=report)
+    failed = run_jobs(
+        list(jobs.values()), workers=workers, threads=threads, limit_s=limit_s, report=report
+    )
     return gather(study, cells, failed)
 
 

@@ -155,6 +155,16 @@ def test_an_interrupted_job_goes_on_from_its_checkpoint(
     assert steps == [3, 4] and job.state() is JobState.done
 
 
+def test_a_time_limit_ends_the_runs_and_says_so(tmp_path: Path) -> None:
+    rows = (Row("long", "static"), Row("waits", "static", ("model.scene.opacity=0.3",)))
+    study = _study(tmp_path, rows, steps=100_000)
+    told: list[str] = []
+    (result,) = run_study(study, limit_s=0.3, report=lambda job, word: told.append(word))
+    assert told == ["started", "stopped"]
+    for row in result.rows[CLIP]:
+        assert "the time limit came first" in str(row.over_seeds(("test frames", "full", "psnr")))
+
+
 def test_a_run_that_stopped_before_its_first_checkpoint_starts_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
