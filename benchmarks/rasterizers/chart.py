@@ -30,6 +30,7 @@ def draw(report: dict[str, Any], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     rows = [row for row in report["times"] if "total_ms" in row]
+    whole = {row["peer"] for row in rows if row["backward_ms"]}  # others have no backward
     sizes = sorted(
         {Case.parse(row["case"]).size for row in rows},
         key=lambda size: math.prod(map(int, size.split("x"))),
@@ -52,10 +53,13 @@ def draw(report: dict[str, Any], path: Path) -> None:
             high = [times["quartiles"][1] for _, times in points]
             color = COLORS.get(peer, "black")
             wide = 2.4 if peer == "warp" else 1.4
-            panel.plot(counts, medians, "o-", color=color, lw=wide, ms=4, label=peer)
+            label = peer if peer in whole else f"{peer} (forward)"
+            line = "o-" if peer in whole else "o--"
+            panel.plot(counts, medians, line, color=color, lw=wide, ms=4, label=label)
             panel.fill_between(counts, low, high, color=color, alpha=0.18, lw=0)
         panel.set(xscale="log", yscale="log", title=size, xlabel="Gaussians")
         panel.set_xticks(*_ticks(rows, size))
+        panel.yaxis.set_major_formatter("{x:g}")
         panel.minorticks_off()
         panel.grid(True, which="major", alpha=0.25)
         panel.spines[["top", "right"]].set_visible(False)
