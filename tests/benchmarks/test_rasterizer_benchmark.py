@@ -108,3 +108,21 @@ def test_growth_is_the_factor_from_case_to_case() -> None:
     assert [x["factor"] for x in growth(rows, "warp")] == [1.5, 2.0]
     assert [x["factor_cores"] for x in growth(rows, "warp")] == [1.5, 2.0]
     assert growth(rows, "warp")[0]["to"] == "8x8/20"
+
+
+@pytest.mark.parametrize("sh_degree", [0, 3])
+def test_memory_of_a_training_step_is_bounded(sh_degree: int) -> None:
+    """The bound that docs/design/cpu-rasterizer.md states, with some room."""
+    from benchmarks.rasterizers.memory import peak_bytes
+    from benchmarks.rasterizers.scenes import synthetic
+    from benchmarks.rasterizers.stages import tile_lists
+    from hoigs.rasterizers.warp import WarpRasterizer
+
+    for count, size in ((3000, (100, 70)), (500, (300, 200))):
+        gaussians, camera = synthetic(count, sh_degree)
+        camera = camera.resized(*size)
+        rasterizer = WarpRasterizer(threads=1)
+        _, pairs = tile_lists(gaussians, camera, rasterizer)
+        fields = 4 * (11 + 3 * (sh_degree + 1) ** 2)
+        bound = count * (100 + fields) + size[0] * size[1] * 42 + pairs * 50 + 40_000
+        assert peak_bytes(gaussians, camera, rasterizer) < bound
