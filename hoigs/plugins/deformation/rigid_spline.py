@@ -130,7 +130,7 @@ class RigidSpline(Resizing, DeformationModel):
         self._track = track
 
     @classmethod
-    def from_config(cls, config: RigidSplineConfig, context: BuildContext) -> Self:
+    def from_config(cls, config: Any, context: BuildContext) -> Self:
         return cls(**cls._arguments(config, context))
 
     @staticmethod

@@ -166,7 +166,8 @@ def test_a_slide_moves_along_its_axis_and_parts_are_guessed_from_the_shape():
     model = entity.deformation
     weights = torch.sigmoid(model.part_logits).detach()
     # along the longest axis, from one end to the other
-    assert abs(float(torch.corrcoef(torch.stack((weights, entity.means.detach()[:, 0])))[0, 1])) > 0.95
+    pair = torch.stack((weights.detach(), entity.means.detach()[:, 0]))
+    assert abs(float(torch.corrcoef(pair)[0, 1])) > 0.95
     assert 0.15 < weights.min() < 0.5 < weights.max() < 0.85
     with torch.no_grad():
         model.joint_values.fill_(0.2)
@@ -204,7 +205,9 @@ def test_a_hinge_is_found_from_where_the_points_go():
         loss.backward()
         optimizer.step()
         optimizer.param_groups[0]["lr"] = 0.03 * (1 - step / 150)
-    worst = max(float((entity(Moment(t)).means - truth(t)).norm(dim=-1).max()) for t in times)
+    worst = max(
+        float((entity(Moment(t)).means - truth(t)).detach().norm(dim=-1).max()) for t in times
+    )
     assert worst < 0.08  # metres, of 1.07 at the start
     found = torch.nn.functional.normalize(entity.deformation.axis.detach(), dim=0)
     assert abs(float(found @ axis)) > math.cos(math.radians(5))
