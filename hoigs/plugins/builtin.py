@@ -80,8 +80,11 @@ PARTS = (
      "a mesh, sampled evenly with its colours and aligned"),
     ("prior:sfm", f"{PRIORS}.sfm", "SfmPrior", "SfmPriorConfig",
      "scene points within the mask of a thing that stands still"),
+    ("prior:sds", f"{PRIORS}.sds", "SdsPrior", "SdsPriorConfig",
+     "score distillation from a diffusers pipeline of yours, for the sides that no frame shows"),
 )  # fmt: skip
-EXTRAS = {"rasterizer:gsplat": "gsplat"}  # parts that need an optional dependency
+# parts that need an optional dependency
+EXTRAS = {"rasterizer:gsplat": "gsplat", "prior:sds": "sds"}
 
 
 @hookimpl

@@ -1,4 +1,7 @@
-"""From the axes, unit and place of a generator to an object of the clip (methods A.2)."""
+"""From the axes, unit and place of a generator to an object of the clip.
+
+HOIGS, Sec. "Object Initialization"; the formulas are those of `hoigs.core.placement`.
+"""
 
 from __future__ import annotations
 
@@ -29,24 +32,11 @@ FIT_POINTS = 20_000  # boxes around more points than this are the same
 FIT_FRAMES = 64
 
 
-class AlignmentConfig(ComponentConfig):
-    """Settings that `prior:points`, `prior:mesh` and `prior:sds` share."""
+class PlacingConfig(ComponentConfig):
+    """Settings of every prior that scales and places a shape of its own."""
 
-    space: Space = Field(
-        default="object",
-        description="whose axes the shape is in: of the clip's track of the object, of the camera "
-        "of frame `reference` (generators that see one image), or of the clip's world then",
-    )
-    axes: str = Field(
-        default="opencv",
-        description="how these axes are written: right, down and forward as axes of the file, "
-        'such as "x -y -z"; or a name: opencv (x y z), opengl (x -y -z), blender (x -z y)',
-    )
     reference: int | None = Field(
         default=None, ge=0, description="frame number; default: the training frame that sees most"
-    )
-    unit: Literal["fit", "m", "cm", "mm"] = Field(
-        default="fit", description="fit: whatever makes it as large as the masks (scale S)"
     )
     center: Literal["box", "mean", "origin"] = Field(
         default="box",
@@ -67,12 +57,33 @@ class AlignmentConfig(ComponentConfig):
         default=True,
         description="place: depth leads from the visible front to the centre; the paper: false",
     )
-    smooth: bool = Field(default=True, description="place: depth smooths v_t over time")
+    smooth: bool = Field(
+        default=True,
+        description="place: depth smooths v_t over 7 frames; false for few frames a second",
+    )
     scale_reduce: Reduce = Field(default="median", description="the paper: mean")
     scale_frames: Frames = Field(default="whole", description="the paper: all")
     scale_iterations: int = Field(default=3, ge=1, description="the paper: 1")
     scale_quantile: float = Field(
         default=0.001, ge=0, lt=0.5, description="share of stray points left out at each side"
+    )
+
+
+class AlignmentConfig(PlacingConfig):
+    """Settings that `prior:points` and `prior:mesh` share: theirs is a file of any origin."""
+
+    space: Space = Field(
+        default="object",
+        description="whose axes the shape is in: of the clip's track of the object, of the camera "
+        "of frame `reference` (generators that see one image), or of the clip's world then",
+    )
+    axes: str = Field(
+        default="opencv",
+        description="how these axes are written: right, down and forward as axes of the file, "
+        'such as "x -y -z"; or a name: opencv (x y z), opengl (x -y -z), blender (x -z y)',
+    )
+    unit: Literal["fit", "m", "cm", "mm"] = Field(
+        default="fit", description="fit: whatever makes it as large as the masks (scale S)"
     )
 
     @field_validator("axes")

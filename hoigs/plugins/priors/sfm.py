@@ -17,6 +17,7 @@ from torch import Tensor
 from hoigs.core.clip import Clip, ObjectTrack
 from hoigs.core.config import ComponentConfig
 from hoigs.core.prior import ObjectPrior, training_frames
+from hoigs.plugins.priors.depth import shrunk
 
 
 class SfmPriorConfig(ComponentConfig):
@@ -27,6 +28,7 @@ class SfmPriorConfig(ComponentConfig):
     )
     min_frames: int = Field(default=3, ge=1, description="that see a point at least")
     min_points: int = Field(default=20, ge=4, description="to call it an object")
+    dilate: int = Field(default=1, ge=0, description="pixels that masks grow; rims are half lost")
     occlusion: float = Field(
         default=0.05, gt=0, description="a point this much behind the depth map, as a share, is "
         "hidden there and does not count; used where the clip has metric depth"
@@ -49,11 +51,12 @@ class SfmPrior(ObjectPrior):
         share: float = 0.8,
         min_frames: int = 3,
         min_points: int = 20,
+        dilate: int = 1,
         occlusion: float = 0.05,
         max_motion: float = 0.05,
     ) -> None:
         self.share, self.min_frames, self.min_points = share, min_frames, min_points
-        self.occlusion, self.max_motion = occlusion, max_motion
+        self.dilate, self.occlusion, self.max_motion = dilate, occlusion, max_motion
 
     def initialise(self, clip: Clip, entity: str) -> ObjectTrack:
         """See ObjectPrior.
@@ -95,6 +98,7 @@ class SfmPrior(ObjectPrior):
             mask, camera = clip.store.mask(entity, i), clip.cameras[i]
             if not mask.any():
                 continue  # out of sight: nobody knows where it is
+            mask = ~shrunk(~mask, self.dilate)
             xy, depth = camera.project(clip.points)
             column, row = xy.floor().long().unbind(-1)
             there = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)

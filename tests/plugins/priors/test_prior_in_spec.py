@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -39,7 +41,7 @@ def box(tmp_path, truth):
 
 def test_every_prior_is_listed():
     registry = default_registry()
-    for key in ("depth", "mesh", "points", "sfm"):
+    for key in ("depth", "mesh", "points", "sds", "sfm"):
         assert issubclass(registry.get(f"prior:{key}"), ObjectPrior)
         assert f"prior:{key}" in registry.keys("prior")
 
@@ -56,7 +58,7 @@ def test_gaussians_start_on_what_the_prior_gives(clip, truth, box):
 
 
 def test_motion_follows_the_priors_track(clip, box):
-    text = f'prior: {{use: "prior:mesh", path: "{box}", place: depth, smooth: false}}'
+    text = f'prior: {{use: "prior:mesh", path: "{box}", count: 400, place: depth, smooth: false}}'
     entity = compose(spec(text), clip).entity("object")
     frame = clip[clip.split["train"][1]]
     moved = entity(frame.moment).means.mean(0)
@@ -66,7 +68,7 @@ def test_motion_follows_the_priors_track(clip, box):
 
 
 def test_the_same_spec_gives_the_same_gaussians(clip, box):
-    text = f'prior: {{use: "prior:mesh", path: "{box}"}}'
+    text = f'prior: {{use: "prior:mesh", path: "{box}", count: 400}}'
     first, again = (compose(spec(text), clip).state_dict() for _ in range(2))
     assert all(torch.equal(v, again[k]) for k, v in first.items())
 
@@ -128,3 +130,10 @@ def test_what_a_track_must_be(clip):
 def test_frames_that_may_be_looked_at(clip):
     assert training_frames(clip) == list(clip.split["train"])
     assert training_frames(replace(clip, split={"train": [], "test": [0]})) == list(range(12))
+
+
+def test_the_snippets_of_the_docs_are_specs():
+    page = Path(__file__).parents[3] / "docs" / "reference" / "priors.md"
+    blocks = re.findall(r"```yaml\n(.*?)```", page.read_text(), flags=re.S)
+    used = {Spec.parse(f"name: x\n{b}").components()["model.object.prior"] for b in blocks}
+    assert used == {f"prior:{k}" for k in ("depth", "points", "mesh", "sfm", "sds")}
