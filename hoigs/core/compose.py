@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from hoigs.core.body import BodyModel
 from hoigs.core.clip import Clip
 from hoigs.core.context import BuildContext
 from hoigs.core.deformation import DeformationModel
@@ -41,8 +42,9 @@ def compose(spec: Spec, clip: Clip, registry: Registry | None = None) -> SceneMo
         torch.manual_seed(spec.train.seed)
         context = BuildContext(clip=clip, seed=spec.train.seed)
         rasterizer = builder.part(("rasterizer",), spec.rasterizer, context)
+        bodies = builder.bodies()
         entities = {
-            name: builder.entity(name, kind, place, block, rasterizer)
+            name: builder.entity(name, kind, place, block, rasterizer, bodies)
             for name, kind, place, block in builder.chosen()
         }
         interaction = builder.part(("interaction",), spec.interaction, context)
@@ -111,12 +113,14 @@ class _Builder:
         place: str,
         block: EntitySpec,
         rasterizer: Rasterizer,
+        bodies: Mapping[str, BodyModel],
     ) -> Entity:
         context = BuildContext(entity=name, clip=self.clip, seed=self.spec.train.seed)
         if kind == "human":
-            context = self._with_body(context, place, block)
+            context = replace(context, body_track=self.clip.bodies[name], body=bodies[name])
         elif kind == "object":
-            context = replace(context, object_track=self.clip.objects.get(name))
+            track = self.clip.objects.get(name)
+            context = replace(context, object_track=track, bodies=bodies)
         if kind == "object" and context.object_track is None and block.prior is None:
             raise SpecError(
                 f"{self.spec.at('model', place)}: the clip has no track of {name}; give a `prior`"
@@ -131,20 +135,34 @@ class _Builder:
             rest = initial_gaussians(kind, deformation, block, context)
             return Entity(rest, deformation, features, kind=kind)
 
-    def _with_body(self, context: BuildContext, place: str, block: EntitySpec) -> BuildContext:
-        """`context` with the body model that the clip's poses were fitted with."""
-        name, track = context.entity, self.clip.bodies[context.entity]
-        context = replace(context, body_track=track)
+    def bodies(self) -> dict[str, BodyModel]:
+        """The body model of every human, by entity."""
+        return {
+            name: self._body(name, place, block)
+            for name, kind, place, block in self.chosen()
+            if kind == "human"
+        }
+
+    def _body(self, name: str, place: str, block: EntitySpec) -> BodyModel:
+        """The body model that the clip's poses of a human were fitted with."""
+        track = self.clip.bodies[name]
+        context = BuildContext(
+            entity=name, clip=self.clip, seed=self.spec.train.seed, body_track=track
+        )
         if block.body is None:
             with _blaming(self.spec, "model", place, why=f"the clip's {name} is a {track.model}: "):
-                body = self.part((), self._default_body(track.model), context)
-            return replace(context, body=body)
+                return self._built(self._default_body(track.model), context)
         if block.body.use.partition("@")[0] != track.model.partition("@")[0]:
             raise SpecError(
                 f"{self.spec.at('model', place, 'body')}: the clip's {name} was fitted with "
                 f"{track.model}; shape coefficients of {block.body.use} mean something else"
             )
-        return replace(context, body=self.part(("model", place, "body"), block.body, context))
+        return self._built(block.body, context, "model", place, "body")
+
+    def _built(self, part: ComponentSpec, context: BuildContext, *place: str) -> BodyModel:
+        body = self.part(place, part, context)
+        assert isinstance(body, BodyModel)
+        return body
 
     def _with_prior(
         self,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ class BuildContext:
         entity: name of the entity being built ("" for scene-wide parts).
         clip: the clip being reconstructed.
         body, body_track: for a human. object_track: for an object.
+        bodies: of every human that is modelled, by entity, for what hangs on them.
         rasterizer: the spec's, for priors that draw.
         seed: for anything random.
     """
@@ -28,5 +30,6 @@ class BuildContext:
     body: BodyModel | None = None
     body_track: BodyTrack | None = None
     object_track: ObjectTrack | None = None
+    bodies: Mapping[str, BodyModel] = field(default_factory=dict)
     rasterizer: Rasterizer | None = None
     seed: int = 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Sequence
 
 import torch
@@ -10,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hoigs.core.moment import BodyPose
+from hoigs.plugins.deformation.trained_frames import TrainedFrames
 
 
 class PoseRefinement(nn.Module):
@@ -28,28 +28,15 @@ class PoseRefinement(nn.Module):
         self.pose = nn.Parameter(torch.zeros(num_frames, 52, 3))
         self.transl = nn.Parameter(torch.zeros(num_frames, 3))
         self.betas = nn.Parameter(torch.zeros(betas))
-        self.set_trained_frames(range(num_frames) if trained is None else trained)
+        self.frames = TrainedFrames(num_frames, trained)
 
     def set_trained_frames(self, indices: Sequence[int]) -> None:
         """Frames whose corrections are learned; the others are interpolated from these."""
-        frames = sorted(set(indices))
-        count = len(self.pose)
-        if not frames or frames[0] < 0 or frames[-1] >= count:
-            raise ValueError(
-                f"trained frames must be some of 0..{count - 1}, got "
-                f"{f'{frames[0]}..{frames[-1]}' if frames else 'none'}"
-            )
-        self.trained = frames
+        self.frames.set(indices)
 
     def neighbours(self, time: float) -> tuple[int, int, float]:
         """Trained frames about `time` and the position between them; held at the ends."""
-        frame = min(max(time, 0.0), 1.0) * (len(self.pose) - 1)
-        if abs(frame - round(frame)) < 1e-4:  # float32 times must still hit their own frame
-            frame = round(frame)
-        after = bisect_left(self.trained, frame)
-        high = self.trained[min(after, len(self.trained) - 1)]
-        low = high if high <= frame else self.trained[max(after - 1, 0)]
-        return low, high, (frame - low) / (high - low) if high > low else 0.0
+        return self.frames.neighbours(time)
 
     def forward(self, pose: BodyPose, time: float) -> BodyPose:
         """`pose` with the corrections at `time`; rotations are added as axis-angle, which is

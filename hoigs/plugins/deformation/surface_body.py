@@ -1,0 +1,156 @@
+"""Gaussians that ride on the surface of a skinned body: what plain avatars share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from hoigs.core.body import PELVIS, BodyModel, BodySurface
+from hoigs.core.context import BuildContext
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.interaction import Residual
+from hoigs.core.moment import BodyPose, Moment
+from hoigs.core.rotation import multiply_quats, normalize_quats
+from hoigs.core.topology import TopologyChange
+from hoigs.plugins.deformation.face_points import HEAD_JOINT, face_points
+from hoigs.plugins.deformation.skinned_body import SkinnedBody, clip_settings
+from hoigs.plugins.deformation.skinning import skin_points, skin_quats
+
+APART = 0.05  # metres; rest made with another seed is decimetres off, a padded one centimetres
+
+
+class SurfaceBody(SkinnedBody):
+    """Points of the body's surface with the skinning weights, part and triangle of each.
+
+    The size of the body is the clip's (there is no learned alpha). The rest Gaussians lie on
+    `surface`, or on `body.surface(len(rest), betas, seed)` when none is given.
+
+    Args:
+        body, entity, betas, num_frames, trained_frames, refine_poses: as SkinnedBody.
+        surface: the points of rest. seed: of the surface, where none is given.
+    """
+
+    provides = frozenset({"skeleton", "face"})
+    rates: ClassVar[Mapping[str, str]] = {"refinement": "pose", "refinement.betas": "shape"}
+
+    template_weights: Tensor
+    parts: Tensor
+    faces: Tensor
+    barycentric: Tensor
+    normals: Tensor
+
+    def __init__(
+        self,
+        body: BodyModel,
+        *,
+        entity: str = "human",
+        betas: Float[Tensor, " B"] | None = None,
+        surface: BodySurface | None = None,
+        seed: int = 0,
+        num_frames: int | None = None,
+        trained_frames: Sequence[int] | None = None,
+        refine_poses: bool = False,
+    ) -> None:
+        super().__init__(
+            body,
+            entity=entity,
+            betas=betas,
+            num_frames=num_frames,
+            trained_frames=trained_frames,
+            camera_centers=None,
+            refine_poses=refine_poses,
+            scale_about="pelvis",
+        )
+        self.log_alpha.requires_grad_(False)
+        self._surface, self.seed = surface, seed
+
+    @staticmethod
+    def context_settings(context: BuildContext, what: str) -> dict[str, Any]:
+        """Constructor arguments that the clip decides.
+
+        Raises:
+            ValueError: no body; `what` names the component.
+        """
+        if context.body is None:
+            raise ValueError(f"{what} needs a body; it suits entities of kind human")
+        settings: dict[str, Any] = {"entity": context.entity, "seed": context.seed}
+        if context.body_track is not None:
+            betas = context.body_track.poses.betas
+            settings["betas"] = betas if betas.dim() == 1 else betas.mean(0)
+            settings["num_frames"] = len(context.body_track.poses.transl)
+        if context.clip is not None:
+            settings |= clip_settings(context.clip)
+            del settings["camera_centers"]
+        return settings
+
+    def bind(self, rest: Gaussians) -> None:
+        surface = self._surface or self.body.surface(len(rest), self.betas, self.seed)
+        if len(surface.points) != len(rest):
+            raise ValueError(
+                f"{len(rest)} rest Gaussians, but a surface of {len(surface.points)} points"
+            )
+        apart = (surface.points - rest.means.detach()).norm(dim=-1)
+        if len(apart) and apart.median() > APART:
+            raise ValueError(
+                f"rest Gaussians stand {apart.median():.2f} m from the surface that weights them; "
+                "make rest with body.rest(count, betas, seed) of the same betas "
+                "and seed, or pass its `surface`"
+            )
+        for name, value in {
+            "template_weights": surface.weights,
+            "parts": surface.parts,
+            "faces": surface.faces,
+            "barycentric": surface.barycentric,
+            "normals": surface.normals,
+        }.items():
+            self.register_buffer(name, value.detach().clone())
+        self._surface = None
+
+    def moved_pose(self, moment: Moment, residual: Residual | None) -> BodyPose:
+        """The refined pose, with what the interaction adds to it."""
+        pose = self.pose(moment)
+        if residual is not None and residual.pose is not None:
+            pose = pose.with_residual(residual.pose)
+        return pose
+
+    def shape_change(self, pose: BodyPose) -> Float[Tensor, "N 3"] | None:
+        """How far each point moves at rest because the pose has other betas; None for not."""
+        if not pose.betas.requires_grad and torch.equal(pose.betas, self.betas):
+            return None
+        change = self.shaped(pose.betas)[0] - self.rest_vertices
+        return (change[self.body.faces[self.faces]] * self.barycentric[..., None]).sum(1)
+
+    def posed(
+        self,
+        canonical: Gaussians,
+        weights: Float[Tensor, "N J"],
+        pose: BodyPose,
+        moment: Moment,
+        residual: Residual | None,
+    ) -> Gaussians:
+        """Gaussians of the zero pose, in the world."""
+        transforms = self.body.skinning_transforms(pose)
+        means = skin_points(canonical.means, weights, transforms)
+        means = self.scaled(means, self.posed_joints(pose, transforms, [PELVIS])[0], moment)
+        if residual is not None and residual.means is not None:
+            means = means + residual.means
+        turns = skin_quats(weights, transforms, self.body.parents, self.ancestors)
+        quats = multiply_quats(turns, normalize_quats(canonical.quats))
+        return replace(canonical, means=means, quats=quats)
+
+    def point_parts(self) -> Int[Tensor, " N"]:
+        return self.parts
+
+    def face_points(self) -> tuple[Int[Tensor, " F"], Float[Tensor, "F 3"]]:
+        triangles, head = self.body.faces[self.faces], self.rest_joints[HEAD_JOINT]
+        return face_points(self.rest_vertices, head, triangles, self.parts, self.barycentric)
+
+    def on_topology(self, change: TopologyChange) -> None:
+        """A child keeps its parent's weights, part, triangle and normal."""
+        for name in ("template_weights", "parts", "faces", "barycentric", "normals"):
+            setattr(self, name, getattr(self, name)[change.source].contiguous())
