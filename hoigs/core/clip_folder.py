@@ -362,7 +362,10 @@ def _save_body(path: Path, track: BodyTrack) -> None:
 
 def _save_object(path: Path, track: ObjectTrack) -> None:
     path.parent.mkdir(exist_ok=True)
-    parts = {} if track.moving is None else {"moving": _array(track.moving, np.bool_)}
+    # numpy types its keywords as flags of its own
+    parts: dict[str, Any] = {}
+    if track.moving is not None:
+        parts["moving"] = _array(track.moving, np.bool_)
     np.savez_compressed(
         path,
         **parts,
