@@ -5,10 +5,11 @@ HOIGS, Sec. "Object Initialization"; the formulas are those of `hoigs.core.place
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from pydantic import Field, field_validator, model_validator
 from torch import Tensor
 
@@ -166,7 +167,8 @@ def align(
     if settings.unit == "fit":
         counted = int(fit.counted.sum())
         provenance += f"; scale {fit.scale:.4g}, spread {fit.spread:.2g} over {counted} frames"
-    return placed_track(canonical, colors, placement, clip.cameras, turns, provenance=provenance)
+    made = placed_track(canonical, colors, placement, clip.cameras, turns, provenance=provenance)
+    return replace(made, moving=moving_part(track, made.points))
 
 
 def centred(
@@ -179,6 +181,16 @@ def centred(
         return points - points.mean(0)
     ordered, cut = points.sort(0).values, len(points) // 1000
     return points - (ordered[cut] + ordered[len(points) - 1 - cut]) / 2
+
+
+def moving_part(track: ObjectTrack, points: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"] | None:
+    """Which points belong to the moving part of an object in two parts: as the track's nearest."""
+    from scipy.spatial import cKDTree  # on use: scipy takes a while to import
+
+    if track.moving is None:
+        return None
+    nearest = cKDTree(track.points.double().numpy()).query(points.double().numpy())[1]
+    return track.moving[torch.from_numpy(nearest)]
 
 
 def most_seen(clip: Clip, entity: str) -> int:

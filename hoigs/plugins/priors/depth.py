@@ -18,7 +18,7 @@ from hoigs.core.clip import Clip, ObjectTrack
 from hoigs.core.config import ComponentConfig
 from hoigs.core.context import BuildContext
 from hoigs.core.prior import ObjectPrior, training_frames
-from hoigs.plugins.priors.alignment import require_metric_depth
+from hoigs.plugins.priors.alignment import moving_part, require_metric_depth
 from hoigs.plugins.priors.outliers import inliers
 
 
@@ -96,6 +96,7 @@ class DepthPrior(ObjectPrior):
             track,
             points=points[kept],
             colors=colors[kept],
+            moving=moving_part(track, points[kept]),
             provenance=f"masked depth of frames {chosen}; poses: {track.provenance}",
         )
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from hoigs.core.clip import Clip, ObjectTrack
 from hoigs.core.config import ComponentConfig
 from hoigs.core.prior import ObjectPrior, training_frames
+from hoigs.plugins.priors.alignment import moving_part
 from hoigs.plugins.priors.depth import shrunk
 
 
@@ -88,6 +89,7 @@ class SfmPrior(ObjectPrior):
             track,
             points=points,
             colors=clip.point_colors[kept],
+            moving=moving_part(track, points),
             provenance=f"scene points within its mask; poses: {track.provenance}",
         )
 

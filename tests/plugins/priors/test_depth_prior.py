@@ -84,6 +84,15 @@ def test_chosen_frames_count_and_seed(clip):
     assert DepthPrior(**config.model_dump()).frames == [2]
 
 
+def test_parts_of_an_object_go_over_to_its_new_points(clip):
+    track = clip.objects["object"]
+    parted = replace(track, moving=track.points[:, 0] > 0)
+    made = DepthPrior().initialise(replace(clip, objects={"object": parted}), "object")
+    sure = made.points[:, 0].abs() > 0.04
+    assert torch.equal(made.moving[sure], made.points[sure, 0] > 0)
+    assert DepthPrior().initialise(clip, "object").moving is None
+
+
 def test_steady_by_hand():
     depth = torch.full((4, 5), 2.0)
     depth[1, 1], depth[2, 3] = 0.0, torch.nan
