@@ -317,7 +317,9 @@ rasterizer.render(random_scene(10), a_camera())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["projection", "list_kernels", "pixel_kernels"])
+@pytest.mark.parametrize(
+    "name", ["projection", "list_kernels", "pixel_kernels", "gather_kernels", "harmonics_kernels"]
+)
 def test_kernels_compile_for_cuda(name: str, tmp_path: Path) -> None:
     """No GPU is needed to compile; to run them see the conformance tests on "cuda"."""
     import importlib
