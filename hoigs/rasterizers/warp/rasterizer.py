@@ -37,8 +37,8 @@ class WarpRasterizer(Rasterizer):
     that has more is still drawn right, with the same picture, but some times slower, and its
     gradients then sum in no fixed order; the next one finds more room. A render holds 20 bytes a
     pair of room (12 of them shared by all renders of a stream), its backward 4 (10 + feature
-    channels) more, and 128 bytes a Gaussian. Steps can be captured in a CUDA graph after a first
-    one; `capture` does that for rendering.
+    channels) more, and 92 bytes a Gaussian, gradients apart. Steps can be captured in a CUDA graph
+    after a first one; `capture` does that for rendering.
 
     Args:
         cpu_kernels: "native", the fast ones; "portable", the very kernels that CUDA runs, as scalar
