@@ -54,7 +54,7 @@ class AvatarGaussians:
 
 
 class Trunk(nn.Module):
-    """`depth` layers of `width`: Linear, GroupNorm and ReLU (ExAvatar), or Linear and GELU (HUGS)."""
+    """`depth` layers of `width`: Linear, GroupNorm, ReLU (ExAvatar), or Linear, GELU (HUGS)."""
 
     def __init__(self, entry: int, width: int, depth: int, kind: Decoder) -> None:
         super().__init__()

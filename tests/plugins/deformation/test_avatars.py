@@ -29,7 +29,7 @@ MAKE = {
     # test_nearest_is_the_nearest_vertex for ExAvatar's rule
     "exavatar": lambda body, **kw: TriplaneAvatar(body, **(SMALL | {"skinning": "template"} | kw)),
     "hugs": lambda body, **kw: TriplaneAvatar(body, **(SMALL | HUGS | kw)),
-    "lbs": lambda body, **kw: Lbs(body, **kw),
+    "lbs": Lbs,
 }
 
 
