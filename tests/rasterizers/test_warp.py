@@ -118,6 +118,17 @@ def test_needles_lose_no_precision(kernels: str) -> None:
         assert_close_gradient(name, actual[name], wanted[name])
 
 
+def test_splats_larger_than_tiles_lose_no_precision() -> None:
+    """Down the columns of large splats alpha is multiplied along, 64 rows and more."""
+    scene = random_scene(60)
+    scene, camera = scene.replace(log_scales=scene.log_scales + 1.2), a_camera(150, 150)
+    smooth = RenderRequest(min_alpha=0.0, min_transmittance=0.0)
+    wanted = gradients(OracleRasterizer(), scene, camera, smooth)
+    actual = gradients(WarpRasterizer(), scene, camera, smooth)
+    for name, value in wanted.items():
+        assert (actual[name] - value).norm() < 1e-5 * value.norm(), name
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 200), (200, 1), (16, 64), (17, 65), (300, 140)])
 def test_tiles_cover_images_of_any_size(size: tuple[int, int]) -> None:
     scene = random_scene(150)

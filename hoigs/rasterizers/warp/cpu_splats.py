@@ -5,17 +5,17 @@ batch, one splat a lane: the range of blocks that its ellipse touches in each st
 splat, alpha in these blocks from the top down, in one of two ways:
 
 - *steady*: log2 alpha is quadratic along a column, so alpha, its growth from block to block and
-  the growth's constant ratio need two exponentials a strip and two products a block.
+  the growth's constant ratio need two exponentials a strip and two products a block. The error
+  grows with the square of the blocks, so it starts afresh after 32: alpha is then off by some 1e-5
+  of itself at the far end of a column, where it is near min_alpha, and by 1e-7 at the near end.
 - else an exponential a block. Needed where somewhere in the blocks log2 alpha is beyond the range
   of float32 (needles, and splats much smaller than a pixel): products could not come back from 0.
-
-The error of the steady way grows with the square of the blocks: some 1e-6 of alpha at the lower
-end of long columns, where alpha is near min_alpha.
 """
 
 # The exponent's least value, for the steady way; growth may then reach 2^(110 + 8)
 LIMITS = r"""
     constexpr float LEAST = -110.0f;
+    constexpr int STEADY = 32;  // blocks before the steady way starts afresh
     float drop[HIGH * BLOCKS + LANES] __attribute__((aligned(64)));  // the part of y, by row
     float slide[BLOCKS + LANES] __attribute__((aligned(64)));  // the shift of u, by block
 """
@@ -101,18 +101,20 @@ SPLATS = r"""
 ALPHA = r"""
     const vec dx = lane_x + ((float)(8 * s) - cx);
     if (((int*)&wild)[n] == 0) {
-        const vec dy = lane_y + ((float)(HIGH * first[s]) + 0.5f - cy);
-        const vec u = sharp * dx - lean * dy;
-        const float jump = HIGH * lean;
-        vec now = power_of_2(log2_opacity - c * dy * dy - u * u);
-        vec growth = power_of_2(2.0f * jump * u - 2.0f * HIGH * c * dy
-            - (jump * jump + HIGH * HIGH * c));
-        const float ratio = lane_of(ratios, n);
-        for (int b = first[s]; b <= last[s]; ++b) {
-            const vec opaque = only(lesser(now, ceiling), now >= min_alpha);
-            now *= growth;
-            growth *= ratio;
-            $BLOCK
+        const float jump = HIGH * lean, ratio = lane_of(ratios, n);
+        for (int from = first[s]; from <= last[s]; from += STEADY) {
+            const vec dy = lane_y + ((float)(HIGH * from) + 0.5f - cy);
+            const vec u = sharp * dx - lean * dy;
+            vec now = power_of_2(log2_opacity - c * dy * dy - u * u);
+            vec growth = power_of_2(2.0f * jump * u - 2.0f * HIGH * c * dy
+                - (jump * jump + HIGH * HIGH * c));
+            const int upto = last[s] < from + STEADY ? last[s] + 1 : from + STEADY;
+            for (int b = from; b < upto; ++b) {
+                const vec opaque = only(lesser(now, ceiling), now >= min_alpha);
+                now *= growth;
+                growth *= ratio;
+                $BLOCK
+            }
         }
     } else {
         for (int v = first[s] / LANES * LANES; v <= last[s]; v += LANES)
