@@ -70,7 +70,7 @@ def compare(
     """One row for each peer: times and the ratio to the first, or why there are none.
 
     At most `rounds` rounds, fewer once `seconds` have passed, but three. A peer whose round takes
-    longer than a tenth of `seconds` runs in three of them.
+    longer than a tenth of `seconds` is left to three rounds with the first peer at the end.
     """
     gaussians, camera = scene
     device = gaussians.means.device
@@ -93,13 +93,17 @@ def compare(
             slow.add(peer.name)
     samples: dict[str, list[Sample]] = {name: [] for name in ready}
     began = time.perf_counter()
+    first = next(iter(ready), None)
     for number in range(rounds):
         if number >= 3 and time.perf_counter() - began > seconds:
             break
-        for name, round_ in ready.items():
-            if number < 3 or name not in slow:
-                samples[name].append(once(round_, device)[0])
-    first = next(iter(ready), None)
+        for name in ready:
+            if name not in slow:
+                samples[name].append(once(ready[name], device)[0])
+    for _ in range(3 if slow else 0):
+        for name in ready:
+            if name == first or name in slow:
+                samples[name].append(once(ready[name], device)[0])
     for name, times in samples.items():
         totals = [x.total for x in times]
         base = [x.total for x in samples[first]] if first else []
