@@ -17,7 +17,7 @@ from hoigs.core.moment import Moment
 from hoigs.core.scene import SceneModel
 from hoigs.core.train_spec import TrainSpec
 from hoigs.evaluation.lpips import Lpips
-from hoigs.evaluation.metrics import psnr
+from hoigs.evaluation.metrics import psnr, region_psnr
 from hoigs.training.checkpoint import Checkpoint, restore_model
 from hoigs.training.face import unwrap_faces
 from hoigs.training.guard import NanGuard, first_not_finite, gradients_finite
@@ -202,7 +202,11 @@ class Trainer:
                 frame = self.clip[position]
                 moment = frame.moment.to(self.model.device)
                 color = self.model.render(moment, frame.camera.to(self.model.device)).color
-                values.append(float(psnr(color.cpu().clamp(0, 1), frame.rgb)))
+                color = color.cpu().clamp(0, 1)
+                if frame.ignored is None:
+                    values.append(float(psnr(color, frame.rgb)))
+                elif not frame.ignored.all():
+                    values.append(float(region_psnr(color, frame.rgb, ~frame.ignored)))
             if values:
                 scores[split] = sum(values) / len(values)
         return scores

@@ -11,11 +11,12 @@ from hoigs.core.clip import Clip, Frame
 from hoigs.core.entity import Entity
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.scene import SceneModel
-from hoigs.core.train_spec import LossSpec
+from hoigs.core.train_spec import LossSpec, TrainSpec
 from hoigs.evaluation.evaluate import evaluate
 from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.training.objective import JointObjective
+from hoigs.training.trainer import Trainer
 
 
 def model(clip: Clip) -> SceneModel:
@@ -77,3 +78,30 @@ def test_scores_leave_them_out_and_say_so() -> None:
     assert painted == known
     assert abs(painted[1] - 24 * 40 / 64**2) < 1e-6
     assert score(base)[1] == 0
+
+
+def test_previews_leave_them_out_too() -> None:
+    clip = small_clip()
+    ignored = torch.zeros(64, 64, dtype=torch.bool)
+    ignored[:24] = True
+    base = clip.store
+
+    class Painted(type(base)):  # type: ignore[misc]
+        def image(self, position: int) -> torch.Tensor:
+            return base.image(position).masked_fill(ignored[..., None], 0)
+
+        def ignored(self, position: int) -> torch.Tensor:
+            del position
+            return ignored
+
+    class Known(type(base)):  # type: ignore[misc]
+        def ignored(self, position: int) -> torch.Tensor:
+            del position
+            return ignored
+
+    def preview(store: object) -> dict[str, float]:
+        return Trainer(model(clip), replace(clip, store=store), TrainSpec())._preview()  # type: ignore[arg-type]
+
+    painted, known = preview(Painted(base.images)), preview(Known(base.images))
+    assert painted and painted == known
+    assert painted != preview(base)
