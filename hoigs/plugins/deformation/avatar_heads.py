@@ -73,7 +73,8 @@ class Trunk(nn.Module):
         """
         first = self.linears[0]
         assert isinstance(first, nn.Linear)
-        own, bias = entry.shape[1], first.bias
+        own = entry.shape[1]
+        bias: Tensor = first.bias
         if shared is not None:
             bias = bias + first.weight[:, own:] @ shared
         hidden = nn.functional.linear(entry, first.weight[:, :own], bias)
