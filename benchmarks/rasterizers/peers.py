@@ -95,8 +95,8 @@ def warp_captured(gaussians: Gaussians, camera: Camera) -> Round:
 def plain_torch(gaussians: Gaussians, camera: Camera) -> Round:
     from hoigs.rasterizers.torch_tiles import TorchRasterizer
 
-    if camera.width * camera.height * len(gaussians) > 256 * 256 * 20_000:
-        raise NotMeasuredError("more than 256x256 with 20,000 Gaussians takes minutes")
+    if camera.width * camera.height * len(gaussians) > 256 * 256 * 5000:
+        raise NotMeasuredError("more than 256x256 with 5,000 Gaussians takes minutes")
     return ours(TorchRasterizer())(gaussians, camera)
 
 
