@@ -221,8 +221,9 @@ def test_a_component_that_cannot_be_imported_is_shown(tmp_path):
 def test_only_importing_finds_some_faults(tmp_path):
     source = offering(key="density:late", target="late_plugin:Late") + "class Late: pass\n"
     write_plugin(tmp_path, "late-plugin", source)
-    assert "density:late                       ok" in hoigs("plugins", sites=(tmp_path,))
-    (line,) = [x for x in hoigs("plugins", "--load", sites=(tmp_path,)).splitlines() if "late" in x]
+    (line,) = new_lines(hoigs("plugins"), hoigs("plugins", sites=(tmp_path,)))
+    assert line.split()[:2] == ["density:late", "ok"]
+    (line,) = new_lines(hoigs("plugins", "--load"), hoigs("plugins", "--load", sites=(tmp_path,)))
     assert "broken" in line and "expected a subclass of hoigs.core.density.DensityControl" in line
 
 
