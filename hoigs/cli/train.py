@@ -66,7 +66,10 @@ def run_session(session: object) -> None:
     from hoigs.training.trainer import StepReport
 
     assert isinstance(session, Session)
-    steps = session.spec.train.steps
+    steps, width = session.spec.train.steps, session.spec.train.width
+    own = session.clip.cameras[0].width
+    if width is not None and own < width:
+        typer.echo(f"train.width={width} is wider than the clip: its {own} pixels are kept")
     typer.echo(
         f"training {session.spec.name} on {session.clip.name}: {steps} steps, "
         f"{len(session.clip.split['train'])} frames of "

@@ -127,7 +127,8 @@ class TrainSpec(_Strict):
     Attributes:
         steps: optimizer steps, one frame each.
         seed: of everything random.
-        width: train and score at this image width; None is the clip's own.
+        width: train and score at this image width, at most: frames are never enlarged. None is
+            the clip's own.
         sh_interval: steps after which one more degree of harmonics is trained (3DGS: 1000); None
             trains all from the start.
         checkpoint_every, log_every, preview_every: steps; the last step always writes both.

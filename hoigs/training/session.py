@@ -31,7 +31,8 @@ def read_clip(
         folder: as `hoigs prepare` makes it, any layout that an installed reader knows, or
             "builtin:NAME".
         registry: where readers are looked up; by default what is installed.
-        width: resize to this image width, aspect kept; None leaves the clip as it is.
+        width: shrink frames to this image width, aspect kept; those that are narrower, and all
+            with None, stay as they are.
 
     Raises:
         ClipError: no reader knows it, or the reader found it incomplete.
@@ -44,7 +45,8 @@ def read_clip(
         reader = registry.get(key)()
         if reader.matches(folder):
             clip = reader.read(folder)
-            return clip if width is None else clip.resized(width)
+            shrinks = width is not None and width < clip.cameras[0].width
+            return clip.resized(width) if shrinks else clip
     raise ClipError(
         f"{folder}: not a layout that {', '.join(registry.keys('reader'))} knows; a clip folder "
         "has clip.json (docs/reference/clip.md); `hoigs prepare` makes one from a video"
