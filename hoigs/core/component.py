@@ -22,7 +22,7 @@ INTERFACES: dict[str, str | None] = {
     "body": "hoigs.core.body:BodyModel",
     "reader": "hoigs.core.reader:ClipReader",
     "density": "hoigs.core.density:DensityControl",
-    "prior": "hoigs.core.prior:ObjectPrior",
+    "prior": "hoigs.core.prior:Prior",
     "exporter": None,
 }
 KINDS = tuple(INTERFACES)

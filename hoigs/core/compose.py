@@ -19,7 +19,7 @@ from hoigs.core.entity import Entity
 from hoigs.core.errors import HoigsError, PluginError, SpecError, did_you_mean
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.interaction import EntityKind
-from hoigs.core.prior import check_track
+from hoigs.core.prior import ObjectPrior, check_track
 from hoigs.core.rasterizer import Rasterizer
 from hoigs.core.registry import Registry, default_registry
 from hoigs.core.scene import SceneModel
@@ -177,6 +177,11 @@ class _Builder:
         if kind != "object":
             raise SpecError(f"{self.spec.at(*where)}: priors make objects; {name} is a {kind}")
         prior = self.part(where, part, replace(context, rasterizer=rasterizer))
+        if not isinstance(prior, ObjectPrior):
+            raise SpecError(
+                f"{self.spec.at(*where)}: {part.use} speaks of videos, for `hoigs prepare`; "
+                "expected one that makes objects, such as prior:depth"
+            )
         with _blaming(self.spec, *where, why=f"{name}: "):
             track = check_track(prior.initialise(self.clip, name), len(self.clip))
         return replace(context, object_track=track)

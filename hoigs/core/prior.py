@@ -1,4 +1,8 @@
-"""ObjectPrior: what an object looks like, and where it is, before training has seen anything."""
+"""Priors: what is known before training has seen anything.
+
+Two interfaces share the kind "prior": ObjectPrior, what an object looks like and where it is, and
+hoigs.core.video_prior.VideoPrior, what estimators say of a video before it is a clip.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +17,20 @@ if TYPE_CHECKING:
     from hoigs.core.context import BuildContext
 
 
-class ObjectPrior(ABC):
+class Prior:
+    """Anything that a spec names "prior:…"."""
+
+    @classmethod
+    def from_config(cls, config: Any, context: BuildContext) -> Self:
+        return cls(**config.model_dump())
+
+
+class ObjectPrior(Prior, ABC):
     """An object initialiser: a clip and the name of one of its objects in, an ObjectTrack out.
 
     A clip carries a track of its own for every object. A prior may keep that track's poses and
     bring better points, or place the object anew (HOIGS, Sec. "Object Initialization").
     """
-
-    @classmethod
-    def from_config(cls, config: Any, context: BuildContext) -> Self:
-        return cls(**config.model_dump())
 
     @abstractmethod
     def initialise(self, clip: Clip, entity: str) -> ObjectTrack:
