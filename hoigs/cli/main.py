@@ -23,7 +23,7 @@ app.command("train")(train.train)
 app.command("eval")(evaluate.evaluate)
 app.command("render")(render.render)
 app.command("tables")(tables.tables)
-app.command("plugins")(plugins.plugins)
+app.add_typer(plugins.app, name="plugins")
 app.add_typer(spec.app, name="spec")
 app.command("doctor")(doctor.doctor)
 

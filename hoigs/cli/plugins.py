@@ -7,12 +7,18 @@ from typing import Annotated, Any
 import typer
 
 from hoigs.cli.common import PluginOption
+from hoigs.cli.plugins_check import check
+
+app = typer.Typer(invoke_without_command=True)
+app.command("check")(check)
 
 # Fixed, so that one plugin's line never moves another's.
 LINE = "{key:<34} {status:<12} {origin:<28} {text}"
 
 
+@app.callback()
 def plugins(
+    context: typer.Context,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print JSON, with versions, targets and full errors.")
     ] = False,
@@ -23,7 +29,9 @@ def plugins(
     plugin: PluginOption = None,
 ) -> None:
     """List all components with their status: ok, broken, conflict, blocked, incompatible,
-    needs-extra."""
+    needs-extra; or one of the commands below."""
+    if context.invoked_subcommand is not None:
+        return
     rows, notes = list_plugins(load=load, files=plugin or ())
     if as_json:
         import json

@@ -25,21 +25,22 @@ class Check(Generic[Subject]):
     Attributes:
         id: stable forever, for example "R07"; a check that is withdrawn leaves its id unused.
         title: one line.
-        function: raises CheckError, or whatever the plugin raises.
+        function: raises CheckError, or whatever the plugin raises; may return a remark.
         needs: what the subject must declare for the question to make sense.
     """
 
     id: str
     title: str
-    function: Callable[[Subject], None]
+    function: Callable[[Subject], str | None]
     needs: tuple[Need, ...] = ()
 
     def missing(self, subject: Subject) -> str | None:
         """Why the subject cannot be asked this, or None."""
         return next((why for need in self.needs if (why := need(subject)) is not None), None)
 
-    def run(self, subject: Subject) -> None:
-        self.function(subject)
+    def run(self, subject: Subject) -> str | None:
+        """A remark, or None; raises when the subject fails."""
+        return self.function(subject)
 
 
 class CheckList(Generic[Subject]):
@@ -55,12 +56,12 @@ class CheckList(Generic[Subject]):
 
     def check(
         self, id: str, *needs: Need
-    ) -> Callable[[Callable[[Subject], None]], Callable[[Subject], None]]:
+    ) -> Callable[[Callable[[Subject], str | None]], Callable[[Subject], str | None]]:
         """Decorator: adds a function; the first line of its docstring is the title."""
         if not re.fullmatch(rf"{self.letter}\d\d", id) or id in self._checks:
             raise ValueError(f'check id "{id}": expected {self.letter} and two digits, used once')
 
-        def add(function: Callable[[Subject], None]) -> Callable[[Subject], None]:
+        def add(function: Callable[[Subject], str | None]) -> Callable[[Subject], str | None]:
             title = (function.__doc__ or function.__name__).strip().partition("\n")[0].rstrip(".")
             self._checks[id] = Check(id, title, function, needs)
             return function
@@ -89,7 +90,7 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class Result:
-    """What became of one check; `why` says so unless it passed."""
+    """What became of one check; `why` says so, and of one that passed it may be a remark."""
 
     id: str
     title: str
@@ -123,9 +124,19 @@ class Report:
         lines += [
             f"  {r.id} {r.outcome}: {r.title}" + (f"\n      {r.why}" if r.why else "")
             for r in self.results
-            if r.outcome is not Outcome.PASSED
+            if r.why or r.outcome is not Outcome.PASSED
         ]
         return "\n".join(lines)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: subject, ok, counts by outcome, and every result."""
+        counts = {str(o): self.count(o) for o in Outcome}
+        results = [
+            {"id": r.id, "title": r.title, "outcome": str(r.outcome), "why": r.why}
+            for r in self.results
+        ]
+        counts["run"] = self.run
+        return {"subject": self.subject, "ok": self.ok, "counts": counts, "results": results}
 
 
 def run_checks(
@@ -143,25 +154,31 @@ def run_checks(
         ValueError: `expected_failures` names a check that is not among `checks`.
     """
     checks, expected = list(checks), dict(expected_failures or {})
-    ids = [check.id for check in checks]
-    for id in expected:
-        if id not in ids:
-            raise ValueError(f'expected_failures: no check "{id}"{did_you_mean(id, ids)}')
-    results = tuple(_result(check, subject, expected.get(check.id)) for check in checks)
+    refuse_unknown(expected, [check.id for check in checks])
+    results = tuple(run_check(check, subject, expected.get(check.id)) for check in checks)
     return Report(str(subject), results)
 
 
-def _result(check: Check[Subject], subject: Subject, expected: str | None) -> Result:
+def refuse_unknown(expected_failures: Iterable[str], ids: Iterable[str]) -> None:
+    """Raise ValueError when an expected failure is none of these ids."""
+    ids = list(ids)
+    for id in expected_failures:
+        if id not in ids:
+            raise ValueError(f'expected_failures: no check "{id}"{did_you_mean(id, ids)}')
+
+
+def run_check(check: Check[Subject], subject: Subject, expected: str | None = None) -> Result:
+    """What becomes of one check; `expected` is why it should fail."""
     missing = check.missing(subject)
     if missing is not None:
         return Result(check.id, check.title, Outcome.SKIPPED, missing)
     try:
-        check.run(subject)
+        remark = check.run(subject)
     except Exception as error:
         text = str(error) if isinstance(error, CheckError) else f"{type(error).__name__}: {error}"
         if expected is None:
             return Result(check.id, check.title, Outcome.FAILED, text)
         return Result(check.id, check.title, Outcome.EXPECTED_FAILURE, expected)
     if expected is None:
-        return Result(check.id, check.title, Outcome.PASSED)
+        return Result(check.id, check.title, Outcome.PASSED, remark or "")
     return Result(check.id, check.title, Outcome.UNEXPECTED_PASS, f"expected to fail: {expected}")

@@ -17,8 +17,8 @@ from hoigs.testing.rasterizer import (
     rows,
     rules,
 )
-from hoigs.testing.rasterizer.subject import CHECKS, RasterizerSubject
+from hoigs.testing.rasterizer.subject import CHECKS, RasterizerSubject, subject
 
 FAMILIES = (rules, pictures, rows, gradients, bad_rows, promises)  # importing them fills CHECKS
 
-__all__ = ["CHECKS", "FAMILIES", "RasterizerSubject", "run_checks"]
+__all__ = ["CHECKS", "FAMILIES", "RasterizerSubject", "run_checks", "subject"]

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from hoigs.core.camera import Camera
+from hoigs.core.context import BuildContext
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.rasterizer import Rasterizer, RenderOutput, RenderRequest
 from hoigs.testing.checks import CheckList, Need
 from hoigs.testing.rasterizer.scenes import RAW, Scene, forged, on
+
+if TYPE_CHECKING:
+    from hoigs.testing.door import Options
 
 INPUTS = (*RAW, "features", "screen_offsets", "background", "world_to_camera")
 
@@ -71,6 +75,11 @@ class RasterizerSubject:
 
 
 CHECKS: CheckList[RasterizerSubject] = CheckList("R")
+
+
+def subject(cls: type[Rasterizer], config: Any, options: Options) -> RasterizerSubject:
+    """The backend of these settings, on the device of the options."""
+    return RasterizerSubject(cls.from_config(config, BuildContext()), torch.device(options.device))
 
 
 def camera_gradients(subject: RasterizerSubject) -> str | None:

@@ -1,0 +1,190 @@
+"""check: a component by its registry key, through the checks of every plugin and of its kind."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hoigs.core.errors import PluginError, did_you_mean
+from hoigs.core.manager import normal_name
+from hoigs.testing.checks import Check, Outcome, Report, Result, refuse_unknown, run_check
+
+if TYPE_CHECKING:
+    from hoigs.core.registry import Registry
+
+# kind -> package with its CHECKS and `subject(cls, config, options)`; the others have P alone
+KINDS = {
+    "rasterizer": "hoigs.testing.rasterizer",
+}
+PLUGIN = "hoigs.testing.plugin"
+
+
+@dataclass(frozen=True)
+class Options:
+    """How the subject of a check is made.
+
+    Attributes:
+        settings: of the component, where its defaults are not meant, or where it has none.
+        device: that it is checked on.
+        folder: a clip in a reader's own layout. Without one, a reader is given the clip folder of
+            hoigs, if its `matches` takes it.
+    """
+
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    device: str = "cpu"
+    folder: Path | None = None
+
+
+class Candidate:
+    """One component, as the checks get it: nothing is imported before a check asks for it.
+
+    Args:
+        key: "kind:name", or "kind:name@dist".
+        registry: where it is looked up; by default that of this process.
+    """
+
+    def __init__(
+        self, key: str, options: Options | None = None, registry: Registry | None = None
+    ) -> None:
+        self.key, self.options = key, options or Options()
+        self._registry = registry
+
+    @cached_property
+    def registry(self) -> Registry:
+        from hoigs.core.registry import default_registry
+
+        return self._registry or default_registry()
+
+    @cached_property
+    def plugin(self) -> Any:
+        """The subject of the P checks."""
+        return importlib.import_module(PLUGIN).subject(self.key, self.registry, self.options)
+
+    @cached_property
+    def part(self) -> Any:
+        """The subject of its kind's checks; an Exception where it cannot be made."""
+        package = importlib.import_module(KINDS[kind_of(self.key)])
+        try:
+            config = self.registry.config_class(self.key).model_validate(
+                dict(self.options.settings)
+            )
+            return package.subject(self.registry.get(self.key), config, self.options)
+        except Exception as error:  # a stranger's code may raise anything
+            return error
+
+    def checks(self) -> list[Check[Any]]:
+        """All checks that there are for its kind."""
+        return checks_of(self.key)
+
+    def result(self, check: Check[Any], expected: str | None = None) -> Result:
+        """What becomes of one of `checks`."""
+        if check.id.startswith("P"):
+            return run_check(check, self.plugin, expected)
+        if isinstance(self.part, Exception):
+            why = f"it cannot be made, see P10: {type(self.part).__name__}: {self.part}"
+            return Result(check.id, check.title, Outcome.SKIPPED, why)
+        return run_check(check, self.part, expected)
+
+    def report(self, expected_failures: Mapping[str, str] | None = None) -> Report:
+        expected = dict(expected_failures or {})
+        refuse_unknown(expected, [check.id for check in self.checks()])
+        results = [self.result(check, expected.get(check.id)) for check in self.checks()]
+        return Report(self.key, tuple(results))
+
+
+def kind_of(key: str) -> str:
+    return key.partition(":")[0]
+
+
+def checks_of(key: str) -> list[Check[Any]]:
+    """The checks for a component of this key: those of plugins, then those of its kind."""
+    packages = [PLUGIN, *([KINDS[kind_of(key)]] if kind_of(key) in KINDS else [])]
+    return [check for name in packages for check in importlib.import_module(name).CHECKS]
+
+
+def check(
+    key: str,
+    *,
+    expected_failures: Mapping[str, str] | None = None,
+    settings: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+    folder: str | Path | None = None,
+    registry: Registry | None = None,
+) -> Report:
+    """Hold the component `key` to what its interface promises.
+
+    Args:
+        key: "kind:name", or "kind:name@dist".
+        expected_failures: id of a check -> why it is known to fail. It is run all the same, and
+            its passing is an error too.
+        settings, device, folder: see Options.
+        registry: where `key` is looked up; by default that of this process.
+
+    Raises:
+        PluginError: nobody offers `key`.
+        ValueError: `expected_failures` names a check that there is not.
+    """
+    options = Options(settings or {}, device, None if folder is None else Path(folder))
+    candidate = Candidate(key, options, registry)
+    require_offered(key, candidate.registry)
+    return candidate.report(expected_failures)
+
+
+def check_plugin(
+    name: str,
+    *,
+    expected_failures: Mapping[str, str] | None = None,
+    settings: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+    folder: str | Path | None = None,
+    registry: Registry | None = None,
+) -> list[Report]:
+    """`check` for a key, or for every component of a distribution or entry point of that name.
+
+    Raises:
+        PluginError: it is neither, or offers nothing.
+    """
+    from hoigs.core.registry import default_registry
+
+    registry = registry or default_registry()
+    keys = [name] if ":" in name else keys_of(name, registry)
+    return [
+        check(
+            key,
+            expected_failures=expected_failures,
+            settings=settings,
+            device=device,
+            folder=folder,
+            registry=registry,
+        )
+        for key in keys
+    ]
+
+
+def keys_of(name: str, registry: Registry) -> list[str]:
+    """Exact keys of all that a distribution, or an entry point, of this name offers."""
+    wanted = normal_name(name)
+    plugins = registry.manager.plugins
+    found = [p for p in plugins if wanted in (normal_name(p.dist), normal_name(p.name))]
+    keys = [o.exact for o in registry.manager.offers if o.plugin in found]
+    if keys:
+        return keys
+    if found:
+        said = "; ".join(f"{p.status}: {p.error}" if p.error else str(p.status) for p in found)
+        raise PluginError(f'the plugin "{name}" offers nothing to check ({said})')
+    names: Sequence[str] = [*(p.dist for p in plugins), *registry.keys()]
+    raise PluginError(
+        f'"{name}" is neither a component key nor a plugin{did_you_mean(name, names)}; '
+        "`hoigs plugins` lists both"
+    )
+
+
+def require_offered(key: str, registry: Registry) -> None:
+    """Raise PluginError, with the nearest name, when nobody offers `key`."""
+    name = key.partition("@")[0]
+    if not any(offer.key == name for offer in registry.manager.offers):
+        registry.component(key)
