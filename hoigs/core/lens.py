@@ -135,9 +135,9 @@ def _undistortion(lens: Lens) -> Undistortion:
         return np.asarray(colmap.img_from_cam(rays), np.float64)
 
     source = seen(flat)
-    # beyond the radius where a polynomial turns back it shows the inside of the image again
-    further = np.linalg.norm((seen(1.001 * flat) - center) / focal, axis=-1)
-    folded = further < np.linalg.norm((source - center) / focal, axis=-1)
+    # beyond the radius where a polynomial turns back, it shows what it has shown already
+    outward = ((seen(1.001 * flat) - source) / focal * flat).sum(-1)
+    folded = (outward <= 0) & ((flat * flat).sum(-1) > 1e-6)
     source[folded] = np.nan
     source = source.reshape(*pinhole.shape)
     if np.nanmax(np.abs(source - pinhole)) < NEGLIGIBLE_SHIFT:
