@@ -50,9 +50,21 @@ class Checkpoint:
         return weights
 
 
+def _complete(folder: Path) -> list[Path]:
+    return sorted(
+        (p for p in folder.glob("step_*.json") if p.with_suffix(".safetensors").exists()),
+        key=lambda p: int(p.stem.removeprefix("step_")),  # beyond 999999 names grow
+    )
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Whether a run has come as far as its first checkpoint."""
+    return bool(_complete(folder))
+
+
 def latest_checkpoint(folder: Path) -> Path:
     """The JSON of the newest complete checkpoint in a run's `checkpoints/` folder."""
-    found = sorted(p for p in folder.glob("step_*.json") if p.with_suffix(".safetensors").exists())
+    found = _complete(folder)
     if not found:
         raise CheckpointError(
             f"{folder}: no checkpoint here; expected step_*.safetensors with step_*.json beside "

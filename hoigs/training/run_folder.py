@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import platform
@@ -61,18 +62,26 @@ class RunFolder:
                 raise HoigsError(f"{self.path}: --overwrite replaces run folders only")
 
     def create(self, spec_text: str, provenance: dict[str, Any], overwrite: bool = False) -> None:
-        """Make the folder under a temporary name, then rename it into place."""
+        """Make the folder under a temporary name, then rename it into place.
+
+        What an earlier process that was killed here has left beside it is removed.
+        """
         self.refuse_existing(overwrite)
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        for stale in self.path.parent.glob(f".{glob.escape(self.path.name)}.*.part"):
+            if not _alive(stale.name.split(".")[-2]):
+                shutil.rmtree(stale)
         temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
         shutil.rmtree(temporary, ignore_errors=True)
         (temporary / "checkpoints").mkdir(parents=True)
         (temporary / "spec.yaml").write_text(spec_text)
         (temporary / "provenance.json").write_text(json.dumps(provenance, indent=1))
         (temporary / "metrics.jsonl").touch()
+        old = self.path.with_name(f".{self.path.name}.old.{os.getpid()}.part")
         if self.path.exists():
-            shutil.rmtree(self.path)
+            self.path.replace(old)
         temporary.replace(self.path)
+        shutil.rmtree(old, ignore_errors=True)
 
     def go_on(self, spec_text: str, spec_hash: str) -> None:
         """A resumed run is from now on one of this spec: more steps, another density cap."""
@@ -87,12 +96,12 @@ class RunFolder:
             file.write(json.dumps(record) + "\n")
 
     def cut_metrics(self, step: int) -> None:
-        """Drop records after `step`: a resumed run writes them again."""
-        kept = [
-            line
-            for line in self.metrics.read_text().splitlines()
-            if json.loads(line)["step"] <= step
-        ]
+        """Drop records after `step`: a resumed run writes them again.
+
+        A last line without its end was being written when the run was killed: it goes too.
+        """
+        whole = self.metrics.read_text().rpartition("\n")[0]
+        kept = [line for line in whole.splitlines() if json.loads(line)["step"] <= step]
         temporary = self.metrics.with_suffix(".part")
         temporary.write_text("".join(line + "\n" for line in kept))
         temporary.replace(self.metrics)
@@ -103,6 +112,19 @@ class RunFolder:
     def relative(self, path: Path) -> str:
         """`path` as seen from the run folder, so that both can move together."""
         return os.path.relpath(path.resolve(), self.path.resolve())
+
+
+def _alive(pid: str) -> bool:
+    """Whether a process of this number runs; what is no number belongs to nobody we know."""
+    if not pid.isdigit():
+        return True
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def versions() -> dict[str, str]:

@@ -16,7 +16,12 @@ from hoigs.core.registry import Registry, default_registry
 from hoigs.core.scene import SceneModel
 from hoigs.core.spec import Spec
 from hoigs.evaluation.lpips import Lpips, find_weights
-from hoigs.training.checkpoint import latest_checkpoint, load_checkpoint, restore_model
+from hoigs.training.checkpoint import (
+    has_checkpoint,
+    latest_checkpoint,
+    load_checkpoint,
+    restore_model,
+)
 from hoigs.training.clip_source import clip_folder, clip_name
 from hoigs.training.run_folder import RunFolder, versions
 from hoigs.training.trainer import StepReport, Trainer
@@ -103,7 +108,10 @@ class Session:
             lpips=_perceptual(spec, lpips_weights, device),
         )
         if resume:
-            trainer.resume(load_checkpoint(latest_checkpoint(run.checkpoints)))
+            if has_checkpoint(run.checkpoints):
+                trainer.resume(load_checkpoint(latest_checkpoint(run.checkpoints)))
+            else:  # stopped before the first one: from the beginning
+                run.cut_metrics(0)
             run.go_on(spec.dump(), spec.hash())
         else:
             provenance = {
