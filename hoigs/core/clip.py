@@ -70,11 +70,21 @@ class Frame:
 
 @dataclass(frozen=True)
 class BodyTrack:
-    """A body over the clip: which body model, and a BodyPose batched over the frames."""
+    """A body over the clip: which body model, and a BodyPose batched over the frames.
 
-    model: str  # registry key, for example "body:anny"
+    Attributes:
+        model: registry key, for example "body:anny".
+        gender: of the model file that the poses were fitted with ("male", "female", "neutral"),
+            where that matters; body models refuse another.
+        template: the person's own zero-pose vertices, metres, in place of the model's mean
+            (ARCTIC); the betas come on top of it.
+    """
+
+    model: str
     poses: BodyPose
     provenance: str = "unknown"
+    gender: str | None = None
+    template: Float[Tensor, "V 3"] | None = None
 
 
 @dataclass(frozen=True)

@@ -346,8 +346,15 @@ def _save_body(path: Path, track: BodyTrack) -> None:
     poses = track.poses
     if poses.betas.dim() != 1:
         raise ClipError(f"betas have shape {list(poses.betas.shape)}; a clip shares one [B]")
+    # numpy types its keywords as flags of its own
+    special: dict[str, Any] = {}
+    if track.gender is not None:
+        special["gender"] = np.array(track.gender)
+    if track.template is not None:
+        special["template"] = _array(track.template)
     np.savez_compressed(
         path,
+        **special,
         global_orient=_array(poses.global_orient),
         body=_array(poses.body),
         left_hand=_array(poses.left_hand),

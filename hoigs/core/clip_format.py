@@ -177,6 +177,16 @@ BODY = FileSpec(
         ArraySpec("betas", ("B",), "float", "shape, shared by all frames"),
         ArraySpec("hand_pose_convention", (), "str", '"flat" or "mean": what zero means'),
         ArraySpec("model", (), "str", 'body model, as in clip.json: "body:anny"'),
+        ArraySpec(
+            "gender", (), "str", 'of the model file: "male", "female", "neutral"', optional=True
+        ),
+        ArraySpec(
+            "template",
+            ("V", 3),
+            "float",
+            "the person's own zero-pose vertices in place of the model's mean, metres",
+            optional=True,
+        ),
         _PROVENANCE,
     ),
     "a human",

@@ -195,7 +195,13 @@ def _read_body(path: Path) -> BodyTrack:
     fields = ("global_orient", "body", "left_hand", "right_hand", "transl", "betas")
     convention: Any = str(words["hand_pose_convention"])
     poses = BodyPose(**{f: tensors[f] for f in fields}, hand_pose_convention=convention)
-    return BodyTrack(str(words["model"]), poses, str(words.get("provenance", "unknown")))
+    return BodyTrack(
+        str(words["model"]),
+        poses,
+        str(words.get("provenance", "unknown")),
+        gender=str(words["gender"]) if "gender" in words else None,
+        template=tensors.get("template"),
+    )
 
 
 def _read_object(path: Path) -> ObjectTrack:
