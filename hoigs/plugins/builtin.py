@@ -11,6 +11,7 @@ DEFORMATION = "hoigs.plugins.deformation"
 FEATURES = "hoigs.plugins.features"
 INTERACTION = "hoigs.plugins.interaction"
 PRIORS = "hoigs.plugins.priors"
+READERS = "hoigs.plugins.readers"
 
 # key, module, class, config class, summary
 PARTS = (
@@ -76,6 +77,10 @@ PARTS = (
      "SMPL, from your own .npz; HOSNeRF's and NeuMan's body"),
     ("reader:clip", "hoigs.plugins.readers.clip", "ClipFolderReader", "ClipFolderReaderConfig",
      "the clip folder that `hoigs prepare` writes"),
+    ("reader:colmap", f"{READERS}.colmap", "ColmapReader", "ColmapConfig",
+     "images/ beside COLMAP's sparse model, masks by entity if there are any"),
+    ("reader:dnerf", f"{READERS}.dnerf", "DnerfReader", "DnerfConfig",
+     "Blender scenes with times, as D-NeRF's"),
     ("density:adc", "hoigs.plugins.density.adc", "AdaptiveDensity", "AdaptiveDensityConfig",
      "clone, split and prune as 3DGS does, under a hard cap"),
     ("density:absgrad", "hoigs.plugins.density.absgrad", "AbsoluteGradientDensity",
@@ -102,6 +107,10 @@ PARTS = (
      "depth of a video that any estimator has written: npy, npz, 16-bit PNG, EXR"),
     ("prior:landmarks-files", f"{PRIORS}.video_landmarks_files", "LandmarksFilesPrior",
      "LandmarksFilesConfig", "landmarks of a person: MediaPipe's, COCO's, OpenPose's files"),
+    ("prior:mediapipe", f"{PRIORS}.video_mediapipe", "MediapipePrior", "MediapipeConfig",
+     "landmarks of a person by MediaPipe Pose, in an environment of its own"),
+    ("prior:command", f"{PRIORS}.video_command", "CommandPrior", "CommandConfig",
+     "masks, depth or landmarks that a command line of yours writes"),
 )  # fmt: skip
 # parts that need an optional dependency
 EXTRAS = {"rasterizer:gsplat": "gsplat", "prior:sds": "sds"}

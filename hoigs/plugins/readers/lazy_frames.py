@@ -215,6 +215,20 @@ def image_size(path: Path) -> tuple[int, int]:
         raise ClipError(f"{path} is not a readable image ({error})") from error
 
 
+def lens_for(lens: Lens, image: Path) -> Lens:
+    """The lens at the size that an image file has: data sets come with images_2 and the like.
+
+    Raises:
+        ClipError: the image has another shape than the lens, or cannot be read.
+    """
+    width, height = image_size(image)
+    if abs(width * lens.height / (height * lens.width) - 1) > ASPECT_TOLERANCE:
+        raise ClipError(
+            f"{image} is {width}x{height}, its camera {lens.width}x{lens.height}: another shape"
+        )
+    return lens.resized(width, height)
+
+
 def read_depth(path: Path) -> Array:
     """A depth map [H, W] of a `.npy`, a `.npz` with "depth", or a grey image of 8, 16 or 32 bits.
 

@@ -1,0 +1,124 @@
+"""reader:colmap: a folder of images beside COLMAP's sparse model, as the 3DGS family reads it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field
+
+from hoigs.core.clip import Clip, uniform_test_split
+from hoigs.core.config import ComponentConfig
+from hoigs.core.interaction import EntityKind
+from hoigs.core.reader import ClipReader
+from hoigs.plugins.readers.colmap_model import model_folder, read_sparse, sparse_needs
+from hoigs.plugins.readers.frame_order import image_files, video_moments
+from hoigs.plugins.readers.lazy_frames import LazyFrames, MaskFiles, lens_for
+from hoigs.plugins.readers.listing import Need, require_files
+
+LAYOUT = "a COLMAP folder (images/ and sparse/)"
+MASK_MAKER = "your segmenter makes masks/ENTITY/, 0/255, one file an image; or remove the folder"
+NO_POSES = "a COLMAP folder holds none; `hoigs prepare` fits a body to landmarks"
+
+
+class ColmapConfig(ComponentConfig):
+    """Settings of reader:colmap."""
+
+    factor: int = Field(default=1, ge=1, description="2 reads images_2/, and so on")
+    test_every: int | None = Field(
+        default=None,
+        ge=2,
+        description="every n-th image is for tests, from the first on (3DGS: 8); else 16, evenly",
+    )
+    fps: float = Field(default=30.0, gt=0, description="of the video that the images come from")
+    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
+
+
+class ColmapReader(ClipReader):
+    """Cameras and points of a sparse model, in COLMAP's own unit; distortion is taken out.
+
+    Images are in natural order of their names. One that COLMAP could not register is left out,
+    but keeps its time. `masks/NAME/` holds the masks of an entity: a human if NAME starts with
+    "human" or "person", else an object. Mask files right in `masks/` are COLMAP's own (where to
+    take no features) and are left alone.
+
+    Args:
+        factor, test_every, fps, cache_mb: see ColmapConfig.
+    """
+
+    def __init__(
+        self,
+        factor: int = 1,
+        test_every: int | None = None,
+        fps: float = 30.0,
+        cache_mb: int = 512,
+    ) -> None:
+        self.factor, self.test_every, self.fps, self.cache_mb = factor, test_every, fps, cache_mb
+
+    def matches(self, folder: Path) -> bool:
+        return model_folder(Path(folder)) is not None and (Path(folder) / "images").is_dir()
+
+    def read(self, folder: Path) -> Clip:
+        folder = Path(folder)
+        room = "images" if self.factor == 1 else f"images_{self.factor}"
+        shrink = "the video's frames, the ones that COLMAP was run on"
+        if self.factor != 1:
+            shrink = f"images at 1/{self.factor} size: `mogrify -resize {100 / self.factor:g}%`"
+        needs = [Need.of(f"{room}/", maker=shrink), *sparse_needs(folder)]
+        require_files(folder, LAYOUT, needs)
+        place = model_folder(folder)
+        assert place is not None  # require_files has found it
+        model = read_sparse(folder / place)
+        files = {p.stem: p for p in image_files(folder / room)}
+        stems = [Path(view.name).stem for view in model.views]
+        masks = mask_folders(folder)
+        needs = [Need.of(f"{room}/{Path(v.name).name}", maker=shrink)
+                 for v, stem in zip(model.views, stems) if stem not in files]  # fmt: skip
+        for name in masks:
+            needs += [Need.of(f"masks/{name}/{s}.png", maker=MASK_MAKER) for s in stems]
+        require_files(folder, LAYOUT, needs)
+        images = [files[stem] for stem in stems]
+        lenses = [lens_for(view.lens, path) for view, path in zip(model.views, images)]
+        cameras = [lens.camera(v.world_to_camera) for lens, v in zip(lenses, model.views)]
+        order = {path: i for i, path in enumerate(files.values())}
+        return Clip(
+            name=folder.resolve().name,
+            store=LazyFrames(
+                folder,
+                images,
+                cameras,
+                masks={
+                    n: MaskFiles([folder / "masks" / n / f"{s}.png" for s in stems]) for n in masks
+                },
+                lenses=lenses,
+                cache_mb=self.cache_mb,
+            ),
+            cameras=cameras,
+            moments=video_moments([order[p] for p in images], len(files)),
+            kinds=masks,
+            bodies={},
+            objects={},
+            points=model.points,
+            point_colors=model.colors,
+            split=split_of(len(images), self.test_every),
+            fps=self.fps,
+            provenance={
+                "reader": "reader:colmap",
+                "cameras": f"{model.summary}; world in COLMAP's unit",
+                **{f"poses of {n}": NO_POSES for n, kind in masks.items() if kind == "human"},
+            },
+        )
+
+
+def mask_folders(folder: Path) -> dict[str, EntityKind]:
+    """Entities by the folders in masks/."""
+    rooms = sorted(p.name for p in (folder / "masks").glob("*") if p.is_dir())
+    people = ("human", "person")
+    return {name: "human" if name.lower().startswith(people) else "object" for name in rooms}
+
+
+def split_of(count: int, every: int | None) -> dict[str, list[int]]:
+    """Training and test positions; see ColmapConfig.test_every."""
+    if every is None:
+        return uniform_test_split(count)
+    test = list(range(0, count, every))
+    return {"train": [i for i in range(count) if i % every], "test": test}

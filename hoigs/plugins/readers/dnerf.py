@@ -1,0 +1,142 @@
+"""reader:dnerf: Blender scenes with a time for each frame, as D-NeRF published them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from hoigs.core.clip import Clip
+from hoigs.core.config import ComponentConfig
+from hoigs.core.reader import ClipReader
+from hoigs.plugins.readers.frame_order import timed_moments
+from hoigs.plugins.readers.json_file import parse_json
+from hoigs.plugins.readers.lazy_frames import LazyFrames
+from hoigs.plugins.readers.listing import Need, require_files
+from hoigs.plugins.readers.point_file import Points, read_points
+from hoigs.plugins.readers.poses import opengl_to_world_to_camera
+from hoigs.plugins.readers.transforms import TransformFrame, Transforms, lens_of
+
+LAYOUT = "a D-NeRF scene (transforms_train.json …)"
+MAKER = "D-NeRF's data.zip has it (github.com/albertpumarola/D-NeRF), or a Blender export script"
+POINT_FILES = ("fused.ply", "points3d.ply", "points3D.ply")
+COLORS = {"white": (255, 255, 255), "black": (0, 0, 0)}
+
+
+class DnerfConfig(ComponentConfig):
+    """Settings of reader:dnerf."""
+
+    background: Literal["white", "black"] = Field(
+        default="black", description="behind the transparent parts; what renders have where empty"
+    )
+    points: int = Field(
+        default=2000, ge=1, description="random points to start from where no file has any (4DGS)"
+    )
+    box: float = Field(default=1.3, gt=0, description="they lie within -box and box")
+    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
+
+
+class DnerfReader(ClipReader):
+    """Training, validation and test frames of a Blender scene in one clip.
+
+    Images keep their own size, times are the files' (divided by the largest if that exceeds 1).
+    The scene has no unit. Test frames have cameras and mostly times of their own.
+
+    Args:
+        background, points, box, cache_mb: see DnerfConfig.
+    """
+
+    def __init__(
+        self,
+        background: Literal["white", "black"] = "black",
+        points: int = 2000,
+        box: float = 1.3,
+        cache_mb: int = 512,
+    ) -> None:
+        self.background, self.points, self.box = background, points, box
+        self.cache_mb = cache_mb
+
+    def matches(self, folder: Path) -> bool:
+        return (Path(folder) / "transforms_train.json").is_file()
+
+    def read(self, folder: Path) -> Clip:
+        folder = Path(folder)
+        names = ["transforms_train.json", "transforms_test.json"]
+        require_files(folder, LAYOUT, [Need.of(name, maker=MAKER) for name in names])
+        if (folder / "transforms_val.json").is_file():
+            names.append("transforms_val.json")
+        files = {name: parse_json(folder / name, Transforms) for name in names}
+        rows = [(name, i, frame) for name in names for i, frame in enumerate(files[name].frames)]
+        untimed = [(name, i) for name, i, frame in rows if frame.time is None]
+        faults = [f"{name} has no frames" for name in names[:2] if not files[name].frames]
+        if untimed:
+            name, i = untimed[0]
+            faults.append(
+                f'{name}: frames.{i} has no "time" ({len(untimed)} frames of all): a still Blender '
+                "scene? D-NeRF's frames have a time from 0 to 1"
+            )
+        needs = [Need.of(*image_names(frame), maker=MAKER) for _, _, frame in rows]
+        require_files(folder, LAYOUT, needs, faults)
+        images = [path for need in needs if (path := need.found(folder)) is not None]
+        wheres = [f"{folder / name}: frames.{i}" for name, i, _ in rows]
+        lenses = [
+            lens_of(files[name], frame, image, where)
+            for (name, _, frame), image, where in zip(rows, images, wheres)
+        ]
+        cameras = [
+            lens.camera(opengl_to_world_to_camera(frame.camera_to_world, where))
+            for lens, (_, _, frame), where in zip(lenses, rows, wheres)
+        ]
+        split = {
+            name.removeprefix("transforms_").removesuffix(".json"): [
+                i for i, (own, _, _) in enumerate(rows) if own == name
+            ]
+            for name in names
+        }
+        times = [frame.time for _, _, frame in rows if frame.time is not None]
+        points, colors, origin = self._points(folder)
+        return Clip(
+            name=folder.resolve().name,
+            store=LazyFrames(
+                folder,
+                images,
+                cameras,
+                lenses=lenses,
+                background=COLORS[self.background],
+                cache_mb=self.cache_mb,
+            ),
+            cameras=cameras,
+            moments=timed_moments(times, split["train"]),
+            kinds={},
+            bodies={},
+            objects={},
+            points=points,
+            point_colors=colors,
+            split=split,
+            provenance={
+                "reader": "reader:dnerf",
+                "cameras": "Blender, exact; the scene has no unit",
+                "points": origin,
+                "images": f"transparent parts over {self.background}",
+            },
+        )
+
+    def _points(self, folder: Path) -> tuple[*Points, str]:
+        for name in POINT_FILES:
+            if (folder / name).is_file():
+                return (*read_points(folder / name), name)
+        rng = np.random.default_rng(0)
+        points = torch.from_numpy(rng.uniform(-self.box, self.box, (self.points, 3))).float()
+        origin = (
+            f"{self.points} at random within ±{self.box:g} (4DGaussians, readNerfSyntheticInfo)"
+        )
+        return points, torch.full_like(points, 0.5), origin
+
+
+def image_names(frame: TransformFrame) -> tuple[str, ...]:
+    """Where a frame's image may lie: the layout leaves .png out of its paths."""
+    path = frame.file_path.removeprefix("./")
+    return (path,) if Path(path).suffix.lower() in (".png", ".jpg") else (f"{path}.png",)

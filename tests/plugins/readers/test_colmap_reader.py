@@ -1,0 +1,133 @@
+"""reader:colmap: the built-in clip there and back, and what goes wrong in such folders."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from layouts import colmap
+from PIL import Image
+from same import same_cameras
+
+from hoigs.core.clip import Clip
+from hoigs.core.errors import ClipError
+from hoigs.core.lens import Lens
+from hoigs.plugins.readers.colmap import ColmapConfig, ColmapReader
+
+
+@pytest.mark.parametrize(
+    ("binary", "place"), [(False, "sparse/0"), (True, "sparse/0"), (True, "sparse")]
+)
+def test_round_trip(builtin: Clip, tmp_path: Path, binary: bool, place: str) -> None:
+    """All but poses and object tracks, which a COLMAP folder cannot hold."""
+    colmap.write(builtin, tmp_path, binary=binary, place=place)
+    reader = ColmapReader()
+    assert reader.matches(tmp_path) and not reader.matches(tmp_path / "images")
+    clip = reader.read(tmp_path)
+    same_cameras(clip.cameras, builtin.cameras)
+    for mine, theirs in zip(clip, builtin, strict=True):
+        assert mine.image.equal(theirs.image) and mine.moment.time == theirs.moment.time
+        assert all(mine.masks[n].equal(theirs.masks[n]) for n in ("human", "object"))
+    assert clip.kinds == builtin.kinds and not clip.bodies and not clip.objects
+    same = (clip.points[:, None] - builtin.points[None]).norm(dim=-1).min(1)
+    assert len(clip.points) == len(builtin.points)
+    assert float(same.values.max()) < 1e-5
+    assert (clip.point_colors - builtin.point_colors[same.indices]).abs().max() < 0.51 / 255
+    assert clip.split["test"] and not set(clip.split["test"]) & set(clip.split["train"])
+
+
+def test_the_lens_is_taken_out_and_its_centre_kept(builtin: Clip, tmp_path: Path) -> None:
+    params = (18.0, 19.0, 14.0, 17.5, -0.2, 0.02, 0.001, 0.0)  # cx, cy away from the middle
+    colmap.write(builtin, tmp_path, lens=("OPENCV", params))
+    clip = ColmapReader().read(tmp_path)
+    want = torch.tensor([[18.0, 0, 14.0], [0, 19.0, 17.5], [0, 0, 1]])
+    assert clip.cameras[0].K.equal(want)
+    assert not clip[0].image.equal(builtin[0].image)
+    moved = 0
+    for mine, bent in zip(clip, builtin):
+        want = Lens("OPENCV", params, 32, 32).undistortion().mask(bent.masks["human"].numpy())
+        assert mine.masks["human"].equal(torch.from_numpy(want)) and mine.masks["human"].any()
+        moved += not mine.masks["human"].equal(bent.masks["human"])
+    assert moved > 4
+
+
+def test_smaller_images_shrink_the_intrinsics(builtin: Clip, tmp_path: Path) -> None:
+    colmap.write(builtin, tmp_path, masks=False)
+    (tmp_path / "images_2").mkdir()
+    for path in (tmp_path / "images").iterdir():
+        with Image.open(path) as image:
+            image.resize((16, 16)).save(tmp_path / "images_2" / path.name)
+    clip = ColmapReader(factor=2).read(tmp_path)
+    assert clip[0].image.shape == (16, 16, 3)
+    want = builtin.cameras[0].K * torch.tensor([[0.5], [0.5], [1.0]])
+    assert torch.allclose(clip.cameras[0].K, want)
+    with pytest.raises(ClipError, match=r"images_4/ is absent: images at 1/4 size"):
+        ColmapReader(factor=4).read(tmp_path)
+
+
+def test_frames_are_in_the_order_of_their_names(builtin: Clip, tmp_path: Path) -> None:
+    """Not the file's; frame_10 comes after frame_9; a frame without a pose takes its time."""
+    colmap.write(builtin, tmp_path, masks=False, order=(5, 3, 7, 0, 1, 6, 2, 4))
+    clip = ColmapReader().read(tmp_path)
+    same_cameras(clip.cameras, builtin.cameras)
+    for number in (9, 10):  # never registered
+        shutil.copy(tmp_path / "images/frame_8.png", tmp_path / f"images/frame_{number}.png")
+    longer = ColmapReader().read(tmp_path)
+    assert [m.index for m in longer.moments] == list(range(8))
+    assert longer.moments[7].time == pytest.approx(7 / 9)
+
+
+def test_a_partial_folder_is_told_in_one_message(builtin: Clip, tmp_path: Path) -> None:
+    colmap.write(builtin, tmp_path)
+    (tmp_path / "sparse/0/points3D.txt").unlink()
+    shutil.move(tmp_path / "images", tmp_path / "elsewhere")
+    with pytest.raises(ClipError) as caught:
+        ColmapReader().read(tmp_path)
+    message = str(caught.value)
+    assert "images/ is absent: the video's frames" in message
+    assert "sparse/0/points3D.txt is absent: COLMAP makes" in message
+    assert "cameras.txt" not in message
+
+
+def test_absent_images_and_masks_are_named(builtin: Clip, tmp_path: Path) -> None:
+    colmap.write(builtin, tmp_path)
+    for name in ("frame_2", "frame_3"):
+        (tmp_path / f"images/{name}.png").unlink()
+    (tmp_path / "masks/human/frame_5.png").unlink()
+    with pytest.raises(ClipError) as caught:
+        ColmapReader().read(tmp_path)
+    message = str(caught.value)
+    assert "images/frame_{2-3}.png (2 files) are absent" in message
+    assert "masks/human/frame_5.png is absent: your segmenter makes" in message
+
+
+def test_wrong_folders(tmp_path: Path) -> None:
+    with pytest.raises(ClipError, match="is not a folder"):
+        ColmapReader().read(tmp_path / "no")
+    with pytest.raises(ClipError, match=r"sparse/0/cameras\.bin or sparse/0/cameras\.txt is abs"):
+        ColmapReader().read(tmp_path)
+    assert not ColmapReader().matches(tmp_path)
+
+
+def test_a_damaged_model_is_named(builtin: Clip, tmp_path: Path) -> None:
+    colmap.write(builtin, tmp_path, binary=True)
+    path = tmp_path / "sparse/0/images.bin"
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ClipError, match="sparse/0 is not a readable COLMAP model"):
+        ColmapReader().read(tmp_path)
+
+
+def test_images_of_another_shape_are_refused(builtin: Clip, tmp_path: Path) -> None:
+    colmap.write(builtin, tmp_path, masks=False)
+    Image.fromarray(np.zeros((32, 40, 3), np.uint8)).save(tmp_path / "images/frame_4.png")
+    with pytest.raises(ClipError, match=r"frame_4\.png is 40x32, its camera 32x32: another shape"):
+        ColmapReader().read(tmp_path)
+
+
+def test_every_eighth_as_3dgs_splits(builtin: Clip, tmp_path: Path) -> None:
+    colmap.write(builtin, tmp_path, masks=False)
+    reader = ColmapReader(**ColmapConfig(test_every=3).model_dump())
+    assert reader.read(tmp_path).split == {"train": [1, 2, 4, 5, 7], "test": [0, 3, 6]}
