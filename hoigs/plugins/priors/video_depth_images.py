@@ -58,9 +58,9 @@ def read_exr(path: Path) -> Float[np.ndarray, "H W"]:
     if not frame.format.name.endswith("f32le"):
         frame = frame.reformat(format="gbrpf32le")
     planes = [
-        np.frombuffer(plane, np.float32).reshape(frame.height, -1)[:, : frame.width]
+        np.frombuffer(bytes(plane), np.float32).reshape(frame.height, -1)[:, : frame.width]
         for plane in frame.planes[:3]
     ]
     if any(not np.array_equal(planes[0], plane, equal_nan=True) for plane in planes[1:]):
         raise HoigsError(f"{path}: its channels differ, so it is a picture, not depth")
-    return planes[0].copy()
+    return planes[0]

@@ -225,7 +225,8 @@ def _one_person(
         if last is None:
             chosen = max(people[i], key=lambda person: float(person[:, 2].sum()))
         else:
-            chosen = min(people[i], key=lambda person, last=last: _distance(person, last))
+            distances = [_distance(person, last) for person in people[i]]
+            chosen = people[i][distances.index(min(distances))]
         if (chosen[:, 2] > 0).any():
             track[i], last = chosen, chosen
     return track
