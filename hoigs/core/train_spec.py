@@ -8,6 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from hoigs.core.errors import did_you_mean
 
+TestPose = Literal["given", "interpolated", "fitted"]
+
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", validate_assignment=True)
@@ -20,11 +22,13 @@ class WarmupSpec(_Strict):
         motion: the object follows its initial track before this; then its keyframes are free.
         interaction: the interaction module is off before this (methods A.7: 10-20 %).
         poses: body poses stay as given before this, when they are optimised at all.
+        cameras: cameras likewise (`train.rates.camera`).
     """
 
     motion: float = Field(0.1, ge=0, le=1)
     interaction: float = Field(0.2, ge=0, le=1)
     poses: float = Field(0.1, ge=0, le=1)
+    cameras: float = Field(0.1, ge=0, le=1)
 
 
 class LossSpec(_Strict):
@@ -56,6 +60,7 @@ class LossSpec(_Strict):
         regularizers: weight by name of the penalties that components offer, over their defaults;
             and of "residual_pose" and "residual_means", the mean squared corrections by the
             interaction, which m, tau and theta could explain as well (methods A.7); off by default.
+            "camera" is of the squared corrections of cameras, 0.1 where these are learned.
     """
 
     weights: Literal["supp", "main"] = "main"
@@ -90,6 +95,9 @@ class RatesSpec(_Strict):
     Attributes:
         by_extent: rates in units of the entity's extent (3DGS: means; 4DGS: planes and networks
             too). sh_rest: rate of the harmonics above the first, as a share of `sh` (3DGS: 1/20).
+        camera: of each frame's correction of its camera, radians and scene extents a step; 0 takes
+            cameras as they are (docs/reference/refinement.md). pose: of body poses, radians and
+            metres, where the human's deformation refines them.
     """
 
     means: float = Field(8e-4, ge=0)
@@ -109,6 +117,7 @@ class RatesSpec(_Strict):
     embedding: float = Field(2.5e-3, ge=0)
     pose: float = Field(1e-4, ge=0)
     shape: float = Field(1e-4, ge=0)
+    camera: float = Field(0.0, ge=0)
     by_extent: tuple[str, ...] = ("means",)
 
     @field_validator("by_extent")
@@ -151,10 +160,16 @@ class EvaluationSpec(_Strict):
     """How a run is judged.
 
     Attributes:
-        test_pose: "given" uses the clip's poses on test frames as they stand, refined by what the
-            neighbouring training frames learned. Recorded with every score (methods A.9).
+        test_pose: body poses of test frames. "given" are the clip's, moved by the corrections that
+            neighbouring training frames learned; "interpolated" are these neighbours' poses, as if
+            the clip had none for test frames; "fitted" are optimised on the test images that are
+            scored. Recorded with every score (methods A.9; docs/reference/refinement.md).
+        test_camera: cameras of test frames, likewise.
+        fit_steps: of "fitted", a frame.
         held_out: also score cameras that were never trained on, where the clip has them.
     """
 
-    test_pose: Literal["given"] = "given"
+    test_pose: TestPose = "given"
+    test_camera: TestPose = "given"
+    fit_steps: int = Field(40, ge=1)
     held_out: bool = True

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from torch import nn
 
 from hoigs.core.errors import CheckpointError
 from hoigs.core.scene import SceneModel
@@ -23,7 +24,7 @@ class Checkpoint:
     """All that a run needs to go on as if it had never stopped.
 
     Attributes:
-        tensors: "model.*", "optimizer.*", "density.*", "rng.*".
+        tensors: "model.*", "optimizer.*", "density.*", "cameras.*", "rng.*".
         meta: format, version, step, counts, spec_hash, model_hash, sampler order.
     """
 
@@ -119,3 +120,23 @@ def restore_model(model: SceneModel, checkpoint: Checkpoint, model_hash: str) ->
         model.load_state_dict(checkpoint.part("model"))
     except RuntimeError as error:
         raise CheckpointError(f"checkpoint does not fit the model: {error}") from error
+
+
+def restore_cameras(cameras: nn.Module | None, checkpoint: Checkpoint) -> None:
+    """Give camera corrections what a checkpoint holds; one without any leaves them as they are.
+
+    Raises:
+        CheckpointError: there are corrections, but none are wanted, or of another clip.
+    """
+    stored = checkpoint.part("cameras")
+    if not stored:
+        return
+    if cameras is None:
+        raise CheckpointError(
+            f"checkpoint of step {checkpoint.meta['step']} has refined cameras, but "
+            "train.rates.camera is 0: go on with the rate that it was trained with"
+        )
+    try:
+        cameras.load_state_dict(stored)
+    except RuntimeError as error:
+        raise CheckpointError(f"its cameras are of another clip: {error}") from error

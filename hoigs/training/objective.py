@@ -18,6 +18,7 @@ from hoigs.core.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.scene import SceneModel, SceneState
 from hoigs.core.train_spec import LossSpec
 from hoigs.evaluation.lpips import Lpips
+from hoigs.training.camera_refinement import CameraRefinement
 from hoigs.training.face import FaceTexture, face_loss, visible
 from hoigs.training.losses import (
     depth_loss,
@@ -27,6 +28,8 @@ from hoigs.training.losses import (
     term_weights,
 )
 from hoigs.training.regions import Crop, crop_around, dilate, inside, union
+
+CAMERA_WEIGHT = 0.1  # of the penalty on camera corrections: holds what no image decides
 
 
 @dataclass(frozen=True)
@@ -65,10 +68,12 @@ class JointObjective:
         lpips: Lpips | None = None,
         density: Mapping[str, DensityControl] | None = None,
         faces: Mapping[str, FaceTexture] | None = None,
+        cameras: CameraRefinement | None = None,
     ) -> None:
         self.model, self.spec, self.depth_kind, self.lpips = model, spec, depth_kind, lpips
         self.density = dict(density or {})  # whose regularisers count too
         self.faces = dict(faces or {})
+        self.cameras = cameras
         self.weights = term_weights(spec)
 
     def __call__(self, frame: Frame, camera: Camera, generator: torch.Generator) -> ObjectiveResult:
@@ -112,6 +117,9 @@ class JointObjective:
         weights = {name: self.weights[name.partition("/")[0]] for name in terms}
         for name in self.model.entities:
             self._regularize(name, state.gaussians[name], terms, weights)
+        if self.cameras is not None:
+            terms["regularizer/camera"] = self.cameras.penalty(frame.position)
+            weights["regularizer/camera"] = self.spec.regularizers.get("camera", CAMERA_WEIGHT)
         for name, residual in state.residuals.items():
             self._restrain(name, residual, terms, weights)
         total = torch.stack([weights[name] * term for name, term in terms.items()]).sum()

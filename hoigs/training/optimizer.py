@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import torch
 from torch import nn
@@ -22,7 +23,13 @@ FIELD_RATES = {
 }
 
 # Rates that wait for a warm-up: rate -> field of WarmupSpec
-WAITING = {"keyframes": "motion", "keyframe_rotation": "motion", "pose": "poses", "shape": "poses"}
+WAITING = {
+    "keyframes": "motion",
+    "keyframe_rotation": "motion",
+    "pose": "poses",
+    "shape": "poses",
+    "camera": "cameras",
+}
 
 
 @dataclass(frozen=True)
@@ -70,16 +77,27 @@ def named_rates(model: SceneModel) -> Iterator[tuple[str, nn.Parameter, str, Ent
 
 
 class GroupedAdam:
-    """Adam with one group a parameter, so that each has its own schedule and name."""
+    """Adam with one group a parameter, so that each has its own schedule and name.
+
+    Args:
+        cameras: its parameters take the rate "camera" and are named "cameras.…".
+    """
 
     def __init__(
-        self, model: SceneModel, rates: RatesSpec, warmup: WarmupSpec, scene_extent: float
+        self,
+        model: SceneModel,
+        rates: RatesSpec,
+        warmup: WarmupSpec,
+        scene_extent: float,
+        cameras: nn.Module | None = None,
     ) -> None:
         self.names: dict[str, nn.Parameter] = {}
         self.roles: list[str] = []  # name of the rate of each, in the same order
         self.schedules: list[Schedule] = []
         groups = []
-        for name, parameter, rate, entity in named_rates(model):
+        views = [] if cameras is None else cameras.named_parameters(prefix="cameras")
+        trained = chain(named_rates(model), ((name, p, "camera", None) for name, p in views))
+        for name, parameter, rate, entity in trained:
             start = getattr(rates, rate, None)
             if start is None:
                 known = sorted(RatesSpec.model_fields)

@@ -16,10 +16,12 @@ from hoigs.core.registry import Registry, default_registry
 from hoigs.core.scene import SceneModel
 from hoigs.core.spec import Spec
 from hoigs.evaluation.lpips import Lpips, find_weights
+from hoigs.training.camera_refinement import CameraRefinement
 from hoigs.training.checkpoint import (
     has_checkpoint,
     latest_checkpoint,
     load_checkpoint,
+    restore_cameras,
     restore_model,
 )
 from hoigs.training.clip_source import clip_folder, clip_name
@@ -146,7 +148,10 @@ def _perceptual(spec: Spec, weights: Path | None, device: str) -> Lpips | None:
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A finished run, read back: spec, clip at training width, and the trained model."""
+    """A finished run, read back: spec, clip at training width, and the trained model.
+
+    Where cameras were refined, the clip's are those that training ended with.
+    """
 
     spec: Spec
     clip: Clip
@@ -183,6 +188,10 @@ class LoadedRun:
         model = compose(spec, source, registry).to(device)
         checkpoint = load_checkpoint(latest_checkpoint(run.checkpoints))
         restore_model(model, checkpoint, spec.model_hash())
+        if checkpoint.part("cameras"):
+            refinement = CameraRefinement.of(source)
+            restore_cameras(refinement, checkpoint)
+            source = refinement.refined(source)
         model.eval()
         model.set_progress(min(1.0, checkpoint.meta["step"] / spec.train.steps))
         return cls(spec, source, model, checkpoint.meta["step"], provenance)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 
 from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip
+from hoigs.core.clip import Clip, Frame
 from hoigs.core.deformation import DeformationModel, StepEvidence
 from hoigs.core.density import DensityControl, DensityStatistics, check_rasterizer
 from hoigs.core.moment import Moment
@@ -18,7 +18,8 @@ from hoigs.core.scene import SceneModel
 from hoigs.core.train_spec import TrainSpec
 from hoigs.evaluation.lpips import Lpips
 from hoigs.evaluation.metrics import psnr, region_psnr
-from hoigs.training.checkpoint import Checkpoint, restore_model
+from hoigs.training.camera_refinement import CameraRefinement, check_camera_gradients
+from hoigs.training.checkpoint import Checkpoint, restore_cameras, restore_model
 from hoigs.training.face import unwrap_faces
 from hoigs.training.guard import NanGuard, first_not_finite, gradients_finite
 from hoigs.training.objective import JointObjective, ObjectiveResult
@@ -79,9 +80,15 @@ class Trainer:
             check_rasterizer(control, model.rasterizer)
         # unwrapped from the model as composed, so that a resumed run has the same texture
         faces = unwrap_faces(model, clip) if spec.loss.face > 0 else None
-        self.objective = JointObjective(model, spec.loss, clip.depth_kind, lpips, density, faces)
+        self.cameras: CameraRefinement | None = None
+        if spec.rates.camera > 0:
+            check_camera_gradients(model.rasterizer)
+            self.cameras = CameraRefinement.of(clip).to(model.device)
+        self.objective = JointObjective(
+            model, spec.loss, clip.depth_kind, lpips, density, faces, self.cameras
+        )
         scene_extent = clip.extent()
-        self.optimizer = GroupedAdam(model, spec.rates, spec.warmup, scene_extent)
+        self.optimizer = GroupedAdam(model, spec.rates, spec.warmup, scene_extent, self.cameras)
         self.density = {
             name: EntityDensity(
                 model.entity(name), control, entity_extent(model.entity(name), scene_extent)
@@ -123,7 +130,7 @@ class Trainer:
         self.optimizer.set_progress(progress)
         self.model.set_progress(progress)
         frame = self.clip[self.sampler.next()]
-        camera = frame.camera.to(self.model.device)
+        camera = self._camera(frame)
         result = self.objective(frame, camera, self.generator)
         self.optimizer.zero_grad()
         result.total.backward()
@@ -135,10 +142,16 @@ class Trainer:
         self.guard.passed()
         interval = self.spec.sh_interval
         self.optimizer.step(None if interval is None else self.step // interval)
-        self._evolve(result, frame.moment, camera)
+        still = replace(camera, world_to_camera=camera.world_to_camera.detach())
+        self._evolve(result, frame.moment, still)
         self._refine(result, camera.width, camera.height)
         terms = {name: float(term.detach()) for name, term in result.terms.items()}
         return {**terms, "total": float(result.total.detach())}
+
+    def _camera(self, frame: Frame) -> Camera:
+        """Of a frame, as it has been refined so far."""
+        camera = frame.camera.to(self.model.device)
+        return camera if self.cameras is None else self.cameras(camera, frame.position)
 
     def _evolve(self, result: ObjectiveResult, moment: Moment, camera: Camera) -> None:
         """Deformations that change their own size get what this step has shown."""
@@ -201,7 +214,7 @@ class Trainer:
             for position in list(positions)[::stride][:frames]:
                 frame = self.clip[position]
                 moment = frame.moment.to(self.model.device)
-                color = self.model.render(moment, frame.camera.to(self.model.device)).color
+                color = self.model.render(moment, self._camera(frame)).color
                 color = color.cpu().clamp(0, 1)
                 if frame.ignored is None:
                     values.append(float(psnr(color, frame.rgb)))
@@ -217,6 +230,8 @@ class Trainer:
         tensors |= {f"optimizer.{k}": v for k, v in self.optimizer.tensors().items()}
         for name, density in self.density.items():
             tensors |= {f"density.{name}.{k}": v for k, v in vars(density.statistics).items()}
+        if self.cameras is not None:
+            tensors |= {f"cameras.{k}": v for k, v in self.cameras.state_dict().items()}
         tensors["rng.generator"] = self.generator.get_state()
         tensors["rng.torch"] = torch.get_rng_state()
         meta = {
@@ -234,6 +249,7 @@ class Trainer:
     def resume(self, checkpoint: Checkpoint) -> None:
         """Continue from a checkpoint; the rest of the run equals an unbroken one."""
         restore_model(self.model, checkpoint, self.identity["model_hash"])
+        restore_cameras(self.cameras, checkpoint)
         self.optimizer.load_tensors(checkpoint.part("optimizer"))
         for name, density in self.density.items():
             stored = checkpoint.part(f"density.{name}")
