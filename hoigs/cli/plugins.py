@@ -8,9 +8,11 @@ import typer
 
 from hoigs.cli.common import PluginOption
 from hoigs.cli.plugins_check import check
+from hoigs.cli.plugins_new import new
 
 app = typer.Typer(invoke_without_command=True)
 app.command("check")(check)
+app.command("new")(new)
 
 # Fixed, so that one plugin's line never moves another's.
 LINE = "{key:<34} {status:<12} {origin:<28} {text}"
