@@ -30,10 +30,17 @@ def prepare(
         typer.Option("--keep-black", help="Learn flat black patches; default: they are ignored."),
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the clip.")] = False,
+    redo: Annotated[
+        list[str] | None,
+        typer.Option("--redo", help="Run this stage anew, and what builds on it. Repeatable."),
+    ] = None,
+    stage: Annotated[
+        str | None, typer.Option("--stage", help="Stop after this stage; no clip is written.")
+    ] = None,
 ) -> None:
     """Turn a video and its priors into a clip folder, with a written report."""
     from hoigs.core.registry import default_registry
-    from hoigs.preparation.prepare import PrepareOptions
+    from hoigs.preparation.prepare import PrepareOptions, prepare_until, work_folder
     from hoigs.preparation.prepare import prepare as run
 
     options = PrepareOptions(
@@ -42,6 +49,17 @@ def prepare(
     )  # fmt: skip
     body = default_registry().get("body:anny")()
     with progress_bar("preparing", 1.0) as bar:
-        report = run(source, out, options=options, body=body, progress=bar.update)
+        if stage is not None:
+            seconds = prepare_until(
+                stage, source, out, options=options, body=body, progress=bar.update, redo=redo or ()
+            )
+        else:
+            report = run(
+                source, out, options=options, body=body, progress=bar.update, redo=redo or ()
+            )
+    if stage is not None:
+        rows = [(name, f"{value:.1f} s") for name, value in seconds.items()]
+        print_table(f"stages kept in {work_folder(out)}", ("stage", "made in"), rows)
+        return
     print_table(f"prepared {out}", ("what", "value", "note"), report.rows())
     typer.echo(f"clip: {out}")

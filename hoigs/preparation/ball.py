@@ -14,8 +14,8 @@ from torch import Tensor
 
 from hoigs.core.camera import Camera
 from hoigs.core.clip_format import load_arrays
-from hoigs.preparation.cameras import Undistortion
-from hoigs.preparation.frames import VideoFrames
+from hoigs.core.undistortion import Undistortion
+from hoigs.preparation.frames import Frames
 from hoigs.preparation.source import SourceError
 
 
@@ -43,7 +43,7 @@ class BallTrack:
         return x[None] ** 2 + y[:, None] ** 2 <= self.radii[frame] ** 2
 
 
-def load_ball(path: Path, video: VideoFrames, undistort: Undistortion) -> BallTrack:
+def load_ball(path: Path, video: Frames, undistort: Undistortion) -> BallTrack:
     """ball_track.npz (`xyr` [F, 3], pixels of the video, NaN where unseen), at the frames' size.
 
     Raises:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.camera import Camera
-from hoigs.preparation.frames import VideoFrames
-from hoigs.preparation.source import SourceError
+from hoigs.core.lens import NEGLIGIBLE_SHIFT, Lens
+from hoigs.core.undistortion import Undistortion
+from hoigs.preparation.frames import Frames
+from hoigs.preparation.source import SourceError, frame_number
 
 ASSUMED_FOCAL = 0.8  # of the longer side: 64 degrees, a phone's main camera
-NEGLIGIBLE_SHIFT = 0.01  # pixels of distortion that nothing here can see
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,11 @@ class CameraTrack:
         points, colors: scene points in the cameras' own unit, RGB in [0, 1]; none if static.
         provenance: for the clip and the report.
         metric: whether the world is in metres already (a static camera has no scale of its own).
+        lens: what `undistort` takes out; None if nothing is.
+        model: folder of the COLMAP model, or None for a static camera.
+        positions: places, among the frames given in, of those that have a camera.
+        figures: for the report: "registered" and "images", "reprojection_px", "points",
+            "distortion_px", and of a static camera "displacement_px".
     """
 
     cameras: list[Camera]
@@ -37,52 +43,17 @@ class CameraTrack:
     colors: Float[Tensor, "P 3"]
     provenance: str
     metric: bool
+    lens: Lens | None = None
+    model: Path | None = None
+    positions: tuple[int, ...] = ()
+    figures: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def static(self) -> bool:
+        return self.model is None
 
 
-class Undistortion:
-    """Maps a distorted image onto its pinhole camera.
-
-    Args:
-        source: [H, W, 2] where each pinhole pixel lies in the video frame, pixels; None if the
-            video is a pinhole image already.
-        forward: video pixels [N, 2] to pinhole pixels [N, 2]; None for the identity.
-    """
-
-    def __init__(
-        self, source: Float[np.ndarray, "H W 2"] | None = None, forward: Any | None = None
-    ) -> None:
-        self._forward = forward
-        self._grid: Tensor | None = None
-        self.largest_shift = 0.0
-        if source is not None:
-            height, width = source.shape[:2]
-            size = np.array([width, height])
-            self._grid = torch.from_numpy((2 * source / size - 1).astype(np.float32))[None]
-
-    def image(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-        if self._grid is None:
-            return image
-        pixels = torch.from_numpy(image).permute(2, 0, 1)[None].float()
-        moved = torch.nn.functional.grid_sample(
-            pixels, self._grid, mode="bilinear", padding_mode="border", align_corners=False
-        )
-        return moved[0].permute(1, 2, 0).round().to(torch.uint8).numpy()
-
-    def mask(self, mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-        if self._grid is None:
-            return mask
-        moved = torch.nn.functional.grid_sample(
-            torch.from_numpy(mask)[None, None].float(), self._grid, mode="nearest",
-            padding_mode="zeros", align_corners=False,
-        )  # fmt: skip
-        return (moved[0, 0] > 0.5).numpy()
-
-    def pixels(self, xy: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Positions in the frame, pixels; NaN stays NaN."""
-        return xy if self._forward is None else self._forward(xy)
-
-
-def static_cameras(video: VideoFrames, focal: float | None) -> CameraTrack:
+def static_cameras(video: Frames, focal: float | None) -> CameraTrack:
     """One camera at the origin for all frames: the world is its frame, y down, z forward.
 
     Args:
@@ -95,14 +66,20 @@ def static_cameras(video: VideoFrames, focal: float | None) -> CameraTrack:
     how = "given" if focal else "assumed: 0.8 x the longer side; all depths scale with it"
     provenance = f"static camera at the origin, focal {focal or assumed:.0f} px ({how})"
     none = torch.zeros(0, 3)
-    return CameraTrack([camera] * len(video), Undistortion(), none, none, provenance, metric=True)
+    return CameraTrack(
+        [camera] * len(video), Undistortion(), none, none, provenance, metric=True,
+        positions=tuple(range(len(video))),
+    )  # fmt: skip
 
 
-def colmap_cameras(video: VideoFrames, model: Path) -> CameraTrack:
+def colmap_cameras(video: Frames, model: Path, *, partial: bool = False) -> CameraTrack:
     """Cameras and points of a COLMAP model, in its own unit, distortion removed.
 
     Images are matched to frames by the number in their name, which counts video frames from 0
     (or from 1 if no image is numbered 0).
+
+    Args:
+        partial: leave out frames that the model has no camera for.
 
     Raises:
         SourceError: the model is unreadable, lacks frames, or has cameras of several kinds.
@@ -115,24 +92,26 @@ def colmap_cameras(video: VideoFrames, model: Path) -> CameraTrack:
         raise SourceError(f"{model} is not a readable COLMAP model: {error}") from error
     by_frame = _by_frame(model_read)
     missing = [i for i in video.indices if i not in by_frame]
-    if missing:
+    if missing and (not partial or len(missing) == len(video)):
         shown = ", ".join(map(str, missing[:8])) + (", …" if len(missing) > 8 else "")
         raise SourceError(
             f"camera count unlike frame count: {model} registers {len(by_frame)} images, the video "
             f"gives {len(video)} frames, and {len(missing)} of them have no camera ({shown}); "
             "run COLMAP on all frames, or take fewer (every, max_frames)"
         )
-    images = [by_frame[i] for i in video.indices]
+    positions = tuple(i for i, number in enumerate(video.indices) if number in by_frame)
+    images = [by_frame[video.indices[i]] for i in positions]
     lens = _one_lens(model, model_read, {image.camera_id for image in images})
-    K, undistort, shift = _pinhole(lens, video.width, video.height)
+    K, undistort, shift = pinhole(lens, video.width, video.height)
     cameras = [_camera(image, K, video) for image in images]
     points = [p for p in model_read.points3D.values() if p.track.length() >= 3]
     if not points:
         raise SourceError(f"{model} has no points seen by three images or more")
+    off = float(model_read.compute_mean_reprojection_error())
     provenance = (
-        f"COLMAP {lens.model_name}, {len(images)} of {len(by_frame)} images, "
+        f"COLMAP {lens.model}, {len(images)} of {len(by_frame)} images, "
         f"{len(points)} points, reprojection "
-        f"{model_read.compute_mean_reprojection_error():.3f} px, "
+        f"{off:.3f} px, "
         f"distortion up to {shift:.2f} px removed"
     )
     return CameraTrack(
@@ -142,34 +121,56 @@ def colmap_cameras(video: VideoFrames, model: Path) -> CameraTrack:
         torch.tensor(np.array([p.color for p in points]), dtype=torch.float32) / 255,
         provenance,
         metric=False,
+        lens=lens,
+        model=model,
+        positions=positions,
+        figures={
+            "registered": len(images),
+            "images": len(video),
+            "reprojection_px": round(off, 4),
+            "points": len(points),
+            "distortion_px": round(shift, 3),
+        },
     )
 
 
 def _by_frame(model: Any) -> dict[int, Any]:
     numbered: dict[int, Any] = {}
     for image in model.images.values():
-        digits = "".join(c if c.isdigit() else " " for c in Path(image.name).stem).split()
-        if not digits:
+        number = frame_number(image.name)
+        if number is None:
             raise SourceError(f'COLMAP image "{image.name}" has no frame number in its name')
         if image.has_pose:
-            numbered[int(digits[-1])] = image
+            numbered[number] = image
     if numbered and 0 not in numbered and 1 in numbered:
         return {number - 1: image for number, image in numbered.items()}
     return numbered
 
 
-def _one_lens(path: Path, model: Any, used: set[int]) -> Any:
+def _one_lens(path: Path, model: Any, used: set[int]) -> Lens:
     lenses = [model.cameras[i] for i in sorted(used)]
     if any(list(lens.params) != list(lenses[0].params) for lens in lenses):
         raise SourceError(
             f"{path} has {len(lenses)} different cameras; one video has one lens: run COLMAP with "
             "--ImageReader.single_camera 1"
         )
-    return lenses[0]
+    first = lenses[0]
+    return Lens(first.model_name, tuple(map(float, first.params)), first.width, first.height)
 
 
-def _pinhole(lens: Any, width: int, height: int) -> tuple[Tensor, Undistortion, float]:
-    """Intrinsics at the given size, the distortion's removal, and its largest shift in pixels."""
+def pinhole(
+    seen: Lens, width: int, height: int
+) -> tuple[Float[Tensor, "3 3"], Undistortion, float]:
+    """Intrinsics at the given size, the distortion's removal, and its largest shift in pixels.
+
+    Raises:
+        SourceError: the lens saw images of another shape.
+    """
+    import pycolmap
+
+    lens = pycolmap.Camera(
+        model=seen.model, width=seen.width, height=seen.height, params=list(seen.params)
+    )
     scale = np.array([width / lens.width, height / lens.height])
     if abs(scale[0] / scale[1] - 1) > 0.02:
         raise SourceError(
@@ -199,7 +200,7 @@ def _pinhole(lens: Any, width: int, height: int) -> tuple[Tensor, Undistortion, 
     return K, Undistortion(source, forward), shift
 
 
-def _camera(image: Any, K: Tensor, video: VideoFrames) -> Camera:
+def _camera(image: Any, K: Tensor, video: Frames) -> Camera:
     pose = image.cam_from_world()
     w2c = torch.eye(4)
     w2c[:3] = torch.tensor(np.asarray(pose.matrix()), dtype=torch.float32)

@@ -1,33 +1,80 @@
-"""Video files to RGB frames, streamed: any number of passes, one frame in memory."""
+"""Videos, and folders of frames, to RGB: streamed, any number of passes, one frame in memory."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Literal, Protocol, Self
 
 import numpy as np
 from jaxtyping import UInt8
 
-from hoigs.preparation.source import SourceError
+from hoigs.preparation.sharpness import sharpness
+from hoigs.preparation.source import IMAGE_SUFFIXES, SourceError, numbered_frames
+
+Pick = Literal["sharpest", "first"]
 
 
-class VideoFrames:
-    """The chosen frames of a video, decoded anew on every iteration.
+class Picture(Protocol):
+    """One frame of a source, not yet converted."""
 
-    Args:
-        path: the video.
-        width: of the frames given out, pixels; None keeps the video's. Height follows.
-        every: take every n-th frame. max_frames: stop after so many; None takes all.
+    def size(self) -> tuple[int, int]:
+        """Width and height, upright."""
+
+    def rgb(self, width: int, height: int) -> UInt8[np.ndarray, "H W 3"]:
+        """Pixels at a size."""
+
+    def grey(self, width: int) -> UInt8[np.ndarray, "h w"]:
+        """Brightness at about this width, however turned."""
+
+
+@dataclass(frozen=True)
+class FrameList:
+    """What a survey of a source found.
 
     Attributes:
-        native_width, native_height: of the video as displayed (rotation applied).
+        native_width, native_height: of the source as displayed (rotation applied).
+        rate: frames a second of the source. fps: of the chosen ones.
+        total: frames in the source, up to the last one looked at.
+        indices: frame number of each chosen one.
+        sharpness: of each chosen one; see `sharpness.sharpness`.
+    """
+
+    native_width: int
+    native_height: int
+    rate: float
+    fps: float
+    total: int
+    indices: list[int]
+    sharpness: list[float]
+
+
+class Frames(ABC):
+    """The chosen frames of a source, read anew on every iteration.
+
+    Args:
+        path: the source.
+        width: of the frames given out, pixels; None keeps the source's. Height follows.
+        every: one frame of each window of so many. max_frames: stop after so many; None takes all.
+        fps: frames a second to choose, in place of `every`.
+        pick: which frame of a window: its first, or its sharpest.
+        rate: of a source that does not say its own.
+        known: what an earlier survey found; the source is then not looked at again.
+
+    Attributes:
+        native_width, native_height: of the source as displayed (rotation applied).
         width, height: of the frames given out.
         fps: of the frames given out, `every` allowed for.
-        indices: the video frame number of each frame given out.
-        total: frames in the video, up to the last one taken.
+        indices: the source's frame number of each frame given out.
+        total: frames in the source, up to the last one looked at.
+        sharpness: of each frame given out.
 
     Raises:
-        SourceError: the file is no video, is empty, or is damaged.
+        SourceError: the source is no video, is empty, or is damaged.
     """
 
     def __init__(
@@ -36,47 +83,142 @@ class VideoFrames:
         width: int | None = None,
         every: int = 1,
         max_frames: int | None = None,
+        *,
+        fps: float | None = None,
+        pick: Pick = "first",
+        rate: float = 30.0,
+        known: FrameList | None = None,
     ) -> None:
-        self.path, self.every, self.max_frames = Path(path), every, max_frames
-        self.native_width = self.native_height = 0
-        self._size: tuple[int, int] | None = None
-        rate = self._survey()
-        self.fps = rate / every
-        self.width = width or self.native_width
-        self.height = max(1, round(self.native_height * self.width / self.native_width))
-        if self.width > self.native_width:
+        self.path, self._rate = Path(path), rate
+        self.list = known or self._survey(_Windows(every, fps, max_frames, pick))
+        if width and width > self.native_width:
             raise SourceError(
-                f"width {self.width} is larger than the video's {self.native_width}; "
+                f"width {width} is larger than the video's {self.native_width}; "
                 "frames are not enlarged"
             )
-        self._size = (self.width, self.height)
+        self.width = width or self.native_width
+        self.height = max(1, round(self.native_height * self.width / self.native_width))
+        self._reading: tuple[int, Iterator[Picture]] | None = None
+
+    native_width = property(lambda self: self.list.native_width)
+    native_height = property(lambda self: self.list.native_height)
+    fps = property(lambda self: self.list.fps)
+    total = property(lambda self: self.list.total)
+    indices = property(lambda self: self.list.indices)
+    sharpness = property(lambda self: self.list.sharpness)
 
     def __len__(self) -> int:
         return len(self.indices)
 
     def __iter__(self) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-        for frame in self._chosen():
-            yield self._rgb(frame)
+        for picture in self._chosen():
+            yield picture.rgb(self.width, self.height)
 
-    def _survey(self) -> float:
-        """Counts frames by decoding them, so that damage shows before any work; frame rate."""
-        self.indices: list[int] = []
+    def subset(self, positions: Sequence[int]) -> Self:
+        """Only some of the chosen frames, by their place among them."""
+        part = copy.copy(self)
+        part.list = replace(
+            self.list,
+            indices=[self.indices[i] for i in positions],
+            sharpness=[self.sharpness[i] for i in positions],
+        )
+        part._reading = None
+        return part
+
+    def read(self, number: int) -> UInt8[np.ndarray, "H W 3"]:
+        """Frame `number` of the source at its own size; going forwards is the cheap way."""
+        at, stream = self._reading or (-1, None)
+        if stream is None or number <= at:
+            at, stream = -1, self._pictures()
+        for picture in stream:
+            at += 1
+            if at == number:
+                self._reading = at, stream
+                return picture.rgb(self.native_width, self.native_height)
+        raise SourceError(f"{self.path} has {at + 1} frames, none of number {number}")
+
+    @abstractmethod
+    def _pictures(self) -> Iterator[Picture]:
+        """All frames of the source in order; sets `_rate` where the source says it."""
+
+    def _chosen(self) -> Iterator[Picture]:
+        wanted, last = set(self.indices), self.indices[-1]
+        for number, picture in enumerate(self._pictures()):
+            if number in wanted:
+                yield picture
+            if number == last:
+                return
+
+    def _survey(self, windows: _Windows) -> FrameList:
+        """Looks at every frame, so that damage shows before any work."""
+        native: tuple[int, int] | None = None
         count = 0
-        for count, frame in enumerate(self._decoded(), start=1):
-            if not self.native_width:
-                turned = _quarter_turns(frame) % 2
-                size = (frame.height, frame.width) if turned else (frame.width, frame.height)
-                self.native_width, self.native_height = size
-            if (count - 1) % self.every == 0:
-                self.indices.append(count - 1)
-            if self.max_frames and len(self.indices) == self.max_frames:
+        for number, picture in enumerate(self._pictures()):
+            windows.rate = self._rate
+            native = native or picture.size()
+            if picture.size() != native:
+                raise SourceError(
+                    f"{self.path}: frame {number} is {picture.size()[0]}x{picture.size()[1]}, "
+                    f"the first {native[0]}x{native[1]}; a clip has one size"
+                )
+            if windows.beyond(number):
                 break
-        if not count:
+            count = number + 1
+            windows.offer(number, picture)
+            if windows.full(number):
+                break
+        if native is None:
             raise SourceError(f"{self.path} holds no video frame: it is empty or cut off")
-        self.total = count
-        return self._rate
+        return FrameList(
+            *native, self._rate, windows.fps(), count, windows.indices, windows.sharpnesses
+        )
 
-    def _decoded(self) -> Iterator:
+
+class _Windows:
+    """Cuts a stream of frames into windows and keeps one frame of each."""
+
+    def __init__(self, every: int, fps: float | None, max_frames: int | None, pick: Pick) -> None:
+        self.every, self.wanted_fps, self.max_frames, self.pick = every, fps, max_frames, pick
+        self.rate = 0.0
+        self.indices: list[int] = []
+        self.sharpnesses: list[float] = []
+
+    def fps(self) -> float:
+        return self.rate / self.every if self.wanted_fps is None else self.wanted_fps
+
+    def of(self, number: int) -> int:
+        if self.wanted_fps is None:
+            return number // self.every
+        if self.wanted_fps > self.rate:
+            raise SourceError(
+                f"fps {self.wanted_fps:g} is more than the video's {self.rate:g}; "
+                "frames are not invented"
+            )
+        return int(number * self.wanted_fps / self.rate + 1e-6)
+
+    def beyond(self, number: int) -> bool:
+        return self.max_frames is not None and self.of(number) >= self.max_frames
+
+    def full(self, number: int) -> bool:
+        """Whether no later frame can be chosen."""
+        return self.beyond(number + 1 if self.pick == "sharpest" else number + self.every)
+
+    def offer(self, number: int, picture: Picture) -> None:
+        new = self.of(number) == len(self.indices)
+        if not new and self.pick == "first":
+            return
+        value = sharpness(picture)
+        if new:
+            self.indices.append(number)
+            self.sharpnesses.append(value)
+        elif value > self.sharpnesses[-1]:
+            self.indices[-1], self.sharpnesses[-1] = number, value
+
+
+class VideoFrames(Frames):
+    """The chosen frames of a video file, decoded anew on every iteration."""
+
+    def _pictures(self) -> Iterator[Picture]:
         import av
 
         try:
@@ -86,7 +228,7 @@ class VideoFrames:
                 stream = container.streams.video[0]
                 stream.thread_type = "AUTO"
                 self._rate = float(stream.average_rate or stream.guessed_rate or 30)
-                yield from container.decode(stream)
+                yield from map(_VideoPicture, container.decode(stream))
         except (av.error.FFmpegError, ValueError) as error:
             size = self.path.stat().st_size if self.path.exists() else 0
             raise SourceError(
@@ -94,21 +236,102 @@ class VideoFrames:
                 "re-encode it, for example with `ffmpeg -i VIDEO -c:v libx264 fixed.mp4`"
             ) from error
 
-    def _chosen(self) -> Iterator:
-        last = self.indices[-1]
-        for number, frame in enumerate(self._decoded()):
-            if number % self.every == 0:
-                yield frame
-            if number == last:
-                return
 
-    def _rgb(self, frame) -> UInt8[np.ndarray, "H W 3"]:
-        turns = _quarter_turns(frame)
-        width, height = (self.height, self.width) if turns % 2 else (self.width, self.height)
+class FolderFrames(Frames):
+    """The chosen images of a folder in the order of their names, which end in a number."""
+
+    def _pictures(self) -> Iterator[Picture]:
+        return map(_FilePicture, self._paths())
+
+    def _chosen(self) -> Iterator[Picture]:
+        paths = self._paths()
+        return (_FilePicture(paths[number]) for number in self.indices)
+
+    def _paths(self) -> list[Path]:
+        paths = numbered_frames(self.path)
+        if not paths:
+            raise SourceError(f"{self.path} holds no images ({', '.join(IMAGE_SUFFIXES)})")
+        return paths
+
+
+def open_frames(
+    path: Path,
+    width: int | None = None,
+    every: int = 1,
+    max_frames: int | None = None,
+    *,
+    fps: float | None = None,
+    pick: Pick = "first",
+    rate: float = 30.0,
+    known: FrameList | None = None,
+) -> Frames:
+    """A video file's or a folder's frames; see `Frames`."""
+    kind = FolderFrames if Path(path).is_dir() else VideoFrames
+    return kind(path, width, every, max_frames, fps=fps, pick=pick, rate=rate, known=known)
+
+
+class _VideoPicture:
+    """A decoded frame."""
+
+    def __init__(self, frame) -> None:
+        self.frame, self.turns = frame, _quarter_turns(frame)
+
+    def size(self) -> tuple[int, int]:
+        size = (self.frame.width, self.frame.height)
+        return size[::-1] if self.turns % 2 else size
+
+    def rgb(self, width: int, height: int) -> UInt8[np.ndarray, "H W 3"]:
+        frame = self.frame
+        if self.turns % 2:
+            width, height = height, width
         if (width, height) != (frame.width, frame.height):
             frame = frame.reformat(width=width, height=height, interpolation="AREA")
         pixels = frame.to_ndarray(format="rgb24")
-        return np.ascontiguousarray(np.rot90(pixels, turns)) if turns else pixels
+        return np.ascontiguousarray(np.rot90(pixels, self.turns)) if self.turns else pixels
+
+    def grey(self, width: int) -> UInt8[np.ndarray, "h w"]:
+        frame = self.frame
+        width = min(width, frame.width)
+        height = max(1, round(frame.height * width / frame.width))
+        return frame.reformat(
+            width=width, height=height, format="gray", interpolation="AREA"
+        ).to_ndarray()
+
+
+class _FilePicture:
+    """An image file, opened when its pixels are asked for."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @cached_property
+    def image(self):
+        from PIL import Image, ImageOps
+
+        try:
+            with Image.open(self.path) as image:
+                return ImageOps.exif_transpose(image).convert("RGB")
+        except (OSError, ValueError) as error:
+            raise SourceError(f"{self.path} is not a readable image: {error}") from error
+
+    def size(self) -> tuple[int, int]:
+        return self.image.size
+
+    def rgb(self, width: int, height: int) -> UInt8[np.ndarray, "H W 3"]:
+        from PIL import Image
+
+        image = self.image
+        if image.size != (width, height):
+            image = image.resize((width, height), Image.Resampling.BOX)
+        return np.array(image)
+
+    def grey(self, width: int) -> UInt8[np.ndarray, "h w"]:
+        from PIL import Image
+
+        image = self.image.convert("L")
+        width = min(width, image.width)
+        height = max(1, round(image.height * width / image.width))
+        return np.array(image.resize((width, height), Image.Resampling.BOX))
 
 
 def _quarter_turns(frame) -> int:

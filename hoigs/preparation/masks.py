@@ -6,12 +6,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from scipy import ndimage
 
-from hoigs.preparation.cameras import Undistortion
-from hoigs.preparation.frames import VideoFrames
+from hoigs.core.undistortion import Undistortion
+from hoigs.preparation.frames import Frames
 from hoigs.preparation.source import SourceError
 
 
@@ -23,6 +23,22 @@ class MaskStack:
         self._shape = (0, 0)
         for mask in masks:
             self.append(mask)
+
+    @staticmethod
+    def from_bits(bits: UInt8[np.ndarray, "F H B"], width: int) -> MaskStack:
+        """From what `bits` and `width` give."""
+        stack = MaskStack()
+        stack._bits, stack._shape = list(bits), (bits.shape[1], width)
+        return stack
+
+    @property
+    def bits(self) -> UInt8[np.ndarray, "F H B"]:
+        """Eight pixels of a row a byte."""
+        return np.stack(self._bits)
+
+    @property
+    def width(self) -> int:
+        return self._shape[1]
 
     def append(self, mask: Bool[np.ndarray, "H W"]) -> None:
         self._shape = mask.shape
@@ -43,7 +59,7 @@ class MaskStack:
         return np.array([mask.sum() / pixels for mask in self])
 
 
-def load_masks(folder: Path, video: VideoFrames, undistort: Undistortion) -> MaskStack:
+def load_masks(folder: Path, video: Frames, undistort: Undistortion) -> MaskStack:
     """The masks of the chosen frames, at their size and without lens distortion.
 
     Files are named by video frame number: 00017.png is frame 17 of the video.
@@ -62,7 +78,7 @@ def load_masks(folder: Path, video: VideoFrames, undistort: Undistortion) -> Mas
     return MaskStack(undistort.mask(_read(p, video)) for p in paths)
 
 
-def _read(path: Path, video: VideoFrames) -> Bool[np.ndarray, "H W"]:
+def _read(path: Path, video: Frames) -> Bool[np.ndarray, "H W"]:
     try:
         with Image.open(path) as image:
             grey = image.convert("L")

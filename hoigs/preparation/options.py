@@ -8,6 +8,7 @@ from pydantic import Field
 
 from hoigs.core.config import ComponentConfig
 from hoigs.preparation.body_fit import FitOptions
+from hoigs.preparation.frames import Pick
 
 
 class PrepareOptions(ComponentConfig):
@@ -17,9 +18,25 @@ class PrepareOptions(ComponentConfig):
         default=None, ge=16, description="of the stored frames, pixels; None keeps the video's"
     )
     every: int = Field(default=1, ge=1, description="take every n-th frame")
+    fps: float | None = Field(
+        default=None, gt=0, description="frames a second to take, in place of `every`"
+    )
+    pick: Pick = Field(
+        default="sharpest",
+        description='which frame of each n to take: the "sharpest" or the "first"',
+    )
+    folder_fps: float = Field(
+        default=30.0, gt=0, description="frames a second of a folder of frames"
+    )
     max_frames: int | None = Field(default=None, ge=1, description="stop after so many frames")
     image_format: Literal["jpg", "png"] = Field(default="jpg", description="of the stored frames")
     quality: int = Field(default=95, ge=1, le=100, description="of jpg frames")
+    camera: Literal["auto", "static", "moving", "sfm"] = Field(
+        default="auto",
+        description='"static": it never moves; "moving": the COLMAP model beside the video, or '
+        'structure from motion without one; "sfm": structure from motion in any case; "auto": the '
+        "COLMAP model, or else whether the background moves decides",
+    )
     focal: float | None = Field(
         default=None,
         gt=0,

@@ -18,7 +18,7 @@ from hoigs.core.clip_format import load_arrays
 from hoigs.core.moment import BodyPose
 from hoigs.preparation.body_fit import FitOptions, fit_body
 from hoigs.preparation.cameras import CameraTrack
-from hoigs.preparation.frames import VideoFrames
+from hoigs.preparation.frames import Frames
 from hoigs.preparation.landmarks import LandmarkTrack
 from hoigs.preparation.silhouette import posed
 from hoigs.preparation.source import SourceError
@@ -34,6 +34,7 @@ class FittedBody:
         poses: batched over the frames. joints: world.
         scene_scale: metres a unit of the cameras' own world.
         residual_px: mean distance of visible landmarks, median over frames, pixels of the frames.
+        residuals: of each frame, NaN without landmarks.
         ground: largest y of the body, median over frames: the floor's height, if y points down.
         found: frames with landmarks; the body of the others is interpolated.
         report: what the fit says of itself.
@@ -43,6 +44,7 @@ class FittedBody:
     joints: Float[Tensor, "F J 3"]
     scene_scale: float
     residual_px: float
+    residuals: Float[Tensor, " F"]
     ground: float
     found: Bool[np.ndarray, " F"]
     provenance: str
@@ -59,8 +61,30 @@ class FittedBody:
         return float(torch.stack(depths).median())
 
 
-def load_landmarks(path: Path, video: VideoFrames, track: CameraTrack) -> LandmarkTrack:
-    """pose_mediapipe.npz in pixels of the frames, distortion removed.
+@dataclass(frozen=True)
+class RawLandmarks:
+    """Landmarks of the chosen frames, distortion still in; NaN where none were found.
+
+    Attributes:
+        image: x, y, relative depth (pixels of the frames) and visibility. world: metres about the
+            hips' middle, and visibility.
+        source: for the report.
+    """
+
+    image: Float[np.ndarray, "F 33 4"]
+    world: Float[np.ndarray, "F 33 4"]
+    source: str = "MediaPipe"
+
+    def straight(self, track: CameraTrack) -> LandmarkTrack:
+        """On the cameras' undistorted images, without the frames that have no camera."""
+        rows = list(track.positions)
+        image = self.image[rows].copy()
+        image[..., :2] = track.undistort.pixels(image[..., :2])
+        return LandmarkTrack.from_mediapipe(image, self.world[rows])
+
+
+def read_landmarks(path: Path, video: Frames) -> RawLandmarks:
+    """pose_mediapipe.npz in pixels of the frames.
 
     Raises:
         SourceError: arrays are absent, of another length than the video, or no person is found.
@@ -78,22 +102,36 @@ def load_landmarks(path: Path, video: VideoFrames, track: CameraTrack) -> Landma
                 f"{path}: {name} has shape {list(array.shape)}, expected [{video.total}, 33, 4]: "
                 "MediaPipe's 33 landmarks of each video frame, NaN where no person was found"
             )
+    return chosen_landmarks(image, world, video, str(path))
+
+
+def chosen_landmarks(
+    image: Float[np.ndarray, "T 33 4"],
+    world: Float[np.ndarray, "T 33 4"],
+    video: Frames,
+    what: str,
+    source: str = "MediaPipe",
+) -> RawLandmarks:
+    """Landmarks of a whole video, in its own pixels, as those of the chosen frames.
+
+    Raises:
+        SourceError: no person is found in them; `what` says where they come from.
+    """
     image = image[video.indices].astype(np.float64)
     image[..., :3] *= video.width / video.native_width
-    image[..., :2] = track.undistort.pixels(image[..., :2])
-    landmarks = LandmarkTrack.from_mediapipe(image, world[video.indices].astype(np.float64))
-    if not landmarks.found.any():
-        raise SourceError(f"{path}: no person was found in the {len(image)} chosen frames")
-    return landmarks
+    raw = RawLandmarks(image, world[video.indices].astype(np.float64), source)
+    if not LandmarkTrack.from_mediapipe(raw.image, raw.world).found.any():
+        raise SourceError(f"{what}: no person was found in the {len(image)} chosen frames")
+    return raw
 
 
 def fit_person(
     landmarks: LandmarkTrack,
-    video: VideoFrames,
     track: CameraTrack,
     body: BodyModel,
     steps: int,
     progress: Callable[[float], None] | None = None,
+    source: str = "MediaPipe",
 ) -> FittedBody:
     """Fits the body to landmarks in `steps`; finds the scale of a world that has none."""
     options = FitOptions(scale=not track.metric, steps=steps)
@@ -107,23 +145,24 @@ def fit_person(
         joints=torch.stack([joints for _, joints in frames]),
         scene_scale=fit.scene_scale,
         residual_px=residual,
+        residuals=fit.residual_px,
         ground=float(torch.stack([vertices[:, 1].max() for vertices, _ in frames]).median()),
         found=landmarks.found.numpy(),
         provenance=(
-            f"fitted to MediaPipe landmarks of {found} of {len(video)} frames, "
+            f"fitted to {source} landmarks of {found} of {len(track.cameras)} frames, "
             f"{residual:.1f} px off (median of frames); hands are not fitted"
         ),
         report=fit.report,
-        warnings=_warnings(residual, found, video),
+        warnings=_warnings(residual, found, track.cameras),
     )
 
 
-def _warnings(residual: float, found: int, video: VideoFrames) -> list[str]:
+def _warnings(residual: float, found: int, cameras: Sequence[Camera]) -> list[str]:
     warnings = []
-    if residual > POOR_FIT * max(video.width, video.height):
+    if residual > POOR_FIT * max(cameras[0].width, cameras[0].height):
         warnings.append(f"the body misses its landmarks by {residual:.1f} px: see overlay.mp4")
-    if found < 0.8 * len(video):
+    if found < 0.8 * len(cameras):
         warnings.append(
-            f"landmarks were found in {found} of {len(video)} frames; the others are interpolated"
+            f"landmarks were found in {found} of {len(cameras)} frames; the others are interpolated"
         )
     return warnings

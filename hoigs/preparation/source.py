@@ -8,6 +8,8 @@ from pathlib import Path
 from hoigs.core.errors import HoigsError
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+FRAME_FOLDERS = ("frames", "images")  # where a folder of frames may keep them
 _COLMAP_FILES = ("cameras", "images", "points3D")
 _LAYOUT = """  FOLDER/
     video.mp4            the video (any name; one file)
@@ -121,3 +123,15 @@ def _find_colmap(folder: Path, missing: list[str]) -> Path | None:
         "run `colmap mapper`, or delete the folder if the camera does not move"
     )
     return None
+
+
+def numbered_frames(folder: Path) -> list[Path]:
+    """The images of a folder in the order of the number that their names end in."""
+    paths = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+    return sorted(paths, key=lambda p: (frame_number(p.name) or 0, p.name))
+
+
+def frame_number(name: str) -> int | None:
+    """The last number in a file's name: 17 of frame_00017.png."""
+    digits = "".join(c if c.isdigit() else " " for c in Path(name).stem).split()
+    return int(digits[-1]) if digits else None

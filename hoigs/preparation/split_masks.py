@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Bool
 from scipy import ndimage
 
+from hoigs.core.undistortion import Undistortion
 from hoigs.preparation.ball import BallTrack
-from hoigs.preparation.cameras import Undistortion
-from hoigs.preparation.frames import VideoFrames
+from hoigs.preparation.cameras import CameraTrack
+from hoigs.preparation.frames import Frames
 from hoigs.preparation.masks import MaskStack, largest_parts, load_masks
 from hoigs.preparation.separate import Images, separate
 from hoigs.preparation.source import Source
@@ -25,16 +26,34 @@ class GivenMasks:
     human: MaskStack | None = None
     thing: MaskStack | None = None
 
+    def named(self) -> dict[str, MaskStack]:
+        """Those that there are, by the name of the field."""
+        return {f.name: m for f in fields(self) if (m := getattr(self, f.name)) is not None}
 
-def read_masks(
-    source: Source, video: VideoFrames, undistort: Undistortion, names: tuple[str, str]
-) -> GivenMasks:
-    """The source's masks of the chosen frames; `names` of the human and object entities."""
-    apart = {n: load_masks(folder, video, undistort) for n, folder in source.apart.items()}
+    def moving(self, frame: int) -> Bool[np.ndarray, "H W"]:
+        """Everything masked in a frame: what does not stand still with the scene."""
+        return np.logical_or.reduce([stack[frame] for stack in self.named().values()])
+
+    def straight(self, track: CameraTrack) -> GivenMasks:
+        """On the cameras' undistorted images, without the frames that have no camera."""
+        return GivenMasks(
+            **{
+                name: MaskStack(track.undistort.mask(stack[i]) for i in track.positions)
+                for name, stack in self.named().items()
+            }
+        )
+
+
+def read_masks(source: Source, video: Frames, names: tuple[str, str]) -> GivenMasks:
+    """The source's masks of the chosen frames, distortion still in; `names` of the human and object
+    entities.
+    """
+    plain = Undistortion()
+    apart = {n: load_masks(folder, video, plain) for n, folder in source.apart.items()}
     human, thing = (apart.get(name) for name in names)
     if source.together is None or (human and thing):
         return GivenMasks(human=human, thing=thing)
-    return GivenMasks(together=load_masks(source.together, video, undistort))
+    return GivenMasks(together=load_masks(source.together, video, plain))
 
 
 def entity_masks(

@@ -25,6 +25,7 @@ class Stages:
         self._progress = progress or (lambda _done, _text: None)
         self._before = 0.0
         self._name = ""
+        self._start = 0.0
         self.seconds: dict[str, float] = {}
 
     @contextmanager
@@ -32,11 +33,15 @@ class Stages:
         """One of the named stages."""
         self._name = name
         self._progress(self._before, name)
-        start = time.perf_counter()
+        self._start = time.perf_counter()
         yield
-        self.seconds[name] = round(time.perf_counter() - start, 2)
+        self.seconds[name] = self.elapsed()
         self._before += self._share[name]
         self._progress(self._before, name)
+
+    def elapsed(self) -> float:
+        """Seconds since the current stage began."""
+        return round(time.perf_counter() - self._start, 2)
 
     def advance(self, fraction: float) -> None:
         """`fraction` 0..1 of the current stage is done."""

@@ -9,8 +9,9 @@ import pytest
 import torch
 from tiny import BALL, FRAMES, HEIGHT, WIDTH, masks
 
+from hoigs.core.undistortion import Undistortion
 from hoigs.preparation.ball import ball_centers, load_ball, refine_ball, smooth
-from hoigs.preparation.cameras import Undistortion, static_cameras
+from hoigs.preparation.cameras import static_cameras
 from hoigs.preparation.frames import VideoFrames
 from hoigs.preparation.source import SourceError
 

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from tiny import FRAMES, HEIGHT, WIDTH, masks
 
-from hoigs.preparation.cameras import Undistortion
+from hoigs.core.undistortion import Undistortion
 from hoigs.preparation.frames import VideoFrames
 from hoigs.preparation.masks import MaskStack, largest_parts, load_masks
 from hoigs.preparation.source import SourceError

@@ -94,7 +94,7 @@ def test_files_beside_the_clip(static: tuple[Path, PrepareReport, list[float]]) 
     assert "focal length is assumed" in (out / "report.md").read_text()
     overlay = VideoFrames(out / "overlay.mp4")
     assert (len(overlay), overlay.width) == (FRAMES, WIDTH)
-    assert sorted(p.name for p in out.parent.iterdir()) == ["clip", "source"]
+    assert sorted(p.name for p in out.parent.iterdir()) == ["clip", "clip.prepare", "source"]
 
 
 def test_options(tiny_source: Path, tmp_path: Path, body: AnnyBody) -> None:

@@ -1,0 +1,281 @@
+"""One preparation: each method is a stage, whose result comes from the work folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+import numpy as np
+
+import hoigs
+from hoigs.core.body import LEFT_WRIST, RIGHT_WRIST, BodyModel
+from hoigs.core.clip import BodyTrack, ObjectTrack
+from hoigs.preparation import saved
+from hoigs.preparation.ball import BallTrack, load_ball, refine_ball
+from hoigs.preparation.blank import blank_pixels
+from hoigs.preparation.cameras import CameraTrack, colmap_cameras, scaled_cameras, static_cameras
+from hoigs.preparation.clip_writing import write_clip_folder
+from hoigs.preparation.frames import FrameList, open_frames
+from hoigs.preparation.leftovers import Leftovers
+from hoigs.preparation.masks import MaskStack
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.person import FittedBody, fit_person, read_landmarks
+from hoigs.preparation.plan import PLAN
+from hoigs.preparation.report import PrepareReport
+from hoigs.preparation.saved import EntityStacks, Inputs, RawEvidence
+from hoigs.preparation.scene import ScenePoints, colmap_scene, static_scene
+from hoigs.preparation.silhouette import silhouette
+from hoigs.preparation.source import Source
+from hoigs.preparation.split_masks import entity_masks, read_masks
+from hoigs.preparation.stages import Stages
+from hoigs.preparation.store import Result, WorkFolder, digest, fingerprint
+from hoigs.preparation.things import make_object
+
+FORMAT = 1  # of what the stages keep; another number makes older results unread
+T = TypeVar("T")
+
+
+class Pipeline:
+    """One run. `run` goes through the stages in order; each sets what the next ones read."""
+
+    def __init__(
+        self,
+        source: Source,
+        out: Any,
+        body: BodyModel,
+        options: PrepareOptions,
+        stages: Stages,
+        work: WorkFolder,
+        leftovers: Leftovers,
+    ) -> None:
+        self.source, self.out, self.body = source, out, body
+        self.options, self.stages, self.work = options, stages, work
+        self.leftovers = leftovers
+        self.warnings: list[str] = []
+        self.provenance: dict[str, str] = {}
+        self.worth_keeping = False
+        self._keys: dict[str, str] = {}
+
+    def run(self, until: str | None = None) -> None:
+        """All stages, or those up to `until`; the last sets `report`."""
+        for name in PLAN:
+            getattr(self, f"_{name}")()
+            if name == until:
+                return
+
+    def images(self) -> Iterable[np.ndarray]:
+        """The frames anew, undistorted."""
+        return (self.track.undistort.image(image) for image in self.video)
+
+    def _stage(
+        self,
+        name: str,
+        make: Callable[[], T],
+        save: Callable[[T], Result],
+        load: Callable[[Result], T],
+        made_from: Any = None,
+    ) -> T:
+        """A stage's result as the work folder has it, made before if it is not there.
+
+        It is read back even when it has just been made, so that a run that was taken up gives
+        what an unbroken one gives.
+
+        Args:
+            made_from: JSON of whatever else the result depends on, beside PLAN's options.
+        """
+        key = self._keys[name] = self._key(name, made_from)
+        with self.stages.stage(name):
+            stored = self.work.load(name, key)
+            if stored is None:
+                warned, known = len(self.warnings), dict(self.provenance)
+                made = save(make())
+                notes: dict[str, Any] = {
+                    "warnings": self.warnings[warned:],
+                    "provenance": {k: v for k, v in self.provenance.items() if k not in known},
+                    "seconds": self.stages.elapsed(),
+                }
+                values = {"made": made.values, "notes": notes}
+                stored = self.work.save(
+                    name, key, Result(values, made.arrays, made.files, made.folder)
+                )
+                self.worth_keeping |= PLAN[name].long
+            else:
+                notes = stored.values["notes"]
+                self.warnings += notes["warnings"]
+                self.provenance |= notes["provenance"]
+            value = load(Result(stored.values["made"], stored.arrays, None, stored.folder))
+        self.stages.seconds[name] = notes["seconds"]
+        return value
+
+    def _key(self, name: str, made_from: Any) -> str:
+        options = self.options.model_dump(mode="json")
+        stage = PLAN[name]
+        return digest(
+            {
+                "format": [FORMAT, hoigs.__version__],
+                "options": {key: options[key] for key in stage.options},
+                "after": {other: self._keys[other] for other in stage.after},
+                "from": made_from,
+            }
+        )
+
+    def _frames(self) -> None:
+        options, path = self.options, self.source.video
+
+        def make() -> FrameList:
+            frames = open_frames(
+                path, options.width, options.every, options.max_frames, fps=options.fps,
+                pick=options.pick, rate=options.folder_fps,
+            )  # fmt: skip
+            return frames.list
+
+        found = self._stage(
+            "frames", make, saved.save_frames, saved.load_frames, fingerprint([path])
+        )
+        self.video = open_frames(path, options.width, known=found)
+
+    def _evidence(self) -> None:
+        # all of it before the long work, so that what is wrong is said at once
+        source, names = self.source, (self.options.human, self.options.object)
+
+        def make() -> RawEvidence:
+            landmarks = read_landmarks(source.landmarks, self.video)
+            return RawEvidence(landmarks, read_masks(source, self.video, names))
+
+        folders = [source.together, *source.apart.values()]
+        files = fingerprint([source.landmarks, *(p for p in folders if p is not None)])
+        self.raw = self._stage("evidence", make, saved.save_evidence, saved.load_evidence, files)
+
+    def _cameras(self) -> None:
+        model = self.source.colmap
+        files = None if model is None else [str(model), fingerprint([model])]
+        self.track = self._stage(
+            "cameras", self._find_cameras, saved.save_cameras, saved.load_cameras, files
+        )
+        if len(self.track.positions) < len(self.video):
+            self.video = self.video.subset(self.track.positions)
+
+    def _find_cameras(self) -> CameraTrack:
+        if self.source.colmap is not None:
+            track = colmap_cameras(self.video, self.source.colmap)
+        else:
+            track = static_cameras(self.video, self.options.focal)
+            if self.options.focal is None:
+                self.warnings.append(
+                    "the focal length is assumed, and every depth is proportional to it: give "
+                    "--focal if you know it"
+                )
+        self.provenance["cameras"] = track.provenance
+        return track
+
+    def _inputs(self) -> None:
+        def make() -> Inputs:
+            landmarks = self.raw.landmarks.straight(self.track)
+            return Inputs(landmarks, self.raw.masks.straight(self.track), self._ball())
+
+        ball = self.source.ball
+        files = None if ball is None else fingerprint([ball])
+        inputs = self._stage("inputs", make, saved.save_inputs, saved.load_inputs, files)
+        self.landmarks, self.given, self.ball = inputs.landmarks, inputs.given, inputs.ball
+
+    def _ball(self) -> BallTrack | None:
+        if self.source.ball is None:
+            return None
+        rough = load_ball(self.source.ball, self.video, self.track.undistort)
+        return refine_ball(rough, self.images())
+
+    def _body(self) -> None:
+        def make() -> FittedBody:
+            person = fit_person(
+                self.landmarks, self.track, self.body, self.options.fit_steps,
+                self.stages.advance, self.raw.landmarks.source,
+            )  # fmt: skip
+            self.provenance["body"] = person.provenance
+            self.warnings.extend(person.warnings)
+            return person
+
+        model = [type(self.body).__qualname__, self.body.num_betas, len(self.body.parents)]
+        self.person = self._stage("body", make, saved.save_body, saved.load_body, model)
+        self.cameras = scaled_cameras(self.track.cameras, self.person.scene_scale)
+
+    def _masks(self) -> None:
+        def make() -> EntityStacks:
+            human, thing, text = entity_masks(
+                self.given, self.ball, self.images, self._silhouettes, self.person.found
+            )
+            self.provenance["masks"] = text
+            return EntityStacks(human, thing, self._blank(human, thing))
+
+        self.masks = self._stage("masks", make, saved.save_masks, saved.load_masks)
+
+    def _blank(self, humans: MaskStack, things: MaskStack) -> MaskStack:
+        rows = zip(self.images(), humans, things, strict=True)
+        if self.options.keep_black:
+            return MaskStack(np.zeros_like(human) for _, human, _ in rows)
+        blank = MaskStack(blank_pixels(image, human | thing) for image, human, thing in rows)
+        coverage = blank.coverage()
+        if coverage.any():
+            self.warnings.append(
+                f"{int((coverage > 0).sum())} frames have flat black patches, up to "
+                f"{100 * coverage.max():.1f} % of the image, which show no scene: they are left "
+                "out of training and scores (--keep-black if they are real)"
+            )
+        return blank
+
+    def _silhouettes(self) -> MaskStack:
+        pairs = zip(self.person.posed(self.body), self.cameras, strict=True)
+        return MaskStack(silhouette(v, self.body.faces, c) for (v, _), c in pairs)
+
+    def _object(self) -> None:
+        self.object, self.spread = self._stage(
+            "object", self._place_object, saved.save_object, saved.load_object
+        )
+
+    def _place_object(self) -> tuple[ObjectTrack, float]:
+        wrists = self.person.joints[:, [LEFT_WRIST, RIGHT_WRIST]]
+        track, spread = make_object(
+            self.ball, self.masks.thing, self.cameras, wrists, self.images,
+            radius=self.options.ball_radius, count=self.options.object_points,
+        )  # fmt: skip
+        self.provenance["object"] = track.provenance
+        lost = (~track.observed).nonzero().flatten().tolist()
+        if lost:
+            shown = ", ".join(map(str, lost[:12])) + (", …" if len(lost) > 12 else "")
+            self.warnings.append(f"the object is not seen in {len(lost)} frames: {shown}")
+        if self.ball is None:
+            self.warnings.append(
+                "of the object's rotation only the roll is known, and its shape is a cushion "
+                "inflated from one outline: training has to find both"
+            )
+        return track, spread
+
+    def _scene(self) -> None:
+        self.scene = self._stage("scene", self._find_scene, saved.save_scene, saved.load_scene)
+
+    def _find_scene(self) -> ScenePoints:
+        masks = (self.masks.human, self.masks.thing, self.masks.blank)
+        if not self.track.static:
+            scale = self.person.scene_scale
+            scene = colmap_scene(
+                self.track.points * scale, self.track.colors, masks, self.cameras, self.images,
+                self.options.scene_points,
+            )  # fmt: skip
+        else:
+            scene = static_scene(
+                self.images, masks, self.cameras[0],
+                ground=self.person.ground, distance=self.person.distance(self.cameras),
+                backdrop=self.options.backdrop, count=self.options.scene_points,
+            )  # fmt: skip
+            self.warnings.append(
+                "the camera stands still: the scene's depth is supposed, only what moves has a "
+                "measured place"
+            )
+        self.provenance["scene"] = scene.provenance
+        return scene
+
+    def _writing(self) -> None:
+        self.report: PrepareReport = write_clip_folder(self)
+
+    @property
+    def body_track(self) -> BodyTrack:
+        return BodyTrack(self.options.body, self.person.poses, self.provenance["body"])
