@@ -1,0 +1,222 @@
+"""reader:hypernerf: captures as Nerfies and HyperNeRF published them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from hoigs.core.clip import Clip
+from hoigs.core.config import ComponentConfig
+from hoigs.core.errors import ClipError
+from hoigs.core.lens import Lens
+from hoigs.core.moment import Moment
+from hoigs.core.reader import ClipReader
+from hoigs.plugins.readers.frame_order import natural
+from hoigs.plugins.readers.json_file import parse_json, parse_json_map
+from hoigs.plugins.readers.lazy_frames import DepthFiles, LazyFrames, MaskFiles, dark, lens_for
+from hoigs.plugins.readers.listing import Need, require_files
+from hoigs.plugins.readers.point_file import Points, read_points
+from hoigs.plugins.readers.poses import checked_rotation, rigid
+
+LAYOUT = "a Nerfies or HyperNeRF capture (dataset.json, camera/ …)"
+MAKER = (
+    "the captures have it (github.com/google/hypernerf/releases), and Nerfies' "
+    "Nerfies_Capture_Processing.ipynb makes it of your own video"
+)
+POINT_FILES = ("points3D_downsample2.ply", "points3D_downsample.ply", "points.npy")
+USUAL_FACTOR = 2  # the resolution of the published scores
+
+
+class SceneJson(BaseModel):
+    """scene.json: the world is (x - center) * scale."""
+
+    scale: float = Field(gt=0)
+    center: tuple[float, float, float]
+
+
+class DatasetJson(BaseModel):
+    """dataset.json: image names by use."""
+
+    ids: list[str] = Field(min_length=1)
+    train_ids: list[str] = []
+    val_ids: list[str] = []
+
+
+class MetadataJson(BaseModel):
+    """An entry of metadata.json."""
+
+    warp_id: int
+    camera_id: int = 0
+    time_id: int | None = None
+
+    @property
+    def step(self) -> int:
+        return self.warp_id if self.time_id is None else self.time_id
+
+
+class CameraJson(BaseModel):
+    """camera/ID.json; orientation is world-to-camera, position the camera's centre."""
+
+    orientation: list[list[float]]
+    position: tuple[float, float, float]
+    focal_length: float = Field(gt=0)
+    principal_point: tuple[float, float]
+    image_size: tuple[float, float]
+    skew: float = 0.0
+    pixel_aspect_ratio: float = Field(default=1.0, gt=0)
+    radial_distortion: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tangential_distortion: tuple[float, float] = (0.0, 0.0)
+
+
+class HypernerfConfig(ComponentConfig):
+    """Settings of reader:hypernerf."""
+
+    factor: int | None = Field(
+        default=None, ge=1, description="reads rgb/FACTORx; 2 if it is there, else the finest"
+    )
+    fps: float = Field(default=15.0, gt=0, description="of the capture")
+    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
+
+
+class HypernerfReader(ClipReader):
+    """Frames in order of time, then camera; distortion is taken out.
+
+    The world is (x - center) * scale of scene.json, for cameras, points and depth alike. With no
+    val_ids every fourth image trains and the one two later tests, as 4DGaussians does it;
+    covisible/ (DyCheck) marks what of a test image can be known, the rest is ignored.
+
+    Args:
+        factor, fps, cache_mb: see HypernerfConfig.
+    """
+
+    def __init__(self, factor: int | None = None, fps: float = 15.0, cache_mb: int = 512) -> None:
+        self.factor, self.fps, self.cache_mb = factor, fps, cache_mb
+
+    def matches(self, folder: Path) -> bool:
+        folder = Path(folder)
+        return (folder / "dataset.json").is_file() and (folder / "camera").is_dir()
+
+    def read(self, folder: Path) -> Clip:
+        folder = Path(folder)
+        names = ("dataset.json", "metadata.json", "scene.json", "camera/")
+        require_files(folder, LAYOUT, [Need.of(name, maker=MAKER) for name in names])
+        dataset = parse_json(folder / "dataset.json", DatasetJson)
+        scene = parse_json(folder / "scene.json", SceneJson)
+        metadata = parse_json_map(folder / "metadata.json", MetadataJson)
+        room = f"rgb/{self.factor or _usual_factor(folder)}x"
+        require_files(folder, LAYOUT, _needs(dataset, room), _faults(dataset, metadata))
+        ids = sorted(
+            dataset.ids, key=lambda i: (metadata[i].step, metadata[i].camera_id, natural(i))
+        )
+        images = [folder / room / f"{name}.png" for name in ids]
+        cameras, lenses = [], []
+        for name, image in zip(ids, images):
+            path = folder / "camera" / f"{name}.json"
+            lens, w2c = _camera(path, parse_json(path, CameraJson), scene)
+            lenses.append(lens_for(lens, image))
+            cameras.append(lenses[-1].camera(w2c))
+        split = _split(dataset, ids)
+        depths = _optional(folder, "depth/*x", ids, ".npy")
+        seen = _optional(folder, "covisible/*x/val", ids, ".png")
+        points, colors, origin = _points(folder, scene)
+        last = max(1, *(metadata[name].step for name in ids))
+        return Clip(
+            name=folder.resolve().name,
+            store=LazyFrames(
+                folder,
+                images,
+                cameras,
+                ignored=MaskFiles(seen, dark) if any(seen) else None,
+                depth=DepthFiles(depths, scene.scale) if any(depths) else None,
+                lenses=lenses,
+                cache_mb=self.cache_mb,
+            ),
+            cameras=cameras,
+            moments=[Moment(metadata[n].step / last, metadata[n].step) for n in ids],
+            kinds={},
+            bodies={},
+            objects={},
+            points=points,
+            point_colors=colors,
+            split=split,
+            fps=self.fps,
+            depth_kind="metric" if any(depths) else "none",
+            provenance={
+                "reader": "reader:hypernerf",
+                "cameras": f"the capture's, (x - {list(scene.center)}) * {scene.scale:g}",
+                "images": room,
+                "points": origin,
+            },
+        )
+
+
+def _usual_factor(folder: Path) -> int:
+    factors = sorted(int(p.name[:-1]) for p in (folder / "rgb").glob("*x") if p.name[:-1].isdigit())
+    return USUAL_FACTOR if USUAL_FACTOR in factors or not factors else factors[0]
+
+
+def _needs(dataset: DatasetJson, room: str) -> list[Need]:
+    needs = [Need.of(*POINT_FILES[::-1], maker=MAKER)]
+    for name in dataset.ids:
+        needs.append(Need.of(f"camera/{name}.json", maker=MAKER))
+        needs.append(Need.of(f"{room}/{name}.png", maker=MAKER))
+    return needs
+
+
+def _faults(dataset: DatasetJson, metadata: dict[str, MetadataJson]) -> list[str]:
+    faults = []
+    unknown = [name for name in dataset.ids if name not in metadata]
+    if unknown:
+        faults.append(f"metadata.json has no {', '.join(unknown[:4])} of dataset.json's ids")
+    known = set(dataset.ids)
+    for key, names in (("train_ids", dataset.train_ids), ("val_ids", dataset.val_ids)):
+        strange = [name for name in names if name not in known]
+        if strange:
+            faults.append(f"dataset.json: {key} has {', '.join(strange[:4])}: not among its ids")
+    if dataset.val_ids and not dataset.train_ids:
+        faults.append("dataset.json has val_ids and no train_ids")
+    return faults
+
+
+def _camera(path: Path, camera: CameraJson, scene: SceneJson) -> tuple[Lens, np.ndarray]:
+    """The lens at full size, and world-to-camera."""
+    if abs(camera.skew) > 1e-6:
+        raise ClipError(f"{path}: skew is {camera.skew:g}; a pinhole camera here has none")
+    f, (k1, k2, k3), (p1, p2) = (
+        camera.focal_length, camera.radial_distortion, camera.tangential_distortion
+    )  # fmt: skip
+    cx, cy = camera.principal_point
+    K = np.array([[f, 0, cx], [0, f * camera.pixel_aspect_ratio, cy], [0, 0, 1]])
+    width, height = (round(n) for n in camera.image_size)
+    rotation = checked_rotation(np.array(camera.orientation, np.float64), str(path))
+    center = (np.array(camera.position) - scene.center) * scene.scale
+    return Lens.opencv(K, (k1, k2, p1, p2, k3), width, height), rigid(rotation, -rotation @ center)
+
+
+def _split(dataset: DatasetJson, ids: Sequence[str]) -> dict[str, list[int]]:
+    train, test = set(dataset.train_ids), set(dataset.val_ids)
+    if not dataset.val_ids:
+        fourth = dataset.ids[::4]
+        train, test = set(fourth), set(dataset.ids[2::4][: max(len(fourth) - 1, 0)])
+    return {
+        "train": [i for i, name in enumerate(ids) if name in train],
+        "test": [i for i, name in enumerate(ids) if name in test],
+    }
+
+
+def _optional(folder: Path, rooms: str, ids: Sequence[str], suffix: str) -> list[Path | None]:
+    """Files of the finest of the folders that match, where a frame has one."""
+    found = sorted(folder.glob(rooms), key=lambda p: natural(p.as_posix()))
+    if not found:
+        return [None] * len(ids)
+    paths = [found[0] / f"{name}{suffix}" for name in ids]
+    return [path if path.is_file() else None for path in paths]
+
+
+def _points(folder: Path, scene: SceneJson) -> tuple[*Points, str]:
+    path = next(folder / name for name in POINT_FILES if (folder / name).is_file())
+    points, colors = read_points(path)
+    return (points - points.new_tensor(scene.center)) * scene.scale, colors, path.name

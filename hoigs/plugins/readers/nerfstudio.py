@@ -1,0 +1,196 @@
+"""reader:nerfstudio: one transforms.json for a captured scene, as ns-process-data writes it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from hoigs.core.camera import Camera
+from hoigs.core.clip import Clip, uniform_test_split
+from hoigs.core.config import ComponentConfig
+from hoigs.core.moment import Moment
+from hoigs.core.reader import ClipReader
+from hoigs.plugins.readers.frame_order import natural, timed_moments, video_moments
+from hoigs.plugins.readers.json_file import parse_json
+from hoigs.plugins.readers.lazy_frames import DepthFiles, LazyFrames, MaskFiles, dark
+from hoigs.plugins.readers.listing import Need, require_files
+from hoigs.plugins.readers.point_file import Points, read_points
+from hoigs.plugins.readers.poses import opengl_to_world_to_camera
+from hoigs.plugins.readers.transforms import TransformFrame, Transforms, lens_of
+
+LAYOUT = "a nerfstudio capture (transforms.json)"
+MAKER = "`ns-process-data images` or `video` writes transforms.json and the images beside it"
+MASK_MAKER = "your segmenter makes it: black where nothing shall be learned; or drop mask_path"
+DEPTH_MAKER = "your capture app or depth network makes it; or drop depth_file_path"
+RANDOM_BOX = 5.0  # times the largest camera coordinate: splatfacto's random_scale of 10
+
+
+class NerfstudioConfig(ComponentConfig):
+    """Settings of reader:nerfstudio."""
+
+    factor: int = Field(default=1, ge=1, description="2 reads images_2/, and so on")
+    depth_unit: float = Field(default=0.001, gt=0, description="metres in a depth file's 1")
+    points: int = Field(
+        default=50_000, ge=1, description="random points to start from where there is no PLY"
+    )
+    fps: float = Field(default=30.0, gt=0, description="of the video that the images come from")
+    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
+
+
+class NerfstudioReader(ClipReader):
+    """Frames in natural order of their names, as nerfstudio sorts them, whatever the file's order.
+
+    The world is the file's, divided by its `applied_scale`, so that capture apps' metres come
+    back. Masks are nerfstudio's: black pixels are ignored. Depth is in metres. Frames without
+    "time" are evenly spaced.
+
+    Args:
+        factor, depth_unit, points, fps, cache_mb: see NerfstudioConfig.
+    """
+
+    def __init__(
+        self,
+        factor: int = 1,
+        depth_unit: float = 0.001,
+        points: int = 50_000,
+        fps: float = 30.0,
+        cache_mb: int = 512,
+    ) -> None:
+        self.factor, self.depth_unit, self.points = factor, depth_unit, points
+        self.fps, self.cache_mb = fps, cache_mb
+
+    def matches(self, folder: Path) -> bool:
+        return (Path(folder) / "transforms.json").is_file()
+
+    def read(self, folder: Path) -> Clip:
+        folder = Path(folder)
+        require_files(folder, LAYOUT, [Need.of("transforms.json", maker=MAKER)])
+        file = parse_json(folder / "transforms.json", Transforms)
+        rows = sorted(enumerate(file.frames), key=lambda row: natural(row[1].file_path))
+        frames = [frame for _, frame in rows]
+        require_files(folder, LAYOUT, self._needs(file, frames), _faults(file, frames))
+        wheres = [f"{folder / 'transforms.json'}: frames.{i}" for i, _ in rows]
+        images = [folder / self._image(frame) for frame in frames]
+        lenses = [lens_of(file, *each) for each in zip(frames, images, wheres)]
+        cameras = []
+        for lens, frame, where in zip(lenses, frames, wheres):
+            w2c = opengl_to_world_to_camera(frame.camera_to_world, where)
+            w2c[:3, 3] /= file.applied_scale
+            cameras.append(lens.camera(w2c))
+        split = _split(file, frames)
+        depths = [folder / f.depth_file_path if f.depth_file_path else None for f in frames]
+        masks = [folder / f.mask_path if f.mask_path else None for f in frames]
+        points, colors, origin = self._points(folder, file, cameras)
+        return Clip(
+            name=folder.resolve().name,
+            store=LazyFrames(
+                folder,
+                images,
+                cameras,
+                ignored=MaskFiles(masks, dark) if any(masks) else None,
+                depth=DepthFiles(depths, self.depth_unit) if any(depths) else None,
+                lenses=lenses,
+                cache_mb=self.cache_mb,
+            ),
+            cameras=cameras,
+            moments=_moments(frames, split["train"]),
+            kinds={},
+            bodies={},
+            objects={},
+            points=points,
+            point_colors=colors,
+            split=split,
+            fps=self.fps,
+            depth_kind="metric" if any(depths) else "none",
+            provenance={
+                "reader": "reader:nerfstudio",
+                "cameras": f"transforms.json, applied_scale {file.applied_scale:g} undone",
+                "points": origin,
+            },
+        )
+
+    def _image(self, frame: TransformFrame) -> str:
+        if self.factor == 1:
+            return frame.file_path
+        return f"images_{self.factor}/{Path(frame.file_path).name}"
+
+    def _needs(self, file: Transforms, frames: Sequence[TransformFrame]) -> list[Need]:
+        needs = [Need.of(self._image(frame), maker=MAKER) for frame in frames]
+        for frame in frames:
+            if frame.mask_path:
+                needs.append(Need.of(frame.mask_path, maker=MASK_MAKER))
+            if frame.depth_file_path:
+                needs.append(Need.of(frame.depth_file_path, maker=DEPTH_MAKER))
+        if file.ply_file_path:
+            needs.append(Need.of(file.ply_file_path, maker="`ns-process-data`; or drop its key"))
+        return needs
+
+    def _points(
+        self, folder: Path, file: Transforms, cameras: Sequence[Camera]
+    ) -> tuple[*Points, str]:
+        if file.ply_file_path:
+            # in the file's axes, but before applied_scale (nerfstudio_dataparser: _load_3D_points)
+            return (*read_points(folder / file.ply_file_path), file.ply_file_path)
+        centers = torch.stack([camera.center for camera in cameras])
+        middle = centers.mean(0)
+        reach = RANDOM_BOX * max(float((centers - middle).abs().max()), 1e-6)
+        rng = np.random.default_rng(0)
+        points = middle + torch.from_numpy(rng.uniform(-reach, reach, (self.points, 3))).float()
+        origin = f"{self.points} at random within ±{reach:.3g} of the cameras, as splatfacto does"
+        return points, torch.full_like(points, 0.5), origin
+
+
+def _faults(file: Transforms, frames: Sequence[TransformFrame]) -> list[str]:
+    faults = [] if frames else ["transforms.json has no frames"]
+    timed = sum(frame.time is not None for frame in frames)
+    if 0 < timed < len(frames):
+        faults.append(
+            f'transforms.json: {timed} of {len(frames)} frames have a "time"; all or none'
+        )
+    if file.applied_scale <= 0:
+        faults.append(f"transforms.json: applied_scale is {file.applied_scale:g}; expected > 0")
+    named, known = _named(file), {_plain(frame.file_path) for frame in frames}
+    for key, names in named.items():
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            faults.append(f"transforms.json: {key} lists {', '.join(unknown[:4])}: not in frames")
+    if named and "train_filenames" not in named:
+        faults.append(f"transforms.json has {', '.join(named)} and no train_filenames")
+    return faults
+
+
+def _plain(path: str) -> str:
+    return path.removeprefix("./")
+
+
+def _named(file: Transforms) -> dict[str, list[str]]:
+    keys = ("train_filenames", "val_filenames", "test_filenames")
+    lists: dict[str, list[str] | None] = {key: getattr(file, key) for key in keys}
+    return {key: [_plain(n) for n in names] for key, names in lists.items() if names is not None}
+
+
+def _split(file: Transforms, frames: Sequence[TransformFrame]) -> Mapping[str, list[int]]:
+    """The file's lists; where it has no test list, val is for tests; without any, 16 evenly."""
+    named = _named(file)
+    if not named:
+        return uniform_test_split(len(frames))
+    split = {
+        key.removesuffix("_filenames"): [
+            i for i, frame in enumerate(frames) if _plain(frame.file_path) in names
+        ]
+        for key, names in named.items()
+    }
+    if not split.get("test"):
+        split["test"] = split.pop("val", [])
+    return split
+
+
+def _moments(frames: Sequence[TransformFrame], train: Sequence[int]) -> list[Moment]:
+    times = [frame.time for frame in frames if frame.time is not None]
+    if len(times) == len(frames):
+        return timed_moments(times, train)
+    return video_moments(range(len(frames)), len(frames))
