@@ -85,6 +85,8 @@ PARTS = (
      "nerfstudio's transforms.json, lens distortion taken out"),
     ("reader:hypernerf", f"{READERS}.hypernerf", "HypernerfReader", "HypernerfConfig",
      "captures of Nerfies and HyperNeRF"),
+    ("reader:hosnerf", f"{READERS}.hosnerf", "HosnerfReader", "HosnerfConfig",
+     "a scene of HOSNeRF: cameras and SMPL poses by frame name"),
     ("density:adc", "hoigs.plugins.density.adc", "AdaptiveDensity", "AdaptiveDensityConfig",
      "clone, split and prune as 3DGS does, under a hard cap"),
     ("density:absgrad", "hoigs.plugins.density.absgrad", "AbsoluteGradientDensity",
