@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.rotation import exp_se3, quats_to_matrices
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -68,6 +70,20 @@ class Camera:
         y = torch.arange(self.height, device=self.K.device, dtype=self.K.dtype) + 0.5
         x = torch.arange(self.width, device=self.K.device, dtype=self.K.dtype) + 0.5
         return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+
+    def moved(self, turn: Float[Tensor, " 3"], shift: Float[Tensor, " 3"]) -> Camera:
+        """The camera after a rigid motion in its own space: x_cam = Exp(turn, shift) (R x + t).
+
+        A turn alone is about the camera's centre. Differentiable, and smooth at zero.
+
+        Args:
+            turn: axis-angle, radians. shift: metres.
+        """
+        quat, moved = exp_se3(turn, shift)
+        R: Float[Tensor, "3 3"] = quats_to_matrices(quat)
+        given = self.world_to_camera
+        top = torch.cat((R @ given[:3, :3], (R @ given[:3, 3] + moved)[:, None]), 1)
+        return replace(self, world_to_camera=torch.cat((top, given[3:]), 0))
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another image size."""

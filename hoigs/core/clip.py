@@ -16,6 +16,8 @@ from hoigs.core.camera import Camera
 from hoigs.core.interaction import EntityKind
 from hoigs.core.moment import BodyPose, Moment
 
+CAMERAS_REFINED = "cameras_refined_in_training"  # a key of Clip.provenance
+
 
 class FrameStore(ABC):
     """Pixels on demand; implementations decode lazily and may cache. Positions, not names.

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from hoigs.core.clip import Clip, Frame
+from hoigs.core.clip import CAMERAS_REFINED, Clip, Frame
 from hoigs.core.errors import did_you_mean
 from hoigs.core.interaction import EntityKind
 from hoigs.core.rasterizer import RenderOutput
@@ -19,12 +20,13 @@ from hoigs.evaluation.geometry import measure_geometry
 from hoigs.evaluation.lpips import Lpips, find_weights
 from hoigs.evaluation.measure import device_name, model_size, render_time
 from hoigs.evaluation.metrics import region_psnr, ssim_map
+from hoigs.evaluation.posing import FIT_STEPS, posed_clip
 from hoigs.evaluation.protocol import NotComputed, Pixels, Protocol, TestPose, Value
 from hoigs.evaluation.regions import default_band, region_masks
 from hoigs.evaluation.scores import METRICS, Evaluation, FrameScores, ViewScores
 
 Progress = Callable[[float, str], None]
-TIMING_SHARE = 0.3  # of the progress bar
+TIMING_SHARE, FITTING_SHARE = 0.3, 0.5  # of the progress bar
 
 
 def evaluate(
@@ -35,6 +37,8 @@ def evaluate(
     lpips_weights: Path | str | None = None,
     held_out: bool = True,
     test_pose: TestPose = "given",
+    test_camera: TestPose = "given",
+    fit_steps: int = FIT_STEPS,
     pixels: Pixels = "float",
     band: int | None = None,
     timing_frames: int = 100,
@@ -48,7 +52,8 @@ def evaluate(
     Args:
         lpips_weights: see `lpips.find_weights`; without any, LPIPS is "not computed" and says why.
         held_out: also score the clip's held-out cameras, where it has them.
-        test_pose: how the clip came by the body poses of its test frames: recorded, not changed.
+        test_pose, test_camera, fit_steps: where body poses and cameras of the scored frames come
+            from; see `posing.posed_clip`. The clip with these is `Evaluation.scored`.
         pixels: score float renders, or round them to 8 bits first. Clamped to [0, 1] either way.
         band: pixels of the interaction band; 2 % of the longer side when None.
         timing_frames, timing_warmup, timing_budget_s: see `measure.render_time`; 0 frames skip it.
@@ -70,22 +75,31 @@ def evaluate(
     lpips: Lpips | NotComputed = NotComputed(found.reason)
     if found.location is not None:
         lpips = Lpips.load(found).to(model.device)
+    report = progress or (lambda done, text: None)
+    was_training = model.training
+    model.eval()
+    clip = posed_clip(
+        model, clip, split=split, test_pose=test_pose, test_camera=test_camera,
+        fit_steps=fit_steps, progress=lambda done, text: report(FITTING_SHARE * done, text),
+    )  # fmt: skip
+    begun = FITTING_SHARE if "fitted" in (test_pose, test_camera) else 0.0
     chosen = [("test frames" if split == "test" else f"{split} frames", clip, split)]
     if held_out and clip.held_out is not None and len(clip.held_out):
         chosen.append(("held-out cameras", clip.held_out, "test"))
     work = sum(len(source.split[name]) for _, source, name in chosen)
-    report = progress or (lambda done, text: None)
     trained = {clip.moments[p].index for p in clip.split.get("train", ())}
-    was_training = model.training
-    model.eval()
     views, done = [], 0
     for title, source, name in chosen:
-        protocol = _protocol(model, source, title, name, trained, test_pose, pixels, band, lpips)
+        protocol = replace(
+            _protocol(model, source, title, name, trained, test_pose, pixels, band, lpips),
+            test_camera=test_camera if source is clip else "given",
+            fit_steps=fit_steps if begun else 0,
+        )
         frames = []
         for position in source.split[name]:
             frames.append(score_frame(model, source[position], source, protocol, lpips))
             done += 1
-            report((1 - TIMING_SHARE) * done / work, title)
+            report(begun + (1 - TIMING_SHARE - begun) * done / work, title)
         views.append(ViewScores(title, protocol, frames))
     report(1 - TIMING_SHARE, "geometry")
     geometry = measure_geometry(model, clip, clip.split[split])
@@ -97,7 +111,7 @@ def evaluate(
     report(1.0, "")
     model.train(was_training)
     created = datetime.now(UTC).isoformat(timespec="seconds")
-    return Evaluation(clip.name, views, timing, model_size(model), created, geometry)
+    return Evaluation(clip.name, views, timing, model_size(model), created, geometry, clip)
 
 
 def _protocol(
@@ -132,6 +146,7 @@ def _protocol(
         lpips_net=None if isinstance(lpips, NotComputed) else lpips.net,
         device=device_name(model.device),
         rasterizer=type(model.rasterizer).__name__,
+        cameras_refined=bool(clip.provenance.get(CAMERAS_REFINED)),
         ignored=share,
     )
 

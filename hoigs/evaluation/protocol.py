@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-TestPose = Literal["given", "interpolated", "fitted"]
+from hoigs.core.train_spec import TestPose
+
 Pixels = Literal["float", "8-bit"]
 
 
@@ -31,13 +32,17 @@ class Protocol:
         split: name of the clip's split whose frames were scored. frames: how many.
         unseen_times: how many of these frames are at times that were not trained on.
         region: one of regions.REGIONS. band: pixels of the interaction band.
-        test_pose: where body poses on scored frames come from: "given" with the clip,
-            "interpolated" from training frames, or "fitted" to the test images themselves.
+        test_pose: where body poses on scored frames come from: "given" with the clip and moved by
+            what neighbouring training frames learned, "interpolated" from these alone, or "fitted"
+            to the test images themselves (`posing.posed_clip`).
         pixels: "float" renders, or rounded to "8-bit"; clamped to [0, 1] either way.
         background: behind all Gaussians.
         width, height: of the scored images, pixels.
         lpips_net: "alex", "vgg", or None when LPIPS was not computed. lpips_range: of its input.
         device, rasterizer: what drew.
+        test_camera: likewise of cameras; those of held-out views are always given.
+        fit_steps: of "fitted", a frame; 0 where nothing is.
+        cameras_refined: training corrected its cameras, so that given ones are moved too.
         ignored: part of the scored pixels that the clip says show no scene, left out everywhere.
     """
 
@@ -54,6 +59,9 @@ class Protocol:
     lpips_net: str | None
     device: str
     rasterizer: str
+    test_camera: TestPose = "given"
+    fit_steps: int = 0
+    cameras_refined: bool = False
     ignored: float = 0.0
     background: str = "black"
     lpips_range: str = "[-1, 1]"
@@ -64,6 +72,30 @@ class Protocol:
 
     def of(self, region: str) -> Protocol:
         return replace(self, region=region)
+
+    def _cameras(self) -> str:
+        moved = ", moved by the corrections that training learned" if self.cameras_refined else ""
+        return f"cameras: {self.test_camera}{moved if self.test_camera != 'interpolated' else ''}"
+
+    def _warnings(self) -> list[str]:
+        """What was fitted has seen the answer: said before anything else about a score."""
+        fitted = [
+            what
+            for what, how in (("body poses", self.test_pose), ("cameras", self.test_camera))
+            if how == "fitted"
+        ]
+        if not fitted:
+            return []
+        seen = (
+            "the very images that are scored here"
+            if self.views != "held-out cameras"
+            else "the training camera's images of the same moments"
+        )
+        return [
+            f"FITTED TO TEST IMAGES: {' and '.join(fitted)} were optimised for {self.fit_steps} "
+            f"steps a frame on {seen}. Not to be compared with scores under given or interpolated "
+            "ones: elsewhere such a fit was worth 5 dB."
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -83,7 +115,8 @@ class Protocol:
         return [
             f"{self.frames} frames of split {self.split!r} from {self.views}, "
             f"{self.unseen_times or 'none'} of them at times that were not trained on; "
-            f"body poses: {self.test_pose}.",
+            f"body poses: {self.test_pose}; {self._cameras()}.",
+            *self._warnings(),
             f"{self.width}x{self.height}, {self.pixels} pixels clamped to [0, 1] over "
             f"{self.background}; {self.averages}; drawn by {self.rasterizer} on {self.device}"
             f"{left_out}.",

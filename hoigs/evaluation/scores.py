@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from hoigs.core.clip import Clip
 from hoigs.core.errors import did_you_mean
 from hoigs.evaluation.geometry import GEOMETRY
 from hoigs.evaluation.geometry import NOTES as GEOMETRY_NOTES
@@ -104,7 +105,12 @@ class PartSize:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A judged model. geometry: the measures of `geometry.GEOMETRY` on the scored frames."""
+    """A judged model.
+
+    Attributes:
+        geometry: the measures of `geometry.GEOMETRY` on the scored frames.
+        scored: the clip with the poses and cameras that the protocol gave it; not stored.
+    """
 
     clip: str
     views: list[ViewScores]
@@ -112,6 +118,7 @@ class Evaluation:
     sizes: list[PartSize]
     created: str
     geometry: Mapping[str, Value] = field(default_factory=dict)
+    scored: Clip | None = field(default=None, repr=False, compare=False)
 
     def view(self, name: str) -> ViewScores:
         for view in self.views:

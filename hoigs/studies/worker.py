@@ -48,6 +48,8 @@ def run_job(job: Job) -> None:
         lpips_weights=weights,
         held_out=settings.held_out,
         test_pose=settings.test_pose,
+        test_camera=settings.test_camera,
+        fit_steps=settings.fit_steps,
         timing_frames=TIMED_FRAMES,
         timing_warmup=3,
         timing_budget_s=TIMING_BUDGET_S,

@@ -11,13 +11,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip
+from hoigs.core.clip import CAMERAS_REFINED, Clip
 from hoigs.core.errors import SpecError
 from hoigs.core.neighbours import neighbours
 from hoigs.core.rasterizer import Rasterizer
-from hoigs.core.rotation import exp_se3, quats_to_matrices
-
-REFINED = "cameras_refined_in_training"  # the key in a clip's provenance
 
 
 class CameraRefinement(nn.Module):
@@ -59,11 +56,7 @@ class CameraRefinement(nn.Module):
 
     def forward(self, camera: Camera, position: int) -> Camera:
         """The camera of the frame at `position`, moved; differentiable in the corrections."""
-        quat, shift = exp_se3(*self.delta(position))
-        R: Float[Tensor, "3 3"] = quats_to_matrices(quat)
-        given = camera.world_to_camera
-        top = torch.cat((R @ given[:3, :3], (R @ given[:3, 3] + shift)[:, None]), 1)
-        return replace(camera, world_to_camera=torch.cat((top, given[3:]), 0))
+        return camera.moved(*self.delta(position))
 
     def penalty(self, position: int) -> Float[Tensor, ""]:
         """Squared turn, rad^2, and squared shift, extents^2, of one frame."""
@@ -73,7 +66,7 @@ class CameraRefinement(nn.Module):
     def refined(self, clip: Clip) -> Clip:
         """The clip with corrected cameras, which its provenance says; held-out ones stay."""
         cameras = [self(camera, i) for i, camera in enumerate(clip.cameras)]
-        provenance: dict[str, Any] = {**clip.provenance, REFINED: True}
+        provenance: dict[str, Any] = {**clip.provenance, CAMERAS_REFINED: True}
         return replace(clip, cameras=cameras, provenance=provenance)
 
 

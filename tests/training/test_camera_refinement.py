@@ -12,7 +12,7 @@ from small_clip import FRAMES, small_clip, truth
 from torch import Tensor
 
 from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip
+from hoigs.core.clip import CAMERAS_REFINED, Clip
 from hoigs.core.entity import Entity
 from hoigs.core.errors import CheckpointError, SpecError
 from hoigs.core.gaussians import Gaussians
@@ -22,7 +22,7 @@ from hoigs.core.train_spec import TrainSpec
 from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.rasterizers.warp import WarpRasterizer
-from hoigs.training.camera_refinement import REFINED, CameraRefinement
+from hoigs.training.camera_refinement import CameraRefinement
 from hoigs.training.trainer import Trainer
 
 WRONG = 2  # the frame whose camera is not where the clip says
@@ -157,8 +157,8 @@ def test_a_wrong_camera_is_recovered_more_than_halfway(trained: Trainer) -> None
         if i != WRONG:  # right ones stay within a fraction of what the wrong one was off
             turned, shifted = apart(refined.cameras[i], exact[i])
             assert turned < 0.3 * before[0] and shifted < 0.4 * before[1], (i, turned, shifted)
-    assert refined.provenance[REFINED] is True
-    assert REFINED not in trained.clip.provenance
+    assert refined.provenance[CAMERAS_REFINED] is True
+    assert CAMERAS_REFINED not in trained.clip.provenance
 
 
 def test_a_resumed_run_goes_on_with_its_cameras() -> None:
