@@ -9,10 +9,12 @@ import typer
 from hoigs.cli.common import PluginOption
 from hoigs.cli.plugins_check import check
 from hoigs.cli.plugins_new import new
+from hoigs.cli.plugins_show import show
 
 app = typer.Typer(invoke_without_command=True)
 app.command("check")(check)
 app.command("new")(new)
+app.command("show")(show)
 
 # Fixed, so that one plugin's line never moves another's.
 LINE = "{key:<34} {status:<12} {origin:<28} {text}"
@@ -43,21 +45,22 @@ def plugins(
     typer.echo(LINE.format(key="component", status="status", origin="from", text="summary"))
     for row in rows:
         origin = f"{row['dist']} {row['version']}"
-        text = row["error"] or row["summary"]
+        text = one_line(row["error"] or row["summary"])
         typer.echo(LINE.format(**{**row, "origin": origin, "text": text}).rstrip())
     for note in notes:
         typer.echo(f"note: {note}", err=True)
 
 
 def list_plugins(*, load: bool = False, files: Any = ()) -> tuple[list[dict[str, Any]], list[str]]:
-    """A row for each component, and for each plugin that offered none because it failed.
+    """A row for each component, and for each plugin that failed, offers nothing or misbehaves.
 
     Args:
         load: import every component's class and config.
         files: plugin files to load as well.
 
     Returns:
-        Rows with key, status, dist, version, target, summary, error; and notes on the settings.
+        Rows with key, status, dist, version, target, summary, error, seconds (of the plugin's
+        import); and notes on the settings.
     """
     from hoigs.core.component import KINDS
     from hoigs.core.manager import Status
@@ -72,9 +75,14 @@ def list_plugins(*, load: bool = False, files: Any = ()) -> tuple[list[dict[str,
         rows.append(_row(offer.key, offer.plugin, offer.status, offer.error, offer.component))
     order = {kind: i for i, kind in enumerate(KINDS)}
     rows.sort(key=lambda r: (order.get(r["key"].partition(":")[0], 99), r["key"], r["dist"]))
-    failed = [p for p in registry.manager.plugins if p.status is not Status.OK]
-    for plugin in sorted(failed, key=lambda p: (p.dist, p.name)):
-        rows.append(_row(f"(plugin {plugin.name})", plugin, plugin.status, plugin.error, None))
+    offering = {id(offer.plugin) for offer in registry.manager.offers}
+    for plugin in sorted(registry.manager.plugins, key=lambda p: (p.dist, p.name)):
+        remarks = list(plugin.remarks)
+        if plugin.status is Status.OK and id(plugin) not in offering:
+            remarks.insert(0, "offers nothing")
+        if plugin.status is not Status.OK or remarks:
+            text = "; ".join(filter(None, [plugin.error, *remarks]))
+            rows.append(_row(f"(plugin {plugin.name})", plugin, plugin.status, text, None))
     return rows, registry.manager.notes
 
 
@@ -87,4 +95,10 @@ def _row(key: str, plugin: Any, status: str, error: str, component: Any) -> dict
         "target": component.target if component is not None else plugin.module,
         "summary": component.summary if component is not None else "",
         "error": error,
+        "seconds": round(plugin.seconds, 3),
     }
+
+
+def one_line(text: str) -> str:
+    """`text` without line breaks and control characters: a stranger wrote it."""
+    return "".join(c for c in " ".join(text.split()) if c.isprintable())

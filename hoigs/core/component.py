@@ -55,6 +55,13 @@ class Component:
     def kind(self) -> str:
         return self.key.partition(":")[0]
 
+    def check_types(self) -> None:
+        """Raise PluginError when a field is not even text: nothing could be listed then."""
+        for field in ("key", "target", "config", "summary", "extra"):
+            value = getattr(self, field)
+            if not isinstance(value, str) and not (value is None and field in ("config", "extra")):
+                raise PluginError(f"hoigs.Component: {field} is {value!r}, expected a str")
+
     def check(self) -> None:
         """Raise PluginError when a field cannot be right."""
         kind = self.kind

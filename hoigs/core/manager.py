@@ -13,9 +13,10 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from importlib import metadata
+from itertools import islice
 from pathlib import Path
 
 import pluggy
@@ -23,10 +24,13 @@ import pluggy
 from hoigs.core import hookspecs
 from hoigs.core.component import API, Component
 from hoigs.core.errors import PluginError, did_you_mean
+from hoigs.core.extras import declared_extras, missing_requirements
+from hoigs.core.watch import traceback_tail, watched
 
 GROUP = "hoigs"
 HOOK = "hoigs_components"
 BUILTIN_MODULE = "hoigs.plugins.builtin"
+MOST = 1000  # components of one plugin: a hook that never ends must not hang the others
 
 
 class Status(StrEnum):
@@ -47,7 +51,8 @@ class Plugin:
     Attributes:
         name: of its entry point, or of its file. module: where it is imported from.
         dist, version: of the distribution that it came with; of a file, its file name and hash.
-        status, error: how it stands, and why.
+        status, error: how it stands, and why. traceback: the innermost frames, where it raised.
+        seconds: that its import and its hook took. remarks: on what it did meanwhile.
     """
 
     name: str
@@ -56,13 +61,16 @@ class Plugin:
     version: str
     status: Status = Status.OK
     error: str = ""
+    traceback: str = ""
+    seconds: float = 0.0
+    remarks: list[str] = field(default_factory=list)
 
     @property
     def builtin(self) -> bool:
         return self.module == BUILTIN_MODULE and self.dist == "hoigs"
 
-    def fail(self, status: Status, error: str) -> None:
-        self.status, self.error = status, error
+    def fail(self, status: Status, error: str, traceback: str = "") -> None:
+        self.status, self.error, self.traceback = status, error, traceback
 
 
 @dataclass
@@ -73,6 +81,7 @@ class Offer:
     plugin: Plugin
     status: Status = Status.OK
     error: str = ""
+    traceback: str = ""
 
     @property
     def key(self) -> str:
@@ -83,8 +92,8 @@ class Offer:
         """The spelling that means this one and no other: `kind:name@dist`."""
         return f"{self.key}@{self.plugin.dist}"
 
-    def fail(self, status: Status, error: str) -> None:
-        self.status, self.error = status, error
+    def fail(self, status: Status, error: str, traceback: str = "") -> None:
+        self.status, self.error, self.traceback = status, error, traceback
 
 
 class PluginManager(pluggy.PluginManager):
@@ -120,21 +129,16 @@ class PluginManager(pluggy.PluginManager):
         """
         found = metadata.entry_points(group=GROUP) if entry_points is None else entry_points
         for entry in found:
-            dist, version = ("unknown", "unknown")
-            if entry.dist is not None:
-                dist, version = entry.dist.name, entry.dist.version
-            plugin = Plugin(entry.name, entry.value, dist, version)
+            plugin = Plugin(entry.name, entry.value, *_origin(entry))
             self.plugins.append(plugin)
             reason = self._shut_out(plugin)
             if reason:
                 plugin.fail(Status.BLOCKED, reason)
                 continue
-            try:
-                module = entry.load()
-            except (Exception, SystemExit) as error:  # a stranger's code may raise anything
-                plugin.fail(Status.BROKEN, f"cannot load {entry.value}: {describe(error)}")
-                continue
-            self._take(plugin, module)
+            with watched() as seen:
+                self._load(plugin, entry)
+            plugin.seconds = seen.seconds
+            plugin.remarks = [] if plugin.builtin else seen.remarks()
         self._settle()
         self._check_settings()
 
@@ -158,7 +162,9 @@ class PluginManager(pluggy.PluginManager):
         sys.modules[name] = module  # targets are imported by this name
         try:
             spec.loader.exec_module(module)
-        except (Exception, SystemExit) as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
             del sys.modules[name]
             raise PluginError(f"--plugin {path}: {describe(error)}") from error
         self.plugins.append(plugin)
@@ -183,10 +189,24 @@ class PluginManager(pluggy.PluginManager):
             f"{o.exact}: {o.status}: {o.error}" for o in self.offers if o.status not in fine
         ]
 
+    def _load(self, plugin: Plugin, entry: metadata.EntryPoint) -> None:
+        """Import the module of an entry point and take what it offers."""
+        try:
+            module = entry.load()
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # a stranger's code may raise anything
+            reason = f"cannot load {entry.value}: {describe(error)}"
+            plugin.fail(Status.BROKEN, reason, traceback_tail(error))
+            return
+        self._take(plugin, module)
+
     def _take(self, plugin: Plugin, module: object) -> None:
         """Register `module` and collect what it offers; all or nothing."""
         full_name = f"{plugin.dist}:{plugin.name}"
         try:
+            if self.has_plugin(full_name):
+                raise PluginError(f'{plugin.dist} has two entry points "{plugin.name}"')
             if self.is_registered(module):
                 raise PluginError(f"{plugin.module} is already the plugin {self.get_name(module)}")
             self.register(module, name=full_name)
@@ -195,16 +215,22 @@ class PluginManager(pluggy.PluginManager):
                 raise PluginError(problem)
             others = [p for p in self.get_plugins() if p is not module]
             answers = self.subset_hook_caller(HOOK, others)()
-            components = [c for answer in answers for c in answer]
+            components = [c for answer in answers for c in islice(answer, MOST + 1)]
+            if len(components) > MOST:
+                raise PluginError(f"{HOOK} yielded more than {MOST} components")
             for component in components:
                 if not isinstance(component, Component):
                     raise PluginError(
                         f"{HOOK} yielded {component!r}, expected hoigs.Component(...)"
                     )
-        except (Exception, SystemExit) as error:
-            if self.get_plugin(full_name) is not None:
+                component.check_types()
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            if self.get_plugin(full_name) is module:
                 self.unregister(name=full_name)
-            plugin.fail(Status.BROKEN, describe(error))
+            tail = "" if isinstance(error, PluginError) else traceback_tail(error)
+            plugin.fail(Status.BROKEN, describe(error), tail)
             return
         self.offers.extend(Offer(component, plugin) for component in components)
 
@@ -215,6 +241,8 @@ class PluginManager(pluggy.PluginManager):
             impl = next(i for i in caller.get_hookimpls() if i.plugin is module)
             if not caller.has_spec() and not impl.optionalhook:
                 return f'unknown hook "{caller.name}"{did_you_mean(caller.name, known)}'
+            if impl.wrapper or impl.hookwrapper:
+                return f"{caller.name} is marked as a wrapper; mark it with @hoigs.hookimpl alone"
         if any(c.name == HOOK for c in self.get_hookcallers(module) or []):
             return None
         if hasattr(module, HOOK):
@@ -262,6 +290,14 @@ class PluginManager(pluggy.PluginManager):
         if {normal_name(offer.key), normal_name(offer.exact)} & self.blocked:
             offer.fail(Status.BLOCKED, f"{offer.exact} is named in HOIGS_BLOCK")
             return
+        extras = set() if offer.plugin.builtin else declared_extras(offer.plugin.dist)
+        if component.extra is not None and extras and component.extra not in extras:
+            offer.fail(
+                Status.BROKEN,
+                f'{offer.exact}: {offer.plugin.dist} has no extra "{component.extra}"'
+                f"{did_you_mean(component.extra, extras)}",
+            )
+            return
         missing = missing_requirements(offer.plugin.dist, component.extra)
         if missing:
             offer.fail(
@@ -306,26 +342,15 @@ def _settle_key(key: str, offers: list[Offer]) -> None:
         offer.fail(Status.CONFLICT, reason)
 
 
-def missing_requirements(dist: str, extra: str | None) -> list[str]:
-    """Distributions that an extra of `dist` asks for and that are not installed."""
-    if extra is None:
-        return []
+def _origin(entry: metadata.EntryPoint) -> tuple[str, str]:
+    """Distribution and version of an entry point; "unknown" where its metadata is damaged."""
     try:
-        requirements = metadata.requires(dist) or []
-    except metadata.PackageNotFoundError:
-        return []  # a plugin file: its import will tell
-    missing = []
-    for line in requirements:
-        requirement, _, marker = line.partition(";")
-        if not re.search(rf"extra\s*==\s*['\"]{re.escape(extra)}['\"]", marker):
-            continue
-        name = re.match(r"[A-Za-z0-9._-]+", requirement.strip())
-        assert name is not None
-        try:
-            metadata.version(name[0])
-        except metadata.PackageNotFoundError:
-            missing.append(name[0])
-    return missing
+        dist = entry.dist
+        if dist is not None:
+            return str(dist.name or "unknown"), str(dist.version or "unknown")
+    except Exception:  # what a damaged METADATA raises differs between versions of Python
+        return "unknown", "unknown"
+    return "unknown", "unknown"
 
 
 def describe(error: BaseException) -> str:

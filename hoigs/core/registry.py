@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Iterable, Mapping
+from contextlib import redirect_stdout
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -11,6 +13,7 @@ from typing import Any, Protocol
 from hoigs.core.component import INTERFACES, KINDS, Component, missing_target
 from hoigs.core.errors import PluginError, did_you_mean
 from hoigs.core.manager import Offer, PluginManager, Status, describe, normal_name
+from hoigs.core.watch import traceback_tail
 
 
 class UsesComponents(Protocol):
@@ -101,7 +104,10 @@ class Registry:
         """Look for an offer's targets on disk, importing nothing, and mark it when absent."""
         for target in (offer.component.target, offer.component.config):
             if offer.status is Status.OK and target is not None:
-                problem = missing_target(target)
+                try:
+                    problem = missing_target(target)
+                except Exception as error:  # a file that cannot be read, a finder that raises
+                    problem = describe(error)
                 if problem:
                     offer.fail(Status.BROKEN, f"cannot import {target}: {problem}")
 
@@ -153,13 +159,17 @@ class Registry:
 
     def _load(self, offer: Offer, target: str) -> Any:
         try:
-            return _import(target)
-        except (Exception, SystemExit) as error:  # a stranger's module may raise anything
+            with redirect_stdout(sys.stderr):  # stdout belongs to the command, and may be JSON
+                return _import(target)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # a stranger's module may raise anything
             extra = offer.component.extra
             hint = f"; pip install '{offer.plugin.dist}[{extra}]'" if extra else ""
             needs_extra = extra is not None and isinstance(error, ImportError)
             reason = f"{offer.exact}: cannot import {target}: {describe(error)}{hint}"
-            offer.fail(Status.NEEDS_EXTRA if needs_extra else Status.BROKEN, reason)
+            status = Status.NEEDS_EXTRA if needs_extra else Status.BROKEN
+            offer.fail(status, reason, traceback_tail(error))
             raise PluginError(reason) from error
 
     def _break(self, offer: Offer, reason: str) -> None:
