@@ -12,24 +12,51 @@ from hoigs.cli.common import print_table, progress_bar
 
 def prepare(
     source: Annotated[
-        Path, typer.Argument(help="Folder with video.mp4, masks, landmarks …, or a clip to check.")
+        Path,
+        typer.Argument(
+            help="Folder with a video, or with frames, and what is known of it; or the video."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Clip folder to make.")],
     width: Annotated[
         int | None, typer.Option("--width", help="Resize frames; default: the video's own.")
     ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            "--camera",
+            help="auto, static, moving (COLMAP's model beside the video, or structure from motion) "
+            "or sfm (structure from motion in any case).",
+        ),
+    ] = None,
     max_frames: Annotated[
         int | None, typer.Option("--max-frames", help="Use only the first frames.")
     ] = None,
-    every: Annotated[int, typer.Option("--every", help="Use every n-th frame.")] = 1,
+    every: Annotated[
+        int | None, typer.Option("--every", help="Use the sharpest of each n frames.")
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option("--fps", help="Use so many frames a second, the sharpest.")
+    ] = None,
     focal: Annotated[
         float | None, typer.Option("--focal", help="Focal length in pixels of the video, if known.")
     ] = None,
     keep_black: Annotated[
-        bool,
+        bool | None,
         typer.Option("--keep-black", help="Learn flat black patches; default: they are ignored."),
-    ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the clip.")] = False,
+    ] = None,
+    overwrite: Annotated[bool | None, typer.Option("--overwrite", help="Replace the clip.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="Any option: priors.masks.use=prior:masks-files, priors.masks.path=sam2. "
+            "Repeatable.",
+        ),
+    ] = None,
+    file: Annotated[
+        Path | None, typer.Option("--options", help="YAML or TOML file of options.")
+    ] = None,
     redo: Annotated[
         list[str] | None,
         typer.Option("--redo", help="Run this stage anew, and what builds on it. Repeatable."),
@@ -40,13 +67,15 @@ def prepare(
 ) -> None:
     """Turn a video and its priors into a clip folder, with a written report."""
     from hoigs.core.registry import default_registry
-    from hoigs.preparation.prepare import PrepareOptions, prepare_until, work_folder
     from hoigs.preparation.prepare import prepare as run
+    from hoigs.preparation.prepare import prepare_until, work_folder
+    from hoigs.preparation.settings import load_options
 
-    options = PrepareOptions(
-        width=width, max_frames=max_frames, every=every, focal=focal, keep_black=keep_black,
-        overwrite=overwrite,
-    )  # fmt: skip
+    flags = {
+        "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
+        "focal": focal, "keep_black": keep_black, "overwrite": overwrite,
+    }  # fmt: skip
+    options = load_options(file, settings or (), flags)
     body = default_registry().get("body:anny")()
     with progress_bar("preparing", 1.0) as bar:
         if stage is not None:

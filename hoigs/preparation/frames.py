@@ -137,6 +137,10 @@ class Frames(ABC):
                 return picture.rgb(self.native_width, self.native_height)
         raise SourceError(f"{self.path} has {at + 1} frames, none of number {number}")
 
+    def count(self) -> int:
+        """Frames of the whole source, those beyond the last chosen one too."""
+        return sum(1 for _ in self._pictures())
+
     @abstractmethod
     def _pictures(self) -> Iterator[Picture]:
         """All frames of the source in order; sets `_rate` where the source says it."""

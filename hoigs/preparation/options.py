@@ -7,8 +7,23 @@ from typing import Literal
 from pydantic import Field
 
 from hoigs.core.config import ComponentConfig
+from hoigs.core.spec import ComponentSpec
+from hoigs.core.video_prior import EvidenceKind
 from hoigs.preparation.body_fit import FitOptions
 from hoigs.preparation.frames import Pick
+
+
+class Prompt(ComponentConfig):
+    """Where, or what, an entity is, for segmenters that ask."""
+
+    text: str | None = Field(default=None, description='what to look for: "a man", "football"')
+    points: list[tuple[float, float, bool]] = Field(
+        default_factory=list, description="x, y in pixels of the video, and whether it is inside"
+    )
+    box: tuple[float, float, float, float] | None = Field(
+        default=None, description="x0, y0, x1, y1, pixels of the video"
+    )
+    frame: int = Field(default=0, ge=0, description="of the video, in which these are meant")
 
 
 class PrepareOptions(ComponentConfig):
@@ -45,6 +60,14 @@ class PrepareOptions(ComponentConfig):
     )
     body: str = Field(default="body:anny", description="key of the body model, for the clip")
     fit_steps: int = Field(default=FitOptions.steps, ge=1, description="of the body fit")
+    priors: dict[EvidenceKind, ComponentSpec] = Field(
+        default_factory=dict,
+        description="where masks, landmarks and depth come from, each a prior with its settings; "
+        "by default from the files beside the video",
+    )
+    prompts: dict[str, Prompt] = Field(
+        default_factory=dict, description="entity to where or what it is"
+    )
     human: str = Field(default="human", description="name of the person's entity")
     object: str = Field(default="object", description="name of the object's entity")
     ball_radius: float = Field(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,20 +15,22 @@ from hoigs.core.clip import BodyTrack, ObjectTrack
 from hoigs.preparation import saved
 from hoigs.preparation.ball import BallTrack, load_ball, refine_ball
 from hoigs.preparation.blank import blank_pixels
-from hoigs.preparation.cameras import CameraTrack, colmap_cameras, scaled_cameras, static_cameras
+from hoigs.preparation.camera_choice import ChosenCameras, choose_cameras
+from hoigs.preparation.cameras import scaled_cameras
 from hoigs.preparation.clip_writing import write_clip_folder
+from hoigs.preparation.evidence import Gathering, Priors, described, paths_of
 from hoigs.preparation.frames import FrameList, open_frames
 from hoigs.preparation.leftovers import Leftovers
 from hoigs.preparation.masks import MaskStack
 from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.person import FittedBody, fit_person, read_landmarks
+from hoigs.preparation.person import FittedBody, fit_person
 from hoigs.preparation.plan import PLAN
 from hoigs.preparation.report import PrepareReport
-from hoigs.preparation.saved import EntityStacks, Inputs, RawEvidence
+from hoigs.preparation.saved import EntityStacks, Inputs
 from hoigs.preparation.scene import ScenePoints, colmap_scene, static_scene
 from hoigs.preparation.silhouette import silhouette
 from hoigs.preparation.source import Source
-from hoigs.preparation.split_masks import entity_masks, read_masks
+from hoigs.preparation.split_masks import entity_masks
 from hoigs.preparation.stages import Stages
 from hoigs.preparation.store import Result, WorkFolder, digest, fingerprint
 from hoigs.preparation.things import make_object
@@ -41,16 +45,17 @@ class Pipeline:
     def __init__(
         self,
         source: Source,
-        out: Any,
+        out: Path,
         body: BodyModel,
         options: PrepareOptions,
+        priors: Priors,
         stages: Stages,
         work: WorkFolder,
         leftovers: Leftovers,
     ) -> None:
         self.source, self.out, self.body = source, out, body
         self.options, self.stages, self.work = options, stages, work
-        self.leftovers = leftovers
+        self.priors, self.leftovers = priors, leftovers
         self.warnings: list[str] = []
         self.provenance: dict[str, str] = {}
         self.worth_keeping = False
@@ -136,37 +141,46 @@ class Pipeline:
 
     def _evidence(self) -> None:
         # all of it before the long work, so that what is wrong is said at once
-        source, names = self.source, (self.options.human, self.options.object)
-
-        def make() -> RawEvidence:
-            landmarks = read_landmarks(source.landmarks, self.video)
-            return RawEvidence(landmarks, read_masks(source, self.video, names))
-
-        folders = [source.together, *source.apart.values()]
-        files = fingerprint([source.landmarks, *(p for p in folders if p is not None)])
-        self.raw = self._stage("evidence", make, saved.save_evidence, saved.load_evidence, files)
+        gathering = self.gathering = Gathering(
+            self.source, self.video, self.options, self.priors, self.work.root / "priors"
+        )
+        source = self.source
+        paths = [source.landmarks, source.together, *source.apart.values()]
+        used = {kind: prior for kind, prior in self.priors.items() if kind != "depth"}
+        for prior in used.values():
+            paths += paths_of(prior, source.folder)
+        made_from = [
+            fingerprint([path for path in paths if path is not None]),
+            {kind: described(prior) for kind, prior in used.items()},
+        ]
+        self.worth_keeping |= bool(used)
+        self.raw = self._stage(
+            "evidence", lambda: gathering.gather(self.stages.advance), saved.save_evidence,
+            saved.load_evidence, made_from,
+        )  # fmt: skip
 
     def _cameras(self) -> None:
         model = self.source.colmap
         files = None if model is None else [str(model), fingerprint([model])]
-        self.track = self._stage(
-            "cameras", self._find_cameras, saved.save_cameras, saved.load_cameras, files
-        )
+        folder = self.work.temporary()
+        chosen = self._stage(
+            "cameras", lambda: self._choose_cameras(folder), saved.save_chosen, saved.load_chosen,
+            files,
+        )  # fmt: skip
+        shutil.rmtree(folder)
+        self.track = chosen.track
+        self.worth_keeping |= chosen.own_model
         if len(self.track.positions) < len(self.video):
             self.video = self.video.subset(self.track.positions)
 
-    def _find_cameras(self) -> CameraTrack:
-        if self.source.colmap is not None:
-            track = colmap_cameras(self.video, self.source.colmap)
-        else:
-            track = static_cameras(self.video, self.options.focal)
-            if self.options.focal is None:
-                self.warnings.append(
-                    "the focal length is assumed, and every depth is proportional to it: give "
-                    "--focal if you know it"
-                )
-        self.provenance["cameras"] = track.provenance
-        return track
+    def _choose_cameras(self, folder: Path) -> ChosenCameras:
+        chosen = choose_cameras(
+            self.video, self.raw.masks, self.source.colmap, self.options, folder,
+            self.stages.advance,
+        )  # fmt: skip
+        self.provenance["cameras"] = chosen.track.provenance
+        self.warnings.extend(chosen.warnings)
+        return chosen
 
     def _inputs(self) -> None:
         def make() -> Inputs:

@@ -26,7 +26,7 @@ class Stage:
 
 PLAN = {
     "frames": Stage(2, (), ("width", "every", "fps", "max_frames", "pick", "folder_fps")),
-    "evidence": Stage(4, ("frames",), ("human", "object")),
+    "evidence": Stage(4, ("frames",), ("human", "object", "prompts")),
     "cameras": Stage(3, ("frames", "evidence"), ("camera", "focal")),
     "inputs": Stage(6, ("evidence", "cameras")),
     "body": Stage(40, ("inputs",), ("body", "fit_steps"), long=True),

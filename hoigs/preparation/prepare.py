@@ -9,11 +9,13 @@ from hoigs.core.body import BodyModel
 from hoigs.core.clip_folder import check_clip, refuse_to_overwrite
 from hoigs.core.clip_format import is_clip_folder
 from hoigs.core.errors import ClipError, HoigsError
+from hoigs.preparation.evidence import Priors
 from hoigs.preparation.leftovers import Leftovers
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.pipeline import Pipeline
 from hoigs.preparation.plan import PLAN, and_after, check_stage
 from hoigs.preparation.report import PrepareReport
+from hoigs.preparation.settings import installed_priors
 from hoigs.preparation.source import SourceError, find_source
 from hoigs.preparation.stages import Progress, Stages
 from hoigs.preparation.store import WorkFolder
@@ -35,6 +37,7 @@ def prepare(
     options: PrepareOptions | None = None,
     progress: Progress | None = None,
     redo: Sequence[str] = (),
+    priors: Priors | None = None,
 ) -> PrepareReport:
     """Turn a source into a clip folder, stage by stage.
 
@@ -50,6 +53,8 @@ def prepare(
         body: the model to fit; `options.body` is its key.
         progress: called with 0..1 and the stage's name.
         redo: stages to run anew, with all that build on them; an older clip is then replaced.
+        priors: by kind of evidence, "masks", "landmarks" or "depth"; those of `options.priors`,
+            which are looked up among the installed plugins, come second.
 
     Raises:
         SourceError: an input is absent, unreadable or does not fit the others.
@@ -58,7 +63,8 @@ def prepare(
     """
     options = options or PrepareOptions()
     replace = options.overwrite or bool(redo)
-    return _run(source, out, body, options, progress, redo, None, replace).report
+    run = _run(source, out, body, options, progress, redo, priors, None, replace)
+    return run.report
 
 
 def prepare_until(
@@ -70,6 +76,7 @@ def prepare_until(
     options: PrepareOptions | None = None,
     progress: Progress | None = None,
     redo: Sequence[str] = (),
+    priors: Priors | None = None,
 ) -> dict[str, float]:
     """As `prepare`, but only up to and including `stage`; no clip is written.
 
@@ -83,7 +90,8 @@ def prepare_until(
     if stage == list(PLAN)[-1]:
         raise HoigsError(f"{stage} is the last stage: run prepare as a whole")
     options = options or PrepareOptions()
-    return _run(source, out, body, options, progress, redo, stage, True).stages.seconds
+    run = _run(source, out, body, options, progress, redo, priors, stage, True)
+    return run.stages.seconds
 
 
 def _run(
@@ -93,6 +101,7 @@ def _run(
     options: PrepareOptions,
     progress: Progress | None,
     redo: Sequence[str],
+    priors: Priors | None,
     until: str | None,
     replace: bool,
 ) -> Pipeline:
@@ -100,14 +109,18 @@ def _run(
     for name in redo:
         check_stage(name)
     _check_paths(source, out, replace)
-    found = find_source(source, human=options.human, object_name=options.object)
+    chosen = {**installed_priors(options), **(priors or {})}
+    found = find_source(
+        source, human=options.human, object_name=options.object, given=set(chosen),
+        own_cameras=options.camera in ("static", "sfm"),
+    )  # fmt: skip
     stages = Stages({name: stage.weight for name, stage in PLAN.items()}, progress)
     with WorkFolder(work_folder(out)) as work:
         leftovers = Leftovers(out.absolute(), work.root)
         leftovers.remove()
         for name in and_after(redo):
             work.forget(name)
-        pipeline = Pipeline(found, out, body, options, stages, work, leftovers)
+        pipeline = Pipeline(found, out, body, options, chosen, stages, work, leftovers)
         try:
             pipeline.run(until)
         except HoigsError:

@@ -18,7 +18,9 @@ from hoigs.core.lens import Lens
 from hoigs.core.moment import BodyPose
 from hoigs.core.undistortion import Undistortion
 from hoigs.preparation.ball import BallTrack
+from hoigs.preparation.camera_choice import ChosenCameras
 from hoigs.preparation.cameras import CameraTrack, pinhole
+from hoigs.preparation.evidence import RawEvidence
 from hoigs.preparation.frames import FrameList
 from hoigs.preparation.landmarks import LandmarkTrack
 from hoigs.preparation.masks import MaskStack
@@ -52,14 +54,6 @@ def save_frames(found: FrameList) -> Result:
 
 def load_frames(result: Result) -> FrameList:
     return FrameList(**result.values)
-
-
-@dataclass(frozen=True)
-class RawEvidence:
-    """What is known of the chosen frames before their cameras are; distortion still in."""
-
-    landmarks: RawLandmarks
-    masks: GivenMasks
 
 
 def save_evidence(found: RawEvidence) -> Result:
@@ -130,6 +124,14 @@ def load_cameras(result: Result) -> CameraTrack:
         positions=tuple(values["positions"]),
         figures=values["figures"],
     )
+
+
+def save_chosen(chosen: ChosenCameras) -> Result:
+    return save_cameras(chosen.track, own_model=chosen.own_model)
+
+
+def load_chosen(result: Result) -> ChosenCameras:
+    return ChosenCameras(load_cameras(result), result.values["own_model"])
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,11 +13,12 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 FRAME_FOLDERS = ("frames", "images")  # where a folder of frames may keep them
 _COLMAP_FILES = ("cameras", "images", "points3D")
 _LAYOUT = """  FOLDER/
-    video.mp4            the video (any name; one file)
+    video.mp4            the video (any name; one file), or frames/00000.png and so on
     pose_mediapipe.npz   image_xyzv and world_xyzv [F, 33, 4], from MediaPipe Pose
     hoi_mask/00000.png   person and object together, 0/255, one file a video frame,
                          from a video segmenter; or masks/human/ and masks/object/ apart
-    sparse/              a COLMAP model, if the camera moves; absent: a static camera
+    sparse/              a COLMAP model, if you have one; else hoigs looks whether the camera
+                         moves, and then runs structure from motion itself
     ball_track.npz       xyr [F, 3] pixels, if the object is a ball: centre and radius"""
 
 
@@ -29,27 +31,36 @@ class Source:
     """Where each input of `prepare` lies.
 
     Attributes:
-        video: the file. landmarks: pose_mediapipe.npz.
+        video: the file, or the folder of frames. folder: where the other inputs lie.
+        landmarks: pose_mediapipe.npz, or None if a prior gives them.
         together: folder of masks that hold person and object at once, or None.
         apart: folders of masks by entity name.
-        colmap: folder of a COLMAP model, or None for a static camera.
+        colmap: folder of a COLMAP model, or None.
         ball: ball_track.npz, or None.
     """
 
     video: Path
-    landmarks: Path
+    folder: Path
+    landmarks: Path | None = None
     together: Path | None = None
     apart: dict[str, Path] = field(default_factory=dict)
     colmap: Path | None = None
     ball: Path | None = None
 
-    @property
-    def static_camera(self) -> bool:
-        return self.colmap is None
 
-
-def find_source(path: Path, *, human: str = "human", object_name: str = "object") -> Source:
+def find_source(
+    path: Path,
+    *,
+    human: str = "human",
+    object_name: str = "object",
+    given: Collection[str] = (),
+    own_cameras: bool = False,
+) -> Source:
     """The inputs in a folder, or beside a video file.
+
+    Args:
+        given: evidence that priors give ("masks", "landmarks"): it need not be there.
+        own_cameras: cameras are made from the video: no COLMAP model is looked for.
 
     Raises:
         SourceError: naming everything that is absent and who makes it.
@@ -60,25 +71,34 @@ def find_source(path: Path, *, human: str = "human", object_name: str = "object"
     folder = path if path.is_dir() else path.parent
     missing: list[str] = []
     video = path if path.is_file() else _find_video(folder, missing)
-    if video is not None and not video.stat().st_size:
+    if video is not None and video.is_file() and not video.stat().st_size:
         raise SourceError(f"{video} is empty: 0 bytes; copy it again")
-    landmarks = folder / "pose_mediapipe.npz"
-    if not landmarks.is_file():
+    landmarks: Path | None = folder / "pose_mediapipe.npz"
+    if "landmarks" in given:
+        landmarks = None
+    elif not (folder / "pose_mediapipe.npz").is_file():
         missing.append(
             "pose_mediapipe.npz: body landmarks, from MediaPipe Pose (`pip install mediapipe` in "
-            "an environment of its own), arrays image_xyzv and world_xyzv [F, 33, 4]"
+            "an environment of its own), arrays image_xyzv and world_xyzv [F, 33, 4]; or name a "
+            "prior: --set priors.landmarks.use=prior:mediapipe"
         )
-    together, apart = _find_masks(folder, human, object_name, missing)
+    together: Path | None = None
+    apart: dict[str, Path] = {}
+    if "masks" not in given:
+        together, apart = _find_masks(folder, human, object_name, missing)
     ball = folder / "ball_track.npz"
-    colmap = _find_colmap(folder, missing)
+    colmap = None if own_cameras else _find_colmap(folder, missing)
     if missing:
         lines = "\n".join(f"  - {line}" for line in missing)
         raise SourceError(
             f"{path} cannot be prepared; absent:\n{lines}\n"
-            f"hoigs runs no estimator itself, it reads their files from one folder:\n{_LAYOUT}"
+            "Estimators' files are read from one folder, or from where priors say "
+            f"(`hoigs plugins` lists them):\n{_LAYOUT}"
         )
     assert video is not None
-    return Source(video, landmarks, together, apart, colmap, ball if ball.is_file() else None)
+    return Source(
+        video, folder, landmarks, together, apart, colmap, ball if ball.is_file() else None
+    )
 
 
 def _find_video(folder: Path, missing: list[str]) -> Path | None:
@@ -86,9 +106,16 @@ def _find_video(folder: Path, missing: list[str]) -> Path | None:
     if len(videos) > 1:
         names = ", ".join(p.name for p in videos)
         raise SourceError(f"{folder} holds {len(videos)} videos ({names}): name the one to prepare")
-    if not videos:
-        missing.append(f"a video ({', '.join(VIDEO_SUFFIXES)}): from your camera")
-    return videos[0] if videos else None
+    if videos:
+        return videos[0]
+    for frames in (folder, *(folder / name for name in FRAME_FOLDERS)):
+        if frames.is_dir() and numbered_frames(frames):
+            return frames
+    missing.append(
+        f"a video ({', '.join(VIDEO_SUFFIXES)}) from your camera, or its frames as numbered images "
+        f"({', '.join(IMAGE_SUFFIXES)}), there or in {' or '.join(FRAME_FOLDERS)}/"
+    )
+    return None
 
 
 def _find_masks(
@@ -120,7 +147,7 @@ def _find_colmap(folder: Path, missing: list[str]) -> Path | None:
                 return model
     missing.append(
         "sparse/{cameras,images,points3D}.bin: the folder is there but no COLMAP model is in it; "
-        "run `colmap mapper`, or delete the folder if the camera does not move"
+        "run `colmap mapper`, or delete the folder, or say --camera sfm or static"
     )
     return None
 

@@ -14,7 +14,7 @@ def test_finds_everything(tiny_source: Path) -> None:
     source = find_source(tiny_source)
     assert source.video.name == "video.mp4"
     assert source.together is not None and source.ball is not None
-    assert source.static_camera and source.colmap is None
+    assert source.colmap is None
 
 
 def test_a_bare_video_names_all_that_is_absent(tiny_video: Path) -> None:

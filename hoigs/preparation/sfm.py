@@ -1,0 +1,134 @@
+"""Cameras from the video itself: COLMAP's structure from motion with the moving things left out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from hoigs.preparation.cameras import ASSUMED_FOCAL
+from hoigs.preparation.colmap_log import quiet_colmap
+from hoigs.preparation.frames import Frames
+from hoigs.preparation.motion import grown
+from hoigs.preparation.source import SourceError
+from hoigs.preparation.split_masks import GivenMasks
+
+LENS = "SIMPLE_RADIAL"  # one focal length and one distortion: what a phone's video can bear
+FEATURES = 8192  # of an image
+OVERLAP = 10  # frames that each is matched with, and as many at distances 1, 2, 4, 8, …
+SMALLEST_SHARE = 0.5  # of the frames: with fewer cameras there is no clip
+
+
+def structure_from_motion(
+    video: Frames,
+    masks: GivenMasks,
+    folder: Path,
+    *,
+    focal: float | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Path:
+    """A COLMAP model of the chosen frames, the largest that was found.
+
+    Features on masked pixels are left out; frames are matched with their neighbours in time; one
+    camera with one radial distortion serves all (COLMAP, Schoenberger and Frahm 2016).
+
+    Args:
+        folder: to work in; images, database and models are left there.
+        focal: pixels of the frames' size, if known; it is still refined.
+        progress: called with 0..1.
+
+    Returns:
+        folder of the model; its images are named by frame number.
+
+    Raises:
+        SourceError: less than half of the frames were given a camera, and why that may be.
+    """
+    import pycolmap
+
+    tell = progress or (lambda _done: None)
+    images, database = folder / "images", folder / "database.db"
+    _write_images(video, masks, folder, lambda done: tell(0.1 * done))
+    with quiet_colmap():
+        pycolmap.extract_features(
+            database,
+            images,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=_reader(pycolmap, video, folder / "masks", focal),
+            extraction_options=_extraction(pycolmap),
+            device=pycolmap.Device.cpu,
+        )
+        tell(0.4)
+        matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=_threads())
+        pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
+        pycolmap.match_sequential(
+            database,
+            matching_options=matching,
+            pairing_options=pairing,
+            device=pycolmap.Device.cpu,
+        )
+        tell(0.7)
+        (folder / "models").mkdir()
+        models = pycolmap.incremental_mapping(
+            database,
+            images,
+            folder / "models",
+            options=_mapping(pycolmap),
+        )
+    best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+    count = best.num_reg_images() if best is not None else 0
+    if best is None or count < SMALLEST_SHARE * len(video):
+        raise SourceError(
+            f"structure from motion gave cameras to {count} of {len(video)} frames. If the camera "
+            "stands still or only turns, say --camera static; else the background may lack "
+            "texture, be blurred or be hidden by the masks: look at the masks, take sharper or "
+            "more frames, or put a COLMAP model of your own beside the video, as sparse/"
+        )
+    kept = folder / "largest"
+    kept.mkdir()
+    best.write(kept)
+    tell(1.0)
+    return kept
+
+
+def _write_images(
+    video: Frames, masks: GivenMasks, folder: Path, tell: Callable[[float], None]
+) -> None:
+    """images/00017.png by frame number, and masks/00017.png.png, 0 where nothing is to be found."""
+    for name in ("images", "masks"):
+        (folder / name).mkdir(parents=True)
+    for i, (number, image) in enumerate(zip(video.indices, video, strict=True)):
+        name = f"{number:05d}.png"
+        Image.fromarray(image).save(folder / "images" / name, compress_level=1)
+        still = np.where(grown(masks.moving(i)), 0, 255).astype(np.uint8)
+        Image.fromarray(still).save(folder / "masks" / f"{name}.png", compress_level=1)
+        tell((i + 1) / len(video))
+
+
+def _reader(pycolmap: Any, video: Frames, masks: Path, focal: float | None) -> Any:
+    f = focal or ASSUMED_FOCAL * max(video.width, video.height)
+    options = pycolmap.ImageReaderOptions(mask_path=str(masks), camera_model=LENS)
+    options.camera_params = f"{f},{video.width / 2},{video.height / 2},0"
+    return options
+
+
+def _extraction(pycolmap: Any) -> Any:
+    options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=_threads())
+    options.sift.max_num_features = FEATURES
+    return options
+
+
+def _mapping(pycolmap: Any) -> Any:
+    options = pycolmap.IncrementalPipelineOptions(num_threads=_threads(), random_seed=0)
+    # a video adds its frames in order: the whole need not be solved anew after every tenth
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3
+    return options
+
+
+def _threads() -> int:
+    """As many as OpenMP was told to take, else one a core."""
+    told = os.environ.get("OMP_NUM_THREADS", "")
+    return int(told) if told.isdigit() and int(told) else os.cpu_count() or 1
