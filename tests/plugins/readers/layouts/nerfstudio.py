@@ -12,8 +12,9 @@ from layouts.common import opengl_pose, save_image, save_json, save_mask, save_p
 from hoigs.core.clip import Clip
 
 
-def write(clip: Clip, folder: Path, *, scale: float = 1.0, extras: bool = True, times: bool = True,
-          lists: bool = True, ply: bool = True, lens: dict[str, Any] | None = None) -> None:  # fmt: skip
+def write(clip: Clip, folder: Path, *, scale: float = 1.0, extras: bool = True,
+          times: bool = True, lists: bool = True, ply: bool = True,
+          lens: dict[str, Any] | None = None) -> None:  # fmt: skip
     """Masks mark human and object black, as what is not to be learned.
 
     Args:
