@@ -53,6 +53,11 @@ class DeformationModel(nn.Module, ABC):
         rates: parameter-name prefix to the learning rate it takes (a key of the spec's
             `train.rates`, for example "planes" or "keyframes"); the others take "networks".
         regularizer_weights: default weight of each penalty of `regularizers`; 0 where absent.
+        residuals: which parts of a Residual it applies: "means", "pose". What it does not name
+            changes nothing, or is refused with an error.
+        continuous: whether it is continuous in time: a small step of time is a small change.
+        cut_gradients: rest fields, and prefixes of parameter names, whose gradient stops on some
+            way to the output, by design; what arrives is not the derivative.
         rest_space: where it expects the rest Gaussians: "canonical" (a body in its zero pose, an
             object about its centre), when it knows the body or the track that places them; else
             "world". May be set on the instance.
@@ -63,6 +68,9 @@ class DeformationModel(nn.Module, ABC):
     per_gaussian: tuple[str, ...] = ()
     rates: ClassVar[Mapping[str, str]] = {}
     regularizer_weights: ClassVar[Mapping[str, float]] = {}
+    residuals: frozenset[str] = frozenset({"means"})
+    continuous: bool = True
+    cut_gradients: frozenset[str] = frozenset()
     rest_space: Literal["canonical", "world"] = "canonical"
     progress: float = 1.0
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 # kind -> package with its CHECKS and `subject(cls, config, options)`; the others have P alone
 KINDS = {
+    "deformation": "hoigs.testing.deformation",
     "rasterizer": "hoigs.testing.rasterizer",
 }
 PLUGIN = "hoigs.testing.plugin"

@@ -183,7 +183,7 @@ class Embedded(DeformationModel):
         else:
             rough = second_differences(table)
         penalties = {"table_smoothness": rough}
-        if self._near is not None:
+        if self._near is not None and self._near[0].numel():
             indices, squared = self._near
             apart = (self.embedding[:, None] - self.embedding[indices]).square().sum(-1)
             # the constant keeps the root's gradient finite while all codes are equal

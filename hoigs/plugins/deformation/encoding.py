@@ -73,6 +73,8 @@ class UnitBox(nn.Module):
 
     def bind(self, rest: Gaussians) -> None:
         means = rest.means.detach()
+        if len(means) == 0:
+            return
         low, high = means.amin(0), means.amax(0)
         grown = (high - low).clamp_min(1e-3) - (high - low)  # a flat cloud has a box too
         self.low, self.high = low - grown / 2, high + grown / 2

@@ -269,7 +269,7 @@ class HexPlaneSkinning(SkinnedBody):
         if attributes.weights is not None:
             logits = logits + attributes.weights
         weights = logits.softmax(-1)
-        if torch.is_grad_enabled():
+        if self.training and torch.is_grad_enabled():
             self._remember(attributes, weights)
         elif keep:
             self._cached = (state, attributes, weights)

@@ -69,6 +69,8 @@ class MlpDeformation(DeformationModel):
         The others are MlpConfig's.
     """
 
+    cut_gradients = frozenset({"means"})
+
     def __init__(
         self,
         width: int = 256,

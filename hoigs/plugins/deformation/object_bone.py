@@ -104,6 +104,7 @@ class ObjectBone(DeformationModel):
                     + ", ".join(f"{h}/{s}" for h in bodies for s in WRISTS)
                 )
         self.transitions = list(transitions)
+        self.continuous = not self.transitions
         self.offset_quats = nn.Parameter(torch.stack([a.quat for a in attachments]))
         self.offset_translations = nn.Parameter(torch.stack([a.place for a in attachments]))
         self.corrections = corrections

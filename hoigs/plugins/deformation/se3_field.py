@@ -167,7 +167,7 @@ class Se3Field(DeformationModel):
         )
         if self.ambient:
             out = self._sliced(out, points, moment.time)
-        if self.training and torch.is_grad_enabled():
+        if self.training and torch.is_grad_enabled() and len(rest):
             rows = torch.randint(len(rest), (self.elastic_points,)).to(points.device)
             self._seen = (points.detach()[rows], moment.time)
         return with_residual(out, residual)

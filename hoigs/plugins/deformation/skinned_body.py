@@ -36,6 +36,7 @@ class SkinnedBody(DeformationModel):
     """
 
     provides = frozenset({"skeleton"})
+    residuals = frozenset({"means", "pose"})
     rest_space = "canonical"
 
     betas: Tensor

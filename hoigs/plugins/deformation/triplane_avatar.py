@@ -105,6 +105,8 @@ class TriplaneAvatar(SurfaceBody):
         "skinning": 1000.0,
     }
 
+    cut_gradients = frozenset({"refinement.pose"})  # the posing decoders see a detached pose
+
     neighbours: Tensor | None
     candidates: Tensor | None
 
@@ -145,6 +147,8 @@ class TriplaneAvatar(SurfaceBody):
             self.posing = PoseDecoders(features, width, depth, decoder)
         owned = {"quats", "log_scales", "opacity_logits", "sh"}
         self.owns = frozenset(owned if free_points else owned | {"means"})
+        # an offset that follows the pose may carry a point from one nearest vertex to the next
+        self.continuous = not (pose_dependent and skinning == "nearest")
         self._seen: _Seen | None = None
 
     @classmethod
@@ -158,7 +162,8 @@ class TriplaneAvatar(SurfaceBody):
         means = rest.means.detach()
         self.register_buffer("neighbours", nearest(means), persistent=False)
         found = near_vertices(means, self.rest_vertices) if self.skinning == "nearest" else None
-        self.register_buffer("candidates", found, persistent=False)
+        # saved, as rows that have come since cannot tell where they were bound
+        self.register_buffer("candidates", found)
 
     def features(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N F"]:
         """The three planes' values at canonical points, concatenated."""

@@ -1,0 +1,1 @@
+"""What subjects are built from: a tiny body, a tiny clip, made here and read from no file."""

@@ -1,0 +1,204 @@
+"""What checks ask of every torch module: perturbing it, its gradients, its optimizer, its state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import torch
+from safetensors.torch import load, save
+from torch import Tensor, nn
+
+from hoigs.core.topology import AxisChange, TopologyChange
+from hoigs.testing.checks import CheckError
+from hoigs.testing.compare import require_finite
+
+Made = TypeVar("Made")
+
+NUDGE = 0.03  # standard deviation by which parameters leave a start of zeros
+STEPS = (1e-6, 1e-7, 1e-8)  # of difference quotients, in float64; kinks may lie in the larger
+
+
+def seeded(make: Callable[[], Made], seed: int = 0) -> Made:
+    """What `make` makes with torch's global random numbers at `seed`, and these left alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return make()
+
+
+@torch.no_grad()
+def perturb(module: nn.Module, seed: int = 1, size: float = NUDGE) -> None:
+    """Move every trained parameter a little, so that what starts at zero takes part."""
+    generator = torch.Generator().manual_seed(seed)
+    for parameter in module.parameters():
+        if parameter.requires_grad and parameter.is_floating_point():
+            noise = torch.randn(parameter.shape, generator=generator)
+            parameter += (size * noise).to(parameter)
+
+
+def weighed(tensors: Mapping[str, Tensor]) -> Tensor:
+    """A sum in which every entry takes part with a weight of its own."""
+    total = torch.zeros((), dtype=torch.float64)
+    for seed, (_, x) in enumerate(sorted(tensors.items())):
+        generator = torch.Generator().manual_seed(seed)
+        weights = 0.5 + torch.rand(x.shape, generator=generator, dtype=torch.float64)
+        total = total + (x.double().cpu() * weights).sum()
+    return total
+
+
+def trained(module: nn.Module) -> dict[str, nn.Parameter]:
+    """Parameters that are trained and hold something."""
+    return {n: p for n, p in module.named_parameters() if p.requires_grad and p.numel()}
+
+
+def require_gradients(module: nn.Module, losses: Iterable[Tensor]) -> None:
+    """Together, the losses give every trained parameter a gradient that is not all zero."""
+    module.zero_grad()
+    for loss in losses:
+        if loss.requires_grad:
+            loss.backward()
+    dead = []
+    for name, parameter in trained(module).items():
+        if parameter.grad is None or not bool((parameter.grad != 0).any()):
+            dead.append(name)
+        else:
+            require_finite(f"gradient of {name}", parameter.grad)
+    module.zero_grad()
+    if dead:
+        raise CheckError(
+            f"no gradient reaches {', '.join(dead)}: nothing that was asked of it depends on them"
+        )
+
+
+def require_finite_gradients(module: nn.Module, loss: Tensor) -> None:
+    module.zero_grad()
+    if loss.requires_grad:
+        loss.backward()
+    for name, parameter in module.named_parameters():
+        if parameter.grad is not None:
+            require_finite(f"gradient of {name}", parameter.grad)
+    module.zero_grad()
+
+
+def require_true_gradients(
+    leaves: Mapping[str, Tensor], loss: Callable[[], Tensor], cut: Sequence[str] = ()
+) -> None:
+    """In float64, the gradient of every leaf is the slope of `loss` along a direction in it.
+
+    The direction leans on the gradient, so that it is never lost among many entries.
+
+    Args:
+        cut: prefixes of names that are left out.
+    """
+    leaves = {
+        n: x for n, x in leaves.items() if x.numel() and not n.startswith(tuple(cut) or ("\0",))
+    }
+    value = loss()
+    size = 1 + abs(float(value.detach()))
+    found: Sequence[Tensor | None] = [None] * len(leaves)
+    if value.requires_grad:
+        found = torch.autograd.grad(value, list(leaves.values()), allow_unused=True)
+    for seed, ((name, leaf), slope) in enumerate(zip(leaves.items(), found, strict=True)):
+        slope = torch.zeros_like(leaf) if slope is None else slope
+        generator = torch.Generator().manual_seed(seed)
+        aside = torch.randn(leaf.shape, generator=generator, dtype=torch.float64).to(leaf)
+        direction = slope / slope.norm().clamp_min(1e-30) + aside / aside.norm()
+        direction = direction / direction.norm()
+        got = float((slope * direction).sum())
+        expected = [slope_along(leaf, direction, loss, step) for step in STEPS]
+        allowed = 1e-4 * float(slope.norm()) + 1e-6 * size
+        if not any(abs(got - value) <= allowed for value in expected):
+            raise CheckError(
+                f"gradient of {name}: along a direction in it the slope is {expected[1]:.6g}, "
+                f"the gradient says {got:.6g}"
+            )
+
+
+@torch.no_grad()
+def slope_along(leaf: Tensor, direction: Tensor, loss: Callable[[], Tensor], step: float) -> float:
+    """Central difference of `loss` by a move of `leaf` along a unit direction."""
+    before, values = leaf.detach().clone(), []
+    for way in (step, -step):
+        leaf.copy_(before + way * direction)
+        values.append(float(loss()))
+    leaf.copy_(before)
+    return (values[0] - values[1]) / (2 * step)
+
+
+class Moments:
+    """An optimizer's moments, each filled with the parameter's own values, to be followed."""
+
+    def __init__(self, parameters: Mapping[str, nn.Parameter]) -> None:
+        self.parameters = dict(parameters)
+        self.values = {name: p.detach().clone() for name, p in parameters.items()}
+        self.fresh: dict[str, AxisChange] = {}
+
+    def follow(self, name: str, change: TopologyChange | AxisChange) -> None:
+        """Moments of one parameter follow, as an optimizer of hoigs lets them."""
+        if isinstance(change, TopologyChange):
+            change = AxisChange(0, change.source, change.fresh)
+        if name in self.values:
+            self.values[name] = change.follow(self.values[name])
+            self.fresh[name] = change
+
+    def require_in_step(self, now: Mapping[str, nn.Parameter]) -> None:
+        """Moments have their parameter's shape, and where they are not fresh, its values."""
+        for name, parameter in now.items():
+            if parameter is not self.parameters.get(name, parameter):
+                raise CheckError(
+                    f"{name} is another Parameter object than before, which the optimizer does "
+                    "not know; change parameter.data"
+                )
+            if name not in self.values:
+                continue
+            moments = self.values[name]
+            if moments.shape != parameter.shape:
+                raise CheckError(
+                    f"{name} has shape {list(parameter.shape)} after the change, its moments "
+                    f"{list(moments.shape)}: name it in per_gaussian, or in axis_changes"
+                )
+            kept = torch.ones_like(moments, dtype=torch.bool)
+            if name in self.fresh:
+                change = self.fresh[name]
+                kept.index_fill_(change.axis, change.fresh.nonzero().squeeze(1), False)
+            if bool((moments[kept] != parameter.detach()[kept]).any()):
+                raise CheckError(f"rows of {name} and of its moments no longer belong together")
+
+
+def plain_state(module: nn.Module) -> dict[str, Tensor]:
+    """The state dict after a trip through safetensors, which knows tensors only, no pickle.
+
+    Raises:
+        CheckError: it holds anything else, or tensors that share memory.
+    """
+    state: dict[str, Any] = module.state_dict()
+    strange = [name for name, value in state.items() if not isinstance(value, Tensor)]
+    if strange:
+        raise CheckError(f"the state dict holds {strange[0]}, which is no tensor; checkpoints do")
+    try:
+        return load(save({name: x.detach().cpu().contiguous() for name, x in state.items()}))
+    except (RuntimeError, ValueError) as error:
+        raise CheckError(f"safetensors cannot hold the state dict: {error}") from error
+
+
+def require_same_state(what: str, a: nn.Module, b: nn.Module) -> None:
+    """Bit for bit the same parameters and buffers."""
+    one, two = a.state_dict(), b.state_dict()
+    if set(one) != set(two):
+        raise CheckError(f"{what}: {sorted(set(one) ^ set(two))} is in one of them only")
+    for name, x in one.items():
+        same = torch.equal(x, two[name]) if isinstance(x, Tensor) else x == two[name]
+        if not same:
+            raise CheckError(f"{what}: {name} differs")
+
+
+@contextmanager
+def unchanged(what: str, tensors: Mapping[str, Tensor]) -> Any:
+    """CheckError when any of these tensors is written to in this block."""
+    before = {name: x.detach().clone() for name, x in tensors.items()}
+    yield
+    for name, x in tensors.items():
+        if not torch.equal(x.detach().nan_to_num(math.pi), before[name].nan_to_num(math.pi)):
+            raise CheckError(f"{what}{name} was changed in place")
