@@ -83,8 +83,11 @@ class Component:
                 )
 
 
-def missing_target(target: str) -> str | None:
+def missing_target(target: str, *, read: bool = True) -> str | None:
     """Why `target` cannot be there, or None; reads source files but imports nothing.
+
+    Args:
+        read: False looks for the module's file only.
 
     Modules that are not plain source, and names that a module makes in ways that its text does
     not show, are given the benefit of the doubt.
@@ -93,7 +96,7 @@ def missing_target(target: str) -> str | None:
     path = _source_of(module)
     if isinstance(path, str):
         return path
-    if path is None:
+    if path is None or not read:
         return None
     try:
         names, packages = _outline(path)
