@@ -202,7 +202,7 @@ def _by_name(path: Path, images: Sequence[Path]) -> dict[str, Mapping[str, Any]]
             f"{path} has no entry for {len(absent)} of {len(images)} images ({shown}); it has "
             f"{', '.join(map(str, list(table)[:3]))}, …: names must be those of the images"
         )
-    return {p.stem: table.get(p.stem, table.get(p.name)) for p in images}
+    return {p.stem: table[p.stem if p.stem in table else p.name] for p in images}
 
 
 def _bounds(

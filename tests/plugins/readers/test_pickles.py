@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from hoigs.core.errors import ClipError
 from hoigs.plugins.readers.pickles import load_pickle, load_pickled_npy
@@ -38,6 +40,26 @@ def test_npy_with_a_dictionary_and_with_numbers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_pickled_npy(tmp_path / "n.npy"), np.arange(3))
     np.save(tmp_path / "o.npy", np.array([{"a": 1}, {"a": 2}], dtype=object), allow_pickle=True)
     assert load_pickled_npy(tmp_path / "o.npy")[1] == {"a": 2}
+
+
+def test_tensors_come_back_and_carry_no_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    value = torch.arange(6.0).reshape(2, 3).T
+    np.save(tmp_path / "t.npy", {"norm_mat": value}, allow_pickle=True)
+    assert load_pickled_npy(tmp_path / "t.npy")["norm_mat"].equal(value)
+    buffer = io.BytesIO()
+    torch.save(Evil(), buffer)
+
+    class Hidden:
+        def __reduce__(self) -> tuple[object, tuple[bytes]]:
+            return torch.storage._load_from_bytes, (buffer.getvalue(),)
+
+    (tmp_path / "x.pkl").write_bytes(pickle.dumps(Hidden()))
+    with pytest.raises(ClipError, match=r"x\.pkl cannot be read"):
+        load_pickle(tmp_path / "x.pkl")
+    assert not (tmp_path / "ran").exists()
 
 
 def test_code_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
