@@ -91,6 +91,14 @@ PARTS = (
      "ExAvatar's fitted videos: cameras, person masks and SMPL-X poses"),
     ("reader:hosnerf", f"{READERS}.hosnerf", "HosnerfReader", "HosnerfConfig",
      "a scene of HOSNeRF: cameras and SMPL poses by frame name"),
+    ("reader:behave", f"{READERS}.behave", "BehaveReader", "BehaveConfig",
+     "a sequence of BEHAVE: one Kinect, undistorted; SMPL+H and object registrations"),
+    ("reader:arctic", f"{READERS}.arctic", "ArcticReader", "ArcticConfig",
+     "one camera of an ARCTIC sequence: SMPL-X with the subject's template, two-part objects"),
+    ("reader:hold", f"{READERS}.hold", "HoldReader", "HoldConfig",
+     "a build folder of HOLD: a still camera, hands and an object's poses"),
+    ("reader:davis", f"{READERS}.davis", "DavisReader", "DavisConfig",
+     "frames and annotated masks as DAVIS or DreamScene4D has them; no cameras"),
     ("density:adc", "hoigs.plugins.density.adc", "AdaptiveDensity", "AdaptiveDensityConfig",
      "clone, split and prune as 3DGS does, under a hard cap"),
     ("density:absgrad", "hoigs.plugins.density.absgrad", "AbsoluteGradientDensity",
@@ -121,9 +129,21 @@ PARTS = (
      "landmarks of a person by MediaPipe Pose, in an environment of its own"),
     ("prior:command", f"{PRIORS}.video_command", "CommandPrior", "CommandConfig",
      "masks, depth or landmarks that a command line of yours writes"),
+    ("prior:transformers-sam2", f"{PRIORS}.video_sam2", "TransformersSam2Prior",
+     "TransformersSam2Config", "masks by SAM 2, from a point, a box or a detector's find"),
+    ("prior:transformers-depth", f"{PRIORS}.video_depth_anything", "TransformersDepthPrior",
+     "TransformersDepthConfig", "depth by Depth Anything V2 and its kin"),
+    ("prior:transformers-pose", f"{PRIORS}.video_vitpose", "TransformersPosePrior",
+     "TransformersPoseConfig", "landmarks by ViTPose, in a detector's or given boxes"),
 )  # fmt: skip
 # parts that need an optional dependency
-EXTRAS = {"rasterizer:gsplat": "gsplat", "prior:sds": "sds"}
+EXTRAS = {
+    "rasterizer:gsplat": "gsplat",
+    "prior:sds": "sds",
+    "prior:transformers-sam2": "estimators",
+    "prior:transformers-depth": "estimators",
+    "prior:transformers-pose": "estimators",
+}
 
 
 @hookimpl

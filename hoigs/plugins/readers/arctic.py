@@ -1,0 +1,292 @@
+"""reader:arctic: one camera of an ARCTIC sequence (Fan 2023): SMPL-X and objects of two parts."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from pydantic import BaseModel, Field
+
+from hoigs.core.body_params import pose_from_smplx
+from hoigs.core.clip import BodyTrack, Clip, ObjectTrack, uniform_test_split
+from hoigs.core.config import ComponentConfig
+from hoigs.core.errors import ClipError, did_you_mean
+from hoigs.core.interaction import EntityKind
+from hoigs.core.lens import Lens
+from hoigs.core.reader import ClipReader
+from hoigs.core.rotation import axis_angle_to_matrices
+from hoigs.plugins.readers.frame_order import image_files, video_moments
+from hoigs.plugins.readers.json_file import load_json, parse_json_map
+from hoigs.plugins.readers.lazy_frames import LazyFrames, MaskFiles, image_size
+from hoigs.plugins.readers.listing import Need, require_files
+from hoigs.plugins.readers.pickles import load_pickled_npy
+from hoigs.plugins.readers.poses import checked_rotation, rigid
+from hoigs.plugins.readers.start_points import points_along_rays
+from hoigs.plugins.readers.template_mesh import load_mesh
+
+LAYOUT = "an ARCTIC sequence (images/sXX/SEQUENCE or .../SEQUENCE/VIEW)"
+DOWNLOAD = "`bash/download_*.sh` of zc-alexfan/arctic (a registered download)"
+WITHHELD = f"{DOWNLOAD}; of s03, the test subject, ground truth is withheld"
+MASKS = (
+    "ARCTIC has no masks: your segmenter makes them, 0/255, named as the images (HOLD took SAM); "
+    "or `--reader-set masks=false`"
+)
+HINGE = (0.0, 0.0, -1.0)  # the top turns about it (common/object_tensors.py)
+FPS = 30.0
+BEHIND = (1.0, 4.0)  # scene points start within these times the object's distance
+
+
+class ArcticConfig(ComponentConfig):
+    """Settings of reader:arctic."""
+
+    view: int | None = Field(
+        default=None, ge=0, le=8, description="0 is on the head, 1 to 8 stand still; 1 by default"
+    )
+    start: int = Field(default=0, ge=0, description="first frame of the ground truth")
+    count: int | None = Field(default=None, ge=2, description="frames; by default all (HOLD: 300)")
+    masks: bool = Field(default=True, description="False reads it without masks: scene only")
+    points: int = Field(default=20_000, ge=1, description="scene points to start from")
+    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
+
+
+class ArcticReader(ClipReader):
+    """Frames, cameras, SMPL-X poses and an object's pose, in metres.
+
+    Image numbers are frame numbers plus the subject's ioi_offset; the object's millimetres become
+    metres; hands are flat_hand_mean=True; the body is the subject's own template on the model of
+    its gender, which `body:smplx` then insists on. An object's top is put at its median angle, so
+    that it fits "grab" sequences as it stands, and is marked as the moving part.
+
+    Args:
+        view, start, count, masks, points, cache_mb: see ArcticConfig.
+    """
+
+    def __init__(
+        self,
+        view: int | None = None,
+        start: int = 0,
+        count: int | None = None,
+        masks: bool = True,
+        points: int = 20_000,
+        cache_mb: int = 512,
+    ) -> None:
+        self.view, self.start, self.count, self.masks = view, start, count, masks
+        self.points, self.cache_mb = points, cache_mb
+
+    def matches(self, folder: Path) -> bool:
+        return _place(Path(folder), self.view) is not None
+
+    def read(self, folder: Path) -> Clip:
+        folder = Path(folder)
+        place = _place(folder, self.view)
+        if place is None:
+            require_files(folder, LAYOUT, [])
+            raise ClipError(f"{folder} is not named as {LAYOUT}")
+        require_files(place.root, LAYOUT, place.needs())
+        misc = parse_json_map(place.root / "meta/misc.json", Subject)
+        if place.subject not in misc:
+            near = did_you_mean(place.subject, misc)
+            raise ClipError(f"{place.root}/meta/misc.json has no subject {place.subject}{near}")
+        subject = misc[place.subject]
+        truth = np.asarray(load_pickled_npy(place.raw("object")), np.float64)
+        if truth.ndim != 2 or truth.shape[1] != 7 or not np.isfinite(truth).all():
+            raise ClipError(f"{place.raw('object')}: expected [T, 7] numbers, got {truth.shape}")
+        frames = self._frames(place, subject, len(truth))
+        images = [place.image(f + subject.ioi_offset) for f in frames]
+        masks = {n: [place.mask(n, p) for p in images] for n in ("human", "object")}
+        if self.masks:
+            wanted = [p for paths in masks.values() for p in paths]
+            needs = [Need.of(str(p.relative_to(place.root)), maker=MASKS) for p in wanted]
+            require_files(place.root, LAYOUT, needs)
+        lens, poses = _cameras(place, subject, frames)
+        width, height = image_size(images[0])
+        if (width, height) != (lens.width, lens.height):
+            raise ClipError(
+                f"{images[0]} is {width}x{height}, its calibration is for {lens.width}x"
+                f"{lens.height}: the full images are needed, not cropped_images/"
+            )
+        cameras = [lens.camera(w2c) for w2c in poses]
+        kinds: dict[str, EntityKind] = {"human": "human", "object": "object"} if self.masks else {}
+        bodies = {"human": _body(place, subject, frames)} if self.masks else {}
+        thing, angles = _object(place, truth[frames])
+        store = LazyFrames(
+            place.root,
+            images,
+            cameras,
+            masks={n: MaskFiles(paths) for n, paths in masks.items()} if self.masks else None,
+            lenses=[lens] * len(frames),
+            cache_mb=self.cache_mb,
+        )
+        away = float(cameras[0].to_camera(thing.translations)[:, 2].median())
+        span = (BEHIND[0] * away, BEHIND[1] * away)
+        points, colors = points_along_rays(store, cameras, tuple(kinds), span, self.points)
+        return Clip(
+            name=f"{place.subject}_{place.sequence}_{place.view}",
+            store=store,
+            cameras=cameras,
+            moments=video_moments(range(len(frames)), len(frames), bodies),
+            kinds=kinds,
+            bodies=bodies,
+            objects={"object": thing} if self.masks else {},
+            points=points,
+            point_colors=colors,
+            split=uniform_test_split(len(frames)),
+            fps=FPS,
+            provenance={
+                "reader": "reader:arctic",
+                "cameras": f"view {place.view}, frames {frames[0]} to {frames[-1]}",
+                "points": f"random, {span[0]:.2f} to {span[1]:.2f} m away",
+                "articulation": {"unit": "rad", "least": angles.min(), "most": angles.max()},
+            },
+        )
+
+    def _frames(self, place: _Place, subject: Subject, total: int) -> list[int]:
+        """Frames of the ground truth to read: those asked for that lie within the images."""
+        stop = total if self.count is None else min(total, self.start + self.count)
+        there = {int(p.stem) - subject.ioi_offset for p in image_files(place.images)
+                 if p.stem.isdigit()}  # fmt: skip
+        inside = [f for f in range(self.start, stop) if f in there]
+        if not inside:
+            raise ClipError(
+                f"{place.images}: no image of frames {self.start} to {stop - 1}, which are images "
+                f"{self.start + subject.ioi_offset:05d} to {stop - 1 + subject.ioi_offset:05d} "
+                f"(ioi_offset {subject.ioi_offset}); {DOWNLOAD} has them"
+            )
+        room = place.images.relative_to(place.root)
+        gaps = range(inside[0], inside[-1] + 1)
+        names = [f"{room}/{f + subject.ioi_offset:05d}.jpg" for f in gaps]
+        require_files(place.root, LAYOUT, [Need.of(n, maker=DOWNLOAD) for n in names])
+        return list(gaps)
+
+
+class Subject(BaseModel):
+    """An entry of meta/misc.json; views 1 to 8 of the matrices, 0 to 8 of the sizes."""
+
+    gender: str
+    world2cam: list[list[list[float]]]
+    intris_mat: list[list[list[float]]]
+    image_size: list[tuple[int, int]]
+    ioi_offset: int
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a sequence's files are, about the data folder."""
+
+    root: Path
+    subject: str
+    sequence: str
+    view: int
+
+    @property
+    def thing(self) -> str:
+        return self.sequence.split("_", maxsplit=1)[0]
+
+    @property
+    def images(self) -> Path:
+        return self.root / "images" / self.subject / self.sequence / str(self.view)
+
+    def image(self, number: int) -> Path:
+        return self.images / f"{number:05d}.jpg"
+
+    def mask(self, entity: str, image: Path) -> Path:
+        room = self.root / "masks" / self.subject / self.sequence / str(self.view)
+        return room / entity / f"{image.stem}.png"
+
+    def raw(self, kind: str) -> Path:
+        return self.root / "raw_seqs" / self.subject / f"{self.sequence}.{kind}.npy"
+
+    def needs(self) -> list[Need]:
+        kinds = ("smplx", "object", *(("egocam.dist",) if self.view == 0 else ()))
+        own = [f"raw_seqs/{self.subject}/{self.sequence}.{kind}.npy" for kind in kinds]
+        things = [f"meta/object_vtemplates/{self.thing}/{n}" for n in ("mesh.obj", "parts.json")]
+        meta = ("meta/misc.json", f"meta/subject_vtemplates/{self.subject}.obj", *things)
+        room = f"images/{self.subject}/{self.sequence}/{self.view}/"
+        needs = [Need.of(path, maker=WITHHELD) for path in own]
+        return [*needs, *(Need.of(path, maker=DOWNLOAD) for path in (*meta, room))]
+
+
+def _place(folder: Path, view: int | None) -> _Place | None:
+    """Read off the end of the path: images/sXX/SEQUENCE, or that and a view."""
+    parts = folder.resolve().parts
+    named = len(parts) > 4 and re.fullmatch(r"[0-8]", parts[-1]) is not None
+    tail = parts[-4:-1] if named else parts[-3:]
+    if len(tail) < 3 or tail[0] != "images" or not re.fullmatch(r"s\d\d", tail[1]):
+        return None
+    root = folder.resolve().parents[3 if named else 2]
+    shown = int(parts[-1]) if named else 1
+    return _Place(root, tail[1], tail[2], shown if view is None else view)
+
+
+def _cameras(
+    place: _Place, subject: Subject, frames: Sequence[int]
+) -> tuple[Lens, list[Float[np.ndarray, "4 4"]]]:
+    """Views 1 to 8 stand still and are straight; view 0 moves with the head and is bent."""
+    where, size = f"{place.root}/meta/misc.json: {place.subject}", subject.image_size[place.view]
+    if place.view > 0:
+        pose = np.asarray(subject.world2cam[place.view - 1], np.float64)
+        pose = rigid(checked_rotation(pose[:3, :3], f"{where} world2cam"), pose[:3, 3])
+        K = np.asarray(subject.intris_mat[place.view - 1], np.float64)
+        return Lens.opencv(K, [], *size), [pose] * len(frames)
+    ego: Any = load_pickled_npy(place.raw("egocam.dist"))
+    where = str(place.raw("egocam.dist"))
+    turns = np.asarray(ego["R_k_cam_np"], np.float64)
+    shifts = np.asarray(ego["T_k_cam_np"], np.float64).reshape(-1, 3)
+    bent = np.asarray(ego["dist8"], np.float64).reshape(-1).tolist()
+    lens = Lens.opencv(np.asarray(ego["intrinsics"], np.float64), bent, *size)
+    return lens, [rigid(checked_rotation(turns[f], f"{where}: {f}"), shifts[f]) for f in frames]
+
+
+def _body(place: _Place, subject: Subject, frames: Sequence[int]) -> BodyTrack:
+    table: Any = load_pickled_npy(place.raw("smplx"))
+    values = {k: torch.from_numpy(np.asarray(v, np.float64)) for k, v in table.items()}
+    short = {k: len(v) for k, v in values.items() if len(v) <= max(frames)}
+    if short:
+        raise ClipError(f"{place.raw('smplx')} ends before frame {max(frames)}: {short}")
+    chosen = {k: v[list(frames)] for k, v in values.items()}
+    pose = pose_from_smplx({**chosen, "betas": torch.zeros(10).double()}, "flat")
+    path = place.root / "meta/subject_vtemplates" / f"{place.subject}.obj"
+    template = np.asarray(load_mesh(path).vertices, np.float64)
+    return BodyTrack(
+        "body:smplx",
+        pose.to(torch.float32),
+        f"{place.raw('smplx').name}; template of {place.subject}; jaw and eyes left out",
+        gender=subject.gender,
+        template=torch.from_numpy(template).float(),
+    )
+
+
+def _object(
+    place: _Place, truth: Float[np.ndarray, "F 7"]
+) -> tuple[ObjectTrack, Float[np.ndarray, " F"]]:
+    """Track about the middle of the mesh, and the angles of its top, radians."""
+    room = place.root / "meta/object_vtemplates" / place.thing
+    vertices = np.asarray(load_mesh(room / "mesh.obj").vertices, np.float64) / 1000
+    parts = np.asarray(load_json(room / "parts.json"), bool)
+    if len(parts) != len(vertices):
+        raise ClipError(
+            f"{room}: parts.json has {len(parts)} entries, mesh.obj {len(vertices)} vertices"
+        )
+    angles = truth[:, 0]
+    turn = axis_angle_to_matrices(torch.tensor(HINGE).double() * float(np.median(angles))).numpy()
+    points = np.where(parts[:, None], vertices @ turn.T, vertices)
+    center = points.mean(0)
+    rotations = axis_angle_to_matrices(torch.from_numpy(truth[:, 1:4]))
+    places = torch.from_numpy(truth[:, 4:] / 1000) + rotations @ torch.from_numpy(center)
+    about = torch.from_numpy(points - center).float()
+    track = ObjectTrack(
+        points=about,
+        colors=torch.full_like(about, 0.5),
+        rotations=rotations.float(),
+        translations=places.float(),
+        observed=torch.ones(len(truth), dtype=torch.bool),
+        provenance=f"{place.raw('object').name}; mesh.obj",
+        moving=torch.from_numpy(parts),
+    )
+    return track, angles

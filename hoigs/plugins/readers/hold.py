@@ -1,0 +1,194 @@
+"""reader:hold: a build folder of HOLD (Fan 2024): a still camera, hands and an object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from pydantic import Field
+
+from hoigs.core.camera import Camera
+from hoigs.core.clip import Clip, ObjectTrack, uniform_test_split
+from hoigs.core.config import ComponentConfig
+from hoigs.core.errors import ClipError
+from hoigs.core.interaction import EntityKind
+from hoigs.core.reader import ClipReader
+from hoigs.core.rotation import axis_angle_to_matrices
+from hoigs.plugins.readers.frame_order import image_files, video_moments
+from hoigs.plugins.readers.lazy_frames import LazyFrames, MaskFiles, image_size
+from hoigs.plugins.readers.listing import Need, require_files
+from hoigs.plugins.readers.pickles import load_pickled_npy
+from hoigs.plugins.readers.poses import rigid
+from hoigs.plugins.readers.start_points import points_along_rays
+
+LAYOUT = "a HOLD build folder"
+MAKER = "`generator/scripts/build_dataset.py` of zc-alexfan/hold, or its released data, makes it"
+VALUES = {"object": 50, "right": 150, "left": 250}  # of mask pixels
+NEAREST, FARTHEST = 1.0, 4.0  # scene points start within these times the object's distance
+NO_POSES = (
+    "MANO parameters of a hand are no body's: which arm holds it is not in the data, so they are "
+    "not turned into SMPL-X; leave it out with `--set entities=[scene,object]`, or fit a body"
+)
+Array = np.ndarray
+
+
+class HoldConfig(ComponentConfig):
+    """Settings of reader:hold."""
+
+    points: int = Field(default=20_000, ge=1, description="scene points to start from")
+    fps: float = Field(default=30.0, gt=0, description="of the video; the layout does not say")
+    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
+
+
+class HoldReader(ClipReader):
+    """Frames, masks by value, cameras and the object's poses, in metres.
+
+    The world is HOLD's before `scale_mat` shrinks it into the unit sphere. Entities are "object"
+    and "hand_right", "hand_left", which have masks and no body poses. Poses of frames that SfM
+    could not place were filled by HOLD's slerp, and cannot be told from the others.
+
+    Args:
+        points, fps, cache_mb: see HoldConfig.
+    """
+
+    def __init__(self, points: int = 20_000, fps: float = 30.0, cache_mb: int = 512) -> None:
+        self.points, self.fps, self.cache_mb = points, fps, cache_mb
+
+    def matches(self, folder: Path) -> bool:
+        room = _build(Path(folder))
+        return (room / "data.npy").is_file() or (room.name == "build" and (room / "image").is_dir())
+
+    def read(self, folder: Path) -> Clip:
+        folder = Path(folder)
+        require_files(folder, LAYOUT, [])
+        room = _build(folder)
+        images = image_files(room / "image")
+        prefix = f"{room.relative_to(folder).as_posix()}/" if room != folder else ""
+        needs = [Need.of(f"{prefix}data.npy", maker=MAKER)]
+        if not images:
+            needs.append(Need.of(f"{prefix}image/0000.png", maker=MAKER))
+        needs += [Need.of(f"{prefix}mask/{p.stem}.png", maker=MAKER) for p in images]
+        require_files(folder, LAYOUT, needs)
+        data: Any = load_pickled_npy(room / "data.npy")
+        where = str(room / "data.npy")
+        if not isinstance(data, dict) or not {"cameras", "entities"} <= set(data):
+            raise ClipError(f"{where}: expected a dictionary with cameras and entities")
+        paths = [room / "mask" / f"{p.stem}.png" for p in images]
+        _require_values(paths[0])
+        cameras = _cameras(data["cameras"], images, where)
+        hands = [h for h in ("right", "left") if h in data["entities"]]
+        kinds: dict[str, EntityKind] = {f"hand_{h}": "human" for h in hands}
+        kinds["object"] = "object"
+        masks = {n: MaskFiles(paths, _marked(VALUES[n.removeprefix("hand_")])) for n in kinds}
+        track = _object(data["entities"].get("object"), len(images), where)
+        store = LazyFrames(room, images, cameras, masks=masks, cache_mb=self.cache_mb)
+        away = float(cameras[0].to_camera(track.translations)[:, 2].median())
+        span = (NEAREST * away, FARTHEST * away)
+        points, colors = points_along_rays(store, cameras, tuple(kinds), span, self.points)
+        return Clip(
+            name=(room.parent if room.name == "build" else room).resolve().name,
+            store=store,
+            cameras=cameras,
+            moments=video_moments(range(len(images)), len(images)),
+            kinds=kinds,
+            bodies={},
+            objects={"object": track},
+            points=points,
+            point_colors=colors,
+            split=uniform_test_split(len(images)),
+            fps=self.fps,
+            provenance={
+                "reader": "reader:hold",
+                "cameras": "world_mat of data.npy; scale_mat left out, so metres",
+                "points": f"random, {span[0]:.2f} to {span[1]:.2f} m away",
+                **{f"poses of hand_{h}": NO_POSES for h in hands},
+            },
+        )
+
+
+def _build(folder: Path) -> Path:
+    return folder / "build" if (folder / "build").is_dir() else folder
+
+
+def _cameras(table: Any, images: Sequence[Path], where: str) -> list[Camera]:
+    absent = [i for i in range(len(images)) if f"world_mat_{i}" not in table]
+    if absent:
+        raise ClipError(
+            f"{where}: no world_mat_{absent[0]} ({len(absent)} of {len(images)} images have none)"
+        )
+    cameras = []
+    for i, image in enumerate(images):
+        K, w2c = decomposed(np.asarray(table[f"world_mat_{i}"], np.float64)[:3], f"{where}: {i}")
+        width, height = image_size(image)
+        lens, pose = torch.from_numpy(K).float(), torch.from_numpy(w2c).float()
+        cameras.append(Camera(lens, pose, width, height))
+    return cameras
+
+
+def decomposed(
+    projection: Float[Array, "3 4"], where: str
+) -> tuple[Float[Array, "3 3"], Float[Array, "4 4"]]:
+    """K and the rigid world-to-camera of P = K [R | t], up to P's scale and sign.
+
+    Raises:
+        ClipError: it is no camera's, or one with skew.
+    """
+    from scipy.linalg import rq
+
+    if not np.isfinite(projection).all() or np.linalg.matrix_rank(projection[:, :3]) < 3:
+        raise ClipError(f"{where}: the projection has no inverse")
+    P = projection * np.sign(np.linalg.det(projection[:, :3]))
+    K, R = rq(P[:, :3])
+    signs = np.sign(np.diag(K))
+    K, R = K * signs, signs[:, None] * R
+    shift = np.linalg.solve(K, P[:, 3])
+    K = K / K[2, 2]
+    if abs(K[0, 1]) > 1e-3 * K[0, 0]:
+        raise ClipError(f"{where}: pixels are skewed by {K[0, 1]:.3g}; a pinhole camera has none")
+    K[0, 1] = 0.0
+    return K, rigid(R, shift)
+
+
+def _object(table: Any, frames: int, where: str) -> ObjectTrack:
+    """x = R s N^-1 p + t: canonical points p, their normalisation N, the object's scale s."""
+    keys = {"object_poses", "obj_scale", "norm_mat", "pts.cano"}
+    if not isinstance(table, dict) or not keys <= set(table):
+        raise ClipError(f"{where}: entities.object lacks {sorted(keys - set(table or ()))}")
+    poses = np.asarray(table["object_poses"], np.float64)
+    if poses.shape != (frames, 6):
+        raise ClipError(f"{where}: object_poses is {poses.shape}, expected ({frames}, 6)")
+    cano = np.asarray(table["pts.cano"], np.float64)
+    back = np.linalg.inv(np.asarray(table["norm_mat"], np.float64))
+    scale = float(np.asarray(table["obj_scale"]).reshape(-1)[0])
+    points = scale * (cano @ back[:3, :3].T + back[:3, 3])
+    center = points.mean(0)
+    rotations = axis_angle_to_matrices(torch.from_numpy(poses[:, :3]))
+    places = torch.from_numpy(poses[:, 3:]) + rotations @ torch.from_numpy(center)
+    about = torch.from_numpy(points - center).float()
+    return ObjectTrack(
+        points=about,
+        colors=torch.full_like(about, 0.5),
+        rotations=rotations.float(),
+        translations=places.float(),
+        observed=torch.ones(frames, dtype=torch.bool),
+        provenance="HOLD's SfM on the masked object, aligned with the hand",
+    )
+
+
+def _require_values(path: Path) -> None:
+    with Image.open(path) as image:
+        values = set(np.unique(np.asarray(image.convert("L"))).tolist())
+    if values - {0, *VALUES.values()}:
+        raise ClipError(
+            f"{path} has the values {sorted(values)[:8]}; HOLD's build writes 0, 50 (object), 150 "
+            "(right hand) and 250 (left): these are a segmenter's own masks"
+        )
+
+
+def _marked(value: int) -> Any:
+    return lambda image: np.asarray(image.convert("L")) == value
