@@ -1,15 +1,18 @@
 """A scene composed by hand: three entities, what passes between them, and how they are drawn.
 
-No registry, no spec. Run: python examples/01_compose.py [STEPS]
+No registry, no spec. Run: python examples/01_compose.py [CLIP [STEPS]]
 """
 
 import sys
 
 import hoigs as h
 
-body = h.AnnyBody()
-clip = h.read_clip(h.builtin_clip(body), width=128)
+source = sys.argv[1] if sys.argv[1:] else "builtin:lift-and-swing?width=128"
+steps = int(sys.argv[2]) if sys.argv[2:] else 500
+
+clip = h.read_clip(source)
 track = clip.objects["object"]
+body = h.AnnyBody()
 
 scene = h.SceneModel(
     {
@@ -29,9 +32,11 @@ scene = h.SceneModel(
     rasterizer=h.WarpRasterizer(),
 )
 
-trainer = h.Trainer(scene, clip, h.TrainSpec(steps=int(sys.argv[1]) if sys.argv[1:] else 500))
+trainer = h.Trainer(scene, clip, h.TrainSpec(steps=steps))
 trainer.train(lambda report: report.psnr and print(report.step, report.psnr))
 
-frame = clip[12]
+frame = clip[len(clip) // 2]
 image = scene.render(frame.moment, frame.camera).color
-print(f"frame 12 drawn as {tuple(image.shape)} by {sum(scene.count().values())} Gaussians")
+print(
+    f"frame {frame.position} drawn as {tuple(image.shape)} by {sum(scene.count().values())} splats"
+)

@@ -1,36 +1,74 @@
-"""The numbered examples run as a reader would run them."""
+"""The numbered examples run as a reader would run them, on the smallest clip."""
 
 from __future__ import annotations
 
-import subprocess
+import re
+import runpy
 import sys
 from pathlib import Path
 
+import pytest
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
+# SceneKnobs.tiny() by name: the clip that other tests use
+TINY = (
+    "builtin:lift-and-swing?frames=12&width=64&height=64&fps=3&edge_samples=4&held_out_views=3"
+    "&test_frames=3&scene_points=2000&object_points=300"
+)
 
 
-def test_rasterizers_agree_in_the_example():
-    done = subprocess.run(
-        [sys.executable, EXAMPLES / "02_swap_rasterizers.py"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    lines = [line.split() for line in done.stdout.splitlines() if "off the oracle" in line]
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Run an example with arguments; what it prints."""
+
+    def run(name: str, *args: object) -> str:
+        (path,) = EXAMPLES.glob(f"{name}_*.py")
+        monkeypatch.setattr(sys, "argv", [str(path), *map(str, args)])
+        capsys.readouterr()
+        runpy.run_path(str(path), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
+
+
+def test_every_example_is_run_here():
+    numbers = {path.name[:2] for path in EXAMPLES.glob("[0-9]*.py")}
+    assert numbers == set(re.findall(r'run\("(\d\d)"', Path(__file__).read_text()))
+
+
+def test_composing_by_hand_trains(run):
+    assert re.search(r"frame 6 drawn as \(64, 64, 3\) by \d+ splats", run("01", TINY, 3))
+
+
+def test_rasterizers_agree(run):
+    lines = [line.split() for line in run("02").splitlines() if "off the oracle" in line]
     assert {name.rstrip(":") for name, *_ in lines} == {"TorchRasterizer", "WarpRasterizer"}
     assert all(float(off) < 1e-5 for _, off, *_ in lines)
 
 
-def test_composing_by_hand_trains(monkeypatch, capsys):
-    import hoigs
-    from hoigs.synthesis import SceneKnobs, builtin_clip
+def test_a_spec_by_name(run):
+    said = run("03", TINY)
+    assert re.search(r"model.object.deformation +deformation:chs\n", said)
+    error = float(re.search(r"mean error (\S+) of 1", said)[1])
+    assert 0.01 < error < 0.5
 
-    tiny = lambda body: builtin_clip(body, SceneKnobs.tiny())  # noqa: E731
-    monkeypatch.setattr(hoigs, "builtin_clip", tiny, raising=False)
-    monkeypatch.setattr(sys, "argv", ["01_compose.py", "3"])
-    small = hoigs.read_clip
-    monkeypatch.setattr(hoigs, "read_clip", lambda folder, width: small(folder), raising=False)
-    source = (EXAMPLES / "01_compose.py").read_text().replace("clip[12]", "clip[2]")
-    exec(compile(source, "01_compose.py", "exec"), {"__name__": "__main__"})
-    assert "Gaussians" in capsys.readouterr().out
+
+def test_a_deformation_of_ones_own_learns(run):
+    x, y, z = map(float, re.search(r"\[(.*)\]", run("04", 200))[1].split(","))
+    assert abs(x - 0.3) < 0.02 and abs(y) < 0.02 and abs(z) < 0.05
+
+
+def test_two_objects_are_both_corrected(run):
+    corrected = dict(re.findall(r"(\w+) +corrected by up to (\S+)", run("05", TINY)))
+    assert corrected.keys() == {"human", "box", "copy"}
+    assert float(corrected["box"]) > 0 and float(corrected["human"]) > 0
+
+
+def test_cameras_of_ones_own(run, tmp_path):
+    import imageio.v3 as iio
+
+    said = run("06", TINY, tmp_path / "orbit.gif")
+    assert "8 pictures" in said
+    pictures = iio.imread(tmp_path / "orbit.gif")
+    assert pictures.shape[1:] == (64, 64, 3) and pictures.std() > 5
+    assert (pictures[0] != pictures[2]).any()
