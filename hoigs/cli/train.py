@@ -35,6 +35,14 @@ def train(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the run in --out.")
     ] = False,
+    reader: Annotated[
+        str | None,
+        typer.Option("--reader", help="Data set layout of CLIP; default: the one it looks like."),
+    ] = None,
+    reader_set: Annotated[
+        list[str] | None,
+        typer.Option("--reader-set", help="A setting of the reader: masks=false. Repeatable."),
+    ] = None,
     evaluate: Annotated[
         bool, typer.Option("--eval/--no-eval", help="Score the run and write its report.")
     ] = True,
@@ -54,6 +62,8 @@ def train(
         resume=resume,
         overwrite=overwrite,
         plugins=plugin or (),
+        reader=reader,
+        reader_settings=reader_set or (),
     )
     run_session(session)
     if evaluate:
@@ -71,7 +81,7 @@ def run_session(session: object) -> None:
     if width is not None and own < width:
         typer.echo(f"train.width={width} is wider than the clip: its {own} pixels are kept")
     typer.echo(
-        f"training {session.spec.name} on {session.clip.name}: {steps} steps, "
+        f"training {session.spec.name} on {session.clip.name} ({session.reader}): {steps} steps, "
         f"{len(session.clip.split['train'])} frames of "
         f"{session.clip.cameras[0].width}x{session.clip.cameras[0].height}"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from hoigs.core.clip import Clip
 
@@ -13,7 +13,13 @@ if TYPE_CHECKING:
 
 
 class ClipReader(ABC):
-    """One dataset layout."""
+    """One dataset layout.
+
+    Attributes:
+        general: a layout that others contain: where another reader knows a folder too, it reads.
+    """
+
+    general: ClassVar[bool] = False
 
     @classmethod
     def from_config(cls, config: Any, context: BuildContext) -> Self:

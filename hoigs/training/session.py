@@ -25,14 +25,19 @@ from hoigs.training.checkpoint import (
     restore_model,
 )
 from hoigs.training.clip_source import clip_folder, clip_name
+from hoigs.training.reader_choice import ReaderChoice, choose_reader, recorded_reader
 from hoigs.training.run_folder import RunFolder, versions
 from hoigs.training.trainer import StepReport, Trainer
 
 
 def read_clip(
-    folder: Path | str, registry: Registry | None = None, width: int | None = None
+    folder: Path | str,
+    registry: Registry | None = None,
+    width: int | None = None,
+    *,
+    reader: ReaderChoice | None = None,
 ) -> Clip:
-    """The clip in `folder`, by the first reader that knows its layout, at a training width.
+    """The clip in `folder`, by the reader that knows its layout, at a training width.
 
     Args:
         folder: as `hoigs prepare` makes it, any layout that an installed reader knows, or
@@ -40,34 +45,40 @@ def read_clip(
         registry: where readers are looked up; by default what is installed.
         width: shrink frames to this image width, aspect kept; those that are narrower, and all
             with None, stay as they are.
+        reader: from `choose_reader`; None looks at the folder.
 
     Raises:
-        ClipError: no reader knows it, or the reader found it incomplete.
+        ClipError: no reader knows it, several do, or the reader found it incomplete.
     """
     registry = registry or default_registry()
     folder = clip_folder(folder, registry)
+    require_folder(folder)
+    choice = reader or choose_reader(folder, registry)
+    clip = choice.reader.read(folder)
+    if width is None or width >= clip.cameras[0].width:
+        return clip
+    return clip.resized(width)
+
+
+def require_folder(folder: Path) -> None:
+    """ClipError if there is no such folder."""
     if not folder.is_dir():
         raise ClipError(f"{folder}: no such folder; `hoigs prepare VIDEO --out {folder}` makes one")
-    for key in registry.keys("reader"):
-        reader = registry.get(key)()
-        if reader.matches(folder):
-            clip = reader.read(folder)
-            shrinks = width is not None and width < clip.cameras[0].width
-            return clip.resized(width) if shrinks else clip
-    raise ClipError(
-        f"{folder}: not a layout that {', '.join(registry.keys('reader'))} knows; a clip folder "
-        "has clip.json (docs/reference/clip.md); `hoigs prepare` makes one from a video"
-    )
 
 
 @dataclass
 class Session:
-    """One training run, ready to start."""
+    """One training run, ready to start.
+
+    Attributes:
+        reader: key of the reader that read the clip.
+    """
 
     spec: Spec
     clip: Clip
     run: RunFolder
     trainer: Trainer
+    reader: str = ""
 
     @classmethod
     def open(
@@ -82,8 +93,14 @@ class Session:
         overwrite: bool = False,
         plugins: Sequence[Path] = (),
         lpips_weights: Path | None = None,
+        reader: str | None = None,
+        reader_settings: Sequence[str] = (),
     ) -> Session:
         """Check the spec, the clip and the output folder, compose the model, then make the run.
+
+        Args:
+            reader: its name; by default the one that knows the clip's layout.
+            reader_settings: of that reader, "key=value".
 
         Raises:
             HoigsError: anything wrong with the input; no folder has been made by then.
@@ -93,7 +110,9 @@ class Session:
             spec = Spec.load(spec, overrides=overrides, registry=registry)
         torch.manual_seed(spec.train.seed)
         folder = clip_folder(clip, registry)
-        source = read_clip(folder, registry, spec.train.width)
+        require_folder(folder)
+        choice = choose_reader(folder, registry, reader, reader_settings)
+        source = read_clip(folder, registry, spec.train.width, reader=choice)
         run = RunFolder(out or Path("runs") / f"{clip_name(clip)}-{spec.name}")
         if resume:
             run.require()
@@ -121,12 +140,16 @@ class Session:
                 "components": registry.provenance(spec)
                 | {f"body of {n}": registry.origin(t.model) for n, t in source.bodies.items()},
                 "spec_hash": spec.hash(),
-                "clip": {"name": source.name, "path": run.relative(folder)},
+                "clip": {
+                    "name": source.name,
+                    "path": run.relative(folder),
+                    "reader": choice.record(run.relative),
+                },
                 "clip_provenance": dict(source.provenance),
                 "device": device,
             }
             run.create(spec.dump(), provenance, overwrite)
-        return cls(spec, source, run, trainer)
+        return cls(spec, source, run, trainer, choice.key)
 
     def train(self, on_step: Callable[[StepReport], None] | None = None) -> None:
         self.trainer.train(on_step)
@@ -184,7 +207,9 @@ class LoadedRun:
         if not folder.is_dir():
             raise HoigsError(f"{folder}: the clip of this run is not there; give --clip FOLDER")
         torch.manual_seed(spec.train.seed)
-        source = read_clip(folder, registry, spec.train.width)
+        recorded = provenance["clip"].get("reader") if clip is None else None
+        choice = recorded_reader(recorded, path, folder, registry) if recorded else None
+        source = read_clip(folder, registry, spec.train.width, reader=choice)
         model = compose(spec, source, registry).to(device)
         checkpoint = load_checkpoint(latest_checkpoint(run.checkpoints))
         restore_model(model, checkpoint, spec.model_hash())

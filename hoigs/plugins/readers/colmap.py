@@ -45,6 +45,8 @@ class ColmapReader(ClipReader):
         factor, test_every, fps, cache_mb: see ColmapConfig.
     """
 
+    general = True  # NeuMan, ExAvatar and nerfstudio have a COLMAP model too
+
     def __init__(
         self,
         factor: int = 1,

@@ -33,7 +33,8 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def template(models: Path) -> np.ndarray:
-    return SmplxBody(models / "SMPLX_FEMALE.npz").template.double().numpy() + [0.0, 0.02, 0.0]
+    mean = SmplxBody(models / "SMPLX_FEMALE.npz").template.double().numpy()
+    return mean + np.array([0.0, 0.02, 0.0])
 
 
 def shapeless(clip: Clip) -> Clip:
