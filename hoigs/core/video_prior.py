@@ -230,6 +230,11 @@ class VideoPrior(Prior, ABC):
 
     provides: ClassVar[frozenset[EvidenceKind]] = frozenset()
 
+    def __repr__(self) -> str:
+        """Class and settings, the same in every process: results are kept under such a name."""
+        settings = ", ".join(f"{k}={v!r}" for k, v in sorted(vars(self).items()))
+        return f"{type(self).__name__}({settings})"
+
     @abstractmethod
     def estimate(self, video: VideoRequest, progress: Progress = no_progress) -> Evidence:
         """The evidence, lazily where it is large; callers pass it through `checked`.

@@ -29,6 +29,7 @@ from hoigs.core.video_prior import (
     no_progress,
 )
 from hoigs.plugins.priors.video_depth_files import DepthFilesConfig, DepthFilesPrior
+from hoigs.plugins.priors.video_files import absent
 from hoigs.plugins.priors.video_landmarks_files import LandmarksFilesConfig, LandmarksFilesPrior
 from hoigs.plugins.priors.video_masks_files import MasksFilesConfig, MasksFilesPrior
 from hoigs.plugins.priors.video_subprocess import run_tool, settings_key
@@ -47,6 +48,10 @@ class CommandConfig(ComponentConfig):
         "a folder of all frames, 00000.png on; {out}: an empty folder for what it writes; "
         "{video}, {folder}: the video and its folder; {width}, {height}, {count}, {fps}"
     )
+    cwd: Path | None = Field(
+        default=None, description="folder to run it in, such as the tool's own; relative to the "
+        "video's folder, which it is by default"
+    )  # fmt: skip
     masks: MasksFilesConfig | None = Field(
         default=None, description="how to read masks, as prior:masks-files; paths start at {out}"
     )
@@ -81,21 +86,33 @@ class CommandConfig(ComponentConfig):
         return self
 
 
+class _OfReaders:
+    """`provides`: of the class, all that a command may give; of an instance, what it reads."""
+
+    def __get__(
+        self, prior: CommandPrior | None, owner: type[CommandPrior]
+    ) -> frozenset[EvidenceKind]:
+        if prior is None:
+            return frozenset(EVIDENCE)
+        return frozenset().union(*(reader.provides for reader in prior.readers))
+
+
 class CommandPrior(VideoPrior):
     """Evidence from the files of a command.
 
     Args:
         command: as CommandConfig describes it.
         readers: of what it writes, whose relative paths start at {out}; each of one kind.
-
-    Attributes:
-        provides: of this instance, what its readers provide.
+        cwd: folder to run it in; None: the video's.
     """
 
-    def __init__(self, command: str, readers: Iterable[VideoPrior]) -> None:
+    provides = _OfReaders()
+
+    def __init__(
+        self, command: str, readers: Iterable[VideoPrior], cwd: str | Path | None = None
+    ) -> None:
         self.command, self.readers = command, tuple(readers)
-        kinds = frozenset[EvidenceKind]().union(*(reader.provides for reader in self.readers))
-        self.provides = kinds  # type: ignore[misc]  # of the instance: it depends on the settings
+        self.cwd = None if cwd is None else Path(cwd)
 
     @classmethod
     def from_config(cls, config: Any, context: BuildContext) -> Self:
@@ -106,21 +123,23 @@ class CommandPrior(VideoPrior):
             readers.append(DepthFilesPrior.from_config(config.depth, context))
         if config.landmarks is not None:
             readers.append(LandmarksFilesPrior.from_config(config.landmarks, context))
-        return cls(config.command, readers)
+        return cls(config.command, readers, config.cwd)
 
     def estimate(self, video: VideoRequest, progress: Progress = no_progress) -> Evidence:
         # all frames: arrays that tools write have no frame numbers, so their rows must be frames
         whole = replace(video, wanted=None)
-        stamp = video.work / f"command-{settings_key({'command': self.command})}"
+        stamp = video.work / f"command-{settings_key({'command': self.command, 'cwd': self.cwd})}"
         out, done = stamp.with_suffix(".out"), stamp.with_suffix(".done")
         text = f"running {shlex.split(self.command)[0]}"
         if not done.is_file():
             shutil.rmtree(out, ignore_errors=True)  # of a run that was cut short
             out.mkdir(parents=True)
             progress(0.0, text)
-            argv = self._argv(whole, out)
+            argv, cwd = self._argv(whole, out), video.resolve(self.cwd or Path())
+            if not cwd.is_dir():
+                raise HoigsError(f"prior:command: {absent(cwd)}: the command's `cwd`")
             log = stamp.with_suffix(".log")
-            run_tool(argv, what="prior:command", log=log, cwd=video.folder)
+            run_tool(argv, what="prior:command", log=log, cwd=cwd)
         evidence = self._read(replace(video, folder=out))
         done.touch()
         progress(1.0, text)

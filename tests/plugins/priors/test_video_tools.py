@@ -71,6 +71,8 @@ def test_a_command_gives_what_it_writes_and_is_not_run_twice(tmp_path, tool):
     video = request(tmp_path, entities=HUMAN, wanted=(0, 2, 4))
     prior = command(tool)
     assert prior.provides == {"masks", "depth"}
+    assert type(prior).provides == {"masks", "landmarks", "depth"}  # what a command may give
+    assert repr(prior) == repr(command(tool))  # results are kept under this name
     told = []
     evidence = checked(prior.estimate(video, lambda *step: told.append(step)), video, prior)
     for i in range(FRAMES):
@@ -124,6 +126,16 @@ def test_settings_are_checked_before_anything_runs(tool):
         command(tool, command=" ")
     with pytest.raises(ValidationError, match="kinds"):
         command(tool, depth={"kinds": "metric"})
+
+
+def test_a_command_runs_in_the_folder_that_it_wants(tmp_path, tool):
+    video = request(tmp_path, entities=HUMAN)
+    words = f"{shlex.quote(sys.executable)} tool.py {{frames}} {{out}} here"
+    with pytest.raises(HoigsError, match="ended with code 2"):
+        command(tool, command=words).estimate(video)
+    command(tool, command=words, cwd="some folder").estimate(video)
+    with pytest.raises(HoigsError, match=r'did you mean "some folder".*`cwd`'):
+        command(tool, command=words, cwd="some folders").estimate(video)
 
 
 def test_no_shell_is_involved(tmp_path, tool):
