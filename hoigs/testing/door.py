@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 # kind -> package with its CHECKS and `subject(cls, config, options)`; the others have P alone
 KINDS = {
     "deformation": "hoigs.testing.deformation",
+    "features": "hoigs.testing.features",
+    "interaction": "hoigs.testing.interaction",
     "rasterizer": "hoigs.testing.rasterizer",
 }
 PLUGIN = "hoigs.testing.plugin"

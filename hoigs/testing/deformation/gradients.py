@@ -52,9 +52,8 @@ def gradients_are_derivatives(subject: DeformationSubject) -> None:
     """In float64, gradients are slopes, for each parameter and each field of the Gaussians."""
     entity = subject.entity(dtype=torch.float64)
     with torch.no_grad():
-        entity.means += 1e-3 * torch.randn(
-            entity.means.shape, generator=torch.Generator().manual_seed(9), dtype=torch.float64
-        ).to(entity.means)
+        aside = torch.randn(entity.means.shape, generator=torch.Generator().manual_seed(9))
+        entity.means.add_(1e-3 * aside.to(entity.means))
     # of fields that it owns, nobody trains the values at rest
     leaves = {n.removeprefix("deformation."): p for n, p in trained(entity).items()}
     for time in (0.37, 0.81):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -34,7 +35,9 @@ def phases() -> dict[str, Tensor]:
 
 def pose_at(time: float, dtype: torch.dtype = torch.float32) -> BodyPose:
     """The human at any time, also beyond the clip: every joint sways, the pelvis walks."""
-    turns = {n: (0.3 * torch.sin(2.5 * time + phase)).to(dtype) for n, phase in phases().items()}
+    turns: dict[str, Any] = {
+        name: (0.3 * torch.sin(2.5 * time + phase)).to(dtype) for name, phase in phases().items()
+    }
     place = torch.tensor((0.3 * time, 0.05 * math.sin(3 * time), 3.0), dtype=dtype)
     return BodyPose(transl=place, betas=torch.tensor(BETAS, dtype=dtype), **turns)
 
@@ -77,7 +80,9 @@ def object_track() -> ObjectTrack:
 def body_track() -> BodyTrack:
     poses = [pose_at(i / (FRAMES - 1)) for i in range(FRAMES)]
     fields = ("global_orient", "body", "left_hand", "right_hand", "transl")
-    stacked = {name: torch.stack([getattr(p, name) for p in poses]) for name in fields}
+    stacked: dict[str, Any] = {
+        name: torch.stack([getattr(p, name) for p in poses]) for name in fields
+    }
     return BodyTrack("body:tiny", BodyPose(betas=torch.tensor(BETAS), **stacked), "hoigs.testing")
 
 

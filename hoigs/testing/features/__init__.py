@@ -1,0 +1,10 @@
+"""Conformance of feature extractors: `CHECKS`, F01 to F12, on a motion that provides everything."""
+
+from __future__ import annotations
+
+from hoigs.testing.features import keeping, tokens
+from hoigs.testing.features.subject import CHECKS, FeaturesSubject, subject
+
+FAMILIES = (tokens, keeping)  # importing them fills CHECKS
+
+__all__ = ["CHECKS", "FAMILIES", "FeaturesSubject", "subject"]

@@ -1,0 +1,119 @@
+"""F01 to F07: what tokens are, and where."""
+
+from __future__ import annotations
+
+import torch
+
+from hoigs.testing.compare import require, require_close, require_finite
+from hoigs.testing.deformation.subject import apply, changed_by
+from hoigs.testing.features.subject import (
+    CHECKS,
+    INSIDE,
+    OUTSIDE,
+    FeaturesSubject,
+    by_name,
+    learns,
+    require_same,
+)
+from hoigs.testing.modules import (
+    require_finite_gradients,
+    require_gradients,
+    require_true_gradients,
+    trained,
+    weighed,
+)
+
+
+@CHECKS.check("F01")
+def as_many_positions_as_features(subject: FeaturesSubject) -> None:
+    """M tokens are features [M, width] and positions [M, 3], for 1 and for 7 Gaussians."""
+    for count in (1, 7):
+        entity = subject.entity(count)
+        tokens, features = subject.tokens(entity, 0.4), entity.features
+        assert features is not None
+        number, width = len(tokens.features), features.width
+        got = list(tokens.features.shape)
+        require(got == [number, width], f"features are {got}, width says {width}")
+        require(
+            tokens.positions.shape == (number, 3),
+            f"{number} tokens have positions {list(tokens.positions.shape)}",
+        )
+
+
+@CHECKS.check("F02")
+def dtype_and_device_are_kept(subject: FeaturesSubject) -> None:
+    """Tokens have dtype and device of the Gaussians, in float32 and in float64."""
+    for dtype in (torch.float32, torch.float64):
+        entity = subject.entity(dtype=dtype)
+        for name, x in by_name(subject.tokens(entity, 0.4)).items():
+            same = x.dtype == dtype and x.device == entity.means.device
+            require(same, f"{name} are {x.dtype} on {x.device}, the Gaussians {dtype}")
+
+
+@CHECKS.check("F03")
+def numbers_everywhere(subject: FeaturesSubject) -> None:
+    """Tokens and their gradients are finite within the clip, at its ends and beyond."""
+    for perturbed in (False, True):
+        entity = subject.entity(perturbed=perturbed)
+        for time in (*INSIDE, *OUTSIDE):
+            tokens = by_name(subject.tokens(entity, time))
+            for name, x in tokens.items():
+                require_finite(f"{name} at {time}", x)
+            require_finite_gradients(entity, weighed(tokens))
+
+
+@CHECKS.check("F04")
+def order_of_gaussians_does_not_matter(subject: FeaturesSubject) -> None:
+    """Permuted Gaussians have permuted tokens where these are one each, else the same tokens."""
+    order = [3, 0, 6, 2, 5, 1, 4]
+    plain, permuted = subject.entity(), subject.entity()
+    apply(permuted, changed_by(order))
+    wanted, got = subject.tokens(plain, 0.4), subject.tokens(permuted, 0.4)
+    if len(wanted.features) == len(order):
+        wanted = type(wanted)(wanted.features[order], wanted.positions[order])
+    require_same("permuted", got, wanted)
+
+
+@CHECKS.check("F05", learns)
+def every_parameter_learns(subject: FeaturesSubject) -> None:
+    """Every trained parameter gets a gradient from some moment."""
+    entity = subject.entity()
+    assert entity.features is not None
+    times = [i / 16 for i in range(17)]
+    losses = (weighed({"features": subject.tokens(entity, t).features}) for t in times)
+    require_gradients(entity.features, losses)
+
+
+@CHECKS.check("F06", learns)
+def gradients_are_derivatives(subject: FeaturesSubject) -> None:
+    """In float64, the gradient of every parameter is the slope of the tokens."""
+    entity = subject.entity(dtype=torch.float64)
+    assert entity.features is not None
+    for time in (0.37, 0.81):
+        require_true_gradients(
+            trained(entity.features),
+            lambda time=time: weighed(by_name(subject.tokens(entity, time))),  # type: ignore[misc]
+        )
+
+
+@CHECKS.check("F07")
+def tokens_are_where_the_entity_is(subject: FeaturesSubject) -> None:
+    """Positions of tokens are among the Gaussians, or on the body, at that moment."""
+    entity = subject.entity()
+    for time in (0.0, 0.6):
+        moment = moment_of(subject, entity, time)
+        drawn = entity(moment).means
+        field = entity.deformation.posed_field(entity.rest, moment)[1]  # type: ignore[operator]
+        places = subject.tokens(entity, time).positions
+        far = []
+        for around in (drawn, field):
+            low, high = around.amin(0), around.amax(0)
+            far.append(float((places - places.clamp(low, high)).norm(dim=-1).max()))
+        require_close(f"distance of tokens to the entity at {time}", min(far), 0.0, atol=0.05)
+
+
+def moment_of(subject: FeaturesSubject, entity, time: float):  # type: ignore[no-untyped-def]
+    from hoigs.testing.material.clip import moment_at
+
+    del subject
+    return moment_at(time, entity.means.dtype, entity.means.device)
