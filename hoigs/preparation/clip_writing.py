@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 import torch
+from jaxtyping import Float
 
+from hoigs.core.body import PELVIS
 from hoigs.core.clip_folder import ClipWriter
 from hoigs.preparation.cameras import parallax
+from hoigs.preparation.multiview import angular_factor, full_factor
 from hoigs.preparation.overlay import OverlayVideo
 from hoigs.preparation.report import PrepareReport
+
+BODY_JOINTS = 22  # without the hands', which are not fitted
 
 if TYPE_CHECKING:
     from hoigs.preparation.pipeline import Pipeline
@@ -24,7 +31,8 @@ def write_clip_folder(made: Pipeline) -> PrepareReport:
     }
     with ClipWriter(
         made.out, fps=made.video.fps, entities=entities, image_format=options.image_format,
-        quality=options.quality,
+        quality=options.quality, depth_kind="none" if made.depth is None else "metric",
+        depth_dtype=np.float16,
     ) as writer:  # fmt: skip
         made.leftovers.note(writer.root)
         with made.stages.stage("writing"):
@@ -57,7 +65,7 @@ def _write_frames(made: Pipeline, writer: ClipWriter) -> None:
             made.stages.track(rows, len(made.video))
         ):
             masks = {options.human: human, options.object: thing}
-            writer.add_frame(image, camera, masks, ignored=blank)
+            writer.add_frame(image, camera, masks, made.metres(i), blank)
             points = made.object.points @ made.object.rotations[i].mT
             points = points + made.object.translations[i]
             overlay.add(image, camera, vertices, human, thing, points)
@@ -65,8 +73,11 @@ def _write_frames(made: Pipeline, writer: ClipWriter) -> None:
 
 def _report(made: Pipeline, name: str) -> PrepareReport:
     middle = torch.median(made.scene.points, dim=0).values
-    options, person = made.options, made.person
+    options, person, figures = made.options, made.person, made.track.figures
     coverage = {options.human: made.masks.human, options.object: made.masks.thing}
+    pelvis = person.joints[:, PELVIS]
+    moving = torch.cat((person.joints[:, :BODY_JOINTS], made.object.translations[:, None]), 1)
+    focal, depth = float(made.cameras[0].K[0, 0]), made.depth
     return PrepareReport(
         name=name,
         video=made.source.video.name,
@@ -86,4 +97,20 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         provenance=made.provenance,
         warnings=made.warnings,
         seconds=made.stages.seconds,
+        registered=figures["registered"] / figures["images"] if "registered" in figures else None,
+        reprojection_px=figures.get("reprojection_px"),
+        displacement_px=figures.get("displacement_px"),
+        sharpness=[round(value, 4) for value in made.video.sharpness],
+        body_residuals_px=_numbers(person.residuals.numpy(), 2),
+        body_residual_m=round(person.residual_px * person.distance(made.cameras) / focal, 4),
+        depth_residual=None if depth is None else depth.typical,
+        depth_residuals=[] if depth is None else _numbers(depth.residual, 4),
+        depth_against="" if depth is None else depth.against,
+        omega=angular_factor(made.cameras, pelvis, made.video.fps),
+        big_omega=full_factor(made.cameras, moving),
     )
+
+
+def _numbers(values: Float[np.ndarray, " F"], digits: int) -> list[float | None]:
+    """For JSON, which knows no NaN."""
+    return [round(v, digits) if math.isfinite(v) else None for v in values.tolist()]

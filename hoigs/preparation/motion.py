@@ -63,18 +63,17 @@ def background_motion(video: Frames, masks: GivenMasks) -> BackgroundMotion:
     options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1)
     options.sift.max_num_features = FEATURES
     with quiet_colmap():
-        sift = pycolmap.Sift(options, device=pycolmap.Device.cpu)
-    chosen = set(np.linspace(0, len(video) - 1, FRAMES + 1).round().astype(int).tolist())
-    found = [
-        _features(sift, image, masks.moving(i)) for i, image in enumerate(video) if i in chosen
-    ]
+        sift = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    chosen = sorted(set(np.linspace(0, len(video) - 1, FRAMES + 1).round().astype(int).tolist()))
+    pairs = zip(chosen, video.subset(chosen), strict=True)
+    found = [_features(sift, image, masks.moving(i)) for i, image in pairs]
     first, rest = found[0], found[1:]
     displacement, matches = [], []
     for other in rest:
-        pairs = _matches(first[1], other[1])
-        matches.append(len(pairs))
-        moved = np.linalg.norm(first[0][pairs[:, 0]] - other[0][pairs[:, 1]], axis=-1)
-        displacement.append(float(np.median(moved)) if len(pairs) >= ENOUGH else np.nan)
+        again = _matches(first[1], other[1])
+        matches.append(len(again))
+        moved = np.linalg.norm(first[0][again[:, 0]] - other[0][again[:, 1]], axis=-1)
+        displacement.append(float(np.median(moved)) if len(again) >= ENOUGH else np.nan)
     return BackgroundMotion(np.array(displacement), matches, len(first[0]))
 
 
@@ -87,11 +86,11 @@ def _features(
     small = shrink(image, *size)
     grey = np.ascontiguousarray(np.array(Image.fromarray(small).convert("L")))
     hidden = shrink_mask(grown(moving), *size)
-    keypoints, descriptors = sift.extract(grey)
-    xy = np.asarray(keypoints, np.float64)[:, :2]
+    keypoints, found = sift.extract_from_uint8_array(grey)
+    xy = np.array([(k.x, k.y) for k in keypoints], np.float64).reshape(-1, 2)
     column, row = np.clip(xy.astype(int), 0, np.array(size) - 1).T
     seen = ~hidden[row, column]
-    descriptors = np.asarray(descriptors, np.float32)[seen]
+    descriptors = np.asarray(found.data, np.float32)[seen]
     descriptors /= np.linalg.norm(descriptors, axis=-1, keepdims=True).clip(1e-6)
     return xy[seen] * (WIDTH / size[0]), descriptors
 

@@ -18,6 +18,14 @@ from hoigs.preparation.blank import blank_pixels
 from hoigs.preparation.camera_choice import ChosenCameras, choose_cameras
 from hoigs.preparation.cameras import scaled_cameras
 from hoigs.preparation.clip_writing import write_clip_folder
+from hoigs.preparation.depth import (
+    POOR,
+    DepthFit,
+    DepthSource,
+    fit_depth,
+    seen_points,
+    seen_surface,
+)
 from hoigs.preparation.evidence import Gathering, Priors, described, paths_of
 from hoigs.preparation.frames import FrameList, open_frames
 from hoigs.preparation.leftovers import Leftovers
@@ -263,6 +271,53 @@ class Pipeline:
             )
         return track, spread
 
+    def _depth(self) -> None:
+        prior, self.depth_maps = self.priors.get("depth"), None
+        made_from = None
+        if prior is not None:
+            made_from = [described(prior), fingerprint(paths_of(prior, self.source.folder))]
+        self.depth = self._stage(
+            "depth", self._fit_depth, saved.save_depth, saved.load_depth, made_from
+        )
+        if prior is not None and self.depth_maps is None:
+            self.depth_maps = self._read_depth()
+
+    def _read_depth(self) -> DepthSource:
+        maps = self.gathering.estimate("depth", lambda _done: None).depth
+        assert maps is not None  # `checked` saw to it
+        return DepthSource(maps, self.video, self.track.undistort)
+
+    def _fit_depth(self) -> DepthFit | None:
+        if "depth" not in self.priors:
+            return None
+        self.depth_maps = self._read_depth()
+        surfaces = [vertices for vertices, _ in self.person.posed(self.body)]
+        points = self.track.points * self.person.scene_scale
+        fit = fit_depth(
+            self.depth_maps,
+            lambda i: seen_points(points, self.cameras[i], self.moving(i)),
+            lambda i: seen_surface(surfaces[i], self.cameras[i], self.masks.human[i]),
+            len(self.video),
+            self.stages.advance,
+        )
+        self.provenance["depth"] = fit.provenance
+        if fit.typical > POOR:
+            self.warnings.append(
+                f"depth is {100 * fit.typical:.0f} % off {fit.against}: see the report"
+            )
+        return fit
+
+    def moving(self, frame: int) -> np.ndarray:
+        """Pixels of a frame that show no scene."""
+        masks = self.masks
+        return masks.human[frame] | masks.thing[frame] | masks.blank[frame]
+
+    def metres(self, frame: int) -> np.ndarray | None:
+        """Depth of a frame, 0 where it is unknown; None without a prior of depth."""
+        if self.depth is None or self.depth_maps is None:
+            return None
+        return self.depth.metres(self.depth_maps[frame], frame)
+
     def _scene(self) -> None:
         self.scene = self._stage("scene", self._find_scene, saved.save_scene, saved.load_scene)
 
@@ -279,16 +334,23 @@ class Pipeline:
                 self.images, masks, self.cameras[0],
                 ground=self.person.ground, distance=self.person.distance(self.cameras),
                 backdrop=self.options.backdrop, count=self.options.scene_points,
+                metres=None if self.depth is None else self._metres_of,
             )  # fmt: skip
-            self.warnings.append(
-                "the camera stands still: the scene's depth is supposed, only what moves has a "
-                "measured place"
-            )
+            if self.depth is None:
+                self.warnings.append(
+                    "the camera stands still: the scene's depth is supposed, only what moves has a "
+                    "measured place"
+                )
         self.provenance["scene"] = scene.provenance
         return scene
 
     def _writing(self) -> None:
         self.report: PrepareReport = write_clip_folder(self)
+
+    def _metres_of(self, frame: int) -> np.ndarray:
+        depth = self.metres(frame)
+        assert depth is not None
+        return depth
 
     @property
     def body_track(self) -> BodyTrack:

@@ -32,7 +32,8 @@ PLAN = {
     "body": Stage(40, ("inputs",), ("body", "fit_steps"), long=True),
     "masks": Stage(10, ("inputs", "body"), ("keep_black",), long=True),
     "object": Stage(4, ("masks",), ("ball_radius", "object_points"), long=True),
-    "scene": Stage(6, ("masks",), ("scene_points", "backdrop"), long=True),
+    "depth": Stage(4, ("masks",), ("prompts",), long=True),
+    "scene": Stage(6, ("masks", "depth"), ("scene_points", "backdrop"), long=True),
     "writing": Stage(40, ("object", "scene")),
 }
 

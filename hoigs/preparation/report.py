@@ -7,10 +7,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from hoigs.preparation.findings import Finding, findings
+from hoigs.preparation.report_page import report_page
+
 
 @dataclass(frozen=True)
 class PrepareReport:
-    """Numbers to judge a prepared clip by; written as report.json and report.md beside it.
+    """Numbers to judge a prepared clip by; written as report.json, .md and .html beside it.
 
     Attributes:
         name, frames, width, height, fps: of the clip. video: the source's file name.
@@ -27,6 +30,15 @@ class PrepareReport:
         provenance: what each part was made from, and how weak it is.
         warnings: what a reader should know before training.
         seconds: time by stage.
+        registered: part of the chosen frames that have a camera; None for a static camera.
+        reprojection_px: of COLMAP's points, mean; None for a static camera.
+        displacement_px: of a static camera's background, at a width of 640; None if not measured.
+        sharpness: of each frame (`sharpness.sharpness`).
+        body_residuals_px: of each frame; None without landmarks.
+        body_residual_m: `body_residual_px` at the person's distance.
+        depth_residual: typical relative error of the depth prior once it is in metres, against
+            `depth_against`; depth_residuals: of each frame. None without such a prior.
+        omega, big_omega: effective multi-view factors (`multiview`).
     """
 
     name: str
@@ -47,6 +59,21 @@ class PrepareReport:
     provenance: dict[str, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
+    registered: float | None = None
+    reprojection_px: float | None = None
+    displacement_px: float | None = None
+    sharpness: list[float] = field(default_factory=list)
+    body_residuals_px: list[float | None] = field(default_factory=list)
+    body_residual_m: float | None = None
+    depth_residual: float | None = None
+    depth_residuals: list[float | None] = field(default_factory=list)
+    depth_against: str = ""
+    omega: float | None = None
+    big_omega: float | None = None
+
+    def findings(self) -> list[Finding]:
+        """Its measures, judged, and what to do where they are bad."""
+        return findings(self)
 
     def to_json(self) -> str:
         return json.dumps(asdict(self), indent=2, allow_nan=False)
@@ -63,6 +90,12 @@ class PrepareReport:
             ("object scale spread", f"{100 * self.object_scale_spread:.1f} %", "so its depth's"),
             ("scene points", f"{self.scene_points}", ""),
         ]
+        if self.depth_residual is not None:
+            rows.append(
+                ("depth", f"{100 * self.depth_residual:.1f} %", f"off {self.depth_against}")
+            )
+        if self.omega is not None:
+            rows.append(("multi-view", f"{self.omega:.1f} °/s", "the camera around the person"))
         rows += [(f"mask of {n}", *_coverage(c)) for n, c in self.coverage.items()]
         rows.append(("time", f"{sum(self.seconds.values()):.0f} s", _times(self.seconds)))
         return rows
@@ -72,14 +105,20 @@ class PrepareReport:
         made = "\n".join(f"- **{name}**: {text}" for name, text in self.provenance.items())
         lines = [f"# {self.name}", "", "| | | |", "|---|---|---|", table]
         lines += ["", "## Made from", "", made]
+        todo = [f for f in self.findings() if f.advice]
+        if todo:
+            told = (f"- **{f.what}: {f.value}** ({f.state}), {f.meaning}: {f.advice}" for f in todo)
+            lines += ["", "## What to do", "", *told]
         if self.warnings:
             lines += ["", "## Beware", "", *(f"- {w}" for w in self.warnings)]
         return "\n".join(lines) + "\n"
 
     def save(self, folder: Path) -> None:
-        """report.json and report.md."""
+        """report.json, report.md and report.html."""
         (folder / "report.json").write_text(self.to_json(), encoding="utf-8")
         (folder / "report.md").write_text(self.to_markdown(), encoding="utf-8")
+        page = report_page(self, (folder / "overlay.mp4").is_file())
+        (folder / "report.html").write_text(page, encoding="utf-8")
 
 
 _BARS = "▁▂▃▄▅▆▇█"

@@ -20,6 +20,7 @@ from hoigs.core.undistortion import Undistortion
 from hoigs.preparation.ball import BallTrack
 from hoigs.preparation.camera_choice import ChosenCameras
 from hoigs.preparation.cameras import CameraTrack, pinhole
+from hoigs.preparation.depth import DepthFit
 from hoigs.preparation.evidence import RawEvidence
 from hoigs.preparation.frames import FrameList
 from hoigs.preparation.landmarks import LandmarkTrack
@@ -230,3 +231,20 @@ def load_scene(result: Result) -> ScenePoints:
     return ScenePoints(
         **_torch(result.arrays, "points", "colors"), provenance=result.values["provenance"]
     )
+
+
+_FIT_ARRAYS, _FIT_VALUES = ("scale", "shift", "residual"), ("kind", "against", "provenance")
+
+
+def save_depth(fit: DepthFit | None) -> Result:
+    if fit is None:
+        return Result({"fit": None})
+    values = {name: getattr(fit, name) for name in _FIT_VALUES}
+    return Result({"fit": values}, {name: getattr(fit, name) for name in _FIT_ARRAYS})
+
+
+def load_depth(result: Result) -> DepthFit | None:
+    if result.values["fit"] is None:
+        return None
+    arrays: dict[str, Any] = {name: result.arrays[name] for name in _FIT_ARRAYS}
+    return DepthFit(**result.values["fit"], **arrays)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hoigs.core.camera import Camera
 from hoigs.preparation.dense_points import densify, keyframes
+from hoigs.preparation.depth import median_depth
 from hoigs.preparation.masks import MaskStack
 from hoigs.preparation.overlay import shrink, shrink_mask
 from hoigs.preparation.scene_points import (
@@ -82,6 +83,7 @@ def static_scene(
     distance: float,
     backdrop: float,
     count: int,
+    metres: Callable[[int], Float[np.ndarray, "H W"]] | None = None,
 ) -> ScenePoints:
     """A floor under the feet and a wall behind, coloured by the frames' unmasked pixels.
 
@@ -90,6 +92,7 @@ def static_scene(
         ground: height of the camera over the floor, metres. distance: of the person, metres.
         backdrop: distance of the wall in distances of the person.
         count: of points, about.
+        metres: measured depth of a frame, 0 where unknown; None: it is supposed everywhere.
     """
     width = min(camera.width, REFERENCE_WIDTH)
     small = camera.resized(width, max(1, round(camera.height * width / camera.width)))
@@ -105,12 +108,24 @@ def static_scene(
 
     margin = max(1, round(MASK_MARGIN * width / REFERENCE_WIDTH))
     plate = background_plate(frames(), margin)
+    measured = None
+    if metres is not None:
+        moving = (np.logical_or.reduce([m[i] for m in masks]) for i in sorted(chosen))
+        maps = (metres(i) for i in sorted(chosen))
+        measured = median_depth(maps, moving, (small.width, small.height))
     points, colors = plate_points(
-        plate, small, ground=ground, backdrop=backdrop * distance, count=count
+        plate, small, ground=ground, backdrop=backdrop * distance, count=count, measured=measured
     )
-    text = (
-        f"supposed: a level floor {ground:.2f} m below a level camera and a wall at "
-        f"{backdrop * distance:.1f} m, coloured by the median of unmasked pixels; its depth is "
-        f"not measured, and {100 * (1 - plate.seen.mean()):.1f} % of it is never seen"
+    floor = (
+        f"a level floor {ground:.2f} m below a level camera and a wall at "
+        f"{backdrop * distance:.1f} m"
     )
+    if measured is None:
+        text = f"supposed: {floor}, coloured by the median of unmasked pixels; its depth is not "
+        text += "measured, and "
+    else:
+        share = 100 * float((measured > 0).mean())
+        text = f"the median of the depth maps over unmasked pixels, {share:.0f} % of the image "
+        text += f"(else {floor}); "
+    text += f"{100 * (1 - plate.seen.mean()):.1f} % of it is never seen"
     return ScenePoints(points, colors, text)

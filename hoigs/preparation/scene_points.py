@@ -78,12 +78,19 @@ def supposed_depth(
 
 
 def plate_points(
-    plate: Plate, camera: Camera, *, ground: float, backdrop: float, count: int
+    plate: Plate,
+    camera: Camera,
+    *,
+    ground: float,
+    backdrop: float,
+    count: int,
+    measured: Float[np.ndarray, "H W"] | None = None,
 ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
     """Points on floor and wall, denser where the plate has detail, with its colours.
 
     Args:
         camera: of the plate's size. count: of points, about.
+        measured: depth of the plate, metres, 0 where floor and wall are supposed; None: everywhere.
 
     Returns:
         points in the world, metres, and RGB in [0, 1].
@@ -94,6 +101,10 @@ def plate_points(
     middles = [(x + w / 2, y + h / 2) for y, x, h, w in cells]
     pixels = torch.tensor(middles, dtype=torch.float32)
     depth = supposed_depth(camera, ground, backdrop, pixels)
+    if measured is not None:
+        column, row = pixels.long().unbind(-1)
+        known = torch.from_numpy(measured)[row, column]
+        depth = torch.where(known > 0, known, depth)
     return camera.unproject(pixels, depth), colors
 
 

@@ -1,0 +1,110 @@
+"""report.html: a preparation judged at a glance, one file that asks the network for nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from importlib import resources
+from string import Template
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hoigs.preparation.findings import Finding
+    from hoigs.preparation.report import PrepareReport
+
+WIDTH, HEIGHT = 300, 90  # of a plot, in its own units
+Series = Mapping[str, Sequence[float | None]]
+
+
+def report_page(report: PrepareReport, overlay: bool) -> str:
+    """The page; `overlay`: overlay.mp4 lies beside it."""
+    page = (resources.files(__package__) / "report_page.html").read_text(encoding="utf-8")
+    camera = "a camera that stands still" if report.camera == "static" else "a moving camera"
+    return Template(page).substitute(
+        title=escape(report.name),
+        lead=escape(
+            f"{report.frames} frames of {report.video}, {report.width}×{report.height} at "
+            f"{report.fps:g} a second, from {camera}."
+        ),
+        video=_video() if overlay else "",
+        findings="\n".join(_finding(f) for f in report.findings()),
+        plots=_plots(report),
+        rows=_rows(report.rows()),
+        made=_rows(list(report.provenance.items())),
+        warnings=_warnings(report.warnings),
+    )
+
+
+def _video() -> str:
+    return (
+        "<video src='overlay.mp4' controls loop muted playsinline></video><p class='say'>The "
+        "fitted body in blue, the masks' outlines in green and yellow, points of the object in "
+        "magenta. If the body does not lie on the person here, nothing after it will be right.</p>"
+    )
+
+
+def _finding(found: Finding) -> str:
+    advice = f"<p>{escape(found.advice)}</p>" if found.advice else ""
+    return (
+        f"<div class='finding {found.state}'><span><b>{escape(found.what)}</b> "
+        f"<small>{escape(found.meaning)}</small></span><em>{escape(found.value)} · "
+        f"{found.state}</em>{advice}</div>"
+    )
+
+
+def _plots(report: PrepareReport) -> str:
+    percent = {name: [100 * value for value in values] for name, values in report.coverage.items()}
+    plots = [plot("Masks, % of the image", percent)]
+    if report.sharpness:
+        plots.append(plot("Sharpness", {"": report.sharpness}))
+    if any(v is not None for v in report.body_residuals_px):
+        plots.append(plot("Body off its landmarks, px", {"": report.body_residuals_px}))
+    if any(v is not None for v in report.depth_residuals):
+        off = [None if v is None else 100 * v for v in report.depth_residuals]
+        plots.append(plot(f"Depth off {report.depth_against}, %", {"": off}))
+    return "".join(plots)
+
+
+def plot(title: str, series: Series) -> str:
+    """Lines over the frames, from 0 to the largest value; None leaves a gap."""
+    top = max((v for values in series.values() for v in values if v is not None), default=0.0)
+    lines = []
+    for values, style in zip(series.values(), "abab", strict=False):
+        step = WIDTH / max(1, len(values) - 1)
+        for run in _runs(values):
+            points = " ".join(
+                f"{i * step:.1f},{HEIGHT * (1 - value / (top or 1)):.1f}" for i, value in run
+            )
+            lines.append(f"<polyline class='{style}' points='{points}'/>")
+    colours = zip(series, ("blue", "yellow", "blue", "yellow"), strict=False)
+    told = [f"{name} {colour}" for name, colour in colours if name]
+    label = f"{title}, 0 to {top:.3g}" + (f"; {', '.join(told)}" if told else "")
+    return (
+        f"<figure><svg viewBox='0 -2 {WIDTH} {HEIGHT + 4}' preserveAspectRatio='none' role='img' "
+        f"aria-label='{escape(label, quote=True)}'>{''.join(lines)}</svg>"
+        f"<figcaption>{escape(label)}</figcaption></figure>"
+    )
+
+
+def _runs(values: Sequence[float | None]) -> list[list[tuple[int, float]]]:
+    """Stretches without a gap, with frame numbers."""
+    runs: list[list[tuple[int, float]]] = [[]]
+    for i, value in enumerate(values):
+        if value is None:
+            runs.append([])
+        else:
+            runs[-1].append((i, value))
+    # a line of one point shows nothing: it is drawn twice
+    return [run * 2 if len(run) == 1 else run for run in runs if run]
+
+
+def _rows(rows: Sequence[Sequence[str]]) -> str:
+    cells = ("".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows)
+    return "".join(f"<tr>{row}</tr>" for row in cells)
+
+
+def _warnings(warnings: Sequence[str]) -> str:
+    if not warnings:
+        return ""
+    items = "".join(f"<li>{escape(warning)}</li>" for warning in warnings)
+    return f"<h2>Beware</h2><ul>{items}</ul>"
