@@ -80,6 +80,13 @@ class _Builder:
     def chosen(self) -> list[tuple[str, EntityKind, str, EntitySpec]]:
         """Name, kind, key of the block, and block of every entity to be modelled."""
         kinds: dict[str, EntityKind] = {SCENE: "scene", **self.clip.kinds}
+        wanted = [name for name in self.spec.model if name != SCENE]
+        if not self.clip.kinds and self.spec.entities is None and wanted:
+            raise SpecError(
+                f"{self.spec.at('model')}: {self.spec.name} models {' and '.join(wanted)}, and "
+                f"clip {self.clip.name} has no entity but the scene; take a spec for the whole "
+                "picture (--spec 4dgs, d3dgs), or model the scene alone (--set entities=[scene])"
+            )
         found = []
         for name, kind in kinds.items():
             if not self.spec.selects(name, kind):
@@ -145,7 +152,13 @@ class _Builder:
 
     def _body(self, name: str, place: str, block: EntitySpec) -> BodyModel:
         """The body model that the clip's poses of a human were fitted with."""
-        track = self.clip.bodies[name]
+        track = self.clip.bodies.get(name)
+        if track is None:
+            why = self.clip.provenance.get(f"poses of {name}", "its reader gives none")
+            raise SpecError(
+                f"{self.spec.at('model', place)}: clip {self.clip.name} has no body poses of "
+                f"{name}: {why}; or take a spec for the whole picture (--spec 4dgs, d3dgs)"
+            )
         context = BuildContext(
             entity=name, clip=self.clip, seed=self.spec.train.seed, body_track=track
         )

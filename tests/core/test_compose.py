@@ -289,6 +289,23 @@ def test_an_entity_without_a_block(parse, registry, clip):
     assert set(compose(parse(TEXT.replace("  human:", "  ann:")), clip, registry).entities)
 
 
+def test_a_clip_of_a_scene_alone(parse, registry, clip):
+    bare = replace(clip, kinds={}, bodies={}, objects={})
+    message = refusal(parse(), bare, registry)
+    assert "mine models human and object, and clip made up has no entity but the scene" in message
+    assert "my.yaml:5:3 model" in message and "--spec 4dgs" in message
+    alone = parse(TEXT + "entities: [scene]\n")
+    assert compose(alone, bare, registry).count() == {"scene": 40}
+
+
+def test_a_human_without_poses(parse, registry, clip):
+    unposed = replace(clip, bodies={}, provenance={"poses of anna": "give smpl="})
+    message = refusal(parse(), unposed, registry)
+    assert "model.human: clip made up has no body poses of anna: give smpl=; or take" in message
+    rest = parse(TEXT + "entities: [scene, object]\n")
+    assert compose(rest, unposed, registry).count() == {"scene": 40, "cup": 8}
+
+
 def test_a_component_that_cannot_be_built(parse, registry, clip):
     text = TEXT.replace(
         "human:\n    deformation: {use:", "human:\n    deformation: {fail: true, use:"
