@@ -35,6 +35,13 @@ def train(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the run in --out.")
     ] = False,
+    allow_faults: Annotated[
+        bool,
+        typer.Option(
+            "--allow-faults",
+            help="Go on without masks, images and depth that are absent or broken.",
+        ),
+    ] = False,
     reader: Annotated[
         str | None,
         typer.Option("--reader", help="Data set layout of CLIP; default: the one it looks like."),
@@ -62,6 +69,7 @@ def train(
         resume=resume,
         overwrite=overwrite,
         plugins=plugin or (),
+        allow_faults=allow_faults,
         reader=reader,
         reader_settings=reader_set or (),
     )
@@ -85,6 +93,8 @@ def run_session(session: object) -> None:
         f"{len(session.clip.split['train'])} frames of "
         f"{session.clip.cameras[0].width}x{session.clip.cameras[0].height}"
     )
+    for fault in session.faults:
+        typer.echo(f"warning: {fault}", err=True)
     latest: dict[str, float] = {}
     with progress_bar("training", steps) as bar:
 

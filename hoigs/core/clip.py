@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from hoigs.core.camera import Camera
+from hoigs.core.fault import Fault
 from hoigs.core.interaction import EntityKind
 from hoigs.core.moment import BodyPose, Moment
 
@@ -44,6 +45,11 @@ class FrameStore(ABC):
         """Pixels that show no scene; None where all do."""
         return None
 
+    def mask_known(self, entity: str, position: int) -> bool:
+        """Whether there is a mask at all; where there is none, `mask` is empty and says nothing."""
+        del entity, position
+        return True
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -54,6 +60,7 @@ class Frame:
         masks: by entity, visible pixels. depth: metres, 0 = unknown, or None.
         ignored: pixels that show no scene (painted over, outside the lens image): nothing is
             learned from them and nothing is scored there. None when there are none.
+        unknown: entities that have no mask here; theirs in `masks` is empty and says nothing.
     """
 
     position: int
@@ -63,6 +70,7 @@ class Frame:
     masks: dict[str, Bool[Tensor, "H W"]]
     depth: Float[Tensor, "H W"] | None
     ignored: Bool[Tensor, "H W"] | None = None
+    unknown: frozenset[str] = frozenset()
 
     @property
     def rgb(self) -> Float[Tensor, "H W 3"]:
@@ -127,6 +135,8 @@ class Clip:
         fps: frames a second.
         depth_kind: "metric", "affine-disparity" or "none".
         provenance: where each part came from.
+        faults: what is wrong with the clip and was let pass when it was read (`clip_health` looks
+            for more).
     """
 
     name: str
@@ -143,6 +153,7 @@ class Clip:
     fps: float = 30.0
     depth_kind: str = "none"
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    faults: Sequence[Fault] = ()
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -159,6 +170,7 @@ class Clip:
             masks={name: self.store.mask(name, position) for name in self.kinds},
             depth=self.store.depth(position),
             ignored=self.store.ignored(position),
+            unknown=frozenset(n for n in self.kinds if not self.store.mask_known(n, position)),
         )
 
     def __iter__(self) -> Iterator[Frame]:
@@ -222,6 +234,9 @@ class ResizedStore(FrameStore):
     def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
         ignored = self.base.ignored(position)
         return None if ignored is None else self._nearest(ignored.float(), position) > 0.5
+
+    def mask_known(self, entity: str, position: int) -> bool:
+        return self.base.mask_known(entity, position)
 
     def _nearest(self, image: Tensor, position: int) -> Tensor:
         width, height = self.sizes[position]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,32 +32,17 @@ from hoigs.core.clip_format import (
     mask_path,
     parse_header,
 )
+from hoigs.core.clip_problem import Problem, summarize
 from hoigs.core.errors import ClipError
 
+__all__ = ["Problem", "check_clip", "require_clip", "summarize", "usable_clip"]
+
 ROTATION_TOLERANCE = 1e-3  # of R R^T - I, generous to float16 and text files
+WITHOUT_IMAGE = "the frame is neither trained on nor scored"
+WITHOUT_MASK = "the entity is not compared with the video there"
+WITHOUT_DEPTH = "no depth is compared there"
+WITHOUT_PIXELS = "these pixels count as unknown"
 _HEADER_FROM = "clip.json comes from `hoigs prepare VIDEO --out FOLDER` or ClipWriter"
-
-
-@dataclass(frozen=True)
-class Problem:
-    """One thing wrong with a clip folder.
-
-    Attributes:
-        path: the file, relative to the folder.
-        message: what is wrong and what to do; for an absent file, who makes it.
-        absent: the file is not there.
-    """
-
-    path: str
-    message: str
-    absent: bool = False
-
-    def __str__(self) -> str:
-        return f"{self.path} is absent: {self.message}" if self.absent else _joined(self)
-
-
-def _joined(problem: Problem) -> str:
-    return f"{problem.path}: {problem.message}"
 
 
 def check_clip(folder: Path) -> list[Problem]:
@@ -94,48 +79,31 @@ def require_clip(folder: Path) -> ClipHeader:
     Raises:
         ClipError: naming every absent or inconsistent file and who makes it.
     """
+    return usable_clip(folder)[0]
+
+
+def usable_clip(folder: Path, allow_faults: bool = False) -> tuple[ClipHeader, list[Problem]]:
+    """The header of a clip folder that can be used, and the problems that were let pass.
+
+    Args:
+        allow_faults: let pass what training can go on without (`Problem.instead`).
+
+    Raises:
+        ClipError: naming every absent or inconsistent file and who makes it.
+    """
     folder = Path(folder)
     if not folder.is_dir():
         raise ClipError(f"{folder} is not a folder; make a clip with `hoigs prepare VIDEO --out …`")
     problems = check_clip(folder)
-    if problems:
-        lines = "\n".join(f"  {line}" for line in summarize(problems))
-        raise ClipError(f"{folder} cannot be used as a clip:\n{lines}")
+    fatal = [p for p in problems if not (allow_faults and p.instead)]
+    if fatal:
+        lines = [f"  {line}" for line in summarize(fatal)]
+        if all(p.instead for p in fatal):
+            lines.append("or go on without these: --allow-faults (docs/reference/clip.md)")
+        raise ClipError(f"{folder} cannot be used as a clip:\n" + "\n".join(lines))
     header, _ = parse_header(folder / HEADER, ClipHeader)
     assert header is not None  # check_clip has just read it
-    return header
-
-
-def summarize(problems: Iterable[Problem]) -> list[str]:
-    """One line a problem; numbered files of one folder with one message share a line."""
-    groups: dict[tuple[str, str, str, bool], list[str]] = {}
-    for p in problems:
-        path = Path(p.path)
-        numbered = path.stem.isdigit()
-        room = str(path.parent) if numbered else p.path
-        key = (room, path.suffix if numbered else "", p.message, p.absent)
-        groups.setdefault(key, []).append(path.stem)
-    lines = []
-    for (room, suffix, message, absent), stems in groups.items():
-        if len(stems) == 1:
-            path_name = f"{room}/{stems[0]}{suffix}" if suffix else room
-            lines.append(str(Problem(path_name, message, absent)))
-        else:
-            names = f"{room}/{_ranges(stems)}{suffix} ({len(stems)} files)"
-            lines.append(f"{names} are absent: {message}" if absent else f"{names}: {message}")
-    return lines
-
-
-def _ranges(stems: list[str]) -> str:
-    numbers = sorted({int(s) for s in stems})
-    runs: list[list[int]] = []
-    for n in numbers:
-        if runs and n == runs[-1][1] + 1:
-            runs[-1][1] = n
-        else:
-            runs.append([n, n])
-    text = [f"{a:05d}" if a == b else f"{a:05d}-{b:05d}" for a, b in runs]
-    return text[0] if len(text) == 1 else "{" + ",".join(text) + "}"
+    return header, problems
 
 
 @dataclass(frozen=True)
@@ -167,14 +135,14 @@ def _check_views(folder: Path, view: _View, header: ClipHeader) -> list[Problem]
     root, path = folder / view.room, view.room + CAMERAS.pattern
     problems, arrays = _check_arrays(folder, path, CAMERAS, {"F": view.count})
     problems += _check_cameras(path, arrays)
-    problems += _each_frame(root, view, image_path, IMAGE, _image_problem)
+    problems += _each_frame(root, view, image_path, IMAGE, _image_problem, WITHOUT_IMAGE)
     for name in header.entities:
         at = functools.partial(_mask_at, name)
-        found = _each_frame(root, view, at, MASK, _mask_problem)
+        found = _each_frame(root, view, at, MASK, _mask_problem, WITHOUT_MASK)
         problems += found or _check_mask_content(root, view, name)
     problems += _each_frame(root, view, ignored_path, IGNORED, _mask_problem, optional=True)
     if header.depth_kind != "none":
-        problems += _each_frame(root, view, depth_path, DEPTH, _depth_problem)
+        problems += _each_frame(root, view, depth_path, DEPTH, _depth_problem, WITHOUT_DEPTH)
     return problems
 
 
@@ -187,16 +155,21 @@ def _each_frame(
     view: _View,
     path_of: Callable[[Path, int], Path],
     spec: FileSpec,
-    check: Callable[[Path, _View], str | None],
+    check: Callable[[Path, _View], str | Problem | None],
+    instead: str | None = None,
     optional: bool = False,
 ) -> list[Problem]:
     def one(frame: int) -> Problem | None:
         path = path_of(root, frame)
         name = view.room + path.relative_to(root).as_posix()
         if not path.is_file():
-            return None if optional else Problem(name, spec.maker, absent=True)
-        message = check(path, view)
-        return Problem(name, message) if message else None
+            if optional:
+                return None
+            return Problem(name, spec.maker, absent=True, instead=instead, lost=True)
+        found = check(path, view)
+        if isinstance(found, Problem):
+            return replace(found, path=name)
+        return Problem(name, found, instead=instead, lost=True) if found else None
 
     with ThreadPoolExecutor(4) as pool:  # decompression releases the interpreter lock
         return [p for p in pool.map(one, range(view.count)) if p]
@@ -230,16 +203,17 @@ def _check_mask_content(root: Path, view: _View, entity: str) -> list[Problem]:
                 brightest = max(brightest, int(np.asarray(image.convert("L")).max()))
         except OSError as error:
             name = f"{view.room}masks/{entity}/{frame:05d}.png"
-            return [Problem(name, f"cannot be decoded ({error})")]
+            message = f"cannot be decoded ({error})"
+            return [Problem(name, message, instead=WITHOUT_MASK, lost=True)]
         if brightest > 127:
             return []
     hint = f" (the brightest pixel is {brightest}: write 255)" if brightest else ""
     message = f'"{entity}" is seen in no frame: every mask is empty{hint}'
     # an entity may well be out of the held-out cameras' sight
-    return [] if view.room else [Problem(f"masks/{entity}", message)]
+    return [] if view.room else [Problem(f"masks/{entity}", message, instead=WITHOUT_MASK)]
 
 
-def _depth_problem(path: Path, view: _View) -> str | None:
+def _depth_problem(path: Path, view: _View) -> str | Problem | None:
     try:
         arrays = load_arrays(path)
     except ValueError as error:
@@ -257,7 +231,9 @@ def _depth_problem(path: Path, view: _View) -> str | None:
         ("negative", int((depth < 0).sum())),
     ):
         if count:
-            return f"{count} {name} pixels; write 0 where depth is unknown"
+            message = f"{count} {name} pixels; write 0 where depth is unknown"
+            bad = int((~np.isfinite(depth) | (depth < 0)).sum())
+            return Problem("", message, instead=WITHOUT_PIXELS, pixels=bad)
     return None
 
 

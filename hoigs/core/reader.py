@@ -16,9 +16,12 @@ class ClipReader(ABC):
     """One dataset layout.
 
     Attributes:
+        allow_faults: let pass what training can go on without, named in `Clip.faults`. Readers may
+            refuse it all the same; set before `read`.
         general: a layout that others contain: where another reader knows a folder too, it reads.
     """
 
+    allow_faults: bool = False
     general: ClassVar[bool] = False
 
     @classmethod

@@ -179,7 +179,10 @@ def score_frame(
     for region, mask in regions.items():
         mask = mask.to(device)
         if not mask.any():
-            values[region] = dict.fromkeys(METRICS, NotComputed(_absence(region, clip.kinds)))
+            reason = _absence(region, clip.kinds)
+            if frame.unknown and region != "full":
+                reason = f"no mask of {', '.join(sorted(frame.unknown))}"
+            values[region] = dict.fromkeys(METRICS, NotComputed(reason))
             continue
         values[region] = {
             "psnr": float(region_psnr(color, target, mask)),

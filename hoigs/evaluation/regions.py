@@ -28,7 +28,8 @@ def region_masks(
 ) -> dict[str, Bool[Tensor, "H W"]]:
     """The mask of each of REGIONS; all False where a frame has none of it.
 
-    No region holds pixels that the frame says show no scene.
+    No region holds pixels that the frame says show no scene. Where the mask of an entity is not
+    known, no region that it decides holds any.
 
     Args:
         kinds: kind of each entity of the clip.
@@ -51,6 +52,10 @@ def region_masks(
         "interaction": dilate(human, band) & dilate(object_, band),
         "background": ~either,
     }
+    unknown = {kinds[name] for name in frame.unknown}
+    if unknown:
+        decided = {"human_object", "interaction", "background", *unknown}
+        regions |= dict.fromkeys(decided & set(regions), empty)
     if frame.ignored is None:
         return regions
     return {name: mask & ~frame.ignored for name, mask in regions.items()}

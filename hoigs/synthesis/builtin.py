@@ -16,6 +16,7 @@ import torch
 from hoigs.core.body import BodyModel
 from hoigs.core.clip import BodyTrack, ObjectTrack, uniform_test_split
 from hoigs.core.clip_folder import ClipWriter
+from hoigs.synthesis.damage import damage, with_frames_dropped
 from hoigs.synthesis.generate import (
     ENTITIES,
     SyntheticScene,
@@ -111,6 +112,7 @@ def write_scene(
     Raises:
         ClipError: `folder` exists and is no clip.
     """
+    scene = with_frames_dropped(scene)
     knobs = scene.knobs
     rng = np.random.default_rng(knobs.seed + 3)
     gather = _Points(scene, rng)
@@ -146,6 +148,7 @@ def write_scene(
             }
         )
     save_truth(scene, folder / "truth.npz")
+    damage(folder, knobs.noise, knobs.seed)
 
 
 @torch.no_grad()

@@ -65,13 +65,22 @@ class LightKnobs(ComponentConfig):
 
 
 class NoiseKnobs(ComponentConfig):
-    """Errors put on what is written, as a real pipeline would make them; the truth stays exact."""
+    """Errors put on what is written, as a real pipeline would make them; the truth stays exact.
+
+    Clips with absent files or NaN depth are refused unless faults are allowed (`--allow-faults`).
+    """
 
     mask_boundary: float = Field(0.0, ge=0, le=1, description="share of boundary pixels flipped")
-    mask_missing: float = Field(0.0, ge=0, le=1, description="share of frames without a mask")
+    mask_missing: float = Field(0.0, ge=0, le=1, description="share of masks that are all zero")
+    mask_absent: float = Field(0.0, ge=0, le=1, description="share of masks that are no file")
     depth_relative: float = Field(0.0, ge=0, description="std as a share of the depth")
     depth_scale: float = Field(1.0, gt=0)
     depth_holes: float = Field(0.0, ge=0, le=1, description="share of pixels without a depth")
+    depth_nan: float = Field(0.0, ge=0, le=1, description="share of pixels whose depth is NaN")
+    frames_dropped: float = Field(
+        0.0, ge=0, lt=0.5, description="share of frames lost from the video: the clip is shorter"
+    )
+    frames_absent: float = Field(0.0, ge=0, lt=1, description="share of images that are no file")
     pose_degrees: float = Field(0.0, ge=0, description="std of each joint's rotation")
     pose_metres: float = Field(0.0, ge=0, description="std of the body's place")
     object_degrees: float = Field(0.0, ge=0, description="std of the object's rotation")

@@ -122,7 +122,9 @@ class JointObjective:
             weights["regularizer/camera"] = self.spec.regularizers.get("camera", CAMERA_WEIGHT)
         for name, residual in state.residuals.items():
             self._restrain(name, residual, terms, weights)
-        total = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
+        total = 0 * composite.color.sum()  # of a frame that tells nothing
+        for name, term in terms.items():
+            total = total + weights[name] * term
         return ObjectiveResult(terms, total, state, composite, offsets, weights, absolutes)
 
     def _scene(
@@ -142,7 +144,8 @@ class JointObjective:
                 drawn = torch.where(blank[..., None], image, drawn)
             terms["scene"] = image_loss(drawn, image, *dssim)
         scenes = self.model.names("scene")
-        if self.spec.scene_loss in ("masked", "both") and scenes:
+        untold = frame.unknown & set(self.model.entities)  # what to leave out is not known
+        if self.spec.scene_loss in ("masked", "both") and scenes and not untold:
             alone = self.model.rasterizer.render(state.joined(scenes), camera)
             modelled = [m for n, m in frame.masks.items() if n in self.model.entities]
             dynamic = union(modelled)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from hoigs.core.clip import Clip
+from hoigs.core.clip_health import examine
 from hoigs.core.compose import compose, compose_density
 from hoigs.core.errors import ClipError, HoigsError
+from hoigs.core.fault import Fault
 from hoigs.core.registry import Registry, default_registry
 from hoigs.core.scene import SceneModel
 from hoigs.core.spec import Spec
@@ -35,6 +37,7 @@ def read_clip(
     registry: Registry | None = None,
     width: int | None = None,
     *,
+    allow_faults: bool = False,
     reader: ReaderChoice | None = None,
 ) -> Clip:
     """The clip in `folder`, by the reader that knows its layout, at a training width.
@@ -45,6 +48,7 @@ def read_clip(
         registry: where readers are looked up; by default what is installed.
         width: shrink frames to this image width, aspect kept; those that are narrower, and all
             with None, stay as they are.
+        allow_faults: let pass what training can go on without (`ClipReader.allow_faults`).
         reader: from `choose_reader`; None looks at the folder.
 
     Raises:
@@ -54,6 +58,7 @@ def read_clip(
     folder = clip_folder(folder, registry)
     require_folder(folder)
     choice = reader or choose_reader(folder, registry)
+    choice.reader.allow_faults = allow_faults
     clip = choice.reader.read(folder)
     if width is None or width >= clip.cameras[0].width:
         return clip
@@ -71,6 +76,7 @@ class Session:
     """One training run, ready to start.
 
     Attributes:
+        faults: of the clip, which training goes on with; in the run's provenance too.
         reader: key of the reader that read the clip.
     """
 
@@ -78,6 +84,7 @@ class Session:
     clip: Clip
     run: RunFolder
     trainer: Trainer
+    faults: list[Fault] = field(default_factory=list)
     reader: str = ""
 
     @classmethod
@@ -93,12 +100,14 @@ class Session:
         overwrite: bool = False,
         plugins: Sequence[Path] = (),
         lpips_weights: Path | None = None,
+        allow_faults: bool = False,
         reader: str | None = None,
         reader_settings: Sequence[str] = (),
     ) -> Session:
         """Check the spec, the clip and the output folder, compose the model, then make the run.
 
         Args:
+            allow_faults: train without masks, images and depth that are absent or broken.
             reader: its name; by default the one that knows the clip's layout.
             reader_settings: of that reader, "key=value".
 
@@ -112,12 +121,15 @@ class Session:
         folder = clip_folder(clip, registry)
         require_folder(folder)
         choice = choose_reader(folder, registry, reader, reader_settings)
-        source = read_clip(folder, registry, spec.train.width, reader=choice)
+        source = read_clip(
+            folder, registry, spec.train.width, allow_faults=allow_faults, reader=choice
+        )
         run = RunFolder(out or Path("runs") / f"{clip_name(clip)}-{spec.name}")
         if resume:
             run.require()
         else:
             run.refuse_existing(overwrite)
+        faults = examine(source)
         model = compose(spec, source, registry).to(device)
         trainer = Trainer(
             model,
@@ -146,10 +158,12 @@ class Session:
                     "reader": choice.record(run.relative),
                 },
                 "clip_provenance": dict(source.provenance),
+                "allow_faults": allow_faults,
+                "clip_faults": [fault.to_dict() for fault in faults],
                 "device": device,
             }
             run.create(spec.dump(), provenance, overwrite)
-        return cls(spec, source, run, trainer, choice.key)
+        return cls(spec, source, run, trainer, faults, choice.key)
 
     def train(self, on_step: Callable[[StepReport], None] | None = None) -> None:
         self.trainer.train(on_step)
@@ -207,9 +221,10 @@ class LoadedRun:
         if not folder.is_dir():
             raise HoigsError(f"{folder}: the clip of this run is not there; give --clip FOLDER")
         torch.manual_seed(spec.train.seed)
+        allowed = bool(provenance.get("allow_faults"))
         recorded = provenance["clip"].get("reader") if clip is None else None
         choice = recorded_reader(recorded, path, folder, registry) if recorded else None
-        source = read_clip(folder, registry, spec.train.width, reader=choice)
+        source = read_clip(folder, registry, spec.train.width, allow_faults=allowed, reader=choice)
         model = compose(spec, source, registry).to(device)
         checkpoint = load_checkpoint(latest_checkpoint(run.checkpoints))
         restore_model(model, checkpoint, spec.model_hash())

@@ -14,7 +14,7 @@ import hoigs
 from hoigs.core.clip import Clip
 from hoigs.core.scene import SceneModel
 from hoigs.evaluation.report import curves, media, sections
-from hoigs.evaluation.scores import Evaluation, score_table, size_table, timing_table
+from hoigs.evaluation.scores import Evaluation, Table, score_table, size_table, timing_table
 
 
 def write_report(
@@ -46,6 +46,7 @@ def write_report(
         ("scores", lambda: _scores(evaluation)),
         ("curves", lambda: _training(records)),
         ("cost", lambda: _cost(evaluation)),
+        ("faults", lambda: _faults(folder)),
         ("provenance", lambda: _origin(folder)),
     ]
     for i, (name, make) in enumerate(steps):
@@ -142,6 +143,20 @@ def _cost(evaluation: Evaluation) -> str:
         "What it costs",
         "",
         sections.time_bar(evaluation.timing) + "".join(sections.table(t) for t in tables),
+    )
+
+
+def _faults(folder: Path) -> str:
+    """What was wrong with the clip, each with what to do; nothing when all was well."""
+    provenance = folder / "provenance.json"
+    found = json.loads(provenance.read_text()).get("clip_faults") if provenance.is_file() else None
+    if not found:
+        return ""
+    rows = [(fault["what"], fault["do"]) for fault in found]
+    return _section(
+        "What is wrong with the clip",
+        "Training went on all the same.",
+        sections.table(Table("", ("found", "what to do, and what was done"), rows, ())),
     )
 
 

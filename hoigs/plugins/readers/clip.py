@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hoigs.core.camera import Camera
 from hoigs.core.clip import BodyTrack, Clip, FrameStore, ObjectTrack
-from hoigs.core.clip_check import require_clip
+from hoigs.core.clip_check import usable_clip
 from hoigs.core.clip_format import (
     HEADER,
     VIEWS,
@@ -30,6 +30,7 @@ from hoigs.core.clip_format import (
     mask_path,
     parse_header,
 )
+from hoigs.core.clip_problem import as_faults
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
 from hoigs.core.interaction import EntityKind
@@ -58,7 +59,9 @@ class ClipFolderReader(ClipReader):
 
     def read(self, folder: Path) -> Clip:
         folder = Path(folder)
-        header = require_clip(folder)
+        header, problems = usable_clip(folder, self.allow_faults)
+        lost = frozenset(p.path for p in problems if p.lost)
+        size = (header.height, header.width)
         bodies, objects = {}, {}
         for name, entity in header.entities.items():
             if entity.kind == "human":
@@ -77,30 +80,45 @@ class ClipFolderReader(ClipReader):
             "depth_kind": header.depth_kind,
             "provenance": header.provenance,
         }
+        held_out = self._read_held_out(folder, header, moments, shared, lost)
         return Clip(
             name=header.name,
-            store=FolderStore(folder, header.depth_kind != "none", self.cache_mb),
+            store=FolderStore(folder, header.depth_kind != "none", self.cache_mb, lost, size),
             cameras=_read_cameras(folder / "cameras.npz", header.width, header.height),
             moments=moments,
-            split={"train": header.split.train, "test": header.split.test},
-            held_out=self._read_held_out(folder, header, moments, shared),
+            split=_kept({"train": header.split.train, "test": header.split.test}, lost, folder),
+            held_out=held_out,
+            faults=as_faults(problems, header),
             **shared,
         )
 
     def _read_held_out(
-        self, folder: Path, header: ClipHeader, moments: list[Moment], shared: dict[str, Any]
+        self,
+        folder: Path,
+        header: ClipHeader,
+        moments: list[Moment],
+        shared: dict[str, Any],
+        lost: frozenset[str],
     ) -> Clip | None:
         if not (folder / VIEWS).is_file():
             return None
         views, _ = parse_header(folder / VIEWS, ViewsHeader)
-        assert views is not None  # require_clip has read it
+        assert views is not None  # usable_clip has read it
         room = folder / "held_out"
+        lost = frozenset(p.removeprefix("held_out/") for p in lost if p.startswith("held_out/"))
+        views_left = _kept({"train": [], "test": list(range(len(views.frames)))}, lost, room)
         return Clip(
             name=f"{header.name} held out",
-            store=FolderStore(room, header.depth_kind != "none", self.cache_mb),
+            store=FolderStore(
+                room,
+                header.depth_kind != "none",
+                self.cache_mb,
+                lost,
+                (views.height, views.width),
+            ),
             cameras=_read_cameras(room / "cameras.npz", views.width, views.height),
             moments=[moments[i] for i in views.frames],
-            split={"train": [], "test": list(range(len(views.frames)))},
+            split=views_left,
             **shared,
         )
 
@@ -111,33 +129,57 @@ class FolderStore(FrameStore):
     Args:
         root: the clip, or its held_out. has_depth: whether depth maps are there.
         cache_mb: decoded pixels kept, MiB; the least recently used go first.
+        lost: files that are absent or hold nothing, by their paths in `root`. Such an image is
+            black and all ignored, such a mask empty and not known, such a depth map None.
+        size: height and width, pixels; needed where files are lost.
 
     Safe to read from several threads.
     """
 
     root: Path
 
-    def __init__(self, root: Path, has_depth: bool, cache_mb: int = 512) -> None:
+    def __init__(
+        self,
+        root: Path,
+        has_depth: bool,
+        cache_mb: int = 512,
+        lost: frozenset[str] = frozenset(),
+        size: tuple[int, int] = (0, 0),
+    ) -> None:
         self.root, self.has_depth = Path(root), has_depth
+        self.lost, self.size = lost, size
         self.budget = cache_mb * 2**20
         self.cached_bytes = 0
         self._cache: OrderedDict[Path, Tensor] = OrderedDict()
         self._lock = threading.Lock()
 
     def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
-        return self._get(image_path(self.root, position), lambda p: _decode(p, "RGB"))
+        path = image_path(self.root, position)
+        if self._is_lost(path):
+            return torch.zeros(*self.size, 3, dtype=torch.uint8)
+        return self._get(path, lambda p: _decode(p, "RGB"))
 
     def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
+        if not self.mask_known(entity, position):
+            return torch.zeros(self.size, dtype=torch.bool)
         return self._get(mask_path(self.root, entity, position), lambda p: _decode(p, "L") > 127)
 
+    def mask_known(self, entity: str, position: int) -> bool:
+        return not self._is_lost(mask_path(self.root, entity, position))
+
+    def _is_lost(self, path: Path) -> bool:
+        return bool(self.lost) and path.relative_to(self.root).as_posix() in self.lost
+
     def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
+        if self._is_lost(image_path(self.root, position)):
+            return torch.ones(self.size, dtype=torch.bool)
         path = ignored_path(self.root, position)
         if not path.is_file():
             return None
         return self._get(path, lambda p: _decode(p, "L") > 127)
 
     def depth(self, position: int) -> Float[Tensor, "H W"] | None:
-        if not self.has_depth:
+        if not self.has_depth or self._is_lost(depth_path(self.root, position)):
             return None
         return self._get(depth_path(self.root, position), _read_depth)
 
@@ -171,7 +213,17 @@ def _read_depth(path: Path) -> Tensor:
         depth = load_arrays(path)["depth"].astype(np.float32)
     except (OSError, ValueError, KeyError) as error:
         raise ClipError(f"{path} cannot be read ({error}); write it again") from error
-    return torch.from_numpy(np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0))
+    return torch.from_numpy(np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0)))
+
+
+def _kept(split: dict[str, list[int]], lost: frozenset[str], folder: Path) -> dict[str, list[int]]:
+    """A split without the frames whose images are lost."""
+    gone = {int(Path(p).stem) for p in lost if p.startswith("images/")}
+    left = {name: [i for i in frames if i not in gone] for name, frames in split.items()}
+    for name, frames in split.items():
+        if frames and not left[name]:
+            raise ClipError(f"{folder}: no image of split {name} is left: {sorted(gone)} are lost")
+    return left
 
 
 def _tensors(path: Path) -> dict[str, Tensor]:

@@ -1,0 +1,216 @@
+"""What is wrong with a clip that can be read: faults that training goes on with, by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from hoigs.core.clip import Clip
+from hoigs.core.fault import Fault, ranges
+from hoigs.core.rotation import axis_angle_to_quats, multiply_quats, quats_to_axis_angle, slerp
+
+MOST_FRAMES = 600  # looked at in long clips, evenly spaced: decoding takes milliseconds each
+DEPTH_FRAMES, DEPTH_POINTS = 12, 20_000
+STEADY = 12  # median deviations of a track's own steps beyond which a gap needs no second witness
+FULL, RAGGED, JITTER_DEGREES, UNLIKE, HOLES, GAP = 0.98, 0.12, 1.5, 0.07, 0.3, 1.6
+
+
+def examine(clip: Clip) -> list[Fault]:
+    """Faults that the clip's reader let pass, then those that its content shows.
+
+    Looks at masks of up to 600 frames, depth of a dozen, and all poses, cameras and tracks.
+    """
+    found = list(clip.faults)
+    with ThreadPoolExecutor(4) as pool:  # decompression releases the interpreter lock
+        for name in clip.kinds:
+            found += _masks(clip, name, pool)
+    found += _depth(clip)
+    for name, body in clip.bodies.items():
+        found += _jitter(name, body.poses.rotations[:, :22])
+    return [*found, *_gaps(clip)]
+
+
+def raggedness(mask: Bool[Tensor, "H W"]) -> float:
+    """Share of the pixels within 2 px of a mask's smoothed edge that disagree with their
+    surroundings (the majority of 5x5): fingers give a few per cent, noise its own share."""
+    area = mask.nonzero()
+    if len(area) == 0:
+        return 0.0
+    (top, left), (bottom, right) = (area.amin(0) - 6).clamp_min(0), area.amax(0) + 7
+    x = mask[top:bottom, left:right].float()[None, None]
+    pool = torch.nn.functional
+    smooth = (pool.avg_pool2d(x, 5, 1, 2, count_include_pad=False) > 0.5).float()
+    wide = pool.max_pool2d(smooth, 5, 1, 2)
+    narrow = 1 - pool.max_pool2d(1 - smooth, 5, 1, 2)
+    band = (wide - narrow) > 0.5
+    return float(((x != smooth) & band).sum() / band.sum().clamp_min(1))
+
+
+def _masks(clip: Clip, name: str, pool: ThreadPoolExecutor) -> Iterator[Fault]:
+    step = -(-len(clip) // MOST_FRAMES)
+    positions = [p for p in range(0, len(clip), step) if clip.store.mask_known(name, p)]
+
+    def look(position: int) -> tuple[float, float]:
+        mask = clip.store.mask(name, position)
+        return float(mask.float().mean()), raggedness(mask)
+
+    seen = list(pool.map(look, positions))
+    number = {p: clip.moments[p].index for p in positions}
+    empty = [number[p] for p, (area, _) in zip(positions, seen) if area == 0]
+    full = [number[p] for p, (area, _) in zip(positions, seen) if area > FULL]
+    edges = sorted(rough for area, rough in seen if 0 < area <= FULL)
+    if empty:
+        yield Fault(
+            "empty-masks",
+            f'masks of "{name}" are empty in frames {ranges(empty)} '
+            f"({len(empty)} of {len(positions)})",
+            "right where it is out of sight; make them again where it is not: it is not compared "
+            "with the video there",
+            tuple(empty),
+        )
+    if full:
+        yield Fault(
+            "full-masks",
+            f'masks of "{name}" cover the whole image in frames {ranges(full)}',
+            "make them again, or delete them and train with --allow-faults: as they are, all that "
+            "is seen there is taken for it",
+            tuple(full),
+        )
+    if edges and edges[len(edges) // 2] > RAGGED:
+        yield Fault(
+            "ragged-masks",
+            f'masks of "{name}" have ragged edges: {100 * edges[len(edges) // 2]:.0f} % of the '
+            "pixels within 2 px of them disagree with their surroundings",
+            "smooth them (a median of 5x5 takes single pixels away), or use a segmenter that "
+            "follows edges",
+        )
+
+
+def _depth(clip: Clip) -> Iterator[Fault]:
+    if clip.depth_kind == "none":
+        return
+    positions = range(0, len(clip), max(1, len(clip) // DEPTH_FRAMES))
+    holes, ratios = [], []
+    points = clip.points[:: max(1, len(clip.points) // DEPTH_POINTS)]
+    for p in positions:
+        depth = clip.store.depth(p)
+        if depth is None:
+            continue
+        holes.append(float((depth <= 0).float().mean()))
+        ratios.append(_against_points(clip, p, depth, points))
+    if holes and sum(holes) / len(holes) > HOLES:
+        yield Fault(
+            "depth-holes",
+            f"{100 * sum(holes) / len(holes):.0f} % of the depth maps' pixels are unknown",
+            "nothing is learned from depth there; it is right for sparse sensors, else make depth "
+            "again",
+        )
+    if clip.depth_kind == "metric" and ratios:
+        factor = _agreed(torch.cat(ratios))
+        if factor is not None and abs(factor - 1) > UNLIKE:
+            yield Fault(
+                "depth-scale",
+                f"the depth maps are {factor:.2f} times as deep as the scene points",
+                f"multiply them by {1 / factor:.2f}, or train with "
+                "--set train.loss.depth_fit=scale, which fits one factor a frame; left as they "
+                "are, they pull the scene away from where its cameras see it",
+            )
+
+
+def _against_points(
+    clip: Clip, position: int, depth: Float[Tensor, "H W"], points: Float[Tensor, "P 3"]
+) -> Float[Tensor, " R"]:
+    """Depth over the points' own, where these fall on nothing that moves."""
+    camera = clip.cameras[position]
+    pixels, z = camera.project(points)
+    column, row = pixels.floor().long().unbind(-1)
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (z > 0)
+    row, column, z = row[inside], column[inside], z[inside]
+    still = torch.ones_like(depth, dtype=torch.bool)
+    for name in clip.kinds:
+        still &= ~clip.store.mask(name, position)
+    seen = depth[row, column]
+    keep = (seen > 0) & still[row, column]
+    return seen[keep] / z[keep]
+
+
+def _agreed(ratios: Float[Tensor, " R"]) -> float | None:
+    """The commonest ratio; points behind others fall below it, so a mean would not do.
+
+    None unless a quarter of at least 200 lie about it.
+    """
+    if len(ratios) < 200:
+        return None
+    logs = ratios.log()
+    counts = torch.histc(logs, 150, -1.5, 1.5)  # 2 % each
+    near = torch.nn.functional.conv1d(counts[None, None], torch.ones(1, 1, 5), padding=2)[0, 0]
+    peak = -1.5 + (int(near.argmax()) + 0.5) * 0.02
+    close = logs[(logs - peak).abs() < 0.06]
+    return float(close.median().exp()) if len(close) > 0.25 * len(ratios) else None
+
+
+def _jitter(name: str, rotations: Float[Tensor, "F J 3"]) -> Iterator[Fault]:
+    """Each joint against the middle of its neighbours in time: half the second difference."""
+    if len(rotations) < 3:
+        return
+    quats = axis_angle_to_quats(rotations)
+    middle = slerp(quats[:-2], quats[2:], 0.5)
+    back = middle * torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=middle.dtype)
+    off = quats_to_axis_angle(multiply_quats(back, quats[1:-1])).norm(dim=-1)
+    degrees = float(torch.rad2deg(off.median()))
+    if degrees > JITTER_DEGREES:
+        yield Fault(
+            "pose-noise",
+            f'body poses of "{name}" jitter: half of all joints are more than {degrees:.1f} '
+            "degrees off the middle of the frames before and after",
+            "smooth the poses, or let training refine them more (train.rates.pose, "
+            "docs/reference/refinement.md)",
+        )
+
+
+def _gaps(clip: Clip) -> Iterator[Fault]:
+    """Steps that stand out in most of what moves: frames between them were lost."""
+    tracks = {"the camera": torch.stack([c.center for c in clip.cameras])}
+    for name, body in clip.bodies.items():
+        turns = 0.1 * body.poses.rotations.flatten(1)  # radians at an arm's length or so
+        tracks[f'"{name}"'] = torch.cat((body.poses.transl, turns), 1)
+    for name, thing in clip.objects.items():
+        turns = 0.1 * thing.rotations.flatten(1)
+        tracks[f'"{name}"'] = torch.cat((thing.translations, turns), 1)
+    votes = [_standing_out(path) for path in tracks.values()]
+    steps = (torch.stack(votes).sum(0) >= 2).nonzero().squeeze(1).tolist()
+    if steps:
+        where: Sequence[str] = [f"{s} and {s + 1}" for s in steps[:6]]
+        yield Fault(
+            "missing-frames",
+            f"frames are missing between {', '.join(where)}{', …' if len(steps) > 6 else ''}: what "
+            "moves goes much further there than in the steps before and after",
+            "take the frames from the video again without dropping any, as times are taken to be "
+            "even; motion is interpolated across the gaps",
+            tuple(steps),
+        )
+
+
+def _standing_out(path: Float[Tensor, "F D"]) -> Int[Tensor, " S"]:
+    """Votes of one track for a gap at each step: 1 where it goes much further than in the steps
+    about it, 2 where it does so though it is steady everywhere else.
+
+    Much further than the second largest of the four about it: not than the largest, so that two
+    gaps close together do not hide each other; not than the middle one, so that a start from rest
+    is none.
+    """
+    steps = (path[1:] - path[:-1]).norm(dim=-1)
+    if len(steps) < 5 or float(steps.median()) < 1e-4:
+        return torch.zeros(len(steps), dtype=torch.long)
+    padded = torch.cat((steps[[2, 1]], steps, steps[[-2, -3]]))
+    about = torch.stack([padded[i : i + len(steps)] for i in (0, 1, 3, 4)])
+    second = about.sort(0).values[-2]
+    logs = (steps / second.clamp_min(0.2 * float(steps.median()))).clamp_min(1e-6).log()
+    spread = max(float((logs - logs.median()).abs().median()), 0.01)
+    out = logs > math.log(GAP)
+    return out.long() + (out & (logs > STEADY * spread)).long()
