@@ -16,6 +16,7 @@ from hoigs.core.camera import Camera
 from hoigs.core.errors import ClipError, did_you_mean
 from hoigs.core.undistortion import Undistortion
 
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 NEGLIGIBLE_SHIFT = 0.01  # pixels of distortion that nothing here can see
 
 
@@ -100,6 +101,8 @@ class Lens:
 
     def undistortion(self) -> Undistortion:
         """From this lens's images to those of `camera`; made once for equal lenses."""
+        if self.model in PINHOLES:  # captures with a focal length a frame stay cheap
+            return Undistortion()
         return _undistortion(self)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from pydantic import Field
@@ -70,10 +71,10 @@ class ColmapReader(ClipReader):
         place = model_folder(folder)
         assert place is not None  # require_files has found it
         model = read_sparse(folder / place)
-        files = {p.stem: p for p in image_files(folder / room)}
-        stems = [Path(view.name).stem for view in model.views]
+        files = _by_stem(folder / room)
+        stems = [_stem(view.name, files) for view in model.views]
         masks = mask_folders(folder)
-        needs = [Need.of(f"{room}/{Path(v.name).name}", maker=shrink)
+        needs = [Need.of(f"{room}/{v.name}", maker=shrink)
                  for v, stem in zip(model.views, stems) if stem not in files]  # fmt: skip
         for name in masks:
             needs += [Need.of(f"masks/{name}/{s}.png", maker=MASK_MAKER) for s in stems]
@@ -109,6 +110,19 @@ class ColmapReader(ClipReader):
                 **{f"poses of {n}": NO_POSES for n, kind in masks.items() if kind == "human"},
             },
         )
+
+
+def _by_stem(room: Path) -> dict[str, Path]:
+    """Images of a folder and of the folders in it (one a camera), by path without suffix."""
+    rooms = [room, *sorted(p for p in room.rglob("*") if p.is_dir())]
+    files = [path for each in rooms for path in image_files(each)]
+    return {path.relative_to(room).with_suffix("").as_posix(): path for path in files}
+
+
+def _stem(name: str, files: Mapping[str, Path]) -> str:
+    """As files have it: COLMAP's names may hold folders that are not there any more."""
+    whole = Path(name).with_suffix("").as_posix()
+    return whole if whole in files else Path(name).stem
 
 
 def mask_folders(folder: Path) -> dict[str, EntityKind]:

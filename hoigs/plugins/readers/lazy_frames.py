@@ -126,17 +126,17 @@ class LazyFrames(FrameStore):
         return self.cache.get(("depth", position), lambda: self._depth(position))
 
     def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
+        marked = self.cache.get(("ignored", position), lambda: self._ignored(position))
+        return marked if marked.numel() else None
+
+    def _ignored(self, position: int) -> Tensor:
+        """Empty where nothing is ignored, so that this is remembered too."""
         files, outside = self.ignored_files, self._flat(position).outside
-        listed = files is not None and files.paths[position] is not None
-        if not listed:
-            return None if outside is None else torch.from_numpy(outside)
-
-        def load() -> Tensor:
-            assert files is not None
-            marked = self._mask(files, position)
-            return marked if outside is None else marked | torch.from_numpy(outside)
-
-        return self.cache.get(("ignored", position), load)
+        beyond = torch.zeros(0, dtype=torch.bool) if outside is None else torch.from_numpy(outside)
+        if files is None or files.paths[position] is None:
+            return beyond
+        marked = self._mask(files, position)
+        return marked | beyond if beyond.numel() else marked
 
     def _mask(self, files: MaskFiles, position: int) -> Tensor:
         path, camera = files.paths[position], self.cameras[position]

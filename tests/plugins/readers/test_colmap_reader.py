@@ -80,6 +80,24 @@ def test_frames_are_in_the_order_of_their_names(builtin: Clip, tmp_path: Path) -
     assert longer.moments[7].time == pytest.approx(7 / 9)
 
 
+def test_images_in_folders_of_their_own(builtin: Clip, tmp_path: Path) -> None:
+    """One folder a camera, with the same names in both; masks likewise."""
+    colmap.write(builtin, tmp_path)
+    text = (tmp_path / "sparse/0/images.txt").read_text()
+    for i in range(8):
+        room, name = f"cam{i // 4}", f"{i % 4}.png"
+        text = text.replace(f"frame_{i + 1}.png", f"{room}/{name}")
+        for place in ("images", "masks/human", "masks/object"):
+            (tmp_path / place / room).mkdir(exist_ok=True)
+            shutil.move(tmp_path / place / f"frame_{i + 1}.png", tmp_path / place / room / name)
+    (tmp_path / "sparse/0/images.txt").write_text(text)
+    clip = ColmapReader().read(tmp_path)
+    same_cameras(clip.cameras, builtin.cameras)
+    for mine, theirs in zip(clip, builtin, strict=True):
+        assert mine.image.equal(theirs.image)
+        assert mine.masks["human"].equal(theirs.masks["human"])
+
+
 def test_a_partial_folder_is_told_in_one_message(builtin: Clip, tmp_path: Path) -> None:
     colmap.write(builtin, tmp_path)
     (tmp_path / "sparse/0/points3D.txt").unlink()

@@ -72,7 +72,7 @@ def save_smpl(clip: Clip, body: BodyModel, units: float, scales: list[float], na
         shift = pose.transl[i] + pelvis - turns[i] @ pelvis
         shift = eye + scales[i] * (shift - eye)
         rows = torch.cat((scales[i] * turns[i].mT, shift[None])) * units
-        alignments[name] = rows.float().numpy()
+        alignments[name] = rows.numpy()
     np.save(folder / "alignments.npy", np.array(alignments, dtype=object))
 
 
