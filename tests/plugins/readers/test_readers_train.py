@@ -15,7 +15,8 @@ from hoigs.cli.main import app
 from hoigs.core.clip import Clip
 from hoigs.plugins.bodies.smplh import SmplBody, SmplhBody
 
-SMALL = ["--set", "train.steps=1", "--rasterizer", "torch", "--device", "cpu", "--no-eval"]
+SMALL = ["--set", "train.steps=1", "--set", "train.preview_every=0", "--rasterizer", "torch",
+         "--device", "cpu", "--no-eval"]  # fmt: skip
 
 
 @pytest.mark.slow
@@ -26,12 +27,15 @@ def test_a_person_and_an_object_of_behave(still: Clip, tmp_path: Path) -> None:
     args = ["train", str(folder), "--out", str(tmp_path / "run"), *SMALL]
     bare = CliRunner().invoke(app, args)
     assert "is a body:smplh: add `body" in str(bare.exception)
+    few = ["--reader-set", "points=50", "--reader-set", "object_points=40"]
     body = ["--set", "model.human.body.use=body:smplh", "--set", f"model.human.body.path={model}"]
-    done = CliRunner().invoke(app, [*args, *body])
+    done = CliRunner().invoke(app, [*args, *few, *body])
     assert done.exit_code == 0, done.output
     assert f"on {behave.NAME} (reader:behave)" in done.output
     provenance = json.loads((tmp_path / "run" / "provenance.json").read_text())
-    assert provenance["clip"]["reader"] == {"use": "reader:behave", "settings": {}}
+    assert provenance["clip"]["reader"] == {
+        "use": "reader:behave", "settings": {"object_points": 40, "points": 50}
+    }  # fmt: skip
 
 
 @pytest.mark.slow
