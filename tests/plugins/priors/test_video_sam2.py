@@ -31,6 +31,15 @@ PROMPTED = (
 )
 
 
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Models as small as these are twenty times slower on two threads when the machine is busy."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory) -> Path:
     """A SAM 2 for 128x128 images, of some hundred thousand random weights."""
