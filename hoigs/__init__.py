@@ -47,6 +47,7 @@ _PUBLIC = {
     "CubicHermite": "hoigs.plugins.deformation.chs",
     "Embedded": "hoigs.plugins.deformation.embedded",
     "EmbeddingFeatures": "hoigs.plugins.features.embedding",
+    "GsplatRasterizer": "hoigs.rasterizers.gsplat",
     "HexPlaneField": "hoigs.plugins.deformation.hexplane_field",
     "HexPlaneSkinning": "hoigs.plugins.deformation.hexplane_skinning",
     "MlpDeformation": "hoigs.plugins.deformation.mlp",

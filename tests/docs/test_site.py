@@ -1,0 +1,89 @@
+"""The site without building it: its menu, its links, and the pages that are made from the code."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+GENERATED = {f"reference/{name}.md" for name in ("cli", "api", "components", "spec-schema")}
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """scripts/docs_pages.py as a module."""
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    import docs_pages
+
+    yield docs_pages
+    del sys.modules["docs_pages"]
+
+
+def menu() -> list[str]:
+    paths = re.findall(r"[\w/-]+\.md", yaml.safe_dump(yaml.safe_load(MKDOCS.read_text())["nav"]))
+    assert len(paths) == len(set(paths))
+    return paths
+
+
+MKDOCS = ROOT / "mkdocs.yml"
+PAGES = sorted(str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md"))
+
+
+def test_the_menu_leads_to_every_page():
+    # reference pages that it does not list are added by the hook
+    missing = {page for page in PAGES if not page.startswith("reference/")} - set(menu())
+    assert not missing
+    assert set(menu()) - set(PAGES) == GENERATED
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page):
+    text = re.sub(r"```.*?```", "", (DOCS / page).read_text(), flags=re.S)
+    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
+        if "://" not in target:
+            path = (DOCS / page).parent / target
+            inside = path.resolve().relative_to(DOCS.resolve())  # a site has nothing else
+            assert path.exists() or str(inside) in GENERATED, f"{page}: {target}"
+
+
+def test_every_command_and_option_is_there(made):
+    page = made.cli_page()
+    for command in ("train", "prepare", "plugins new", "plugins show", "spec check", "tables"):
+        assert f"## hoigs {command}\n" in page
+    assert "| `--resume` | Go on with the run in --out. |  |" in page
+    assert "| `--path` | The clip's own cameras, or an orbit while it plays. | `playback` |" in page
+
+
+def test_the_schema_page_has_every_key(made):
+    page = made.schema_page()
+    assert "| `steps` | `int >= 1` | `2000` | optimizer steps, one frame each. |" in page
+    assert "| `loss.lambda_dssim` | `float >= 0 and <= 1` | `0.2` |" in page
+    assert "| `deformation.use` |" in page or "| `deformation` |" in page
+
+
+def test_the_gallery_has_every_component_with_its_settings(made, monkeypatch):
+    from hoigs.plugins.builtin import PARTS
+
+    kept = ("rasterizer:torch",)  # the others take as long again
+    monkeypatch.setattr(made, "PREVIEWS", {k: made.PREVIEWS[k] for k in kept})
+    files = made.component_pages()
+    page = files["reference/components.md"]
+    assert {line.removeprefix("### ") for line in page.splitlines() if line.startswith("### ")} == {
+        part[0] for part in PARTS
+    }
+    assert "| `keyframe_step` | `int >= 1` | `4` | frames between knots (the paper's 4). |" in page
+    for picture in re.findall(r"\]\((pictures/[^)]+)\)", page):
+        assert files[f"reference/{picture}"].startswith(b"\x89PNG")
+
+
+def test_the_api_page_has_every_public_name(made):
+    import hoigs
+
+    page = made.api_page()
+    for name, module in hoigs._PUBLIC.items():
+        assert f"::: {module}.{name}\n" in page
