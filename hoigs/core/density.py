@@ -113,10 +113,12 @@ class DensityControl(ABC):
     Attributes:
         absolute_gradients: whether it decides on absolute screen gradients, which not every
             rasterizer gives; see `check_rasterizer`.
+        cap: most Gaussians that it makes of fewer; None promises no number.
         regularizer_weights: default weight of each penalty of `regularizers`; 0 where absent.
     """
 
     absolute_gradients: bool = False
+    cap: int | None = None
     regularizer_weights: Mapping[str, float] = {}
 
     @classmethod

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 # kind -> package with its CHECKS and `subject(cls, config, options)`; the others have P alone
 KINDS = {
     "deformation": "hoigs.testing.deformation",
+    "body": "hoigs.testing.body",
+    "reader": "hoigs.testing.reader",
+    "density": "hoigs.testing.density",
     "features": "hoigs.testing.features",
     "interaction": "hoigs.testing.interaction",
     "rasterizer": "hoigs.testing.rasterizer",

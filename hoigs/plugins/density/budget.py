@@ -80,6 +80,7 @@ class BudgetDensity(DensityControl):
         seed: int = 0,
     ) -> None:
         self.window, self.count, self.seed = Window(start, stop, interval), count, seed
+        self.cap = count  # of more than that at the start, fewer come
         self.threshold, self.clone_scale = threshold, clone_scale
         self.prune_opacity = prune_opacity
 
