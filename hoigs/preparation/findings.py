@@ -67,7 +67,7 @@ def _cameras(report: PrepareReport) -> Iterator[Finding]:
             f"{report.reprojection_px:.2f} px",
             "of the scene's points in the images",
             _judge(report.reprojection_px, 1.0, 2.0),
-            "cameras are off by about as much: train with refinement of cameras, or look for "
+            "cameras are off by about as much: let training refine them (train.rates.camera), or look for "
             "moving things outside the masks",
         )
     yield _finding(
@@ -130,7 +130,7 @@ def _things(report: PrepareReport) -> Iterator[Finding]:
             f"off {report.depth_against}, after its scale was fitted",
             _judge(report.depth_residual, 0.05, 0.1),
             "the depth network misjudges this scene: try another, or leave its loss out "
-            "(train.losses.depth=0)",
+            "(--set train.loss.depth=0)",
         )
 
 
