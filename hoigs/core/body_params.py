@@ -22,6 +22,7 @@ from hoigs.core.rotation import axis_angle_to_matrices, matrices_to_axis_angle
 # of a hand's 15 joints, in SMPL-X's order: the first joint of index, middle, pinky, ring, thumb.
 # SMPL turns a hand as one block at its knuckles; thumbs stand elsewhere and are part of the block.
 KNUCKLES = (0, 3, 6, 9, 12)
+ANOTHER_PERSON = 3.0  # in standard deviations of people, which betas count
 CLEARLY = 2.0  # a convention is told apart when the other one's error is this many times larger
 
 
@@ -211,16 +212,17 @@ def betas_of_joints(
 
 
 def same_betas(betas: Sequence[Float[Tensor, " B"]], what: str) -> Float[Tensor, " B"]:
-    """The one shape of a person, from files that repeat it every frame: the median.
+    """The one shape of a person, from files with one for every frame: the median.
+
+    Fits of single frames differ a little; a jump means that somebody else was fitted.
 
     Raises:
-        ClipError: coefficients differ by more than 0.5 between frames: several people, or a shape
-            that was fitted anew in every frame.
+        ClipError: some frame's are further than ANOTHER_PERSON from it.
     """
     stacked = torch.stack(list(betas))
     middle = stacked.median(0).values
     spread = float((stacked - middle).abs().max())
-    if spread > 0.5:
+    if spread > ANOTHER_PERSON:
         frame = int((stacked - middle).abs().amax(1).argmax())
         raise ClipError(
             f"{what}: betas of frame {frame} differ from the median by {spread:.2f}; one person "

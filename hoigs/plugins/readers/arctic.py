@@ -37,6 +37,7 @@ MASKS = (
     "ARCTIC has no masks: your segmenter makes them, 0/255, named as the images (HOLD took SAM); "
     "or `--reader-set masks=false`"
 )
+SMPLX = ("global_orient", "body_pose", "left_hand_pose", "right_hand_pose", "transl")
 HINGE = (0.0, 0.0, -1.0)  # the top turns about it (common/object_tensors.py)
 FPS = 30.0
 BEHIND = (1.0, 4.0)  # scene points start within these times the object's distance
@@ -245,7 +246,7 @@ def _cameras(
 
 def _body(place: _Place, subject: Subject, frames: Sequence[int]) -> BodyTrack:
     table: Any = load_pickled_npy(place.raw("smplx"))
-    values = {k: torch.from_numpy(np.asarray(v, np.float64)) for k, v in table.items()}
+    values = {k: torch.from_numpy(np.asarray(table[k], np.float64)) for k in SMPLX if k in table}
     short = {k: len(v) for k, v in values.items() if len(v) <= max(frames)}
     if short:
         raise ClipError(f"{place.raw('smplx')} ends before frame {max(frames)}: {short}")

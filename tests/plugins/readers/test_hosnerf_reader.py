@@ -90,6 +90,28 @@ def test_without_a_model_there_are_no_poses_but_a_clip(
     same_cameras(clip.cameras, builtin.cameras)
 
 
+def test_each_frame_may_have_a_shape_of_its_own(builtin: Clip, smpl: Path, tmp_path: Path) -> None:
+    """As HumanNeRF's preparation leaves it; the person's is their mean."""
+    clip, body = without_fingers(builtin), SmplBody(smpl)
+    hosnerf.write(clip, tmp_path, body)
+    betas = clip.bodies["human"].poses.betas
+    offsets = 0.5 * torch.randn(8, len(betas), generator=torch.Generator().manual_seed(0))
+    offsets -= offsets.mean(0)
+    joints = body.shaped(betas + offsets)[1][:, [*range(22), 25, 40]].double().numpy()
+
+    def own(content: dict[str, Any]) -> None:
+        for entry, rest in zip(content.values(), joints, strict=True):
+            entry["tpose_joints"] = rest - rest[:1]
+
+    edit(tmp_path / "mesh_infos.pkl", own)
+    track = HosnerfReader(smpl=smpl, points=10).read(tmp_path).bodies["human"]
+    torch.testing.assert_close(track.poses.betas, betas, atol=1e-3, rtol=0)
+    assert "vary by" in track.provenance
+    edit(tmp_path / "mesh_infos.pkl", lambda m: m["000003"]["tpose_joints"].__imul__(1.5))
+    with pytest.raises(ClipError, match="they are of somebody else"):
+        HosnerfReader(smpl=smpl).read(tmp_path)
+
+
 def test_masks_of_the_object_may_be_added(builtin: Clip, smpl: Path, tmp_path: Path) -> None:
     hosnerf.write(without_fingers(builtin), tmp_path, SmplBody(smpl), object_masks=True)
     clip = HosnerfReader(points=10).read(tmp_path)
