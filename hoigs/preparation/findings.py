@@ -67,8 +67,8 @@ def _cameras(report: PrepareReport) -> Iterator[Finding]:
             f"{report.reprojection_px:.2f} px",
             "of the scene's points in the images",
             _judge(report.reprojection_px, 1.0, 2.0),
-            "cameras are off by about as much: let training refine them (train.rates.camera), or look for "
-            "moving things outside the masks",
+            "cameras are off by about as much: let training refine them (train.rates.camera), or "
+            "look for moving things outside the masks",
         )
     yield _finding(
         "parallax",
