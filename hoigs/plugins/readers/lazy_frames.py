@@ -111,7 +111,10 @@ class LazyFrames(FrameStore):
             path = self.images[position]
             pixels = self._read_image(path)
             self._check_size(path, pixels, position)
-            return torch.from_numpy(self._flat(position).image(pixels))
+            flat = torch.from_numpy(self._flat(position).image(pixels))
+            # a copy made once all that it took is freed: kept frames that lie behind freed ones
+            # would hold ten times their memory in holes of the heap
+            return flat.clone(memory_format=torch.contiguous_format)
 
         return self.cache.get(("image", position), load)
 
