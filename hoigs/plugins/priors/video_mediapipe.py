@@ -51,6 +51,9 @@ class MediapipeConfig(ComponentConfig):
 class MediapipePrior(VideoPrior):
     """Landmarks of the one person of a video by MediaPipe Pose.
 
+    It follows a person from frame to frame and loses who jumps, so it is given every frame up to
+    the last that is wanted, not only those that are.
+
     Args: as MediapipeConfig describes them.
     """
 
@@ -83,47 +86,52 @@ class MediapipePrior(VideoPrior):
         python = video.resolve(self.python)
         if not python.exists():
             raise HoigsError(f"prior:mediapipe: there is no {python}; {INSTALL}")
-        key = settings_key({"pose": self.pose, "frames": video.numbers})
+        count = max(video.numbers, default=-1) + 1
+        key = settings_key({"pose": self.pose, "frames": count})
         out = video.work / f"mediapipe-{key}.npz"
         if not out.is_file():
-            self._run(python, out, video, progress)
+            self._run(python, out, count, video, progress)
         with np.load(out, allow_pickle=False) as file:
-            image, world = (self._spread(file[k], video) for k in ("image_xyzv", "world_xyzv"))
+            image, world = (
+                self._spread(file[k], count, video) for k in ("image_xyzv", "world_xyzv")
+            )
         progress(1.0, "landmarks")
         text = f"MediaPipe Pose, complexity {self.pose['model_complexity']}"
         return Evidence(landmarks={people[0]: Landmarks(image, world, text)})
 
-    def _run(self, python: Path, out: Path, video: VideoRequest, progress: Progress) -> None:
+    def _run(
+        self, python: Path, out: Path, count: int, video: VideoRequest, progress: Progress
+    ) -> None:
         out.parent.mkdir(parents=True, exist_ok=True)
         half = out.with_suffix(".part")
         settings = {
-            "width": video.width, "height": video.height, "count": len(video.numbers),
+            "width": video.width, "height": video.height, "count": count,
             "pose": self.pose, "out": str(half.absolute()),
         }  # fmt: skip
         # -I: the script's own folder, where modules of hoigs lie, is not searched for imports
         argv = [str(python.absolute()), "-I", str(SCRIPT), json.dumps(settings)]
         log = out.with_suffix(".log")
         try:
-            run_tool(argv, what="prior:mediapipe", log=log, images=_told(video, progress))
+            run_tool(argv, what="prior:mediapipe", log=log, images=_told(video, count, progress))
         except HoigsError as error:
             lacking = log.is_file() and "has no mediapipe" in log.read_text(errors="replace")
             raise HoigsError(f"{error}\n{INSTALL}" if lacking else str(error)) from error
         half.replace(out)
 
-    def _spread(self, rows: np.ndarray, video: VideoRequest) -> np.ndarray:
-        """Rows of the wanted frames among those of the whole video."""
-        if rows.shape != (len(video.numbers), 33, 4):
+    def _spread(self, rows: np.ndarray, count: int, video: VideoRequest) -> np.ndarray:
+        """The first rows among those of the whole video."""
+        if rows.shape != (count, 33, 4):
             raise HoigsError(
-                f"prior:mediapipe wrote an array of shape {rows.shape} for {len(video.numbers)} "
-                "frames; expected 33 landmarks of 4 numbers in each"
+                f"prior:mediapipe wrote an array of shape {rows.shape} for {count} frames; "
+                "expected 33 landmarks of 4 numbers in each"
             )
         spread = np.full((video.frames, 33, 4), np.nan, np.float32)
-        spread[list(video.numbers)] = rows
+        spread[:count] = rows
         return spread
 
 
-def _told(video: VideoRequest, progress: Progress) -> Iterator[np.ndarray]:
-    """The wanted frames, saying how far it is."""
-    for done, (_, image) in enumerate(video.sequence()):
-        progress(done / len(video.numbers), "landmarks")
-        yield image
+def _told(video: VideoRequest, count: int, progress: Progress) -> Iterator[np.ndarray]:
+    """The first frames, saying how far it is."""
+    for i in range(count):
+        progress(i / count, "landmarks")
+        yield video.frame(i)

@@ -192,14 +192,16 @@ def fake_python(tmp_path) -> Path:
     return path
 
 
-def test_mediapipe_gets_the_wanted_frames_and_its_landmarks_come_back(tmp_path, fake_python):
-    video = request(tmp_path, wanted=(0, 2, 4))
+def test_mediapipe_gets_all_frames_to_the_last_wanted_one_and_its_landmarks_come_back(
+    tmp_path, fake_python
+):
+    video = request(tmp_path, wanted=(0, 3))
     prior = MediapipePrior(fake_python, complexity=2)
     track = checked(prior.estimate(video), video, prior).landmarks["human"]
     found = np.isfinite(track.image_xyzv).all((1, 2)).tolist()
-    assert found == [True, False, False, False, True]  # 1 and 3 unwanted, in 2 nobody was found
+    assert found == [True, False, True, True, False]  # in 1 nobody was found, 4 it did not see
     assert track.image_xyzv[0, 0, :3] == pytest.approx([0.5 * WIDTH, 0.25 * HEIGHT, -0.1 * WIDTH])
-    assert track.image_xyzv[4, 7, 3] == pytest.approx(video.frame(4).mean() / 255)
+    assert track.image_xyzv[3, 7, 3] == pytest.approx(video.frame(3).mean() / 255)
     assert track.world_xyzv[0, 0].tolist() == [2, 0, 1, 1]
     fake_python.write_text("#!/bin/sh\nexit 1\n")
     again = MediapipePrior(fake_python, complexity=2).estimate(video).landmarks["human"]
