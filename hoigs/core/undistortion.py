@@ -47,7 +47,7 @@ class Undistortion:
         if self._grid is None:
             return image
         out = torch.empty(image.shape, dtype=torch.uint8)
-        # a channel at a time: small scraps leave small holes in the heap behind frames that are kept
+        # a channel at a time: large scraps leave large holes in the heap behind frames kept
         for channel, values in enumerate(torch.from_numpy(image).unbind(-1)):
             moved = torch.nn.functional.grid_sample(
                 values.float()[None, None], self._grid, mode="bilinear", padding_mode="border",
