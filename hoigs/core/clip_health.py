@@ -94,15 +94,8 @@ def _masks(clip: Clip, name: str, pool: ThreadPoolExecutor) -> Iterator[Fault]:
 def _depth(clip: Clip) -> Iterator[Fault]:
     if clip.depth_kind == "none":
         return
-    positions = range(0, len(clip), max(1, len(clip) // DEPTH_FRAMES))
-    holes, ratios = [], []
-    points = clip.points[:: max(1, len(clip.points) // DEPTH_POINTS)]
-    for p in positions:
-        depth = clip.store.depth(p)
-        if depth is None:
-            continue
-        holes.append(float((depth <= 0).float().mean()))
-        ratios.append(_against_points(clip, p, depth, points))
+    maps = [d for p in _depth_frames(clip) if (d := clip.store.depth(p)) is not None]
+    holes = [float((depth <= 0).float().mean()) for depth in maps]
     if holes and sum(holes) / len(holes) > HOLES:
         yield Fault(
             "depth-holes",
@@ -110,16 +103,33 @@ def _depth(clip: Clip) -> Iterator[Fault]:
             "nothing is learned from depth there; it is right for sparse sensors, else make depth "
             "again",
         )
-    if clip.depth_kind == "metric" and ratios:
-        factor = _agreed(torch.cat(ratios))
-        if factor is not None and abs(factor - 1) > UNLIKE:
-            yield Fault(
-                "depth-scale",
-                f"the depth maps are {factor:.2f} times as deep as the scene points",
-                f"multiply them by {1 / factor:.2f}, or train with "
-                "--set train.loss.depth_fit=scale, which fits one factor a frame; left as they "
-                "are, they pull the scene away from where its cameras see it",
-            )
+    factor = depth_factor(clip)
+    if factor != 1:
+        yield Fault(
+            "depth-scale",
+            f"the depth maps are {factor:.2f} times as deep as the scene points",
+            f"multiply them by {1 / factor:.2f}; the depth loss does so meanwhile "
+            "(train.loss.depth_fit=auto), but scores and what is placed by depth do not",
+        )
+
+
+def _depth_frames(clip: Clip) -> range:
+    return range(0, len(clip), max(1, len(clip) // DEPTH_FRAMES))
+
+
+def depth_factor(clip: Clip) -> float:
+    """How many times as deep as the scene points metric depth maps are; 1 where that is not known,
+    or so little off that the points' own spread may be to blame."""
+    if clip.depth_kind != "metric":
+        return 1.0
+    points = clip.points[:: max(1, len(clip.points) // DEPTH_POINTS)]
+    ratios = [
+        _against_points(clip, p, depth, points)
+        for p in _depth_frames(clip)
+        if (depth := clip.store.depth(p)) is not None
+    ]
+    factor = _agreed(torch.cat(ratios)) if ratios else None
+    return factor if factor is not None and abs(factor - 1) > UNLIKE else 1.0
 
 
 def _against_points(

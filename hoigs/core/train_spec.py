@@ -51,8 +51,10 @@ class LossSpec(_Strict):
         lpips_net: "vgg" (ExAvatar) or "alex"; None takes what is found.
         face: weight of L_face, the textured face mesh against the video (hoigs/training/face.py).
         depth_fit: how the depth prior meets the render in L_depth. "auto" takes metric depth as it
-            stands and fits scale and shift to relative disparity; "scale" fits one factor to either
-            ("scaled via COLMAP points", which cannot mend a shift), "affine" both.
+            stands, or by one factor for all frames where it disagrees with the scene points by more
+            than 7 % (which the run reports), and fits scale and shift to relative disparity;
+            "scale" fits one factor a frame to either ("scaled via COLMAP points", which cannot mend
+            a shift), "affine" both.
         scene_loss: "full" compares the composite with the whole image (the supplement's formula),
             "masked" draws the scene alone and leaves out the dilated masks (its text), "both".
         background: colour behind masked terms. "random" is drawn anew at each step.

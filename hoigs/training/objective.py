@@ -55,6 +55,7 @@ class ObjectiveResult:
 class JointObjective:
     """L = w_h L_human + w_o L_object + w_s L_scene + w_d L_depth + regularisers.
 
+    `depth_scale` brings the depth prior to the world's scale, where its own is another.
     L_human and L_object draw the entity alone over a random background, on the crop of its mask
     (L_human may compare the composite there instead or too, and adds L_face where asked: LossSpec);
     L_scene compares the composite (or the scene alone); L_depth compares the composite's depth.
@@ -69,11 +70,12 @@ class JointObjective:
         density: Mapping[str, DensityControl] | None = None,
         faces: Mapping[str, FaceTexture] | None = None,
         cameras: CameraRefinement | None = None,
+        depth_scale: float = 1.0,
     ) -> None:
         self.model, self.spec, self.depth_kind, self.lpips = model, spec, depth_kind, lpips
         self.density = dict(density or {})  # whose regularisers count too
         self.faces = dict(faces or {})
-        self.cameras = cameras
+        self.cameras, self.depth_scale = cameras, depth_scale
         self.weights = term_weights(spec)
 
     def __call__(self, frame: Frame, camera: Camera, generator: torch.Generator) -> ObjectiveResult:
@@ -95,7 +97,7 @@ class JointObjective:
         terms: dict[str, Tensor] = {}
         terms.update(self._scene(frame, camera, image, blank, state, composite))
         if frame.depth is not None and self.weights["depth"] > 0:
-            prior = frame.depth.to(device)
+            prior = frame.depth.to(device) * self.depth_scale
             if blank is not None:
                 prior = prior.masked_fill(blank, 0.0)  # 0 = unknown
             depth = depth_loss(

@@ -11,6 +11,7 @@ import torch
 
 from hoigs.core.camera import Camera
 from hoigs.core.clip import Clip, Frame
+from hoigs.core.clip_health import depth_factor
 from hoigs.core.deformation import DeformationModel, StepEvidence
 from hoigs.core.density import DensityControl, DensityStatistics, check_rasterizer
 from hoigs.core.moment import Moment
@@ -84,8 +85,9 @@ class Trainer:
         if spec.rates.camera > 0:
             check_camera_gradients(model.rasterizer)
             self.cameras = CameraRefinement.of(clip).to(model.device)
+        scale = 1 / depth_factor(clip) if spec.loss.depth_fit == "auto" else 1.0
         self.objective = JointObjective(
-            model, spec.loss, clip.depth_kind, lpips, density, faces, self.cameras
+            model, spec.loss, clip.depth_kind, lpips, density, faces, self.cameras, scale
         )
         scene_extent = clip.extent()
         self.optimizer = GroupedAdam(model, spec.rates, spec.warmup, scene_extent, self.cameras)

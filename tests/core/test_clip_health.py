@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hoigs.core.camera import Camera
 from hoigs.core.clip import BodyTrack, Clip, FrameStore, ObjectTrack
-from hoigs.core.clip_health import examine, raggedness
+from hoigs.core.clip_health import depth_factor, examine, raggedness
 from hoigs.core.fault import Fault, ranges
 from hoigs.core.moment import BodyPose, Moment
 
@@ -140,7 +140,8 @@ def test_depth_unlike_the_points(clip: Clip, factor: float) -> None:
     fault = only(clip)
     assert fault.kind == "depth-scale"
     assert f"{factor:.2f} times as deep as the scene points" in fault.what
-    assert f"multiply them by {1 / factor:.2f}" in fault.do and "depth_fit=scale" in fault.do
+    assert f"multiply them by {1 / factor:.2f}" in fault.do and "depth_fit=auto" in fault.do
+    assert depth_factor(clip) == pytest.approx(factor, rel=0.02)
     assert kinds(replace(clip, depth_kind="affine-disparity")) == []
 
 
