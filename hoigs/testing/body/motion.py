@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 
 from hoigs.core.body import LEFT_WRIST, PELVIS
-from hoigs.core.moment import BodyPose
 from hoigs.core.rotation import axis_angle_to_matrices
 from hoigs.core.skinning import transform_points
 from hoigs.testing.body.subject import CHECKS, BodySubject
@@ -63,9 +62,8 @@ def a_batch_is_a_loop(subject: BodySubject) -> None:
     """Poses of several frames at once give what each gives alone."""
     body = subject.body
     poses = [subject.pose(time) for time in (0.0, 0.4, 0.9)]
-    stacked = BodyPose(
-        *(torch.stack([getattr(p, name) for p in poses]) for name in FIELDS[:-1]), poses[0].betas
-    )
+    fields = {name: torch.stack([getattr(p, name) for p in poses]) for name in FIELDS[:-1]}
+    stacked = poses[0].replace(**fields)
     together, transforms = body(stacked), body.skinning_transforms(stacked)
     for i, pose in enumerate(poses):
         alone = body(pose)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from hoigs.core.deformation import ProvidesField
 from hoigs.testing.compare import require, require_close, require_finite
 from hoigs.testing.deformation.subject import apply, changed_by
 from hoigs.testing.features.subject import (
@@ -15,6 +16,7 @@ from hoigs.testing.features.subject import (
     learns,
     require_same,
 )
+from hoigs.testing.material.clip import moment_at
 from hoigs.testing.modules import (
     require_finite_gradients,
     require_gradients,
@@ -101,19 +103,13 @@ def tokens_are_where_the_entity_is(subject: FeaturesSubject) -> None:
     """Positions of tokens are among the Gaussians, or on the body, at that moment."""
     entity = subject.entity()
     for time in (0.0, 0.6):
-        moment = moment_of(subject, entity, time)
+        moment = moment_at(time, entity.means.dtype, entity.means.device)
         drawn = entity(moment).means
-        field = entity.deformation.posed_field(entity.rest, moment)[1]  # type: ignore[operator]
+        assert isinstance(entity.deformation, ProvidesField)
+        field = entity.deformation.posed_field(entity.rest, moment)[1]
         places = subject.tokens(entity, time).positions
         far = []
         for around in (drawn, field):
             low, high = around.amin(0), around.amax(0)
             far.append(float((places - places.clamp(low, high)).norm(dim=-1).max()))
         require_close(f"distance of tokens to the entity at {time}", min(far), 0.0, atol=0.05)
-
-
-def moment_of(subject: FeaturesSubject, entity, time: float):  # type: ignore[no-untyped-def]
-    from hoigs.testing.material.clip import moment_at
-
-    del subject
-    return moment_at(time, entity.means.dtype, entity.means.device)

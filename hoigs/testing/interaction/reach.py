@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from hoigs.core.features import Tokens
+from hoigs.testing.checks import CheckError
 from hoigs.testing.compare import require, require_finite, require_zero
 from hoigs.testing.interaction.subject import (
     CHECKS,
@@ -82,7 +83,8 @@ def who_is_far_does_not_matter(subject: InteractionSubject) -> None:
             require_zero(f"{name}, out of reach", x.detach())
             continue
         wanted = corrections(alone).get(name)
-        require(wanted is not None, f"{name} is asked for only beside an object that is far")
+        if wanted is None:
+            raise CheckError(f"{name} is asked for only beside an object that is far")
         off = float((x - wanted).detach().abs().max())
         require(off < 1e-5, f"{name} is off by {off:.2g} because of an object that is far")
 

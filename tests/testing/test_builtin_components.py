@@ -1,0 +1,43 @@
+"""All that is built in conforms; what has settings without defaults is given some."""
+
+from __future__ import annotations
+
+import pytest
+
+from hoigs.core.registry import default_registry
+from hoigs.testing import Options, Outcome
+from hoigs.testing.door import KINDS, Candidate
+from hoigs.testing.plugin.imports import probe_targets
+
+REGISTRY = default_registry()
+SMALL = {  # the same code on less
+    "deformation:hexplane-field": {"channels": 2, "resolution": 8, "width": 16, "multires": [1, 2]},
+    "deformation:hexplane-skinning": {"resolution": 16, "channels": 4, "width": 16},
+    "deformation:triplane-avatar": {"resolution": 16, "channels": 4, "width": 16},
+    "deformation:mlp": {"width": 32, "depth": 4},
+    "deformation:se3-field": {"width": 32},
+    "deformation:static-dynamic": {"width": 32},
+    "density:adc": {"cap": 300},
+    "density:absgrad": {"cap": 300},
+    "density:mcmc": {"cap": 300},
+    "density:budget": {"count": 300},
+}
+# rasterizers have tests/rasterizers/test_conformance.py; these need a file of the user's
+ELSEWHERE = {"body:smplx", "body:smpl", "body:smplh"}
+KEYS = [
+    key
+    for key in sorted(REGISTRY.keys())
+    if key.partition(":")[0] in set(KINDS) - {"rasterizer"} and key not in ELSEWHERE
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _imported_at_once() -> None:
+    probe_targets(REGISTRY.component(key).target.partition(":")[0] for key in KEYS)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_conforms(key) -> None:
+    report = Candidate(key, Options(SMALL.get(key, {})), REGISTRY).report()
+    assert report.ok, report
+    assert report.run - report.count(Outcome.EXPECTED_FAILURE) == report.count(Outcome.PASSED)
