@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Annotated, Literal, Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,6 +21,7 @@ from hoigs.core.density import (
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.topology import TopologyChange
 from hoigs.plugins.density.children import Window, with_children
+from hoigs.plugins.density.frame_cap import cap_in
 
 LATEST_RESET = 0.85  # a reset in the last 15 % of the run would not be recovered from (F41)
 
@@ -32,7 +33,8 @@ class AdaptiveDensityConfig(ComponentConfig):
         start, stop: of the window in which Gaussians are added and removed, fractions of all
             steps (3DGS: 500 and 15 000 of 30 000). interval: steps between refinements.
         threshold: screen-space gradient, in units of half the image, above which one is refined.
-        cap: most Gaussians there may be. keep: fewest that pruning may leave.
+        cap: most Gaussians there may be; "auto" goes by the size of the frames (`frame_cap`).
+        keep: fewest that pruning may leave.
         clone_scale: largest scale to be cloned, larger ones are split; fraction of the extent.
         prune_opacity: below it, Gaussians are removed.
         prune_scale: above it too, fraction of the extent; None (as 3DGS without resets) never.
@@ -46,7 +48,7 @@ class AdaptiveDensityConfig(ComponentConfig):
     stop: float = Field(0.5, ge=0, le=1)
     interval: int = Field(100, ge=1)
     threshold: float = Field(2e-4, gt=0)
-    cap: int = Field(60_000, ge=1)
+    cap: Annotated[int, Field(ge=1)] | Literal["auto"] = 60_000
     keep: int = Field(16, ge=1)
     clone_scale: float = Field(0.01, gt=0)
     prune_opacity: float = Field(0.005, ge=0, lt=1)
@@ -70,6 +72,8 @@ class AdaptiveDensity(DensityControl):
 
     Args: as AdaptiveDensityConfig. seed: of the children's places.
     """
+
+    cap: int
 
     def __init__(
         self,
@@ -95,7 +99,8 @@ class AdaptiveDensity(DensityControl):
 
     @classmethod
     def from_config(cls, config: AdaptiveDensityConfig, context: BuildContext) -> Self:
-        return cls(**config.model_dump(), seed=entity_seed(context))
+        settings = config.model_dump() | {"cap": cap_in(context, config.cap)}
+        return cls(**settings, seed=entity_seed(context))
 
     @torch.no_grad()
     def refine(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Annotated, Literal, Self
 
 import torch
 from jaxtyping import Float
@@ -22,6 +22,7 @@ from hoigs.core.gaussians import Gaussians
 from hoigs.core.rotation import quats_to_matrices
 from hoigs.core.topology import TopologyChange
 from hoigs.plugins.density.children import Window, drawn_offsets, drawn_rows
+from hoigs.plugins.density.frame_cap import cap_in
 from hoigs.plugins.density.relocation import MAX_COPIES, divided
 
 SHARPNESS = 100.0  # of the gate of the noise
@@ -33,7 +34,8 @@ class McmcDensityConfig(ComponentConfig):
     Attributes:
         start, stop: of the window of relocation and growth, fractions of all steps (published:
             500 and 25 000 of 30 000). interval: steps between refinements.
-        cap: most Gaussians there may be. growth: by which the count grows at each refinement.
+        cap: most Gaussians there may be; "auto" goes by the size of the frames (`frame_cap`).
+        growth: by which the count grows at each refinement.
         dead_opacity: at or below it, a Gaussian is relocated; it is also the middle of the noise's
             gate, and the least opacity that a division leaves.
         spread: how far a copy stands from the place that it joins, in standard deviations of what
@@ -49,7 +51,7 @@ class McmcDensityConfig(ComponentConfig):
     start: float = Field(1 / 60, ge=0, le=1)
     stop: float = Field(5 / 6, ge=0, le=1)
     interval: int = Field(100, ge=1)
-    cap: int = Field(60_000, ge=1)
+    cap: Annotated[int, Field(ge=1)] | Literal["auto"] = 60_000
     growth: float = Field(0.05, ge=0)
     dead_opacity: float = Field(0.005, gt=0, lt=1)
     spread: float = Field(0.0, ge=0)
@@ -81,6 +83,8 @@ class McmcDensity(DensityControl):
     Args: as McmcDensityConfig. seed: of draws and noise.
     """
 
+    cap: int
+
     def __init__(
         self,
         start: float = 1 / 60,
@@ -103,7 +107,8 @@ class McmcDensity(DensityControl):
 
     @classmethod
     def from_config(cls, config: McmcDensityConfig, context: BuildContext) -> Self:
-        return cls(**config.model_dump(), seed=entity_seed(context))
+        settings = config.model_dump() | {"cap": cap_in(context, config.cap)}
+        return cls(**settings, seed=entity_seed(context))
 
     @torch.no_grad()
     def refine(

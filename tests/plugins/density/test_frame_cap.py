@@ -1,0 +1,40 @@
+"""cap: auto counts the pixels of a frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from hoigs.core.context import BuildContext
+from hoigs.plugins.bodies.anny import AnnyBody
+from hoigs.plugins.density.adc import AdaptiveDensity, AdaptiveDensityConfig
+from hoigs.plugins.density.frame_cap import LEAST, MOST, cap_in
+from hoigs.plugins.density.mcmc import McmcDensity, McmcDensityConfig
+from hoigs.synthesis import SceneKnobs, builtin_clip
+from hoigs.training.session import read_clip
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return read_clip(builtin_clip(AnnyBody(), SceneKnobs.tiny()))
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "cap"), [(368, 480, 70_656), (64, 64, LEAST), (4000, 3000, MOST)]
+)
+def test_it_goes_by_the_pixels_within_bounds(clip, width, height, cap):
+    cameras = [c.resized(width, height) for c in clip.cameras]
+    context = BuildContext(entity="scene", clip=replace(clip, cameras=cameras))
+    assert cap_in(context, "auto") == cap
+    assert AdaptiveDensity.from_config(AdaptiveDensityConfig(cap="auto"), context).cap == cap
+    assert McmcDensity.from_config(McmcDensityConfig(cap="auto"), context).cap == cap
+
+
+def test_a_number_stays():
+    assert cap_in(BuildContext(), 123) == 123
+
+
+def test_without_a_clip_there_is_nothing_to_count():
+    with pytest.raises(ValueError, match="say a number"):
+        cap_in(BuildContext(), "auto")
