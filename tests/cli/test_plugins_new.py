@@ -71,19 +71,26 @@ def test_their_own_tests_pass(packages, site):
 
 SPECS = """
 import sys
-from hoigs.core.spec import Spec
+import hoigs as h
+from hoigs.synthesis import SceneKnobs
+clip = h.read_clip(h.builtin_clip(h.AnnyBody(), SceneKnobs.tiny()))
+few = [f"model.{name}.points=50" for name in ("scene", "human", "object")]
 for path in sys.argv[1:]:
-    print(*Spec.load(path).components().values())
+    spec = h.Spec.load(path, overrides=few)
+    model = h.compose(spec, clip)
+    image = model.render(clip.moments[3], clip.cameras[3]).color
+    print(*spec.components().values(), bool(image.isfinite().all() and image.max() > 0.05))
 """
 
 
 def test_a_spec_uses_each_by_name(packages, site):
-    specs = sorted(packages.glob("acme-*/*.yaml"))
+    specs = sorted([*packages.glob("acme-*/*.yaml")])
     kinds = [kind for kind in sorted(NewKind) if kind is not NewKind.reader]  # specs name none
     assert [path.stem for path in specs] == [f"acme-{kind}-one" for kind in kinds]
     lines = run(sys.executable, "-c", SPECS, *specs, site=site).splitlines()
     for kind, line in zip(kinds, lines, strict=True):
         assert f"{kind}:acme-{kind}-one" in line.split()
+        assert line.split()[-1] == "True"
 
 
 def test_they_are_tidy(packages):
