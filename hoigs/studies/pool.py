@@ -57,7 +57,7 @@ def run_jobs(
             while waiting and len(running) < workers:
                 job = waiting.pop(0)
                 tell(job, "started")
-                running.append((job, _start(job, threads)))
+                running.append((job, _start(job, threads, workers)))
             time.sleep(POLL_S)
             for job, process in [pair for pair in running if pair[1].poll() is not None]:
                 running.remove((job, process))
@@ -84,10 +84,10 @@ def _stop(running: Sequence[Running], tell: Report) -> None:
         tell(job, "stopped")
 
 
-def _start(job: Job, threads: int) -> subprocess.Popen[bytes]:
+def _start(job: Job, threads: int, workers: int) -> subprocess.Popen[bytes]:
     job.log.parent.mkdir(parents=True, exist_ok=True)
     environment = os.environ | dict.fromkeys(THREADS, str(threads))
-    command = [sys.executable, "-m", "hoigs.studies.worker", job.dump()]
+    command = [sys.executable, "-m", "hoigs.studies.worker", job.dump(), str(workers)]
     with job.log.open("wb") as log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
 

@@ -10,7 +10,8 @@ from typing import Any
 
 from hoigs.core.errors import HoigsError
 from hoigs.evaluation.protocol import Protocol
-from hoigs.studies.job import SCORES, Job, JobState, digest_folder, make_job
+from hoigs.studies.clip_folders import ClipFolders
+from hoigs.studies.job import SCORES, Job, JobState, make_job
 from hoigs.studies.pool import Report, run_jobs
 from hoigs.studies.results import Measure, RowResult, TableResult, measures_of
 from hoigs.studies.table_sets import Row, TableSet
@@ -63,7 +64,7 @@ def plan(study: Study) -> list[Cell]:
     Raises:
         ClipError: a clip that does not exist; nothing has been run by then.
     """
-    folders = _ClipFolders()
+    folders = ClipFolders()
     for clip in study.clips:
         folders.get(clip)
     return [
@@ -76,7 +77,7 @@ def plan(study: Study) -> list[Cell]:
 
 
 def _cell(
-    study: Study, table: TableSet, row: Row, clip: str, seed: int, folders: _ClipFolders
+    study: Study, table: TableSet, row: Row, clip: str, seed: int, folders: ClipFolders
 ) -> Cell:
     empty = Cell(table.name, row, clip, seed, None)
     if row.spec is None:
@@ -99,25 +100,6 @@ def _cell(
     except HoigsError as error:
         return replace(empty, why=" ".join(str(error).split()))
     return replace(empty, job=job)
-
-
-class _ClipFolders:
-    """Folder, label and digest of each clip, found once."""
-
-    def __init__(self) -> None:
-        self.known: dict[str, tuple[Path, str, str]] = {}
-
-    def get(self, clip: str) -> tuple[Path, str, str]:
-        from hoigs.core.errors import ClipError
-        from hoigs.training.clip_source import clip_folder, clip_name
-
-        if clip not in self.known:
-            folder = clip_folder(clip)
-            if not folder.is_dir():
-                raise ClipError(f"{clip}: no such clip folder; `hoigs prepare` makes one")
-            folder = folder.resolve()
-            self.known[clip] = (folder, clip_name(clip), digest_folder(folder))
-        return self.known[clip]
 
 
 def run_study(

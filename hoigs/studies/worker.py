@@ -1,18 +1,26 @@
-"""One job in a process of its own: `python -m hoigs.studies.worker JOB_AS_JSON`."""
+"""One job in a process of its own: `python -m hoigs.studies.worker JOB_AS_JSON RUNS_AT_ONCE`."""
 
 from __future__ import annotations
 
+import os
 import sys
+import threading
+import time
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
+from hoigs.studies.cost import train_measured
 from hoigs.studies.job import SCORES, Job, JobState, write_record
 
 TIMED_FRAMES, TIMING_BUDGET_S = 30, 15.0  # other jobs run beside: a rough number is what there is
+PARENT_POLL_S = 0.25
 
 
-def run_job(job: Job) -> None:
+def run_job(job: Job, runs_at_once: int = 1) -> None:
     """Train and score, from where an interrupted run of the same job stopped.
+
+    Args:
+        runs_at_once: how many runs share the machine; kept with what the training cost.
 
     Raises:
         HoigsError: the spec does not fit the clip, or the training failed.
@@ -37,9 +45,9 @@ def run_job(job: Job) -> None:
         lpips_weights=weights,
     )
     if session.spec.hash() != job.spec_hash:
-        raise HoigsError(f"{job.spec} has changed since the tables were begun; start them again")
+        raise HoigsError(f"{job.spec} has changed since the study was begun; start them again")
     write_record(job.folder, job.identity)
-    session.train()
+    train_measured(session, job, runs_at_once)
     loaded = LoadedRun.open(job.folder, clip=job.clip, device=job.device, plugins=plugins)
     settings = loaded.spec.evaluation
     evaluation = evaluate(
@@ -59,11 +67,19 @@ def run_job(job: Job) -> None:
 
 def main() -> None:
     """Exit code 2 and one message for what a user can mend, as the command line does."""
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     try:
-        run_job(Job.parse(sys.argv[1]))
+        run_job(Job.parse(sys.argv[1]), int(sys.argv[2]))
     except HoigsError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+
+
+def _end_with(parent: int) -> None:
+    """A study that was killed outright leaves no run that the next would collide with."""
+    while os.getppid() == parent:
+        time.sleep(PARENT_POLL_S)
+    os._exit(1)
 
 
 if __name__ == "__main__":

@@ -101,14 +101,23 @@ class Trainer:
         self.step = 0
         self.elapsed = 0.0
 
-    def train(self, on_step: Callable[[StepReport], None] | None = None) -> None:
-        """Run to `spec.steps`, logging and saving on the way."""
+    def train(
+        self, on_step: Callable[[StepReport], None] | None = None, *, until: int | None = None
+    ) -> None:
+        """Run to `spec.steps`, logging and saving on the way.
+
+        Args:
+            until: stop after this step already; another call goes on. Schedules know of
+                `spec.steps` alone.
+        """
+        end = self.spec.steps if until is None else min(until, self.spec.steps)
         self.model.train()
         started = time.perf_counter() - self.elapsed
-        while self.step < self.spec.steps:
+        while self.step < end:
             terms = self._step()
             self.elapsed = time.perf_counter() - started
             report = self._report(terms)
+            started = time.perf_counter() - self.elapsed  # previews are not training
             if report is not None:
                 if self.run is not None:
                     self.run.log(report.record())
@@ -118,7 +127,7 @@ class Trainer:
             if self.run is not None and (last or self.step % self.spec.checkpoint_every == 0):
                 self.checkpoint().save(self.run.checkpoints)
         self.model.eval()
-        self.model.set_progress(1.0)
+        self.model.set_progress(self.step / self.spec.steps)
 
     def _step(self) -> dict[str, float] | None:
         """One optimizer step: its loss terms and their "total"; None when the guard skipped it.
