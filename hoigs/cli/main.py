@@ -7,7 +7,7 @@ import sys
 import typer
 
 from hoigs import __version__
-from hoigs.cli import demo, doctor, evaluate, plugins, prepare, render, spec, tables, train
+from hoigs.cli import demo, doctor, evaluate, needs, plugins, prepare, render, spec, tables, train
 from hoigs.core.errors import HoigsError
 
 app = typer.Typer(
@@ -23,6 +23,7 @@ app.command("train")(train.train)
 app.command("eval")(evaluate.evaluate)
 app.command("render")(render.render)
 app.command("tables")(tables.tables)
+app.command("needs")(needs.needs)
 app.add_typer(plugins.app, name="plugins")
 app.add_typer(spec.app, name="spec")
 app.command("doctor")(doctor.doctor)

@@ -1,0 +1,1 @@
+"""No more model than a scene needs: ladders of rungs, climbed on training frames held back."""

@@ -1,0 +1,98 @@
+"""Which rung: the cheapest within one standard error of the best, or the least BIC. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import mean, stdev
+from typing import Literal
+
+Criterion = Literal["one-se", "bic"]
+CRITERIA: tuple[Criterion, ...] = ("one-se", "bic")
+# pixels that speak as one: a square of twice the radius of a small splat's blur (methods G.5)
+CORRELATED = (2 * 1.5) ** 2
+MSE_FLOOR = 1e-10
+
+
+@dataclass(frozen=True)
+class Score:
+    """A rung on the selection frames, in its ladder's region.
+
+    Attributes:
+        psnr: dB, one a frame; all rungs of a ladder have the same frames.
+        squares: summed squared error of a frame's region, mean over RGB. pixels: of the region.
+        parameters: trained numbers of the trial's model.
+    """
+
+    psnr: tuple[float, ...]
+    squares: tuple[float, ...]
+    pixels: tuple[int, ...]
+    parameters: int
+
+    @property
+    def mean(self) -> float:
+        return mean(self.psnr)
+
+    @property
+    def mse(self) -> float:
+        return sum(self.squares) / sum(self.pixels)
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Mean difference of two rungs over the same frames and its standard error, dB."""
+
+    mean: float
+    error: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:+.2f} ± {self.error:.2f} dB"
+
+
+def gain(of: Score, over: Score) -> Gain:
+    """How much better `of` is than `over`, frame by frame.
+
+    Raises:
+        ValueError: fewer than two frames, or not the same number.
+    """
+    if len(of.psnr) != len(over.psnr) or len(of.psnr) < 2:
+        raise ValueError(
+            f"a paired standard error needs the same two or more frames: {len(of.psnr)} and "
+            f"{len(over.psnr)}"
+        )
+    differences = [a - b for a, b in zip(of.psnr, over.psnr, strict=True)]
+    return Gain(mean(differences), stdev(differences) / math.sqrt(len(differences)))
+
+
+def bic(score: Score) -> float:
+    """n log(MSE) + p log(n), with n the pixels that are roughly independent (methods G.3, G.5)."""
+    count = max(2.0, sum(score.pixels) / CORRELATED)
+    return count * math.log(max(score.mse, MSE_FLOOR)) + score.parameters * math.log(count)
+
+
+def near_best(scores: Sequence[Score], least: float = 0.0) -> list[bool]:
+    """Whether each is as good as the best: within one standard error of the paired difference,
+    or within `least` dB, which nobody would see and another seed might turn."""
+    best = max(scores, key=lambda score: score.mean)
+    gains = [gain(best, score) for score in scores]
+    return [g.mean <= max(g.error, least) for g in gains]
+
+
+def choose(scores: Sequence[Score], criterion: Criterion = "one-se", least: float = 0.0) -> int:
+    """Place of the rung to keep, of scores in order of cost."""
+    if criterion == "bic":
+        values = [bic(score) for score in scores]
+        return values.index(min(values))
+    return near_best(scores, least).index(True)
+
+
+def ranked(scores: Sequence[Score], criterion: Criterion, least: float) -> list[int]:
+    """Places from the likeliest choice to the least: those as good as the best by cost, then the
+    others by score."""
+    if criterion == "bic":
+        return sorted(range(len(scores)), key=lambda k: (bic(scores[k]), k))
+    near = near_best(scores, least)
+    return sorted(
+        range(len(scores)), key=lambda k: (not near[k], k if near[k] else -scores[k].mean)
+    )

@@ -1,0 +1,88 @@
+"""The clip as a search sees it: some training frames held back, test frames sealed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from hoigs.core.clip import Clip, FrameStore
+from hoigs.core.errors import ClipError
+
+SELECTION = "selection"  # name of the split
+
+
+class SealedFrameError(RuntimeError):
+    """Something looked at a frame that the choice of a model must not know."""
+
+
+class SealedStore(FrameStore):
+    """Another store, of which some frames cannot be looked at.
+
+    Args:
+        base: where pixels come from. sealed: positions; all that is asked of them raises.
+    """
+
+    def __init__(self, base: FrameStore, sealed: Iterable[int]) -> None:
+        self.base, self.sealed = base, frozenset(sealed)
+        self.root = base.root
+
+    def _open(self, position: int) -> FrameStore:
+        if position in self.sealed:
+            raise SealedFrameError(
+                f"frame {position} is a test frame: no model is chosen by it. Whatever reads it "
+                "(a prior, a start from depth) must keep to clip.split['train']"
+            )
+        return self.base
+
+    def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
+        return self._open(position).image(position)
+
+    def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
+        return self._open(position).mask(entity, position)
+
+    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
+        return self._open(position).depth(position)
+
+    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
+        return self._open(position).ignored(position)
+
+    def mask_known(self, entity: str, position: int) -> bool:
+        return self._open(position).mask_known(entity, position)
+
+
+def selection_frames(train: Sequence[int], share: float = 0.05, least: int = 3) -> list[int]:
+    """Training positions to hold back: a share, at least `least`, evenly spaced, no first or last.
+
+    Raises:
+        ClipError: too few training frames to hold any back.
+    """
+    count = max(least, round(share * len(train)))
+    if len(train) < 2 * count + 2:
+        raise ClipError(
+            f"{len(train)} training frames are too few to hold {count} back: at least "
+            f"{2 * count + 2} are needed to choose a model"
+        )
+    return [sorted(train)[int((k + 0.5) * len(train) / count)] for k in range(count)]
+
+
+def selection_view(clip: Clip, share: float = 0.05, least: int = 3) -> Clip:
+    """`clip` with "train" without, and "selection" with the frames that are held back.
+
+    There is no "test" in it, and no held-out view; of every frame that is in neither split not one
+    pixel, mask or depth can be read. Cameras, poses and tracks are as they were.
+
+    Raises:
+        ClipError: as `selection_frames`.
+    """
+    held = selection_frames(clip.split["train"], share, least)
+    train = [p for p in clip.split["train"] if p not in set(held)]
+    sealed = set(range(len(clip))) - set(clip.split["train"])
+    return replace(
+        clip,
+        store=SealedStore(clip.store, sealed),
+        split={"train": train, SELECTION: held},
+        held_out=None,
+    )
