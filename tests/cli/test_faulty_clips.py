@@ -46,7 +46,7 @@ def test_training_goes_on_and_names_each_fault(hoigs, clip_copy, tmp_path):
 def test_scores_under_another_protocol_stand_beside_the_runs_own(hoigs, tiny_clip, tmp_path):
     run = tmp_path / "run"
     settings = ("--set", "train.steps=4", "--set", "train.preview_every=0")
-    assert hoigs("train", tiny_clip, "--spec", "hoigs", "--out", run, *settings).code == 0
+    assert hoigs("train", tiny_clip, "--spec", "static", "--out", run, *settings).code == 0
     page = (run / "report.html").stat().st_mtime_ns
     assert "What is wrong" not in (run / "report.html").read_text()
     wrong = hoigs("eval", run, "--test-pose", "interpolatd")

@@ -169,6 +169,18 @@ def test_poses_that_jitter(clip: Clip) -> None:
     assert "train.rates.pose" in fault.do
 
 
+def test_a_body_filmed_at_few_frames_a_second_does_not_jitter() -> None:
+    """Its joints are degrees off the middle of their neighbours, but on a smooth path."""
+    times = torch.linspace(0, 1, 12)
+    clip = clip_at(times)
+    pose = clip.bodies["ann"].poses
+    wide = pose.body + 0.6 * torch.sin(9 * times)[:, None, None] * torch.tensor([1.0, 0.0, 0.0])
+    moving = replace(clip.bodies["ann"], poses=pose.replace(body=wide))
+    off = wide[1:-1] - 0.5 * (wide[2:] + wide[:-2])
+    assert float(torch.rad2deg(off.norm(dim=-1).median())) > 4
+    assert "pose-noise" not in kinds(replace(clip, bodies={"ann": moving}))
+
+
 @pytest.mark.parametrize("lost", [[7], [7, 9], [5, 20, 31]])
 def test_frames_lost_from_the_video(lost: list[int]) -> None:
     times = torch.linspace(0, 1, FRAMES)
