@@ -57,6 +57,13 @@ def prepare(
     file: Annotated[
         Path | None, typer.Option("--options", help="YAML or TOML file of options.")
     ] = None,
+    allow_commands: Annotated[
+        bool,
+        typer.Option(
+            "--allow-commands",
+            help="Let options run the programs that they name (prior:command, prior:mediapipe).",
+        ),
+    ] = False,
     redo: Annotated[
         list[str] | None,
         typer.Option("--redo", help="Run this stage anew, and what builds on it. Repeatable."),
@@ -80,12 +87,14 @@ def prepare(
     with progress_bar("preparing", 1.0) as bar:
         if stage is not None:
             seconds = prepare_until(
-                stage, source, out, options=options, body=body, progress=bar.update, redo=redo or ()
-            )
+                stage, source, out, options=options, body=body, progress=bar.update,
+                redo=redo or (), allow_commands=allow_commands,
+            )  # fmt: skip
         else:
             report = run(
-                source, out, options=options, body=body, progress=bar.update, redo=redo or ()
-            )
+                source, out, options=options, body=body, progress=bar.update,
+                redo=redo or (), allow_commands=allow_commands,
+            )  # fmt: skip
     if stage is not None:
         rows = [(name, f"{value:.1f} s") for name, value in seconds.items()]
         print_table(f"stages kept in {work_folder(out)}", ("stage", "made in"), rows)

@@ -235,6 +235,14 @@ class VideoPrior(Prior, ABC):
         settings = ", ".join(f"{k}={v!r}" for k, v in sorted(vars(self).items()))
         return f"{type(self).__name__}({settings})"
 
+    def commands(self) -> tuple[str, ...]:
+        """Command lines of the programs that its settings make it run, as people write them.
+
+        Priors whose settings name a program must say so here: options may come from a stranger, and
+        `hoigs prepare` runs such programs only when it is told to.
+        """
+        return ()
+
     @abstractmethod
     def estimate(self, video: VideoRequest, progress: Progress = no_progress) -> Evidence:
         """The evidence, lazily where it is large; callers pass it through `checked`.

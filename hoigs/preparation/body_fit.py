@@ -17,7 +17,14 @@ from hoigs.core.moment import BodyPose
 from hoigs.core.skinning import skin
 from hoigs.preparation.body_fit_start import Start, first_guess
 from hoigs.preparation.body_limits import limit_penalty
-from hoigs.preparation.landmarks import BONES, FEET, LandmarkPoints, LandmarkTrack, points_of
+from hoigs.preparation.landmarks import (
+    BONES,
+    ENOUGH,
+    FEET,
+    LandmarkPoints,
+    LandmarkTrack,
+    points_of,
+)
 from hoigs.preparation.scene_scale import ground_scale
 
 
@@ -98,8 +105,9 @@ def fit_body(
     """Pose, shape and place of a body in every frame, in metres.
 
     Minimises, over all frames at once: robust reprojection of the landmarks, weighted by their
-    visibility; directions of bones against the 3D landmarks; joint limits; acceleration in the
-    world; a shape prior. Frames without landmarks are carried by smoothness.
+    visibility; directions of bones against the 3D landmarks, where there are any; joint limits;
+    acceleration in the world; a shape prior; departures from the start. Frames with fewer than
+    `landmarks.ENOUGH` landmarks are carried by smoothness.
 
     With `options.scale` the cameras' translations are multiplied by one unknown number: the body
     is metric, and so becomes the world. It comes from the scene's points on the ground at the feet,
@@ -118,8 +126,8 @@ def fit_body(
         raise HoigsError(f"{len(cameras)} cameras but landmarks of {len(seen)} frames")
     if int(seen.sum()) < 2:
         raise HoigsError(
-            f"landmarks were found in {int(seen.sum())} of {len(seen)} frames; a body fit needs "
-            "at least 2: is the person in view?"
+            f"{ENOUGH} landmarks or more were found in {int(seen.sum())} of {len(seen)} frames; a "
+            "body fit needs at least 2: is the person in view?"
         )
     problem = _Problem(body, landmarks, cameras, options)
     if options.scale and points is not None:
@@ -175,8 +183,10 @@ class _Problem:
         self.points: LandmarkPoints = points_of(body)
         rows = list(self.points.landmarks)
         self.seen: Bool[Tensor, " F"] = landmarks.found
+        self.solid = int(landmarks.solid.sum())
         image = landmarks.image[:, rows]
-        self.visible = torch.where(self.seen[:, None], image[..., 2], 0.0).nan_to_num()
+        counted = self.seen[:, None] & landmarks.known[:, rows]
+        self.visible = torch.where(counted, image[..., 2], 0.0)
         self.pixels = image[..., :2].nan_to_num()
         self.K = torch.stack([c.K for c in cameras])
         self.viewmats = torch.stack([c.world_to_camera for c in cameras])
@@ -184,9 +194,10 @@ class _Problem:
         self.cameras, self.ground = cameras, cameras[0].K.new_zeros(0, 3)
         self.scale_from = "feet that stand still" if options.scale else "the cameras: given"
         self.bones = torch.tensor([(self.points.index(a), self.points.index(b)) for a, b in BONES])
-        world = landmarks.world[:, rows].nan_to_num()
-        self.bone_targets = _directions(world, self.bones)
-        self.bone_weights = self.visible[:, self.bones[:, 0]] * self.visible[:, self.bones[:, 1]]
+        world = landmarks.world[:, rows]
+        solid = torch.where(torch.isfinite(world).all(-1), self.visible, 0.0)
+        self.bone_targets = _directions(world.nan_to_num(), self.bones)
+        self.bone_weights = solid[:, self.bones[:, 0]] * solid[:, self.bones[:, 1]]
         above = [body.parents[joint] for joint in self.points.joints.tolist()]
         bones = nn.functional.one_hot(torch.tensor(above), len(body.parents))
         on_skin = body.skinning_weights[self.points.vertices]
@@ -275,6 +286,7 @@ class _Problem:
             "landmark_error_px_at_1280": round(mean * 1280 / self.width, 2),
             "landmark_offset_m_largest": round(float(unknowns.offsets.norm(dim=-1).max()), 3),
             "frames_with_landmarks": int(self.seen.sum()),
+            "frames_with_landmarks_in_space": self.solid,
             "frames": len(self.seen),
             "scene_scale": round(float(scale), 5),
             "scene_scale_from": self.scale_from,

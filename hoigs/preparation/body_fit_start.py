@@ -12,11 +12,12 @@ from torch import Tensor
 from hoigs.core.body import BodyModel
 from hoigs.core.camera import Camera
 from hoigs.core.rotation import matrices_to_quats
+from hoigs.preparation.flat_start import flat_start, relaxed
 from hoigs.preparation.landmarks import JOINTS, TORSO, LandmarkTrack
 from hoigs.preparation.limb_start import limb_pose
+from hoigs.preparation.placing import place
 
 ANKLES = (27, 28)
-REWEIGHTINGS = 5
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,8 @@ class Start:
 
     Attributes:
         global_orient: axis-angle, continuous over frames. transl: metres, world.
-        body: axis-angle of joints 1..21; limbs follow the 3D landmarks, the spine is straight.
+        body: axis-angle of joints 1..21; limbs follow the 3D landmarks, or hang where there are
+            none; the spine is straight.
         scale: metres a unit of the cameras' world.
     """
 
@@ -38,32 +40,39 @@ class Start:
 def first_guess(
     body: BodyModel, landmarks: LandmarkTrack, cameras: Sequence[Camera], find_scale: bool
 ) -> Start:
-    """Torso by Kabsch, depth by a linear fit of the 3D landmarks to the 2D ones."""
-    seen = landmarks.found
+    """Torso by Kabsch, depth by a linear fit of the 3D landmarks to the 2D ones; where there are
+    no 3D landmarks, by those of a relaxed body (`flat_start`).
+    """
+    seen, solid = landmarks.found, landmarks.solid[landmarks.found]
     _, joints = body.shaped(torch.zeros(body.num_betas))
     torso = joints[[JOINTS[mark] for mark in TORSO]]
-    rotations, hips = [], []
-    for i in seen.nonzero().squeeze(1).tolist():
-        rotations.append(_kabsch(torso, landmarks.world[i, list(TORSO)]))
-        hips.append(_place(landmarks.image[i], landmarks.world[i], cameras[i].K))
+    image, world = landmarks.image[seen], landmarks.world[seen].clone()
+    K = torch.stack([c.K for c in cameras])[seen]
+    rotations = torch.eye(3).repeat(len(world), 1, 1)
+    limbs = torch.zeros(len(world), 21, 3)
+    if solid.any():
+        rotations[solid] = torch.stack([_kabsch(torso, w[list(TORSO)]) for w in world[solid]])
+        limbs[solid] = limb_pose(world[solid], rotations[solid])
+    if not solid.all():
+        rotations[~solid], world[~solid] = flat_start(body, image[~solid], K[~solid])
+        limbs[~solid] = relaxed()
+    middle = place(image, world, K)  # camera axes, metres
     turn = torch.stack([cameras[i].world_to_camera[:3, :3] for i in range(len(seen))])
     shift = torch.stack([cameras[i].world_to_camera[:3, 3] for i in range(len(seen))])
-    middle = torch.stack(hips)  # camera axes, metres
     back = turn[seen].mT
     scale = 1.0
     if find_scale:
-        ankles = landmarks.world[seen][:, list(ANKLES)] + middle[:, None]
+        ankles = world[:, list(ANKLES)] + middle[:, None]
         centers = -(back @ shift[seen][..., None])[..., 0]
         scale = _still_feet((back[:, None] @ ankles[..., None])[..., 0], centers)
-    place = (back @ (middle - scale * shift[seen])[..., None])[..., 0]
-    orient = back @ torch.stack(rotations)
+    where = (back @ (middle - scale * shift[seen])[..., None])[..., 0]
+    orient = back @ rotations
     pelvis, between_hips = joints[0], joints[[1, 2]].mean(0)
-    transl = place - (orient @ (between_hips - pelvis)[..., None])[..., 0] - pelvis
-    limbs = limb_pose(landmarks.world[seen], torch.stack(rotations)).flatten(1)
+    transl = where - (orient @ (between_hips - pelvis)[..., None])[..., 0] - pelvis
     return Start(
         _fill(_continuous_axis_angle(orient), seen),
         _fill(transl, seen),
-        _fill(limbs, seen).unflatten(1, (21, 3)),
+        _fill(limbs.flatten(1), seen).unflatten(1, (21, 3)),
         scale,
     )
 
@@ -74,32 +83,6 @@ def _kabsch(source: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"]) -> Float
     u, _, vt = torch.linalg.svd(b.mT @ a)
     sign = torch.linalg.det(u @ vt).sign()
     return u @ torch.diag(torch.stack((torch.ones(()), torch.ones(()), sign))) @ vt
-
-
-def _place(
-    image: Float[Tensor, "33 3"], world: Float[Tensor, "33 3"], K: Float[Tensor, "3 3"]
-) -> Float[Tensor, "3"]:
-    """Position of the hips' middle along the camera's axes, from a robust linear fit.
-
-    (X + tx) f = (x - c) (Z + tz), two equations a landmark, weighted by visibility and, again and
-    again, by how well the landmark agrees with the others.
-    """
-    rows, right = [], []
-    for axis in range(2):
-        ray = (image[:, axis] - K[axis, 2]) / K[axis, axis]
-        row = torch.zeros(len(ray), 3)
-        row[:, axis] = 1.0
-        row[:, 2] = -ray
-        rows.append(row)
-        right.append(ray * world[:, 2] - world[:, axis])
-    matrix, vector = torch.stack(rows), torch.stack(right)
-    weight, place = image[:, 2], torch.zeros(3)
-    for _ in range(REWEIGHTINGS):
-        scaled = (matrix * weight[:, None]).flatten(0, 1), (vector * weight).flatten()
-        place = torch.linalg.lstsq(scaled[0], scaled[1][:, None]).solution[:, 0]
-        miss = (matrix @ place - vector).norm(dim=0)
-        weight = image[:, 2] / (1 + (miss / (2 * miss.median().clamp_min(1e-3))).square())
-    return place
 
 
 def _still_feet(ankles: Float[Tensor, "F 2 3"], centers: Float[Tensor, "F 3"]) -> float:

@@ -113,11 +113,6 @@ class Gathering:
         if name not in tracks:
             raise SourceError(f"{who} gave landmarks of {_listed(tracks)}, not of {name}")
         track: Landmarks = tracks[name]
-        if track.world_xyzv is None:
-            raise SourceError(
-                f"{who} gave landmarks in the image only; the body fit needs their places in "
-                "space too, as prior:mediapipe and pose_mediapipe.npz have them"
-            )
         return chosen_landmarks(
             track.image_xyzv, track.world_xyzv, self.video, who, track.provenance or "given"
         )

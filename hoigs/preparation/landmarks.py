@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hoigs.core.body import BodyModel
@@ -22,15 +22,19 @@ BONES = (
 )  # fmt: skip
 TORSO = (11, 12, 23, 24)
 FEET = (29, 30, 31, 32)
+USED = tuple(sorted((*JOINTS, *KNUCKLES, 0, 7, 8, *FEET)))  # landmarks that `points_of` places
+SOLID = (11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)  # in space: torso and limbs start on them
+ENOUGH = 8  # landmarks of USED in the image, with which a frame counts
 
 
 @dataclass(frozen=True)
 class LandmarkTrack:
-    """Landmarks of one person over a clip; NaN where none were found.
+    """Landmarks of one person over a clip; NaN where they were not found.
 
     Attributes:
         image: x, y in pixels of the frames, and visibility in [0, 1].
-        world: metres about the hips' middle, along the camera's axes (x right, y down, z away).
+        world: metres about the hips' middle, along the camera's axes (x right, y down, z away);
+            NaN where the estimator sees the image only.
     """
 
     image: Float[Tensor, "F 33 3"]
@@ -46,11 +50,19 @@ class LandmarkTrack:
         return LandmarkTrack(image, world)
 
     @property
-    def found(self) -> Tensor:
-        """Frames in which all landmarks are there, bool [F]."""
-        return torch.isfinite(self.image).all(-1).all(-1) & torch.isfinite(self.world).all(-1).all(
-            -1
-        )
+    def known(self) -> Bool[Tensor, "F 33"]:
+        """Landmarks that were found in the image."""
+        return torch.isfinite(self.image).all(-1)
+
+    @property
+    def found(self) -> Bool[Tensor, " F"]:
+        """Frames in which enough landmarks of the body were found in the image."""
+        return self.known[:, list(USED)].sum(1) >= ENOUGH
+
+    @property
+    def solid(self) -> Bool[Tensor, " F"]:
+        """Frames of `found` whose torso and limbs are known in space, too."""
+        return self.found & torch.isfinite(self.world[:, list(SOLID)]).all(-1).all(-1)
 
 
 @dataclass(frozen=True)

@@ -63,11 +63,11 @@ class FittedBody:
 
 @dataclass(frozen=True)
 class RawLandmarks:
-    """Landmarks of the chosen frames, distortion still in; NaN where none were found.
+    """Landmarks of the chosen frames, distortion still in; NaN where they were not found.
 
     Attributes:
         image: x, y, relative depth (pixels of the frames) and visibility. world: metres about the
-            hips' middle, and visibility.
+            hips' middle, and visibility; NaN if the estimator sees the image only.
         source: for the report.
     """
 
@@ -107,19 +107,26 @@ def read_landmarks(path: Path, video: Frames) -> RawLandmarks:
 
 def chosen_landmarks(
     image: Float[np.ndarray, "T 33 4"],
-    world: Float[np.ndarray, "T 33 4"],
+    world: Float[np.ndarray, "T 33 4"] | None,
     video: Frames,
     what: str,
     source: str = "MediaPipe",
 ) -> RawLandmarks:
     """Landmarks of a whole video, in its own pixels, as those of the chosen frames.
 
+    Args:
+        world: None if the estimator sees the image only.
+
     Raises:
         SourceError: no person is found in them; `what` says where they come from.
     """
     image = image[video.indices].astype(np.float64)
     image[..., :3] *= video.width / video.native_width
-    raw = RawLandmarks(image, world[video.indices].astype(np.float64), source)
+    if world is None:
+        places = np.full_like(image, np.nan)
+    else:
+        places = world[video.indices].astype(np.float64)
+    raw = RawLandmarks(image, places, source)
     if not LandmarkTrack.from_mediapipe(raw.image, raw.world).found.any():
         raise SourceError(f"{what}: no person was found in the {len(image)} chosen frames")
     return raw
@@ -139,7 +146,7 @@ def fit_person(
     fit = fit_body(body, landmarks, track.cameras, options=options, points=known, progress=progress)
     frames = list(posed(body, fit.poses))
     residual = float(fit.residual_px.nanmedian())
-    found = int(landmarks.found.sum())
+    found, solid = int(landmarks.found.sum()), int(landmarks.solid.sum())
     return FittedBody(
         poses=fit.poses,
         joints=torch.stack([joints for _, joints in frames]),
@@ -149,16 +156,22 @@ def fit_person(
         ground=float(torch.stack([vertices[:, 1].max() for vertices, _ in frames]).median()),
         found=landmarks.found.numpy(),
         provenance=(
-            f"fitted to {source} landmarks of {found} of {len(track.cameras)} frames, "
+            f"fitted to {source} landmarks{'' if solid else ' in the image only'} of {found} of "
+            f"{len(track.cameras)} frames, "
             f"{residual:.1f} px off (median of frames); hands are not fitted"
         ),
         report=fit.report,
-        warnings=_warnings(residual, found, track.cameras),
+        warnings=_warnings(residual, found, solid, track.cameras),
     )
 
 
-def _warnings(residual: float, found: int, cameras: Sequence[Camera]) -> list[str]:
+def _warnings(residual: float, found: int, solid: int, cameras: Sequence[Camera]) -> list[str]:
     warnings = []
+    if solid < found:
+        warnings.append(
+            f"landmarks of {found - solid} of {found} frames are known in the image only: the "
+            "depth of limbs is a guess there (prior:mediapipe sees it)"
+        )
     if residual > POOR_FIT * max(cameras[0].width, cameras[0].height):
         warnings.append(f"the body misses its landmarks by {residual:.1f} px: see overlay.mp4")
     if found < 0.8 * len(cameras):

@@ -15,7 +15,7 @@ from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.pipeline import Pipeline
 from hoigs.preparation.plan import PLAN, and_after, check_stage
 from hoigs.preparation.report import PrepareReport
-from hoigs.preparation.settings import installed_priors
+from hoigs.preparation.settings import installed_priors, refuse_commands
 from hoigs.preparation.source import SourceError, find_source
 from hoigs.preparation.stages import Progress, Stages
 from hoigs.preparation.store import WorkFolder
@@ -38,6 +38,7 @@ def prepare(
     progress: Progress | None = None,
     redo: Sequence[str] = (),
     priors: Priors | None = None,
+    allow_commands: bool = False,
 ) -> PrepareReport:
     """Turn a source into a clip folder, stage by stage.
 
@@ -55,15 +56,19 @@ def prepare(
         redo: stages to run anew, with all that build on them; an older clip is then replaced.
         priors: by kind of evidence, "masks", "landmarks" or "depth"; those of `options.priors`,
             which are looked up among the installed plugins, come second.
+        allow_commands: let `options.priors` run the programs that they name.
 
     Raises:
+        SpecError: `options.priors` would run programs, and may not.
         SourceError: an input is absent, unreadable or does not fit the others.
         ClipError: `out` is there already, or another process is preparing it.
         HoigsError: there is no stage of a name in `redo`.
     """
     options = options or PrepareOptions()
     replace = options.overwrite or bool(redo)
-    run = _run(source, out, body, options, progress, redo, priors, None, replace)
+    run = _run(
+        source, out, body, options, progress, redo, priors, None, replace, allow_commands
+    )  # fmt: skip
     return run.report
 
 
@@ -77,6 +82,7 @@ def prepare_until(
     progress: Progress | None = None,
     redo: Sequence[str] = (),
     priors: Priors | None = None,
+    allow_commands: bool = False,
 ) -> dict[str, float]:
     """As `prepare`, but only up to and including `stage`; no clip is written.
 
@@ -90,7 +96,7 @@ def prepare_until(
     if stage == list(PLAN)[-1]:
         raise HoigsError(f"{stage} is the last stage: run prepare as a whole")
     options = options or PrepareOptions()
-    run = _run(source, out, body, options, progress, redo, priors, stage, True)
+    run = _run(source, out, body, options, progress, redo, priors, stage, True, allow_commands)
     return run.stages.seconds
 
 
@@ -104,12 +110,16 @@ def _run(
     priors: Priors | None,
     until: str | None,
     replace: bool,
+    allow_commands: bool,
 ) -> Pipeline:
     source, out = Path(source), Path(out)
     for name in redo:
         check_stage(name)
     _check_paths(source, out, replace)
-    chosen = {**installed_priors(options), **(priors or {})}
+    named = installed_priors(options)
+    if not allow_commands:
+        refuse_commands(named)  # `priors` are the caller's own code
+    chosen = {**named, **(priors or {})}
     found = find_source(
         source, human=options.human, object_name=options.object, given=set(chosen),
         own_cameras=options.camera in ("static", "sfm"),

@@ -85,6 +85,18 @@ def installed_priors(
     return priors
 
 
+def refuse_commands(priors: Mapping[EvidenceKind, VideoPrior]) -> None:
+    """SpecError, showing the command lines, if priors would run programs."""
+    lines = [f"  priors.{kind}: {c}" for kind, prior in priors.items() for c in prior.commands()]
+    if lines:
+        found = "\n".join(lines)
+        raise SpecError(
+            f"these options run programs on this machine:\n{found}\n"
+            "nothing was run; if you trust them, say --allow-commands (prepare(..., "
+            "allow_commands=True))"
+        )
+
+
 def _givers(registry: Registry, kind: EvidenceKind) -> list[str]:
     """Keys of the installed priors that give a kind of evidence."""
     found = []

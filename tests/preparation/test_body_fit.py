@@ -236,10 +236,16 @@ def test_landmark_points_of_the_head_and_feet_are_where_they_belong() -> None:
 def test_mediapipe_arrays_and_missing_frames() -> None:
     image = np.ones((3, 33, 4), np.float32) * (1, 2, 3, 0.5)
     world = np.ones((3, 33, 4), np.float32)
-    image[1, 5, 0] = np.nan
+    image[1] = np.nan
+    image[2, 8:] = np.nan  # of the head, three landmarks have a point of the body
     track = LandmarkTrack.from_mediapipe(image, world)
     assert track.image[0, 0].tolist() == [1.0, 2.0, 0.5]
+    assert track.found.tolist() == [True, False, False]
+    image[2, 11:18] = 1  # with shoulders, elbows, wrists and one finger it is enough
+    world[2, 13] = np.nan
+    track = LandmarkTrack.from_mediapipe(image, world)
     assert track.found.tolist() == [True, False, True]
+    assert track.solid.tolist() == [True, False, False]
 
 
 def test_too_little_to_fit_is_refused() -> None:

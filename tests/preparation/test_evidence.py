@@ -15,7 +15,7 @@ from hoigs.core.video_prior import Evidence, Landmarks, VideoPrior
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.preparation.frames import FolderFrames, VideoFrames, open_frames
-from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until
+from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until, work_folder
 from hoigs.preparation.settings import load_options
 from hoigs.preparation.source import SourceError, find_source, numbered_frames
 
@@ -132,14 +132,52 @@ class FlatPrior(VideoPrior):
         return Evidence(landmarks={"human": track})
 
 
-def test_landmarks_without_space_are_refused(tiny_source: Path, tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="in the image only"):
-        prepare_until(
-            "evidence", tiny_source, tmp_path / "clip", body=AnnyBody(),
-            options=PrepareOptions(fit_steps=3), priors={"landmarks": FlatPrior()},
-        )  # fmt: skip
+def test_landmarks_without_space_are_enough(tiny_source: Path, tmp_path: Path) -> None:
+    report = prepare(
+        tiny_source, tmp_path / "clip", body=AnnyBody(),
+        options=PrepareOptions(fit_steps=30, overlay_width=0), priors={"landmarks": FlatPrior()},
+    )  # fmt: skip
+    assert check_clip(tmp_path / "clip") == [] and report.body_residual_px < 4
+    assert "known in the image only" in " ".join(report.warnings)
+
+
+def test_a_prior_of_other_evidence_is_refused(tiny_source: Path, tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="FlatPrior provides landmarks, not masks"):
         prepare_until(
             "evidence", tiny_source, tmp_path / "clip", body=AnnyBody(),
             options=PrepareOptions(fit_steps=3), priors={"masks": FlatPrior()},
         )  # fmt: skip
+
+
+COMMAND = """
+priors:
+  masks: {{use: "prior:command", command: "touch {mark}", masks: {{path: .}}}}
+  landmarks: {{use: "prior:mediapipe", python: env/bin/python}}
+"""
+
+
+def test_options_of_strangers_run_nothing(tiny_source: Path, tmp_path: Path) -> None:
+    file, mark = tmp_path / "theirs.yaml", tmp_path / "ran"
+    file.write_text(COMMAND.format(mark=mark))
+    options = load_options(file)
+    for run in (
+        lambda: prepare(tiny_source, tmp_path / "clip", body=AnnyBody(), options=options),
+        lambda: prepare_until(
+            "evidence", tiny_source, tmp_path / "clip", body=AnnyBody(), options=options
+        ),
+    ):
+        with pytest.raises(SpecError) as refused:
+            run()
+        message = str(refused.value)
+        assert f"priors.masks: touch {mark}" in message and "--allow-commands" in message
+        assert "priors.landmarks: env/bin/python -I mediapipe_script.py" in message
+    assert not mark.exists() and not work_folder(tmp_path / "clip").exists()
+    # allowed, it runs: what it wrote is looked for
+    settings = [f"priors.masks.command=touch {mark}", "priors.masks.use=prior:command",
+                "priors.masks.masks.path=."]  # fmt: skip
+    with pytest.raises(HoigsError, match="ended well, but what it wrote cannot be used"):
+        prepare(
+            tiny_source, tmp_path / "clip", body=AnnyBody(), options=load_options(None, settings),
+            allow_commands=True,
+        )  # fmt: skip
+    assert mark.exists()

@@ -40,7 +40,8 @@ PLACES = ("frames", "out", "video", "folder", "width", "height", "count", "fps")
 class CommandConfig(ComponentConfig):
     """Settings of `prior:command`.
 
-    Whoever runs such settings runs the command in them: read those of others before use.
+    Whoever uses such settings runs the command in them, which `hoigs prepare` does only with
+    --allow-commands: read those of others before.
     """
 
     command: str = Field(
@@ -124,6 +125,9 @@ class CommandPrior(VideoPrior):
         if config.landmarks is not None:
             readers.append(LandmarksFilesPrior.from_config(config.landmarks, context))
         return cls(config.command, readers, config.cwd)
+
+    def commands(self) -> tuple[str, ...]:
+        return (self.command if self.cwd is None else f"{self.command}   (in {self.cwd})",)
 
     def estimate(self, video: VideoRequest, progress: Progress = no_progress) -> Evidence:
         # all frames: arrays that tools write have no frame numbers, so their rows must be frames

@@ -75,6 +75,9 @@ class MediapipePrior(VideoPrior):
             "min_tracking_confidence": tracking_confidence,
         }
 
+    def commands(self) -> tuple[str, ...]:
+        return (f"{self.python} -I {SCRIPT.name}",)
+
     def estimate(self, video: VideoRequest, progress: Progress = no_progress) -> Evidence:
         people = video.named("human") or ("human",)
         if len(people) > 1:
