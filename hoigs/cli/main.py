@@ -7,7 +7,19 @@ import sys
 import typer
 
 from hoigs import __version__
-from hoigs.cli import demo, doctor, evaluate, needs, plugins, prepare, render, spec, tables, train
+from hoigs.cli import (
+    chart,
+    demo,
+    doctor,
+    evaluate,
+    needs,
+    plugins,
+    prepare,
+    render,
+    spec,
+    tables,
+    train,
+)
 from hoigs.core.errors import HoigsError
 
 app = typer.Typer(
@@ -23,6 +35,7 @@ app.command("train")(train.train)
 app.command("eval")(evaluate.evaluate)
 app.command("render")(render.render)
 app.command("tables")(tables.tables)
+app.command("chart")(chart.chart)
 app.command("needs")(needs.needs)
 app.add_typer(plugins.app, name="plugins")
 app.add_typer(spec.app, name="spec")
