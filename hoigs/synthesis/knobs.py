@@ -10,7 +10,9 @@ from pydantic import Field, model_validator
 from hoigs.core.config import ComponentConfig
 
 CameraPathName = Literal["orbit", "pan", "static"]
-ObjectMotionName = Literal["held", "thrown", "pushed", "bending", "static", "carried"]
+ObjectMotionName = Literal[
+    "held", "thrown", "pushed", "bending", "static", "carried", "gliding", "figure-eight"
+]
 
 
 class CameraKnobs(ComponentConfig):
@@ -47,6 +49,9 @@ class ObjectKnobs(ComponentConfig):
     lift_height: float = Field(1.22, gt=0, description="of the centre at the top of the swing")
     stand_height: float = Field(0.56, gt=0.1, description="of what it stands on, metres")
     throw_height: float = Field(0.45, gt=0, description="rise of a throw, metres")
+    jolt_metres: float = Field(
+        0.0, ge=0, description="std of jolts, frame by frame, of a pushed object and the hands"
+    )
     bend_degrees: float = Field(70.0, ge=0, le=150, description="of a bending bar, end to end")
 
 

@@ -29,6 +29,11 @@ CLIPS: Mapping[str, Mapping[str, Any]] = {
         },
     },
     "throw-and-catch": {"object": {"motion": "thrown"}},
+    "still-box": {"object": {"motion": "static"}},
+    "glide": {"object": {"motion": "gliding"}},
+    "figure-eight": {"object": {"motion": "figure-eight"}},
+    "bending-bar": {"object": {"motion": "bending", "size": (0.70, 0.12, 0.12)}},
+    "jolted-push": {"object": {"motion": "pushed", "jolt_metres": 0.03}},
 }
 
 

@@ -201,6 +201,10 @@ class Pushed(ObjectMotion):
         )
         track = self.path(keys)
         track.translations[:, 2] = STAND_RADIUS
+        if self.object.jolt_metres:  # hands and object together, so that one tells of the other
+            rng = np.random.default_rng([self.knobs.seed, 21])
+            jolts = self.object.jolt_metres * rng.normal(size=len(self.u))
+            track.translations[:, 0] += jolts * self.lift_grip()
         return self.scripted(track, track, self.lift_grip(), (self.stand(0, width=1.15),))
 
 
@@ -218,6 +222,30 @@ class Bending(ObjectMotion):
         s = 0.6 * self.object.swing_degrees
         script = self.scripted(held, held, self.lift_grip(), (self.stand(-s), self.stand(s)))
         return replace(script, bend=bend)
+
+
+class Gliding(ObjectMotion):
+    """Held before the chest and moved across at constant speed, turning evenly: two knots do."""
+
+    def script(self) -> ObjectScript:
+        sweep = np.linspace(-1, 1, len(self.u))
+        yaw = np.radians(0.4 * self.object.swing_degrees) * sweep
+        height = np.full_like(sweep, 0.86 * self.object.lift_height)
+        place = np.stack((0.22 * sweep, height + 0.08 * sweep, np.full_like(sweep, 0.5)), -1)
+        track = Track(about(np.array([0, 1, 0]), yaw), place)
+        return self.scripted(track, track, np.ones(len(self.u)))
+
+
+class FigureEight(ObjectMotion):
+    """Held before the chest and led along an eight that lies on its side."""
+
+    def script(self) -> ObjectScript:
+        phase = 2 * np.pi * self.u
+        height = 0.86 * self.object.lift_height + 0.15 * np.sin(2 * phase)
+        place = np.stack((0.24 * np.sin(phase), height, np.full_like(phase, 0.5)), -1)
+        roll = np.radians(self.object.tilt_degrees) * np.sin(phase)
+        track = Track(about(np.array([0, 0, 1]), roll), place)
+        return self.scripted(track, track, np.ones(len(self.u)))
 
 
 class Carried(ObjectMotion):
@@ -263,7 +291,7 @@ class Static(ObjectMotion):
 
 MOTIONS: dict[str, type[ObjectMotion]] = {
     "held": Held, "thrown": Thrown, "pushed": Pushed, "bending": Bending, "static": Static,
-    "carried": Carried,
+    "carried": Carried, "gliding": Gliding, "figure-eight": FigureEight,
 }  # fmt: skip
 
 

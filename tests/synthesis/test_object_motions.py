@@ -75,3 +75,32 @@ def test_a_static_object_never_moves() -> None:
     assert np.ptp(script.track.translations, axis=0).max() == 0
     assert np.ptp(script.track.rotations, axis=0).max() == 0
     assert script.grip.max() == 0
+
+
+def test_a_glide_is_uniform() -> None:
+    track = MOTIONS["gliding"](_knobs("gliding")).script().track
+    steps = np.diff(track.translations, axis=0)
+    np.testing.assert_allclose(steps, np.broadcast_to(steps[0], steps.shape), atol=1e-12)
+    turns = track.rotations[:-1].transpose(0, 2, 1) @ track.rotations[1:]
+    np.testing.assert_allclose(turns, np.broadcast_to(turns[0], turns.shape), atol=1e-12)
+    assert np.linalg.norm(steps.sum(0)) > 0.4
+
+
+def test_a_figure_eight_crosses_itself_in_the_middle() -> None:
+    knobs = SceneKnobs.model_validate({"frames": 65, "object": {"motion": "figure-eight"}})
+    place = MOTIONS["figure-eight"](knobs).script().track.translations
+    np.testing.assert_allclose(place[0], place[32], atol=1e-9)
+    np.testing.assert_allclose(place[0], place[64], atol=1e-9)
+    assert np.ptp(place[:, 0]) > 0.4 and np.ptp(place[:, 1]) > 0.25
+    height = place[:, 1] - place[0, 1]
+    assert (np.diff(np.sign(height[np.abs(height) > 1e-6])) != 0).sum() == 3
+
+
+def test_jolts_shake_a_pushed_box_and_the_hands_with_it() -> None:
+    calm = MOTIONS["pushed"](_knobs("pushed")).script()
+    shaken = MOTIONS["pushed"](_knobs("pushed", jolt_metres=0.03)).script()
+    jolts = shaken.track.translations - calm.track.translations
+    np.testing.assert_array_equal(jolts[:, 1:], 0)
+    assert 0.02 < jolts[calm.grip > 0.9, 0].std() < 0.04
+    assert jolts[0, 0] == 0 and jolts[-1, 0] == 0  # nobody holds it
+    np.testing.assert_array_equal(shaken.hold.translations, shaken.track.translations)
