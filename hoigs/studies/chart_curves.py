@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
 from hoigs.studies.chart_data import Point
 from hoigs.studies.chart_draw import DPI, machine_sentences
@@ -23,7 +24,7 @@ from hoigs.studies.chart_style import (
     short_number,
 )
 
-DASHES: tuple[str | tuple[int, tuple[int, ...]], ...] = ("-", (0, (5, 2)), (0, (2, 1.5)))  # type: ignore[arg-type]
+DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (2, 1.5)))  # matplotlib's
 ROOM = 0.3  # of the width, for the labels at the lines' ends
 
 
@@ -85,6 +86,7 @@ def _lines(axes: Axes, points: Sequence[Point], which: int) -> None:
     ends = [p.curve[-1][which] for p in points]
     if which == 1 and min(ends) > 0 and max(ends) > 6 * min(ends):
         axes.set_xscale("log")
+        axes.xaxis.set_minor_locator(NullLocator())
     low, high = axes.get_xlim()
     if axes.get_xscale() == "log":
         axes.set_xlim(low, high * (high / low) ** (ROOM / (1 - ROOM)))
@@ -108,5 +110,5 @@ def _end_labels(axes: Axes, points: Sequence[Point], which: int) -> None:
         at = invert.transform([(x, y), (column - 4, height), (column, height)])
         axes.plot(at[:2, 0], at[:2, 1], color=colors[p.spec], linewidth=0.7, alpha=0.6,
                   scalex=False, scaley=False)  # fmt: skip
-        axes.text(*at[2], names[i], color=ink_of(colors[p.spec]), size=8.5, weight="bold",
+        axes.text(at[2, 0], at[2, 1], names[i], color=ink_of(colors[p.spec]), size=8.5, weight="bold",
                   va="center")  # fmt: skip

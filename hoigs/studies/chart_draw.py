@@ -249,7 +249,7 @@ def _label(axes: Axes, points: Sequence[Point], cost: Axis, accuracy: Axis) -> l
     invert = axes.transData.inverted()
     for artist, spot, point in zip(artists, placed, named, strict=True):
         artist.set_position(tuple(invert.transform((spot.box.x0 + 1, spot.box.y0 + 1))))
-        artist.set_va("bottom")
+        artist.set_verticalalignment("bottom")
         if spot.leader:
             x, y = pixels(point)
             near = (min(max(x, spot.box.x0), spot.box.x1), min(max(y, spot.box.y0), spot.box.y1))

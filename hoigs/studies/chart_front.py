@@ -18,8 +18,9 @@ class Dominance:
     """`winner` is no worse on every axis and better on one at least.
 
     Attributes:
-        sure: on one axis the lead is above the standard deviation, over seeds, of the difference;
-            never of points of a single seed each, whose spread nobody knows.
+        sure: on every axis where they differ the lead is above the standard deviation, over
+            seeds, of the difference; never of points of a single seed each, whose spread nobody
+            knows.
     """
 
     winner: Point
@@ -60,9 +61,9 @@ def dominances(points: Sequence[Point], axes: Sequence[Axis]) -> list[Dominance]
 def _sure(a: Point, b: Point, axes: Sequence[Axis]) -> bool:
     if len(a.seeds) < 2 and len(b.seeds) < 2:
         return False
-    return any(
-        abs(_known(a, axis) - _known(b, axis)) > math.hypot(a.spread(axis), b.spread(axis))
-        for axis in axes
+    leads = [(axis, abs(_known(a, axis) - _known(b, axis))) for axis in axes]
+    return all(
+        lead == 0 or lead > math.hypot(a.spread(axis), b.spread(axis)) for axis, lead in leads
     )
 
 

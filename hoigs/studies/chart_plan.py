@@ -118,12 +118,14 @@ def plan(study: ChartStudy) -> list[Planned]:
     folders = ClipFolders()
     for clip in study.clips:
         folders.get(clip)
+    rasterizers: Sequence[str | None] = study.rasterizers or [None]
+    budgets: Sequence[int | None] = study.budgets or [None]
     return [
         _planned(study, variant, rasterizer, budget, clip, seed, folders)
         for clip in study.clips
         for variant in study.variants
-        for rasterizer in study.rasterizers or [None]
-        for budget in study.budgets or [None]
+        for rasterizer in rasterizers
+        for budget in budgets
         for seed in range(study.seeds)
     ]
 

@@ -183,10 +183,12 @@ def dominance_table(points: Sequence[Point], mix_machines: bool) -> list[str]:
     columns, refused = usable_axes(points, COST, mix_machines)
     if not rows or not columns:
         return ["Nothing to compare: no accuracy or no cost is computed."]
-    sets = {f"{rows[0].title} against {c.title}": (c, rows[0]) for c in columns}
+    sets: dict[str, tuple[Axis, ...]] = {
+        f"{rows[0].title} against {c.title}": (c, rows[0]) for c in columns
+    }
     sets["everything that is computed"] = (*columns, *rows)
-    lines = ["Who dominates: no worse on every axis of the column and better on one. (?): by less "
-             "than one standard deviation over seeds, or only one seed.", "",
+    lines = ["Who dominates: no worse on every axis of the column and better on one. (?): on some "
+             "axis by less than one standard deviation over seeds, or of single seeds.", "",
              "| | " + " | ".join(sets) + " |", "|---" * (len(sets) + 1) + "|"]  # fmt: skip
     found = {name: (dominances(points, axes), front(points, axes)) for name, axes in sets.items()}
     for p in points:

@@ -87,7 +87,8 @@ def _stop(running: Sequence[Running], tell: Report) -> None:
 def _start(job: Job, threads: int, workers: int) -> subprocess.Popen[bytes]:
     job.log.parent.mkdir(parents=True, exist_ok=True)
     environment = os.environ | dict.fromkeys(THREADS, str(threads))
-    command = [sys.executable, "-m", "hoigs.studies.worker", job.dump(), str(workers)]
+    numbers = (str(workers), str(os.getpid()))
+    command = [sys.executable, "-m", "hoigs.studies.worker", job.dump(), *numbers]
     with job.log.open("wb") as log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
 

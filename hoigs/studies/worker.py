@@ -1,4 +1,4 @@
-"""One job in a process of its own: `python -m hoigs.studies.worker JOB_AS_JSON RUNS_AT_ONCE`."""
+"""One job in a process of its own: `python -m hoigs.studies.worker JOB RUNS_AT_ONCE PARENT`."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def run_job(job: Job, runs_at_once: int = 1) -> None:
 
 def main() -> None:
     """Exit code 2 and one message for what a user can mend, as the command line does."""
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=_end_with, args=(int(sys.argv[3]),), daemon=True).start()
     try:
         run_job(Job.parse(sys.argv[1]), int(sys.argv[2]))
     except HoigsError as error:
