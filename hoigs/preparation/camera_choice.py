@@ -10,8 +10,10 @@ from hoigs.preparation.cameras import CameraTrack, colmap_cameras, static_camera
 from hoigs.preparation.frames import Frames
 from hoigs.preparation.motion import background_motion
 from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.person import RawLandmarks
 from hoigs.preparation.sfm import structure_from_motion
 from hoigs.preparation.split_masks import GivenMasks
+from hoigs.preparation.static_focal import static_focal
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class ChosenCameras:
 
 def choose_cameras(
     video: Frames,
+    landmarks: RawLandmarks,
     masks: GivenMasks,
     model: Path | None,
     options: PrepareOptions,
@@ -34,7 +37,7 @@ def choose_cameras(
     """Cameras as `options.camera` says.
 
     Args:
-        masks: of the raw frames. model: a COLMAP model that is there already, or None.
+        landmarks, masks: of the raw frames. model: a COLMAP model that is there already, or None.
         folder: to work in; it may go when what is returned has been kept.
 
     Raises:
@@ -43,7 +46,7 @@ def choose_cameras(
     if options.camera not in {"static", "sfm"} and model is not None:
         return ChosenCameras(colmap_cameras(video, model))
     if options.camera == "static":
-        return _static(video, options, "", {})
+        return _static(video, landmarks, options, "", {})
     if options.camera == "auto":
         motion = background_motion(video, masks)
         if motion.static:
@@ -54,7 +57,7 @@ def choose_cameras(
                 if motion.known
                 else ""
             )
-            chosen = _static(video, options, how, figures)
+            chosen = _static(video, landmarks, options, how, figures)
             if not motion.known:
                 chosen.warnings.append(
                     f"only {motion.features} features lie outside the masks, too few to tell "
@@ -65,17 +68,17 @@ def choose_cameras(
 
 
 def _static(
-    video: Frames, options: PrepareOptions, how: str, figures: dict[str, float]
+    video: Frames,
+    landmarks: RawLandmarks,
+    options: PrepareOptions,
+    how: str,
+    figures: dict[str, float],
 ) -> ChosenCameras:
-    track = static_cameras(video, options.focal)
-    warnings = []
-    if options.focal is None:
-        warnings.append(
-            "the focal length is assumed, and every depth is proportional to it: give "
-            "--focal if you know it"
-        )
+    found = static_focal(video, landmarks, options.focal)
+    track = static_cameras(video, found.pixels, found.how)
+    figures = {**figures, **found.figures}
     track = replace(track, provenance=track.provenance + how, figures=figures)
-    return ChosenCameras(track, warnings=warnings)
+    return ChosenCameras(track, warnings=list(found.warnings))
 
 
 def _from_motion(

@@ -34,7 +34,7 @@ class CameraTrack:
         model: folder of the COLMAP model, or None for a static camera.
         positions: places, among the frames given in, of those that have a camera.
         figures: for the report: "registered" and "images", "reprojection_px", "points",
-            "distortion_px", and of a static camera "displacement_px".
+            "distortion_px", and of a static camera "displacement_px" and those of its focal length.
     """
 
     cameras: list[Camera]
@@ -53,18 +53,16 @@ class CameraTrack:
         return self.model is None
 
 
-def static_cameras(video: Frames, focal: float | None) -> CameraTrack:
+def static_cameras(video: Frames, focal: float, how: str = "given") -> CameraTrack:
     """One camera at the origin for all frames: the world is its frame, y down, z forward.
 
     Args:
-        focal: pixels at the video's own size; None assumes 0.8 of the longer side.
+        focal: pixels at the video's own size. how: it is known, for the provenance.
     """
-    assumed = ASSUMED_FOCAL * max(video.native_width, video.native_height)
-    f = (focal or assumed) * video.width / video.native_width
+    f = focal * video.width / video.native_width
     K = torch.tensor([[f, 0, video.width / 2], [0, f, video.height / 2], [0, 0, 1]])
     camera = Camera(K, torch.eye(4), video.width, video.height)
-    how = "given" if focal else "assumed: 0.8 x the longer side; all depths scale with it"
-    provenance = f"static camera at the origin, focal {focal or assumed:.0f} px ({how})"
+    provenance = f"static camera at the origin, focal {focal:.0f} px ({how})"
     none = torch.zeros(0, 3)
     return CameraTrack(
         [camera] * len(video), Undistortion(), none, none, provenance, metric=True,

@@ -1,9 +1,10 @@
-"""What is known of the chosen frames before their cameras are: from priors, or files found."""
+"""What is known of the chosen frames before their cameras are, from priors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +25,9 @@ from hoigs.core.video_prior import (
 from hoigs.preparation.frames import Frames
 from hoigs.preparation.masks import MaskStack
 from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.person import RawLandmarks, chosen_landmarks, read_landmarks
+from hoigs.preparation.person import RawLandmarks, chosen_landmarks
 from hoigs.preparation.source import Source, SourceError
-from hoigs.preparation.split_masks import GivenMasks, read_masks
+from hoigs.preparation.split_masks import GivenMasks
 from hoigs.preparation.store import digest
 
 Priors = Mapping[EvidenceKind, VideoPrior]
@@ -42,7 +43,7 @@ class RawEvidence:
 
 @dataclass(frozen=True)
 class Gathering:
-    """Where evidence comes from: each kind from its prior, or else from the source's files.
+    """Where evidence comes from: each kind from its prior, given or of the files found beside.
 
     Attributes:
         work: folder for what priors keep between runs.
@@ -56,15 +57,10 @@ class Gathering:
 
     def gather(self, progress: Callable[[float], None]) -> RawEvidence:
         """Landmarks first: they are read fast, and a clip without them cannot be made."""
-        names = (self.options.human, self.options.object)
-        if "landmarks" in self.priors:
-            landmarks = self._landmarks(progress)
-        else:
-            assert self.source.landmarks is not None  # find_source asks for one or the other
-            landmarks = read_landmarks(self.source.landmarks, self.video)
-        if "masks" in self.priors:
-            return RawEvidence(landmarks, self._masks(names, progress))
-        return RawEvidence(landmarks, read_masks(self.source, self.video, names))
+        landmarks = self._landmarks(progress)
+        return RawEvidence(
+            landmarks, self._masks((self.options.human, self.options.object), progress)
+        )
 
     def estimate(self, kind: EvidenceKind, progress: Callable[[float], None]) -> Evidence:
         """What the prior of a kind says.
@@ -91,21 +87,33 @@ class Gathering:
         video, options = self.video, self.options
         path = self.source.video
         return VideoRequest(
-            frames=video.count(),
+            frames=self._total,
             width=video.native_width,
             height=video.native_height,
             read=video.read,
             folder=self.source.folder,
             work=self.work / digest([described(self.priors[kind]), str(path)])[:16],
             static_camera=options.camera == "static",
-            entities=(
-                _asked(options, options.human, "human"),
-                _asked(options, options.object, "object"),
-            ),
+            entities=self._entities(kind),
             wanted=tuple(video.indices),
             video=path if path.is_file() else None,
             fps=video.list.rate,
         )
+
+    @cached_property
+    def _total(self) -> int:
+        """Frames of the whole video, which are counted only where the survey stopped early."""
+        return self.video.total if self.options.max_frames is None else self.video.count()
+
+    def _entities(self, kind: EvidenceKind) -> tuple[EntityRequest, ...]:
+        options = self.options
+        asked = (
+            _asked(options, options.human, "human"),
+            _asked(options, options.object, "object"),
+        )
+        if kind == "masks" and kind in self.source.beside:
+            return tuple(entity for entity in asked if entity.name in self.source.masked)
+        return asked
 
     def _landmarks(self, progress: Callable[[float], None]) -> RawLandmarks:
         tracks = self.estimate("landmarks", progress).landmarks

@@ -1,18 +1,12 @@
-"""Masks of a video's frames: read from files, kept as bits, measured."""
+"""Masks of a video's frames: kept as bits, measured, cleaned."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from PIL import Image
 from scipy import ndimage
-
-from hoigs.core.undistortion import Undistortion
-from hoigs.preparation.frames import Frames
-from hoigs.preparation.source import SourceError
 
 
 class MaskStack:
@@ -57,41 +51,6 @@ class MaskStack:
         """Part of the image that each mask covers, 0..1."""
         pixels = max(1, self._shape[0] * self._shape[1])
         return np.array([mask.sum() / pixels for mask in self])
-
-
-def load_masks(folder: Path, video: Frames, undistort: Undistortion) -> MaskStack:
-    """The masks of the chosen frames, at their size and without lens distortion.
-
-    Files are named by video frame number: 00017.png is frame 17 of the video.
-
-    Raises:
-        SourceError: naming the files that are absent, or of another shape than the video.
-    """
-    paths = [folder / f"{index:05d}.png" for index in video.indices]
-    absent = [p.name for p in paths if not p.is_file()]
-    if absent:
-        shown = ", ".join(absent[:8]) + (", …" if len(absent) > 8 else "")
-        raise SourceError(
-            f"{folder} lacks {len(absent)} of {len(paths)} masks: {shown}; masks come from your "
-            "segmenter, one a video frame, named by frame number, all 0 where nothing is seen"
-        )
-    return MaskStack(undistort.mask(_read(p, video)) for p in paths)
-
-
-def _read(path: Path, video: Frames) -> Bool[np.ndarray, "H W"]:
-    try:
-        with Image.open(path) as image:
-            grey = image.convert("L")
-    except OSError as error:
-        raise SourceError(f"{path} is not a readable image: {error}") from error
-    if abs(grey.width * video.height - grey.height * video.width) > video.width + grey.width:
-        raise SourceError(
-            f"{path} is {grey.width}x{grey.height}, another shape than the video's "
-            f"{video.native_width}x{video.native_height}"
-        )
-    if grey.size != (video.width, video.height):
-        grey = grey.resize((video.width, video.height), Image.Resampling.BOX)
-    return np.asarray(grey) > 127
 
 
 def largest_parts(mask: Bool[np.ndarray, "H W"], smallest: float = 0.05) -> Bool[np.ndarray, "H W"]:

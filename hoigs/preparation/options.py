@@ -55,8 +55,9 @@ class PrepareOptions(ComponentConfig):
     focal: float | None = Field(
         default=None,
         gt=0,
-        description="focal length in pixels of the *video's* own size, for a static camera; "
-        "None assumes 0.8 x the longer side (64 degrees), which scales all depths",
+        description="focal length in pixels of the *video's* own size, for a static camera; None: "
+        "what the file says, or the landmarks if they say it clearly, or else 0.8 x the longer "
+        "side (64 degrees); it scales all depths",
     )
     body: str = Field(default="body:anny", description="key of the body model, for the clip")
     fit_steps: int = Field(default=FitOptions.steps, ge=1, description="of the body fit")

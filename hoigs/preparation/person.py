@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from torch import Tensor
 
 from hoigs.core.body import PELVIS, BodyModel
 from hoigs.core.camera import Camera
-from hoigs.core.clip_format import load_arrays
 from hoigs.core.moment import BodyPose
 from hoigs.preparation.body_fit import FitOptions, fit_body
 from hoigs.preparation.cameras import CameraTrack
@@ -81,28 +79,6 @@ class RawLandmarks:
         image = self.image[rows].copy()
         image[..., :2] = track.undistort.pixels(image[..., :2])
         return LandmarkTrack.from_mediapipe(image, self.world[rows])
-
-
-def read_landmarks(path: Path, video: Frames) -> RawLandmarks:
-    """pose_mediapipe.npz in pixels of the frames.
-
-    Raises:
-        SourceError: arrays are absent, of another length than the video, or no person is found.
-    """
-    try:
-        arrays = load_arrays(path)
-        image, world = (arrays[name] for name in ("image_xyzv", "world_xyzv"))
-    except (ValueError, KeyError) as error:
-        raise SourceError(
-            f"{path}: expected an npz with image_xyzv and world_xyzv [F, 33, 4]; {error}"
-        ) from error
-    for name, array in (("image_xyzv", image), ("world_xyzv", world)):
-        if array.ndim != 3 or array.shape[1:] != (33, 4) or len(array) < video.total:
-            raise SourceError(
-                f"{path}: {name} has shape {list(array.shape)}, expected [{video.total}, 33, 4]: "
-                "MediaPipe's 33 landmarks of each video frame, NaN where no person was found"
-            )
-    return chosen_landmarks(image, world, video, str(path))
 
 
 def chosen_landmarks(

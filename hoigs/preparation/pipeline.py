@@ -12,6 +12,7 @@ import numpy as np
 import hoigs
 from hoigs.core.body import LEFT_WRIST, RIGHT_WRIST, BodyModel
 from hoigs.core.clip import BodyTrack, ObjectTrack
+from hoigs.core.errors import HoigsError
 from hoigs.preparation import saved
 from hoigs.preparation.ball import BallTrack, load_ball, refine_ball
 from hoigs.preparation.blank import blank_pixels
@@ -43,7 +44,7 @@ from hoigs.preparation.stages import Stages
 from hoigs.preparation.store import Result, WorkFolder, digest, fingerprint
 from hoigs.preparation.things import make_object
 
-FORMAT = 1  # of what the stages keep; another number makes older results unread
+FORMAT = 2  # of what the stages keep; another number makes older results unread
 T = TypeVar("T")
 
 
@@ -152,20 +153,33 @@ class Pipeline:
         gathering = self.gathering = Gathering(
             self.source, self.video, self.options, self.priors, self.work.root / "priors"
         )
-        source = self.source
-        paths = [source.landmarks, source.together, *source.apart.values()]
+        self._without_dubious_depth()
+        beside = self.source.beside
         used = {kind: prior for kind, prior in self.priors.items() if kind != "depth"}
-        for prior in used.values():
-            paths += paths_of(prior, source.folder)
+        paths = [path for prior in used.values() for path in paths_of(prior, self.source.folder)]
         made_from = [
-            fingerprint([path for path in paths if path is not None]),
+            fingerprint(paths),
             {kind: described(prior) for kind, prior in used.items()},
+            self.source.masked,
         ]
-        self.worth_keeping |= bool(used)
+        self.worth_keeping |= any(kind not in beside for kind in used)
         self.raw = self._stage(
             "evidence", lambda: gathering.gather(self.stages.advance), saved.save_evidence,
             saved.load_evidence, made_from,
         )  # fmt: skip
+
+    def _without_dubious_depth(self) -> None:
+        """Depth that nobody asked for, but which lies beside the video, must be in order."""
+        if "depth" not in self.source.beside:
+            return
+        try:
+            self.gathering.estimate("depth", lambda _done: None)
+        except HoigsError as error:
+            self.warnings.append(
+                f"depth/ beside the video is not used (name it with --set "
+                f"priors.depth.use=prior:depth-files and its settings, to use it): {error}"
+            )
+            self.priors = {k: prior for k, prior in self.priors.items() if k != "depth"}
 
     def _cameras(self) -> None:
         model = self.source.colmap
@@ -183,8 +197,8 @@ class Pipeline:
 
     def _choose_cameras(self, folder: Path) -> ChosenCameras:
         chosen = choose_cameras(
-            self.video, self.raw.masks, self.source.colmap, self.options, folder,
-            self.stages.advance,
+            self.video, self.raw.landmarks, self.raw.masks, self.source.colmap, self.options,
+            folder, self.stages.advance,
         )  # fmt: skip
         self.provenance["cameras"] = chosen.track.provenance
         self.warnings.extend(chosen.warnings)

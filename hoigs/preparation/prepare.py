@@ -124,6 +124,7 @@ def _run(
         source, human=options.human, object_name=options.object, given=set(chosen),
         own_cameras=options.camera in ("static", "sfm"),
     )  # fmt: skip
+    chosen = {**installed_priors(PrepareOptions(priors=found.beside)), **chosen}
     stages = Stages({name: stage.weight for name, stage in PLAN.items()}, progress)
     with WorkFolder(work_folder(out)) as work:
         leftovers = Leftovers(out.absolute(), work.root)

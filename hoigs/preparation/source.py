@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.spec import ComponentSpec
+from hoigs.core.video_prior import EvidenceKind
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+LANDMARKS = "pose_mediapipe.npz"
 FRAME_FOLDERS = ("frames", "images")  # where a folder of frames may keep them
 _COLMAP_FILES = ("cameras", "images", "points3D")
 _LAYOUT = """  FOLDER/
@@ -17,6 +21,7 @@ _LAYOUT = """  FOLDER/
     pose_mediapipe.npz   image_xyzv and world_xyzv [F, 33, 4], from MediaPipe Pose
     hoi_mask/00000.png   person and object together, 0/255, one file a video frame,
                          from a video segmenter; or masks/human/ and masks/object/ apart
+    depth/               depth maps as .npz that say whether they are metric_depth or disparity
     sparse/              a COLMAP model, if you have one; else hoigs looks whether the camera
                          moves, and then runs structure from motion itself
     ball_track.npz       xyr [F, 3] pixels, if the object is a ball: centre and radius"""
@@ -32,18 +37,16 @@ class Source:
 
     Attributes:
         video: the file, or the folder of frames. folder: where the other inputs lie.
-        landmarks: pose_mediapipe.npz, or None if a prior gives them.
-        together: folder of masks that hold person and object at once, or None.
-        apart: folders of masks by entity name.
+        beside: priors that read the files found there, of the kinds that no other prior gives.
+        masked: entities that `beside`'s masks are asked for.
         colmap: folder of a COLMAP model, or None.
         ball: ball_track.npz, or None.
     """
 
     video: Path
     folder: Path
-    landmarks: Path | None = None
-    together: Path | None = None
-    apart: dict[str, Path] = field(default_factory=dict)
+    beside: dict[EvidenceKind, ComponentSpec] = field(default_factory=dict)
+    masked: tuple[str, ...] = ()
     colmap: Path | None = None
     ball: Path | None = None
 
@@ -59,7 +62,7 @@ def find_source(
     """The inputs in a folder, or beside a video file.
 
     Args:
-        given: evidence that priors give ("masks", "landmarks"): it need not be there.
+        given: evidence that priors give ("masks", "landmarks", "depth"): it is not looked for.
         own_cameras: cameras are made from the video: no COLMAP model is looked for.
 
     Raises:
@@ -73,19 +76,20 @@ def find_source(
     video = path if path.is_file() else _find_video(folder, missing)
     if video is not None and video.is_file() and not video.stat().st_size:
         raise SourceError(f"{video} is empty: 0 bytes; copy it again")
-    landmarks: Path | None = folder / "pose_mediapipe.npz"
-    if "landmarks" in given:
-        landmarks = None
-    elif not (folder / "pose_mediapipe.npz").is_file():
+    beside: dict[EvidenceKind, ComponentSpec] = {}
+    if (folder / LANDMARKS).is_file():
+        beside["landmarks"] = _files("landmarks", LANDMARKS)
+    elif "landmarks" not in given:
         missing.append(
             "pose_mediapipe.npz: body landmarks, from MediaPipe Pose (`pip install mediapipe` in "
             "an environment of its own), arrays image_xyzv and world_xyzv [F, 33, 4]; or name a "
             "prior: --set priors.landmarks.use=prior:mediapipe"
         )
-    together: Path | None = None
-    apart: dict[str, Path] = {}
+    masked: tuple[str, ...] = ()
     if "masks" not in given:
-        together, apart = _find_masks(folder, human, object_name, missing)
+        beside["masks"], masked = _find_masks(folder, human, object_name, missing)
+    if (folder / "depth").is_dir():
+        beside["depth"] = _files("depth", "depth")
     ball = folder / "ball_track.npz"
     colmap = None if own_cameras else _find_colmap(folder, missing)
     if missing:
@@ -96,9 +100,12 @@ def find_source(
             f"(`hoigs plugins` lists them):\n{_LAYOUT}"
         )
     assert video is not None
-    return Source(
-        video, folder, landmarks, together, apart, colmap, ball if ball.is_file() else None
-    )
+    beside = {kind: spec for kind, spec in beside.items() if kind not in given}
+    return Source(video, folder, beside, masked, colmap, ball if ball.is_file() else None)
+
+
+def _files(kind: EvidenceKind, path: str, **settings: Any) -> ComponentSpec:
+    return ComponentSpec(use=f"prior:{kind}-files", path=path, **settings)
 
 
 def _find_video(folder: Path, missing: list[str]) -> Path | None:
@@ -120,13 +127,14 @@ def _find_video(folder: Path, missing: list[str]) -> Path | None:
 
 def _find_masks(
     folder: Path, human: str, object_name: str, missing: list[str]
-) -> tuple[Path | None, dict[str, Path]]:
-    apart = {n: folder / "masks" / n for n in (human, object_name)}
-    apart = {n: p for n, p in apart.items() if p.is_dir()}
+) -> tuple[ComponentSpec, tuple[str, ...]]:
+    """The prior that reads them, and the entities it is asked for."""
+    names = (human, object_name)
+    apart = tuple(n for n in names if (folder / "masks" / n).is_dir())
     together = folder / "hoi_mask"
-    if together.is_dir() and any(together.glob("*.png")):
-        return together, apart
-    for name in (human, object_name):
+    if apart != names and together.is_dir() and any(together.glob("*.png")):
+        return _files("masks", "hoi_mask", holds="together", resize=True), names
+    for name in names:
         # a tracked ball gives the object's mask, so the person's alone is enough
         covered = name == object_name and (folder / "ball_track.npz").is_file()
         if name not in apart and not covered:
@@ -134,7 +142,7 @@ def _find_masks(
                 f"masks/{name}/00000.png, …: from a video segmenter such as SAM 2, one file a "
                 "video frame, 0/255 (or hoi_mask/ with person and object together)"
             )
-    return None, apart
+    return _files("masks", "masks", resize=True), apart
 
 
 def _find_colmap(folder: Path, missing: list[str]) -> Path | None:

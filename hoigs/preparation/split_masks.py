@@ -9,13 +9,10 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import ndimage
 
-from hoigs.core.undistortion import Undistortion
 from hoigs.preparation.ball import BallTrack
 from hoigs.preparation.cameras import CameraTrack
-from hoigs.preparation.frames import Frames
-from hoigs.preparation.masks import MaskStack, largest_parts, load_masks
+from hoigs.preparation.masks import MaskStack, largest_parts
 from hoigs.preparation.separate import Images, separate
-from hoigs.preparation.source import Source
 
 
 @dataclass(frozen=True)
@@ -44,18 +41,6 @@ class GivenMasks:
         )
 
 
-def read_masks(source: Source, video: Frames, names: tuple[str, str]) -> GivenMasks:
-    """The source's masks of the chosen frames, distortion still in; `names` of the human and object
-    entities.
-    """
-    plain = Undistortion()
-    apart = {n: load_masks(folder, video, plain) for n, folder in source.apart.items()}
-    human, thing = (apart.get(name) for name in names)
-    if source.together is None or (human and thing):
-        return GivenMasks(human=human, thing=thing)
-    return GivenMasks(together=load_masks(source.together, video, plain))
-
-
 def entity_masks(
     given: GivenMasks,
     ball: BallTrack | None,
@@ -74,7 +59,7 @@ def entity_masks(
         human = MaskStack(h & ~o for h, o in zip(given.human, given.thing, strict=True))
         return human, given.thing, "given for each entity; the object's win where they overlap"
     together = given.together or given.human
-    assert together is not None  # find_source asks for one or the other
+    assert together is not None  # evidence sees to one or the other
     if ball is not None:
         human, things = _disc_masks(together, ball)
         return human, things, "ball: its disc; person: the given mask without the disc"

@@ -54,7 +54,7 @@ def test_refinement_finds_the_round_edge(tiny_source: Path) -> None:
 def test_distance_is_metric(tiny_source: Path) -> None:
     video = VideoFrames(tiny_source / "video.mp4")
     ball = load_ball(tiny_source / "ball_track.npz", video, Undistortion())
-    cameras = static_cameras(video, None).cameras
+    cameras = static_cameras(video, 0.8 * WIDTH).cameras
     centers = ball_centers(ball, cameras, radius=0.11)
     expected = 0.11 * 0.8 * WIDTH / ball.radii
     np.testing.assert_allclose(centers[:, 2], expected, rtol=0.01)

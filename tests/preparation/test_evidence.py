@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from tiny import FRAMES, landmarks, masks, picture
+from tiny import FRAMES, HEIGHT, WIDTH, landmarks, masks, picture
 
 from hoigs.core.clip_folder import check_clip
 from hoigs.core.errors import HoigsError, SpecError
@@ -80,7 +80,7 @@ def test_a_folder_may_keep_frames_inside(bare_frames: Path, tmp_path: Path) -> N
     bare_frames.rename(inside)
     found = find_source(inside.parent, given={"masks", "landmarks"})
     assert found.video == inside and found.folder == inside.parent
-    assert found.landmarks is None
+    assert not found.beside
 
 
 def test_the_sharpest_of_each_window(tmp_path: Path) -> None:
@@ -147,6 +147,23 @@ def test_a_prior_of_other_evidence_is_refused(tiny_source: Path, tmp_path: Path)
             "evidence", tiny_source, tmp_path / "clip", body=AnnyBody(),
             options=PrepareOptions(fit_steps=3), priors={"masks": FlatPrior()},
         )  # fmt: skip
+
+
+def test_depth_beside_the_video_says_what_it_is_or_is_left_out(
+    tiny_source: Path, tmp_path: Path
+) -> None:
+    (tiny_source / "depth").mkdir()
+    options = PrepareOptions(fit_steps=3, overlay_width=0)
+    for name, used in (("values", False), ("metric_depth", True)):
+        for i in range(FRAMES):
+            depth = np.full((HEIGHT, WIDTH), 2.8, np.float32)
+            np.savez(tiny_source / f"depth/{i:05d}.npz", **{name: depth})
+        out = tmp_path / name
+        report = prepare(tiny_source, out, body=AnnyBody(), options=options)
+        said = [w for w in report.warnings if w.startswith("depth/ beside the video is not used")]
+        assert (report.depth_residual is not None) == used and len(said) == (not used)
+        assert used or "does not say whether it holds metres or disparity" in said[0]
+        assert ClipFolderReader().read(out).depth_kind == ("metric" if used else "none")
 
 
 COMMAND = """

@@ -17,7 +17,6 @@ from hoigs.core.errors import ClipError, HoigsError
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.plan import PLAN, and_after
 from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until, work_folder
-from hoigs.preparation.source import SourceError
 from hoigs.preparation.store import LOCK, Result, WorkFolder, digest, fingerprint
 
 OPTIONS = PrepareOptions(fit_steps=3, overlay_width=0, max_frames=6)
@@ -94,7 +93,7 @@ def test_a_fault_after_long_work_keeps_it(tiny_source: Path, tmp_path: Path) -> 
     out, body = tmp_path / "clip", AnnyBody()
     prepare_until("body", tiny_source, out, body=body, options=OPTIONS)
     (tiny_source / "hoi_mask/00002.png").unlink()
-    with pytest.raises(SourceError, match="lacks 1 of 6 masks"):
+    with pytest.raises(HoigsError, match="lacks 1 of 6 frames: 2"):
         prepare(tiny_source, out, body=body, options=OPTIONS)
     assert "body" in made(out)
 

@@ -14,6 +14,7 @@ from hoigs.preparation.frames import Frames, open_frames
 from hoigs.preparation.masks import MaskStack
 from hoigs.preparation.motion import background_motion
 from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.person import RawLandmarks
 from hoigs.preparation.source import SourceError
 from hoigs.preparation.split_masks import GivenMasks
 
@@ -62,12 +63,17 @@ def recorded(folder: Path, steps: list[float], block: bool = True) -> tuple[Fram
     return open_frames(folder), GivenMasks(together=masks)
 
 
+def nobody(count: int) -> RawLandmarks:
+    unseen = np.full((count, 33, 4), np.nan)
+    return RawLandmarks(unseen, unseen)
+
+
 def test_a_camera_that_stands_still(tmp_path: Path) -> None:
     video, masks = recorded(tmp_path / "still", [0.0] * COUNT)
     motion = background_motion(video, masks)
     assert motion.known and motion.static and motion.largest < 0.5
     chosen = choose_cameras(
-        video, masks, None, PrepareOptions(focal=FOCAL), tmp_path, lambda _: None
+        video, nobody(COUNT), masks, None, PrepareOptions(focal=FOCAL), tmp_path, lambda _: None
     )
     assert chosen.track.static and "features outside the masks move by" in chosen.track.provenance
     assert chosen.track.figures["displacement_px"] < 0.5
@@ -80,7 +86,9 @@ def test_a_camera_that_moves_and_one_that_shows_nothing(tmp_path: Path) -> None:
     hidden = GivenMasks(together=MaskStack([np.ones((HEIGHT, WIDTH), bool)] * COUNT))
     nothing = background_motion(video, hidden)
     assert not nothing.known and nothing.static
-    chosen = choose_cameras(video, hidden, None, PrepareOptions(), tmp_path, lambda _: None)
+    chosen = choose_cameras(
+        video, nobody(COUNT), hidden, None, PrepareOptions(), tmp_path, lambda _: None
+    )
     assert any("too few to tell" in warning for warning in chosen.warnings)
 
 
@@ -88,7 +96,7 @@ def test_the_way_of_a_moving_camera(tmp_path: Path) -> None:
     steps = [0.1 * i for i in range(COUNT)]
     video, masks = recorded(tmp_path / "moves", steps)
     chosen = choose_cameras(
-        video, masks, None, PrepareOptions(focal=FOCAL), tmp_path, lambda _: None
+        video, nobody(COUNT), masks, None, PrepareOptions(focal=FOCAL), tmp_path, lambda _: None
     )
     track = chosen.track
     assert chosen.own_model and track.positions == tuple(range(COUNT))
@@ -111,5 +119,11 @@ def test_a_turning_camera_is_refused_with_advice(tmp_path: Path) -> None:
     empty = GivenMasks(together=MaskStack([np.zeros((HEIGHT, WIDTH), bool)] * 4))
     with pytest.raises(SourceError, match=r"gave cameras to 0 of 4 frames.*--camera static"):
         choose_cameras(
-            video, empty, None, PrepareOptions(camera="moving"), tmp_path, lambda _: None
+            video,
+            nobody(4),
+            empty,
+            None,
+            PrepareOptions(camera="moving"),
+            tmp_path,
+            lambda _: None,
         )

@@ -13,7 +13,11 @@ from hoigs.preparation.source import SourceError, find_source
 def test_finds_everything(tiny_source: Path) -> None:
     source = find_source(tiny_source)
     assert source.video.name == "video.mp4"
-    assert source.together is not None and source.ball is not None
+    assert source.beside["masks"].settings["path"] == "hoi_mask" and source.ball is not None
+    assert source.beside["landmarks"].use == "prior:landmarks-files" and len(source.beside) == 2
+    (tiny_source / "depth").mkdir()
+    assert set(find_source(tiny_source).beside) == {"landmarks", "masks", "depth"}
+    assert set(find_source(tiny_source, given={"depth", "masks"}).beside) == {"landmarks"}
     assert source.colmap is None
 
 
@@ -48,7 +52,7 @@ def test_masks_apart(tiny_source: Path) -> None:
     (tiny_source / "masks").mkdir()
     (tiny_source / "hoi_mask").rename(tiny_source / "masks/human")
     source = find_source(tiny_source)  # the ball track stands for the object's mask
-    assert source.together is None and set(source.apart) == {"human"}
+    assert source.beside["masks"].settings["path"] == "masks" and source.masked == ("human",)
     (tiny_source / "ball_track.npz").unlink()
     with pytest.raises(SourceError, match="masks/object/00000"):
         find_source(tiny_source)
