@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test lint docs changelog format clean
+.PHONY: demo test lint docs charts changelog format clean
 
 demo: $(INSTALLED)
 	$(BIN)/hoigs demo --out runs/demo --overwrite
@@ -21,6 +21,18 @@ lint: $(INSTALLED)
 # the site, into build/site; strict: a dead link or a page that nothing leads to is an error
 docs: $(INSTALLED)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
+# accuracy against cost, into docs/results/chart; a kill loses nothing, the same command goes on
+CHART_CLIPS ?= builtin:lift-and-swing builtin:carry builtin:throw-and-catch
+CHART_SPECS ?= hoigs,4dgs,d3dgs,e-d3dgs,exavatar,hugs,k-planes-gs,static-3dgs
+CHART_BUDGETS ?= 500,2000
+CHART_SEEDS ?= 3
+CHART_OUT ?= runs/results-chart
+charts: $(INSTALLED)
+	$(BIN)/hoigs chart $(CHART_CLIPS) --specs "$(CHART_SPECS)" --budgets $(CHART_BUDGETS) \
+		--seeds $(CHART_SEEDS) --out $(CHART_OUT)
+	mkdir -p docs/results/chart
+	cp $(CHART_OUT)/chart* docs/results/chart/
 
 # fragments of changelog.d, collected into CHANGELOG.md
 changelog: $(INSTALLED)
