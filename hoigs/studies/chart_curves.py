@@ -110,5 +110,5 @@ def _end_labels(axes: Axes, points: Sequence[Point], which: int) -> None:
         at = invert.transform([(x, y), (column - 4, height), (column, height)])
         axes.plot(at[:2, 0], at[:2, 1], color=colors[p.spec], linewidth=0.7, alpha=0.6,
                   scalex=False, scaley=False)  # fmt: skip
-        axes.text(at[2, 0], at[2, 1], names[i], size=8.5, weight="bold", color=ink_of(colors[p.spec]),
-                  va="center")  # fmt: skip
+        axes.text(at[2, 0], at[2, 1], names[i], size=8.5, weight="bold", va="center",
+                  color=ink_of(colors[p.spec]))  # fmt: skip

@@ -143,17 +143,17 @@ def _planned(
     from hoigs.core.spec import Spec
 
     registry = default_registry(list(study.plugins))
-    settings = list(variant.settings)
+    settings = [*study.settings, *variant.settings]  # what one spec says wins
     if rasterizer is not None:
         key = rasterizer if ":" in rasterizer else f"rasterizer:{rasterizer}"
         settings.append(f"rasterizer.use={key}")
     if budget is not None:
         settings.append(f"train.steps={budget}")
     assert variant.spec is not None
-    own = Spec.load(variant.spec, overrides=[*settings, *study.settings], registry=registry)
-    # a few previews of any budget make its curve; --set train.preview_every has the last word
-    settings.append(f"train.preview_every={max(1, own.train.steps // PREVIEWS)}")
-    settings += [*study.settings, f"train.seed={seed}"]
+    own = Spec.load(variant.spec, overrides=settings, registry=registry)
+    # a few previews of any budget make its curve; --set train.preview_every wins
+    previews = f"train.preview_every={max(1, own.train.steps // PREVIEWS)}"
+    settings = [previews, *settings, f"train.seed={seed}"]
     folder, label, digest = folders.get(clip)
     job = make_job(
         study.out, folder, label, digest, variant.spec, settings, device=study.device,
