@@ -91,7 +91,7 @@ def test_files_beside_the_clip(static: tuple[Path, PrepareReport, list[float]]) 
     out, _, _ = static
     numbers = json.loads((out / "report.json").read_text())
     assert numbers["frames"] == FRAMES and numbers["seconds"]["writing"] > 0
-    assert "focal length is assumed" in (out / "report.md").read_text()
+    assert "estimated from the person" in (out / "report.md").read_text()
     overlay = VideoFrames(out / "overlay.mp4")
     assert (len(overlay), overlay.width) == (FRAMES, WIDTH)
     assert sorted(p.name for p in out.parent.iterdir()) == ["clip", "clip.prepare", "source"]

@@ -39,12 +39,13 @@ def test_stages_are_taken_up_and_redone(tiny_source: Path, tmp_path: Path) -> No
     assert check_clip(out) == [] and set(report.seconds) == set(PLAN)
     assert {name: when for name, when in made(out).items() if name in first} == first
     assert report.seconds["body"] == seconds["body"], "as long as it took when it was made"
-    assert "focal length is assumed" in " ".join(report.warnings), "of a stage that did not run"
+    assert "estimated from the person" in " ".join(report.warnings), "of a stage that did not run"
     # one stage anew, and what builds on it; the older clip is replaced
     before = made(out)
     again = prepare(tiny_source, out, body=body, options=OPTIONS, redo=["masks"])
     after = made(out)
-    assert {name for name in after if after[name] != before[name]} == {"masks", "object", "scene"}
+    changed = {name for name in after if after[name] != before[name]}
+    assert changed == {"masks", "object", "depth", "scene"}
     assert again.warnings == report.warnings and again.coverage == report.coverage
 
 
