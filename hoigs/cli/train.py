@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -50,6 +51,12 @@ def train(
         list[str] | None,
         typer.Option("--reader-set", help="A setting of the reader: masks=false. Repeatable."),
     ] = None,
+    auto: Annotated[
+        bool,
+        typer.Option(
+            "--auto", help="First find how much of the spec this clip needs (`hoigs needs`)."
+        ),
+    ] = False,
     evaluate: Annotated[
         bool, typer.Option("--eval/--no-eval", help="Score the run and write its report.")
     ] = True,
@@ -57,14 +64,20 @@ def train(
 ) -> None:
     """Fit a model to a clip; then score it and write report.html."""
     from hoigs.cli.evaluate import score_run
+    from hoigs.training.clip_source import clip_name
     from hoigs.training.session import Session
 
     where = pick_device(device)
+    given = overrides(settings, rasterizer)
+    if auto:
+        out = out or Path("runs") / f"{clip_name(clip)}-{Path(spec).stem}-auto"
+        spec, given = _needed(clip, spec, out, given, where, overwrite, resume, allow_faults,
+                              [reader, reader_set], plugin or ())  # fmt: skip
     session = Session.open(
         clip,
         spec,
         out=out,
-        overrides=overrides(settings, rasterizer),
+        overrides=given,
         device=where,
         resume=resume,
         overwrite=overwrite,
@@ -76,6 +89,50 @@ def train(
     run_session(session)
     if evaluate:
         score_run(session.run.path, device=where, plugins=plugin or ())
+
+
+def _needed(
+    clip: Path,
+    spec: str,
+    out: Path,
+    given: Sequence[str],
+    device: str,
+    overwrite: bool,
+    resume: bool,
+    allow_faults: bool,
+    of_reader: Sequence[object],
+    plugins: Sequence[Path],
+) -> tuple[str, list[str]]:
+    """The spec that `--auto` trains, found beside the run folder, and what is left to lay over it.
+
+    A run that goes on takes the answer that it was begun with.
+    """
+    from hoigs.cli.needs import find_needs
+    from hoigs.core.errors import HoigsError
+    from hoigs.training.run_folder import RunFolder
+
+    if any(of_reader):
+        raise HoigsError(
+            "--auto cannot be told a reader; let CLIP be read by the one it looks like"
+        )
+    folder = out.with_name(f"{out.name}-needs")
+    answer = str(folder / "spec.yaml")
+    if resume:
+        if not Path(answer).is_file():
+            raise HoigsError(f"{answer}: not there, so no run of --auto was begun in {out}")
+        return answer, list(given)
+    RunFolder(out).refuse_existing(overwrite)
+    find_needs(
+        clip,
+        spec,
+        folder,
+        given=given,
+        device=device,
+        overwrite=overwrite,
+        allow_faults=allow_faults,
+        plugins=plugins,
+    )
+    return answer, []
 
 
 def run_session(session: object) -> None:

@@ -18,8 +18,8 @@ from hoigs.studies.needs.rungs import Ladder, Overrides, Rung, as_settings, expa
 from hoigs.studies.needs.selection import SELECTION, selection_view
 from hoigs.studies.needs.trial import Trial, alone
 
-TOTAL = 2.5  # full trainings that search, final training and pruning may cost together
-FINAL, PRUNING = 1.0, 0.1  # of these
+TOTAL = 2.5  # full trainings that the search and what comes after it may cost together
+FINAL, AFTER = 1.0, 0.1  # of these: the final training, and a reserve for work on its result
 
 Report = Callable[[str], None]
 
@@ -31,7 +31,7 @@ class Settings:
     Attributes:
         criterion: "one-se" or "bic". least: dB that nobody would see (`criterion.near_best`).
         share, frames: of the training frames, and how many at least, held back.
-        budget: full trainings that everything may cost, final training and pruning included.
+        budget: full trainings that everything may cost, the final training included.
     """
 
     criterion: Criterion = "one-se"
@@ -142,7 +142,7 @@ class Search:
         self.held = self.view.split[SELECTION]
         steps = full.train.steps
         self.most = steps
-        self.ledger = Ledger((self.settings.budget - FINAL - PRUNING) * steps)
+        self.ledger = Ledger((self.settings.budget - FINAL - AFTER) * steps)
         self.blocks, self.entities = _blocks(full, self.clip)
         pace = self._pace(full)
         self.found: Overrides = {}
@@ -245,9 +245,10 @@ class Search:
             overrides = laid(self.found, expanded(ladder.during, blocks))
             overrides = laid(overrides, expanded(rung.overrides, blocks))
             overrides = laid(overrides, alone(ladder.kind, names, self.blocks, steps))
+            spec = self._spec(overrides)  # a rung that is no spec is a mistake, and is told at once
             try:
                 trials[rung.name] = Trial(
-                    self._spec(overrides),
+                    spec,
                     self.view,
                     ladder.region,
                     names,

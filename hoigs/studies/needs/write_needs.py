@@ -107,7 +107,7 @@ def method(needs: Needs) -> list[str]:
         "- Each rung is trained alone, in its own region. Rungs refused early were trained for "
         "fewer steps; they stand against the chosen one as it was then.",
         f"- Search: {needs.ledger.spent:.0f} steps' worth of the {needs.ledger.limit:.0f} that it "
-        f"may cost; all of it, final training and pruning included, keeps within "
+        f"may cost; with the final training it keeps within "
         f"{chosen.budget:g} x {needs.full} = {total:.0f}. By the clock: {needs.seconds:.0f} s, "
         f"where a full training would take about {needs.full_seconds:.0f} s "
         f"({needs.seconds / needs.full_seconds:.2f} of it).",

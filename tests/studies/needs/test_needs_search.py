@@ -9,20 +9,20 @@ import pytest
 import torch
 
 from hoigs.core.clip import Clip, FrameStore
-from hoigs.core.errors import HoigsError
+from hoigs.core.errors import HoigsError, SpecError
 from hoigs.core.spec import Spec
 from hoigs.studies.needs.rungs import Ladder, Rung
 from hoigs.studies.needs.search import Needs, Search, told
 from hoigs.studies.needs.selection import SealedFrameError, selection_view
 from hoigs.studies.needs.trial import region_of
-from hoigs.studies.needs.write_needs import FILES, as_data, page, require_new, write_needs
+from hoigs.studies.needs.write_needs import FILES, as_data, page, require_new, row, write_needs
 from hoigs.training.session import read_clip
 
 NAME = (
     "builtin:lift-and-swing?frames=14&width=32&fps=4&samples=1&edge_samples=1&held_out_views=0"
     "&test_frames=3&scene_points=300&object_points=120"
 )
-GIVEN = ("train.steps=120", "model.human.points=200", "model.human.deformation.resolution=8")
+GIVEN = ("train.steps=40", "model.human.points=200", "model.human.deformation.resolution=8")
 STATIC = Rung(
     name="static",
     why="it stands still",
@@ -36,9 +36,11 @@ SPLINE = Rung(
     overrides={"model.{object}.deformation": {"use": "deformation:rigid-spline"}},
 )
 BROKEN = Rung(
-    name="hanging",
-    why="it hangs on a wrist",
-    overrides={"model.{object}.deformation": {"use": "deformation:object-bone", "human": "nobody"}},
+    name="hinged",
+    why="it has a hinge",
+    overrides={
+        "model.{object}.deformation": {"use": "deformation:articulated", "axis": [0.0, 0.0, 0.0]}
+    },
 )
 OBJECT = Ladder(name="object", kind="object", rungs=(STATIC, SPLINE))
 INTERACTION = Ladder(
@@ -145,9 +147,9 @@ def test_a_box_that_is_swung_moves(needs):
 
 
 def test_the_budget_is_kept(needs):
-    assert needs.ledger.limit == pytest.approx(1.4 * 120)
+    assert needs.ledger.limit == pytest.approx(1.4 * 40)
     trained = [step for a in needs.answers for step in a.steps]
-    assert all(0 < step.steps <= 120 for step in trained)
+    assert all(0 < step.steps <= 40 for step in trained)
     paid = sum(step.rung.cost * step.steps for step in trained)
     assert 0.8 * needs.ledger.limit < needs.ledger.spent <= needs.ledger.limit
     assert paid < needs.ledger.spent
@@ -174,14 +176,25 @@ def test_a_rung_that_cannot_be_built_is_told(clip):
     ladder = Ladder(name="object", kind="object", rungs=(STATIC, BROKEN, SPLINE))
     answer = Search(clip, "hoigs", (ladder,), GIVEN).run().answers[0]
     assert answer.chosen is SPLINE
-    assert 'unknown key "human"' in answer.step(BROKEN).problem
+    assert "the axis of a joint cannot be" in answer.step(BROKEN).problem
+    page_row = row(answer, answer.step(BROKEN))
+    assert page_row[0] == "hinged" and page_row[-1].startswith("not tried: ")
+
+
+def test_a_rung_with_a_slip_is_an_error(clip):
+    slip = {"model.{object}.deformation": {"use": "deformation:rigid-spline", "keyframe": 3}}
+    wrong = SPLINE.model_copy(update={"overrides": slip})
+    ladder = OBJECT.model_copy(update={"rungs": (STATIC, wrong)})
+    with pytest.raises(SpecError, match='did you mean "keyframes"'):
+        Search(clip, "hoigs", (ladder,), GIVEN).run()
 
 
 def test_a_still_object_needs_no_interaction(clip):
     """A ladder that has nothing to ask takes its cheapest rung, untried."""
     still = OBJECT.model_copy(update={"rungs": (STATIC, STATIC.model_copy(update={"name": "b"}))})
-    answers = Search(clip, "hoigs", (still, INTERACTION), GIVEN).run().answers
-    assert answers[1].chosen is INTERACTION.rungs[0] and not answers[1].steps
+    stays = INTERACTION.model_copy(update={"unless": {"object": ("static", "b")}})
+    answers = Search(clip, "hoigs", (still, stays), GIVEN).run().answers
+    assert answers[1].chosen is stays.rungs[0] and not answers[1].steps
     assert told(answers[1]) == "interaction: off, because object is static"
 
 
