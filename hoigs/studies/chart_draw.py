@@ -27,12 +27,11 @@ from hoigs.studies.chart_style import (
     is_log,
     letter,
     markers_of,
-    names_of,
     short_number,
 )
 
 PANEL = (4.3, 3.6)  # inches
-HEAD, FOOT = 0.95, 0.35  # inches above, and below before any line of notes
+HEAD, FOOT = 1.15, 0.35  # inches above, and below before any line of notes
 LINE = 0.2  # inches a line of notes
 DPI = 160
 MARKER_RADIUS = 5.0  # points
@@ -218,12 +217,11 @@ def _scale(axes: Axes, values: Sequence[float]) -> None:
 
 
 def _label(axes: Axes, points: Sequence[Point], cost: Axis, accuracy: Axis) -> list[Box]:
-    """Name the largest budget of each method, where nothing else is."""
+    """Name each spec once, at its largest budget, where nothing else is; markers tell the rest."""
     colors = colors_of(points)
     shown = comparable(points, (cost, accuracy))
     lines = _lines(shown)
-    named = [line[-1] for line in lines]
-    texts = [names_of(points)[next(i for i, p in enumerate(points) if p is own)] for own in named]
+    named = list({line[-1].spec: line[-1] for line in reversed(lines)}.values())
 
     def pixels(p: Point) -> tuple[float, float]:
         x, y = axes.transData.transform((_at(p, cost), _at(p, accuracy)))
@@ -233,9 +231,9 @@ def _label(axes: Axes, points: Sequence[Point], cost: Axis, accuracy: Axis) -> l
     renderer = axes.figure.canvas.get_renderer()  # type: ignore[attr-defined]
     paper = {"facecolor": "white", "alpha": 0.7, "linewidth": 0, "pad": 0.6}
     artists = [
-        axes.text(_at(p, cost), _at(p, accuracy), text, size=8.5, weight="bold", zorder=2.5,
+        axes.text(_at(p, cost), _at(p, accuracy), p.spec, size=8.5, weight="bold", zorder=2.5,
                   color=ink_of(colors[p.spec]), bbox=paper)
-        for text, p in zip(texts, named, strict=True)
+        for p in named
     ]  # fmt: skip
     sizes = [(e.width + 2, e.height + 2) for e in (a.get_window_extent(renderer) for a in artists)]
     r = (MARKER_RADIUS + 1) * pixel
