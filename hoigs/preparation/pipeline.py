@@ -184,12 +184,12 @@ class Pipeline:
     def _cameras(self) -> None:
         model = self.source.colmap
         files = None if model is None else [str(model), fingerprint([model])]
-        folder = self.work.temporary()
+        folder = self.work.unfinished("cameras", self._key("cameras", files))
         chosen = self._stage(
             "cameras", lambda: self._choose_cameras(folder), saved.save_chosen, saved.load_chosen,
             files,
         )  # fmt: skip
-        shutil.rmtree(folder)
+        shutil.rmtree(folder, ignore_errors=True)
         self.track = chosen.track
         self.worth_keeping |= chosen.own_model
         if len(self.track.positions) < len(self.video):

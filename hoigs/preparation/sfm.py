@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,8 @@ def structure_from_motion(
     camera with one radial distortion serves all (COLMAP, Schoenberger and Frahm 2016).
 
     Args:
-        folder: to work in; images, database and models are left there.
+        folder: to work in; images, databases and models are left there. Features and matches
+            that an earlier run of the same frames, masks and focal length left are used again.
         focal: pixels of the frames' size, if known; it is still refined.
         progress: called with 0..1.
 
@@ -50,30 +52,21 @@ def structure_from_motion(
     import pycolmap
 
     tell = progress or (lambda _done: None)
-    images, database = folder / "images", folder / "database.db"
+    images, matches = folder / "images", folder / "matches.db"
+    for name in ("images", "masks", "models", "largest"):  # cheap, or half-made
+        shutil.rmtree(folder / name, ignore_errors=True)
     _write_images(video, masks, folder, lambda done: tell(0.1 * done))
     with quiet_colmap():
-        pycolmap.extract_features(
-            database,
-            images,
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=_reader(pycolmap, video, folder / "masks", focal),
-            extraction_options=_extraction(pycolmap),
-            device=pycolmap.Device.cpu,
-        )
-        tell(0.4)
-        matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=_threads())
-        pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
-        pycolmap.match_sequential(
-            database,
-            matching_options=matching,
-            pairing_options=pairing,
-            device=pycolmap.Device.cpu,
-        )
+        if not matches.is_file():
+            features = folder / "features.db"
+            if not features.is_file():
+                _extract(pycolmap, features, images, _reader(pycolmap, video, folder, focal))
+            tell(0.4)
+            _match(pycolmap, features, matches)
         tell(0.7)
         (folder / "models").mkdir()
         models = pycolmap.incremental_mapping(
-            database,
+            _copy(matches),
             images,
             folder / "models",
             options=_mapping(pycolmap),
@@ -108,9 +101,50 @@ def _write_images(
         tell((i + 1) / len(video))
 
 
-def _reader(pycolmap: Any, video: Frames, masks: Path, focal: float | None) -> Any:
+def _extract(pycolmap: Any, features: Path, images: Path, reader: Any) -> None:
+    """A database with the features of all images; it appears under its name when it is whole."""
+    half = _copy(None, features)
+    pycolmap.extract_features(
+        half,
+        images,
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
+        extraction_options=_extraction(pycolmap),
+        device=pycolmap.Device.cpu,
+    )
+    half.replace(features)
+
+
+def _match(pycolmap: Any, features: Path, matches: Path) -> None:
+    """A database with features and matches, likewise."""
+    half = _copy(features, matches)
+    pycolmap.match_sequential(
+        half,
+        matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=_threads()),
+        pairing_options=pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True),
+        device=pycolmap.Device.cpu,
+    )
+    half.replace(matches)
+
+
+def _copy(database: Path | None, name: Path | None = None) -> Path:
+    """A temporary database for `name`, or beside `database`: a copy of it, or none yet.
+
+    What a killed run left of it goes, with SQLite's own files beside it.
+    """
+    target = name or database
+    assert target is not None
+    half = target.with_suffix(".part")
+    for path in target.parent.glob(f"{half.name}*"):
+        path.unlink()
+    if database is not None:
+        shutil.copyfile(database, half)
+    return half
+
+
+def _reader(pycolmap: Any, video: Frames, folder: Path, focal: float | None) -> Any:
     f = focal or ASSUMED_FOCAL * max(video.width, video.height)
-    options = pycolmap.ImageReaderOptions(mask_path=str(masks), camera_model=LENS)
+    options = pycolmap.ImageReaderOptions(mask_path=str(folder / "masks"), camera_model=LENS)
     options.camera_params = f"{f},{video.width / 2},{video.height / 2},0"
     return options
 

@@ -24,6 +24,7 @@ from hoigs.core.clip_format import load_arrays
 from hoigs.core.errors import ClipError
 
 TEMPORARY = "."  # names that begin so are not read, and swept away at the start
+UNFINISHED = "unfinished-"
 RESULT, ARRAYS, LOCK = "result.json", "arrays.npz", "lock"
 
 
@@ -117,6 +118,17 @@ class WorkFolder:
     def temporary(self) -> Path:
         """A new folder that nobody reads; the next run removes what is left of it."""
         return Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=self.root))
+
+    def unfinished(self, stage: str, key: str) -> Path:
+        """A folder for half of a stage's work, still there in the next run if `key` is the same.
+
+        Whoever works in it names what is whole, and makes the folder; others' are removed.
+        """
+        kept = self.root / f"{UNFINISHED}{stage}-{key[:16]}"
+        for path in self.root.glob(f"{UNFINISHED}{stage}-*"):
+            if path != kept:
+                _remove(path)
+        return kept
 
     def discard(self) -> None:
         """Removes the whole folder; it may be entered again."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 from scipy import ndimage
@@ -15,6 +16,7 @@ from hoigs.preparation.masks import MaskStack
 from hoigs.preparation.motion import background_motion
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.person import RawLandmarks
+from hoigs.preparation.sfm import structure_from_motion
 from hoigs.preparation.source import SourceError
 from hoigs.preparation.split_masks import GivenMasks
 
@@ -127,3 +129,42 @@ def test_a_turning_camera_is_refused_with_advice(tmp_path: Path) -> None:
             tmp_path,
             lambda _: None,
         )
+
+
+def test_features_and_matches_survive_a_kill(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    video, masks = recorded(tmp_path / "moves", [0.1 * i for i in range(COUNT)])
+    work, done = tmp_path / "work", []
+
+    def counted(name: str, killed: bool = False) -> None:
+        real = getattr(pycolmap, name)
+
+        def run(*arguments, **settings):
+            done.append(name)
+            found = real(*arguments, **settings)
+            if killed:
+                raise KeyboardInterrupt
+            return found
+
+        monkeypatch.setattr(pycolmap, name, run)
+
+    counted("extract_features")
+    counted("match_sequential", killed=True)
+    with pytest.raises(KeyboardInterrupt):
+        structure_from_motion(video, masks, work, focal=FOCAL)
+    assert done == ["extract_features", "match_sequential"]
+    assert (work / "features.db").is_file() and not (work / "matches.db").exists()
+    monkeypatch.undo()
+    done.clear()
+    counted("extract_features")
+    counted("match_sequential")
+    resumed = pycolmap.Reconstruction(structure_from_motion(video, masks, work, focal=FOCAL))
+    again = pycolmap.Reconstruction(structure_from_motion(video, masks, work, focal=FOCAL))
+    assert done == ["match_sequential"], "features were kept, and then the matches, too"
+    for image in resumed.images.values():
+        twin = again.images[image.image_id]
+        np.testing.assert_array_equal(
+            twin.cam_from_world().matrix(), image.cam_from_world().matrix()
+        )
+    assert resumed.num_reg_images() == COUNT
