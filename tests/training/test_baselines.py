@@ -192,7 +192,8 @@ def test_matched_differs_in_the_method_alone(name):
     # one set, in the place of three: as many Gaussians as these have together
     assert block.points == sum(theirs[kind].points for kind in ("scene", "human", "object"))
     extra = theirs["human"].points + theirs["object"].points
-    density = {**theirs["scene"].density.settings, "cap": theirs["scene"].density.cap + extra}
+    density = {**theirs["scene"].density.settings, "cap": f"auto+{extra}"}
+    assert theirs["scene"].density.settings["cap"] == "auto"
     assert block.density.settings == density and block.density.use == theirs["scene"].density.use
     # and the field is the native one, but for what the file says
     native = Spec.load(name)

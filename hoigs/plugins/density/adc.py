@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,7 +21,7 @@ from hoigs.core.density import (
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.topology import TopologyChange
 from hoigs.plugins.density.children import Window, with_children
-from hoigs.plugins.density.frame_cap import cap_in
+from hoigs.plugins.density.frame_cap import Cap, cap_in
 
 LATEST_RESET = 0.85  # a reset in the last 15 % of the run would not be recovered from (F41)
 
@@ -48,7 +48,7 @@ class AdaptiveDensityConfig(ComponentConfig):
     stop: float = Field(0.5, ge=0, le=1)
     interval: int = Field(100, ge=1)
     threshold: float = Field(2e-4, gt=0)
-    cap: Annotated[int, Field(ge=1)] | Literal["auto"] = 60_000
+    cap: Cap = 60_000
     keep: int = Field(16, ge=1)
     clone_scale: float = Field(0.01, gt=0)
     prune_opacity: float = Field(0.005, ge=0, lt=1)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated
+
+from pydantic import Field
 
 from hoigs.core.context import BuildContext
 
@@ -10,15 +12,21 @@ PER_PIXEL = 0.4  # Gaussians a pixel: what real clips of 0.18 to 0.23 megapixels
 LEAST, MOST = 10_000, 1_000_000
 
 
-def cap_in(context: BuildContext, cap: int | Literal["auto"]) -> int:
-    """`cap`; of "auto", 0.4 Gaussians for each pixel of one frame, within 10,000 and 1,000,000.
+# what a spec may say: a number, "auto", or "auto+14000" for a scene that shows other things too
+Cap = Annotated[int, Field(ge=1)] | Annotated[str, Field(pattern=r"^auto(\+\d+)?$")]
+
+
+def cap_in(context: BuildContext, cap: int | str) -> int:
+    """`cap`; of "auto", 0.4 Gaussians for each pixel of one frame, within 10,000 and 1,000,000;
+    of "auto+N", N more.
 
     Raises:
         ValueError: "auto" where there is no clip to count pixels of.
     """
-    if cap != "auto":
+    if isinstance(cap, int):
         return cap
     if context.clip is None:
         raise ValueError('cap "auto" counts the pixels of a clip, and none is given: say a number')
     camera = context.clip.cameras[0]
-    return min(max(int(PER_PIXEL * camera.width * camera.height), LEAST), MOST)
+    base = min(max(int(PER_PIXEL * camera.width * camera.height), LEAST), MOST)
+    return base + int(cap.partition("+")[2] or 0)

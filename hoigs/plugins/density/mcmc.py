@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Self
 
 import torch
 from jaxtyping import Float
@@ -22,7 +22,7 @@ from hoigs.core.gaussians import Gaussians
 from hoigs.core.rotation import quats_to_matrices
 from hoigs.core.topology import TopologyChange
 from hoigs.plugins.density.children import Window, drawn_offsets, drawn_rows
-from hoigs.plugins.density.frame_cap import cap_in
+from hoigs.plugins.density.frame_cap import Cap, cap_in
 from hoigs.plugins.density.relocation import MAX_COPIES, divided
 
 SHARPNESS = 100.0  # of the gate of the noise
@@ -51,7 +51,7 @@ class McmcDensityConfig(ComponentConfig):
     start: float = Field(1 / 60, ge=0, le=1)
     stop: float = Field(5 / 6, ge=0, le=1)
     interval: int = Field(100, ge=1)
-    cap: Annotated[int, Field(ge=1)] | Literal["auto"] = 60_000
+    cap: Cap = 60_000
     growth: float = Field(0.05, ge=0)
     dead_opacity: float = Field(0.005, gt=0, lt=1)
     spread: float = Field(0.0, ge=0)

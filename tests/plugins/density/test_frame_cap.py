@@ -31,6 +31,14 @@ def test_it_goes_by_the_pixels_within_bounds(clip, width, height, cap):
     assert McmcDensity.from_config(McmcDensityConfig(cap="auto"), context).cap == cap
 
 
+def test_a_scene_that_shows_more_gets_more(clip):
+    context = BuildContext(entity="scene", clip=clip)
+    assert cap_in(context, "auto+14000") == LEAST + 14_000
+    assert AdaptiveDensityConfig(cap="auto+14000").cap == "auto+14000"
+    with pytest.raises(ValueError, match="auto"):
+        AdaptiveDensityConfig(cap="many")
+
+
 def test_a_number_stays():
     assert cap_in(BuildContext(), 123) == 123
 
