@@ -28,7 +28,8 @@ install_import_hook(list(CHECKED), "shapecheck.check")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    torch.set_num_threads(2)
+    # two threads, or one in each of many workers: threads that wait for each other's core spin
+    torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,17 @@ from typing import Annotated
 
 import typer
 
-from hoigs.cli.common import DeviceOption, PluginOption, SetOption, pick_device, print_table
+from hoigs.cli.common import (
+    DeviceOption,
+    JobsOption,
+    MinutesOption,
+    PluginOption,
+    SeedsOption,
+    SetOption,
+    ThreadsOption,
+    pick_device,
+    print_table,
+)
 from hoigs.cli.evaluate import LpipsOption
 
 
@@ -29,18 +39,13 @@ def chart(
     budgets: Annotated[
         str, typer.Option("--budgets", help="Steps: 200,1000; default each spec's own.")
     ] = "",
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Runs of each, seeds 0, 1 …")] = 3,
+    seeds: SeedsOption = 3,
     out: Annotated[Path, typer.Option("--out", help="Folder of runs and charts.")] = Path(
         "runs/chart"
     ),
-    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Runs at a time.")] = 1,
-    threads: Annotated[
-        int | None, typer.Option("--threads", min=1, help="Of each run; default cores / jobs.")
-    ] = None,
-    minutes: Annotated[
-        float | None,
-        typer.Option("--minutes", help="Stop then, draw what there is; the same command goes on."),
-    ] = None,
+    jobs: JobsOption = 1,
+    threads: ThreadsOption = None,
+    minutes: MinutesOption = None,
     add: Annotated[
         list[Path] | None,
         typer.Option("--add", help="Also draw the cells of another chart.json. Repeatable."),

@@ -20,6 +20,15 @@ RasterizerOption = Annotated[
 DeviceOption = Annotated[
     str, typer.Option("--device", help="cpu, cuda, or auto: cuda where there is one.")
 ]
+SeedsOption = Annotated[int, typer.Option("--seeds", min=1, help="Runs of each, seeds 0, 1 …")]
+JobsOption = Annotated[int, typer.Option("--jobs", min=1, help="Runs at a time.")]
+ThreadsOption = Annotated[
+    int | None, typer.Option("--threads", min=1, help="Of each run; default cores / jobs.")
+]
+MinutesOption = Annotated[
+    float | None,
+    typer.Option("--minutes", help="Stop then, write what there is; the same command goes on."),
+]
 PluginOption = Annotated[
     list[Path] | None,
     typer.Option("--plugin", help="Also load this plugin file. It is Python and will run."),

@@ -39,15 +39,18 @@ def demo(
     from hoigs.cli.train import run_session
     from hoigs.core.registry import default_registry
     from hoigs.synthesis import builtin_clip
+    from hoigs.training.run_folder import RunFolder
     from hoigs.training.session import Session
 
     began = time.perf_counter()
     where = pick_device(device)
-    typer.echo("generating the built-in clip (once; cached afterwards)")
-    clip = builtin_clip(default_registry().get("body:anny")())
     runs = {"hoigs": out}
     if baseline:
         runs["static"] = out.with_name(f"{out.name}-static")
+    for folder in runs.values():  # before the first has trained for minutes
+        RunFolder(folder).refuse_existing(overwrite)
+    typer.echo("generating the built-in clip (once; cached afterwards)")
+    clip = builtin_clip(default_registry().get("body:anny")())
     evaluations = {}
     for spec, folder in runs.items():
         session = Session.open(

@@ -9,7 +9,16 @@ from typing import Annotated
 
 import typer
 
-from hoigs.cli.common import DeviceOption, PluginOption, SetOption, pick_device
+from hoigs.cli.common import (
+    DeviceOption,
+    JobsOption,
+    MinutesOption,
+    PluginOption,
+    SeedsOption,
+    SetOption,
+    ThreadsOption,
+    pick_device,
+)
 from hoigs.cli.evaluate import LpipsOption
 
 
@@ -24,21 +33,16 @@ def tables(
     specs: Annotated[
         str, typer.Option("--specs", help="Also, or instead, a table of these: hoigs,4dgs@matched.")
     ] = "",
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Runs of each, seeds 0, 1 …")] = 3,
+    seeds: SeedsOption = 3,
     steps: Annotated[
         int | None, typer.Option("--steps", min=1, help="Of every run; default each spec's own.")
     ] = None,
     out: Annotated[Path, typer.Option("--out", help="Folder of runs and tables.")] = Path(
         "runs/tables"
     ),
-    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Runs at a time.")] = 1,
-    threads: Annotated[
-        int | None, typer.Option("--threads", min=1, help="Of each run; default cores / jobs.")
-    ] = None,
-    minutes: Annotated[
-        float | None,
-        typer.Option("--minutes", help="Stop then, write what there is; the same command goes on."),
-    ] = None,
+    jobs: JobsOption = 1,
+    threads: ThreadsOption = None,
+    minutes: MinutesOption = None,
     settings: SetOption = None,
     device: DeviceOption = "auto",
     lpips_weights: LpipsOption = None,

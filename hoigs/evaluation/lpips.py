@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import pickle
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -205,11 +206,20 @@ def _read_npz(file: Path) -> dict[str, Tensor]:
         raise HoigsError(f"LPIPS weights {file} cannot be read: {error}") from error
 
 
+def _read_tensors(file: Path) -> dict[str, Tensor]:
+    """A .pth of other libraries: these files are what users have. Tensors only, no code is run;
+    onto the CPU, since they may have been saved from a GPU that is not here."""
+    try:
+        return torch.load(file, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise HoigsError(f"LPIPS weights {file} cannot be read: {error}") from error
+
+
 def _read_checkpoint(file: Path, heads: str | None) -> dict[str, Tensor]:
     """A torchvision backbone and the heads of the `lpips` package, as tensors only."""
     if heads is None:
         raise HoigsError(f"LPIPS weights {file}: a backbone without heads; pip install lpips")
-    backbone = torch.load(file, map_location="cpu", weights_only=True)
+    backbone = _read_tensors(file)
     first = backbone.get("features.0.weight")
     if first is None:
         raise HoigsError(
@@ -221,7 +231,7 @@ def _read_checkpoint(file: Path, heads: str | None) -> dict[str, Tensor]:
     for i, (index, _, _) in enumerate(STACKS[net].convs):
         arrays[f"conv{i}_w"] = backbone[f"features.{index}.weight"]
         arrays[f"conv{i}_b"] = backbone[f"features.{index}.bias"]
-    linear = torch.load(heads, map_location="cpu", weights_only=True)
+    linear = _read_tensors(Path(heads))
     for i in range(len(STACKS[net].taps)):
         arrays[f"lin{i}"] = linear[f"lin{i}.model.1.weight"].flatten()
     return arrays

@@ -106,6 +106,14 @@ def test_an_existing_run_is_not_overwritten_unasked(hoigs, tiny_clip, tmp_path):
     assert (run / "metrics.jsonl").read_bytes() == before
 
 
+def test_the_demo_looks_at_both_of_its_folders_first(hoigs, tmp_path):
+    kept = tmp_path / "demo-static"
+    kept.mkdir()
+    (kept / "scores.txt").write_text("mine")
+    refused(hoigs("demo", "--out", tmp_path / "demo"), tmp_path / "demo", "demo-static")
+    assert (kept / "scores.txt").read_text() == "mine"
+
+
 def test_damaged_checkpoint(hoigs, tiny_clip, tmp_path):
     run = tmp_path / "run"
     assert hoigs("train", tiny_clip, "--spec", "static", "--out", run, *SMALL).code == 0

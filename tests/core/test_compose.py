@@ -65,7 +65,7 @@ class Meet(InteractionModule):
 
 class Draw(Rasterizer):
     def render(self, gaussians, camera, request=None):
-        raise NotImplementedError
+        raise AssertionError("composing draws nothing")
 
 class Grow(DensityControl):
     def __init__(self, cap): self.cap = cap
@@ -80,8 +80,8 @@ class Stick(BodyModel):
     def __init__(self, lean: float = 0.0):
         super().__init__()
         self.lean, self.faces = lean, torch.tensor([[0, 1, 2]])
-    def shaped(self, betas): raise NotImplementedError
-    def skinning_transforms(self, pose): raise NotImplementedError
+    def shaped(self, betas): raise AssertionError("composing asks for surfaces only")
+    def skinning_transforms(self, pose): raise AssertionError("composing poses nothing")
     def forward(self, pose):
         corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
         return BodyOutput(corners + pose.transl, corners)
@@ -135,7 +135,7 @@ model:
 
 class NoPixels(FrameStore):
     def image(self, position):
-        raise NotImplementedError
+        raise AssertionError("composing looks at no pixels")
 
     mask = depth = image
 

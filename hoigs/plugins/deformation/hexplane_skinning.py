@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import torch
 from jaxtyping import Float, Int
@@ -24,7 +24,12 @@ from hoigs.plugins.deformation.alpha_start import AlphaStart, depth_ratio
 from hoigs.plugins.deformation.body_planes import Fusion, body_planes, field_subset
 from hoigs.plugins.deformation.canonical_head import CanonicalAttributes, CanonicalHead, HeadKind
 from hoigs.plugins.deformation.face_points import HEAD_JOINT, face_points
-from hoigs.plugins.deformation.skinned_body import ScaleAbout, SkinnedBody, clip_settings
+from hoigs.plugins.deformation.skinned_body import (
+    ScaleAbout,
+    SkinnedBody,
+    checked_surface,
+    context_settings,
+)
 from hoigs.plugins.deformation.skinning import skin_points, skin_quats
 from hoigs.plugins.deformation.surface_laplacian import (
     LaplacianOn,
@@ -37,7 +42,6 @@ from hoigs.plugins.deformation.surface_laplacian import (
 FieldAt = Literal["posed", "canonical"]
 
 OPAQUE = 4.6  # logit of 0.99
-APART = 0.05  # metres; rest made with another seed is decimetres off, a padded one centimetres
 
 
 class HexPlaneSkinningConfig(ComponentConfig):
@@ -191,37 +195,19 @@ class HexPlaneSkinning(SkinnedBody):
 
     @classmethod
     def from_config(cls, config: HexPlaneSkinningConfig, context: BuildContext) -> Self:
-        if context.body is None:
-            raise ValueError(
-                "deformation:hexplane-skinning needs a body; it suits entities of kind human"
-            )
+        settings = context_settings(context, "deformation:hexplane-skinning")
+        settings |= config.model_dump(exclude={"alpha_start"})
         clip, track = context.clip, context.body_track
-        settings: dict[str, Any] = config.model_dump(exclude={"alpha_start"})
-        if track is not None:
-            betas = track.poses.betas
-            settings["betas"] = betas if betas.dim() == 1 else betas.mean(0)
-            settings["num_frames"] = len(track.poses.transl)
-        if clip is not None:
-            settings |= clip_settings(clip)
-        made = cls(context.body, entity=context.entity, seed=context.seed, **settings)
+        assert context.body is not None
+        made = cls(context.body, **settings)
         if config.alpha_start == "depth" and clip is not None and track is not None:
             ratio = depth_ratio(clip, context.entity, context.body, track)
             nn.init.constant_(made.log_alpha, math.log(ratio))
         return made
 
     def bind(self, rest: Gaussians) -> None:
-        surface = self._surface or self.body.surface(len(rest), self.betas, self.seed)
-        if len(surface.points) != len(rest):
-            raise ValueError(
-                f"{len(rest)} rest Gaussians, but a surface of {len(surface.points)} points"
-            )
-        apart = (surface.points - rest.means.detach()).norm(dim=-1)
-        if len(apart) and apart.median() > APART:
-            raise ValueError(
-                f"rest Gaussians stand {apart.median():.2f} m from the surface that weights them; "
-                "make rest with body.rest(count, betas, seed) of the same betas "
-                "and seed, or pass its `surface`"
-            )
+        made = self._surface or self.body.surface(len(rest), self.betas, self.seed)
+        surface = checked_surface(made, rest)
         for name, value in {
             "log_weights": (surface.weights + 1e-6).log(),
             "parts": surface.parts,

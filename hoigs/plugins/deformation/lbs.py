@@ -9,6 +9,7 @@ from hoigs.core.context import BuildContext
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.interaction import Residual
 from hoigs.core.moment import Moment
+from hoigs.plugins.deformation.skinned_body import context_settings
 from hoigs.plugins.deformation.surface_body import SurfaceBody
 
 
@@ -27,7 +28,8 @@ class Lbs(SurfaceBody):
 
     @classmethod
     def from_config(cls, config: LbsConfig, context: BuildContext) -> Self:
-        settings = cls.context_settings(context, "deformation:lbs")
+        settings = context_settings(context, "deformation:lbs")
+        settings.pop("camera_centers", None)  # it scales about the pelvis
         assert context.body is not None
         return cls(context.body, **settings, **config.model_dump())
 

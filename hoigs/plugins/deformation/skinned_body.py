@@ -9,15 +9,26 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hoigs.core.body import LEFT_FOOT, LEFT_WRIST, PELVIS, RIGHT_FOOT, RIGHT_WRIST, BodyModel
+from hoigs.core.body import (
+    LEFT_FOOT,
+    LEFT_WRIST,
+    PELVIS,
+    RIGHT_FOOT,
+    RIGHT_WRIST,
+    BodyModel,
+    BodySurface,
+)
 from hoigs.core.clip import Clip
+from hoigs.core.context import BuildContext
 from hoigs.core.deformation import DeformationModel
+from hoigs.core.gaussians import Gaussians
 from hoigs.core.moment import BodyPose, Moment
 from hoigs.plugins.deformation.pose_refinement import PoseRefinement
 from hoigs.plugins.deformation.skinning import ancestry
 
 ScaleAbout = Literal["pelvis", "camera"]
 
+APART = 0.05  # metres; rest made with another seed is decimetres off, a padded one centimetres
 ANCHORS = (PELVIS, LEFT_WRIST, RIGHT_WRIST, LEFT_FOOT, RIGHT_FOOT)
 
 
@@ -147,6 +158,45 @@ class SkinnedBody(DeformationModel):
         if self._arm is None or not torch.equal(self._arm[0], betas):
             self._arm = (betas.clone(), self.body.arm_length(betas))
         return self._arm[1] * self.log_alpha.exp()
+
+
+def context_settings(context: BuildContext, what: str) -> dict[str, Any]:
+    """Constructor arguments that the clip decides: entity, seed, betas, num_frames, and those of
+    `clip_settings`.
+
+    Raises:
+        ValueError: no body; `what` names the component.
+    """
+    if context.body is None:
+        raise ValueError(f"{what} needs a body; it suits entities of kind human")
+    settings: dict[str, Any] = {"entity": context.entity, "seed": context.seed}
+    if context.body_track is not None:
+        betas = context.body_track.poses.betas
+        settings["betas"] = betas if betas.dim() == 1 else betas.mean(0)
+        settings["num_frames"] = len(context.body_track.poses.transl)
+    if context.clip is not None:
+        settings |= clip_settings(context.clip)
+    return settings
+
+
+def checked_surface(surface: BodySurface, rest: Gaussians) -> BodySurface:
+    """`surface`, if rest Gaussians were made of it.
+
+    Raises:
+        ValueError: another count, or the points stand apart.
+    """
+    if len(surface.points) != len(rest):
+        raise ValueError(
+            f"{len(rest)} rest Gaussians, but a surface of {len(surface.points)} points"
+        )
+    apart = (surface.points - rest.means.detach()).norm(dim=-1)
+    if len(apart) and apart.median() > APART:
+        raise ValueError(
+            f"rest Gaussians stand {apart.median():.2f} m from the surface that weights them; "
+            "make rest with body.rest(count, betas, seed) of the same betas "
+            "and seed, or pass its `surface`"
+        )
+    return surface
 
 
 def clip_settings(clip: Clip) -> dict[str, Any]:

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from hoigs.core.body import PELVIS, BodyModel, BodySurface
-from hoigs.core.context import BuildContext
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.interaction import Residual
 from hoigs.core.moment import BodyPose, Moment
 from hoigs.core.rotation import multiply_quats, normalize_quats
 from hoigs.core.topology import TopologyChange
 from hoigs.plugins.deformation.face_points import HEAD_JOINT, face_points
-from hoigs.plugins.deformation.skinned_body import SkinnedBody, clip_settings
+from hoigs.plugins.deformation.skinned_body import SkinnedBody, checked_surface
 from hoigs.plugins.deformation.skinning import skin_points, skin_quats
-
-APART = 0.05  # metres; rest made with another seed is decimetres off, a padded one centimetres
 
 
 class SurfaceBody(SkinnedBody):
@@ -69,38 +66,9 @@ class SurfaceBody(SkinnedBody):
         self.log_alpha.requires_grad_(False)
         self._surface, self.seed = surface, seed
 
-    @staticmethod
-    def context_settings(context: BuildContext, what: str) -> dict[str, Any]:
-        """Constructor arguments that the clip decides.
-
-        Raises:
-            ValueError: no body; `what` names the component.
-        """
-        if context.body is None:
-            raise ValueError(f"{what} needs a body; it suits entities of kind human")
-        settings: dict[str, Any] = {"entity": context.entity, "seed": context.seed}
-        if context.body_track is not None:
-            betas = context.body_track.poses.betas
-            settings["betas"] = betas if betas.dim() == 1 else betas.mean(0)
-            settings["num_frames"] = len(context.body_track.poses.transl)
-        if context.clip is not None:
-            settings |= clip_settings(context.clip)
-            del settings["camera_centers"]
-        return settings
-
     def bind(self, rest: Gaussians) -> None:
-        surface = self._surface or self.body.surface(len(rest), self.betas, self.seed)
-        if len(surface.points) != len(rest):
-            raise ValueError(
-                f"{len(rest)} rest Gaussians, but a surface of {len(surface.points)} points"
-            )
-        apart = (surface.points - rest.means.detach()).norm(dim=-1)
-        if len(apart) and apart.median() > APART:
-            raise ValueError(
-                f"rest Gaussians stand {apart.median():.2f} m from the surface that weights them; "
-                "make rest with body.rest(count, betas, seed) of the same betas "
-                "and seed, or pass its `surface`"
-            )
+        made = self._surface or self.body.surface(len(rest), self.betas, self.seed)
+        surface = checked_surface(made, rest)
         for name, value in {
             "template_weights": surface.weights,
             "parts": surface.parts,

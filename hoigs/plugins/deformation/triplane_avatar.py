@@ -29,6 +29,7 @@ from hoigs.plugins.deformation.avatar_heads import (
     Shape,
     matrices_to_6d,
 )
+from hoigs.plugins.deformation.skinned_body import context_settings
 from hoigs.plugins.deformation.skinning import skin_quats
 from hoigs.plugins.deformation.surface_body import SurfaceBody
 from hoigs.plugins.deformation.surface_laplacian import nearest, point_roughness
@@ -153,7 +154,8 @@ class TriplaneAvatar(SurfaceBody):
 
     @classmethod
     def from_config(cls, config: TriplaneAvatarConfig, context: BuildContext) -> Self:
-        settings = cls.context_settings(context, "deformation:triplane-avatar")
+        settings = context_settings(context, "deformation:triplane-avatar")
+        settings.pop("camera_centers", None)  # it scales about the pelvis
         assert context.body is not None
         return cls(context.body, **settings, **config.model_dump())
 

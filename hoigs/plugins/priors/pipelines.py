@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from abc import abstractmethod
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
@@ -129,11 +130,11 @@ class PipelineDenoiser(Denoiser):
             guess = alpha.sqrt() * guess + (1 - alpha).sqrt() * noisy
         return guess
 
+    @abstractmethod
     def tokens(
         self, views: Float[Tensor, "B 3"]
     ) -> tuple[Float[Tensor, "B L D"], Float[Tensor, "B L D"]]:
         """What the UNet attends to, with the condition and without."""
-        raise NotImplementedError
 
     def beside(
         self, noisy: Float[Tensor, "B C h w"]

@@ -44,10 +44,13 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _storage(content: bytes) -> Any:
-    """The numbers of a tensor; torch's own function would unpickle them without any check."""
+    """The numbers of a tensor; torch's own function would unpickle them without any check.
+
+    Onto the CPU: the authors may have saved them from a GPU that is not here.
+    """
     import torch
 
-    return torch.load(io.BytesIO(content), weights_only=True)
+    return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
 
 
 def load_pickle(path: Path) -> Any:

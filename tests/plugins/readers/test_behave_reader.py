@@ -17,6 +17,7 @@ from hoigs.core.clip import Clip
 from hoigs.core.errors import ClipError
 from hoigs.plugins.bodies.smplh import SmplhBody
 from hoigs.plugins.readers.behave import BehaveReader
+from hoigs.plugins.readers.pickles import load_pickle
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +198,7 @@ def test_a_wrong_folder(tmp_path: Path) -> None:
 def test_damaged_fits_are_told(still: Clip, pelvis: Tensor, tmp_path: Path) -> None:
     folder, _ = behave.write(still, tmp_path, pelvis)
     path = folder / "t0003.033/person/fit02/person_fit.pkl"
-    content = pickle.loads(path.read_bytes())
+    content = load_pickle(path)
     path.write_bytes(pickle.dumps({**content, "pose": content["pose"][:72]}))
     with pytest.raises(ClipError, match="expected 156 finite numbers as 'pose', got 72"):
         BehaveReader().read(folder)

@@ -20,6 +20,7 @@ from hoigs.core.clip import Clip
 from hoigs.core.errors import ClipError
 from hoigs.plugins.bodies.smplh import SmplBody
 from hoigs.plugins.readers.hosnerf import HosnerfReader, published_split
+from hoigs.plugins.readers.pickles import load_pickle
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +29,7 @@ def smpl(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    content = pickle.loads(path.read_bytes())
+    content = load_pickle(path)
     change(content)
     path.write_bytes(pickle.dumps(content))
 
