@@ -118,6 +118,7 @@ class RatesSpec(_Strict):
     keyframe_rotation: float = Field(1e-3, ge=0)
     embedding: float = Field(2.5e-3, ge=0)
     pose: float = Field(1e-4, ge=0)
+    pose_final: float = Field(1e-4, ge=0)
     shape: float = Field(1e-4, ge=0)
     camera: float = Field(0.0, ge=0)
     by_extent: tuple[str, ...] = ("means",)
