@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -25,6 +26,7 @@ from hoigs.preparation.landmarks import (
     LandmarkTrack,
     points_of,
 )
+from hoigs.preparation.mask_fit import MaskFit
 from hoigs.preparation.scene_scale import ground_scale
 
 
@@ -40,6 +42,8 @@ class FitOptions:
         smooth: of accelerations of the landmarks in the world. turn: of changes of pose.
         shape: of the shape coefficients, in standard deviations.
         offset: of shifts between the landmarks and the body's own points, in `OFFSET`.
+        masks: of the distance from masks, in frames without landmarks. mask_spread: residual at
+            which a pixel or a point begins to count as an outlier there, in image widths.
         scale: find the cameras' unit in metres too (a moving camera of unknown scale).
     """
 
@@ -53,9 +57,13 @@ class FitOptions:
     turn: float = 1.0
     shape: float = 0.01
     offset: float = 0.01
+    masks: float = 0.1
+    mask_spread: float = 0.03
     scale: bool = False
 
 
+GAP = 12  # frames between landmarks that smoothness carries a pose across
+CARRIED = 0.6  # of the steps, in which frames farther off begin one after another
 OFFSET = 0.03  # metres that a landmark's point may well lie off the joint it is named after
 
 
@@ -100,6 +108,7 @@ def fit_body(
     *,
     options: FitOptions | None = None,
     points: Float[Tensor, "S 3"] | None = None,
+    masks: Iterable[Bool[np.ndarray, "H W"]] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> BodyFit:
     """Pose, shape and place of a body in every frame, in metres.
@@ -107,7 +116,7 @@ def fit_body(
     Minimises, over all frames at once: robust reprojection of the landmarks, weighted by their
     visibility; directions of bones against the 3D landmarks, where there are any; joint limits;
     acceleration in the world; a shape prior; departures from the start. Frames with fewer than
-    `landmarks.ENOUGH` landmarks are carried by smoothness.
+    `landmarks.ENOUGH` landmarks are carried by smoothness and, where there are any, masks.
 
     With `options.scale` the cameras' translations are multiplied by one unknown number: the body
     is metric, and so becomes the world. It comes from the scene's points on the ground at the feet,
@@ -115,6 +124,7 @@ def fit_body(
 
     Args:
         points: of the scene, in the cameras' own unit; only used to find the scale.
+        masks: one a frame, of the person or of all that moves.
         progress: called with 0..1.
 
     Raises:
@@ -132,6 +142,9 @@ def fit_body(
     problem = _Problem(body, landmarks, cameras, options)
     if options.scale and points is not None:
         problem.ground = points
+    if masks is not None and options.masks and not seen.all():
+        unseen = {i: mask for i, mask in enumerate(masks) if not seen[i]}
+        problem.masks = MaskFit(body, unseen, options.mask_spread)
     pairs = int(problem.points.pairs.max()) + 1
     unknowns = _Unknowns(problem.start, body.num_betas, pairs, options.scale)
     solve(problem, unknowns, options, progress)
@@ -159,6 +172,7 @@ def solve(
     for step in range(options.steps):
         if step in (options.steps // 3, 2 * options.steps // 3):
             problem.rescale(unknowns)
+        problem.carry(unknowns, step / options.steps)
         adam.zero_grad()
         # the robust spread narrows, so that a poor start is not taken for outliers
         widen = 1 + 4 * max(0.0, 1 - 2 * step / options.steps)
@@ -192,6 +206,7 @@ class _Problem:
         self.viewmats = torch.stack([c.world_to_camera for c in cameras])
         self.width = float(cameras[0].width)
         self.cameras, self.ground = cameras, cameras[0].K.new_zeros(0, 3)
+        self.masks: MaskFit | None = None
         self.scale_from = "feet that stand still" if options.scale else "the cameras: given"
         self.bones = torch.tensor([(self.points.index(a), self.points.index(b)) for a, b in BONES])
         world = landmarks.world[:, rows]
@@ -230,6 +245,27 @@ class _Problem:
         return xy * focal[:, None] + self.K[:, None, :2, 2], turned
 
     @torch.no_grad()
+    def carry(self, unknowns: _Unknowns, progress: float) -> None:
+        """Frames far from landmarks begin one after another, each where its neighbour has come:
+        masks alone do not tell an arm from what it holds, unless it starts close by. A short gap
+        between landmarks is left to smoothness."""
+        if self.masks is None or progress > CARRIED:
+            return
+        frames = torch.arange(len(self.seen))
+        found = frames[self.seen]
+        after = torch.searchsorted(found, frames)
+        last, first = found[(after - 1).clamp_min(0)], found[after.clamp_max(len(found) - 1)]
+        ends = (frames < found[0]) | (frames > found[-1])
+        distance = torch.minimum((frames - last).abs(), (frames - first).abs())
+        nearest = torch.where((frames - last).abs() < (first - frames).abs(), last, first)
+        far = ends | ((first - last > GAP) & ~self.seen)
+        reach = int(progress / CARRIED * int(distance.max()))
+        late = far & (distance > reach)
+        toward = nearest + (frames - nearest).sign() * reach
+        for values in (unknowns.body, unknowns.global_orient, unknowns.transl):
+            values[late] = values[toward[late]]
+
+    @torch.no_grad()
     def rescale(self, unknowns: _Unknowns) -> None:
         """Take the scale from the ground at the feet; every camera sees the body where it was."""
         if not len(self.ground):
@@ -260,8 +296,14 @@ class _Problem:
         bones = (self.bone_weights * off).sum() / self.bone_weights.sum().clamp_min(1)
         accelerations = points[2:] - 2 * points[1:-1] + points[:-2]
         turns = unknowns.body[1:] - unknowns.body[:-1]
+
+        def project(where: Tensor) -> Tensor:
+            return self.project(where, unknowns.log_scale.exp())[0]
+
+        masks = 0.0 if self.masks is None else self.masks.energy(pose, project, widen)
         terms = (
             data,
+            options.masks * masks,
             options.bones * bones,
             options.limits * limit_penalty(unknowns.body),
             options.rest * (unknowns.body - self.start.body).square().sum((-1, -2)).mean(),

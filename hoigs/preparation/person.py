@@ -18,6 +18,7 @@ from hoigs.preparation.body_fit import FitOptions, fit_body
 from hoigs.preparation.cameras import CameraTrack
 from hoigs.preparation.frames import Frames
 from hoigs.preparation.landmarks import LandmarkTrack
+from hoigs.preparation.masks import MaskStack
 from hoigs.preparation.silhouette import posed
 from hoigs.preparation.source import SourceError
 
@@ -115,11 +116,16 @@ def fit_person(
     steps: int,
     progress: Callable[[float], None] | None = None,
     source: str = "MediaPipe",
+    masks: MaskStack | None = None,
 ) -> FittedBody:
-    """Fits the body to landmarks in `steps`; finds the scale of a world that has none."""
+    """Fits the body to landmarks, and masks if there are any, in `steps`; finds the scale of a
+    world that has none."""
     options = FitOptions(scale=not track.metric, steps=steps)
     known = None if track.metric else track.points
-    fit = fit_body(body, landmarks, track.cameras, options=options, points=known, progress=progress)
+    fit = fit_body(
+        body, landmarks, track.cameras,
+        options=options, points=known, masks=masks, progress=progress,
+    )  # fmt: skip
     frames = list(posed(body, fit.poses))
     residual = float(fit.residual_px.nanmedian())
     found, solid = int(landmarks.found.sum()), int(landmarks.solid.sum())
@@ -133,7 +139,7 @@ def fit_person(
         found=landmarks.found.numpy(),
         provenance=(
             f"fitted to {source} landmarks{'' if solid else ' in the image only'} of {found} of "
-            f"{len(track.cameras)} frames, "
+            f"{len(track.cameras)} frames{'' if masks is None else ' and to masks'}, "
             f"{residual:.1f} px off (median of frames); hands are not fitted"
         ),
         report=fit.report,
@@ -152,6 +158,7 @@ def _warnings(residual: float, found: int, solid: int, cameras: Sequence[Camera]
         warnings.append(f"the body misses its landmarks by {residual:.1f} px: see overlay.mp4")
     if found < 0.8 * len(cameras):
         warnings.append(
-            f"landmarks were found in {found} of {len(cameras)} frames; the others are interpolated"
+            f"landmarks were found in {found} of {len(cameras)} frames; the "
+            "others follow their neighbours, and masks where there are any"
         )
     return warnings

@@ -44,7 +44,7 @@ from hoigs.preparation.stages import Stages
 from hoigs.preparation.store import Result, WorkFolder, digest, fingerprint
 from hoigs.preparation.things import make_object
 
-FORMAT = 2  # of what the stages keep; another number makes older results unread
+FORMAT = 3  # of what the stages keep; another number makes older results unread
 T = TypeVar("T")
 
 
@@ -224,7 +224,7 @@ class Pipeline:
         def make() -> FittedBody:
             person = fit_person(
                 self.landmarks, self.track, self.body, self.options.fit_steps,
-                self.stages.advance, self.raw.landmarks.source,
+                self.stages.advance, self.raw.landmarks.source, self.given.persons(self.ball),
             )  # fmt: skip
             self.provenance["body"] = person.provenance
             self.warnings.extend(person.warnings)

@@ -31,6 +31,20 @@ class GivenMasks:
         """Everything masked in a frame: what does not stand still with the scene."""
         return np.logical_or.reduce([stack[frame] for stack in self.named().values()])
 
+    def persons(self, ball: BallTrack | None) -> MaskStack | None:
+        """The person's, or the nearest to it that can be told before the body is fitted: with what
+        they hold, but without a tracked ball. None where only the object is masked."""
+        if self.human is not None or self.together is None:
+            return self.human
+        stack = MaskStack()
+        for frame, mask in enumerate(self.together):
+            if self.thing is not None:
+                mask = mask & ~self.thing[frame]
+            if ball is not None:
+                mask = mask & ~ball.disc(frame, mask.shape[1], mask.shape[0])
+            stack.append(mask)
+        return stack
+
     def straight(self, track: CameraTrack) -> GivenMasks:
         """On the cameras' undistorted images, without the frames that have no camera."""
         return GivenMasks(
