@@ -1,23 +1,29 @@
 """Does `hoigs needs` find what clips of known truth need? Right or wrong, case by case and seed.
 
-    python benchmarks/needs_truth.py
-    python benchmarks/needs_truth.py --only still glide --seeds 2 --steps 600 --json needs.json
+    python benchmarks/needs_truth.py --jobs 60 --threads 1 --minutes 20
+    python benchmarks/needs_truth.py --only still glide --seeds 2 --jobs 2
 
 A seed is of the clip (textures, points, jolts) and of the training. Only the ladders that a case
-speaks of are climbed, so that they share the budget of a full search between them.
+speaks of are climbed, so that they share the budget of a full search between them; --all climbs
+every ladder. A JSON is written for each case and seed as soon as it is done, and the same command
+goes on where it was stopped; --summary only reads what is there.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import statistics
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from many_cells import read_cell, run_cells, write_cell
 
 RIGID_FEW = ("rigid, 2 knots", "rigid, 3 knots")
-RIGID_MANY = ("rigid, adaptive knots",)
+RIGID_MANY = ("rigid, many knots", "rigid, adaptive knots")
 BEYOND = ("articulated", "rigid and residual", "per Gaussian")
 
 
@@ -39,60 +45,127 @@ CASES = {
 }
 
 
-def run(case: Case, seed: int, options: argparse.Namespace) -> dict[str, object]:
-    """One search; what was chosen, and whether that is right."""
+def run(case: Case, seed: int, options: argparse.Namespace) -> dict[str, Any]:
+    """One search; what was chosen, whether that is right, and what it cost."""
     from hoigs.studies.needs.rungs import load_ladders
     from hoigs.studies.needs.search import Search, Settings, told
+    from hoigs.studies.needs.write_needs import as_data
     from hoigs.training.session import read_clip
 
-    size = options.size
     clip = read_clip(
-        f"builtin:{case.clip}?frames={options.frames}&fps={options.frames / 4}&width={size}"
-        f"&samples=1&edge_samples=1&held_out_views=0&test_frames={options.frames // 8}"
-        f"&scene_points=1000&object_points=600&seed={seed}"
+        f"builtin:{case.clip}?frames={options.frames}&fps={options.frames / 4}"
+        f"&width={options.size}&samples=4&edge_samples=4&held_out_views=0"
+        f"&test_frames={options.frames // 8}&scene_points=1000&object_points=600&seed={seed}"
     )
     wanted = {"object", *case.right}  # what the others ask about
-    ladders = [ladder for ladder in load_ladders() if ladder.name in wanted]
+    ladders = [ladder for ladder in load_ladders() if options.all or ladder.name in wanted]
     given = (f"train.steps={options.steps}", f"train.seed={seed}",
              "model.human.points=2000", "model.human.deformation.resolution=32")  # fmt: skip
-    began = time.perf_counter()
-    needs = Search(clip, "hoigs", ladders, given, Settings(options.criterion)).run()
+    settings = Settings(options.criterion, share=options.share)
+    began = time.process_time()
+    needs = Search(clip, "hoigs", ladders, given, settings).run()
     chosen = {a.ladder.name: a.chosen.name for a in needs.answers if a.chosen is not None}
     return {
         "chosen": chosen,
         "right": all(chosen[name] in rungs for name, rungs in case.right.items()),
         "because": [told(answer) for answer in needs.answers],
-        "seconds": round(time.perf_counter() - began, 1),
+        "cpu_seconds": round(time.process_time() - began, 1),
+        "seconds": round(needs.seconds, 1),
+        "full_seconds": round(needs.full_seconds, 1),
+        "search_over_full": round(needs.seconds / needs.full_seconds, 3),
+        "needs": as_data(needs),
     }
 
 
-def main() -> None:
+def settings_of(options: argparse.Namespace) -> dict[str, Any]:
+    """What a cell's result depends on."""
+    names = ("steps", "frames", "size", "share", "criterion", "all")
+    return {name: getattr(options, name) for name in names}
+
+
+def cells_of(options: argparse.Namespace) -> list[str]:
+    """Seed by seed, so that a run cut short says a little of every case."""
+    return [f"{name}-{seed}" for seed in range(options.seeds) for name in options.only]
+
+
+def summary(options: argparse.Namespace) -> bool:
+    """Print and write the table; whether every case is right in 9 of 10 seeds."""
+    rows, good = [], True
+    for name in options.only:
+        cells = [
+            read_cell(options.out, f"{name}-{seed}", settings_of(options))
+            for seed in range(options.seeds)
+        ]
+        done = [cell for cell in cells if cell is not None]
+        right = sum(bool(cell["right"]) for cell in done)
+        good &= len(done) == options.seeds and right >= 0.9 * options.seeds
+        rows.append(
+            {
+                "case": name,
+                "right": right,
+                "of": len(done),
+                "asked": options.seeds,
+                "chosen": [cell["chosen"] for cell in done],
+                "median_cpu_seconds": _median([cell["cpu_seconds"] for cell in done]),
+                "median_search_over_full": _median([cell["search_over_full"] for cell in done]),
+            }
+        )
+    print("| case | right | CPU s a search | search / full training | with the final training |")
+    print("|---|---|---:|---:|---:|")
+    for row in rows:
+        ratio = row["median_search_over_full"]
+        told = ("–", "–") if ratio is None else (f"{ratio:.2f}", f"<= {1 + ratio:.2f}")
+        print(
+            f"| {row['case']} | in {row['right']} of {row['of']} seeds | "
+            f"{row['median_cpu_seconds'] or '–'} | {told[0]} | {told[1]} |"
+        )
+    path = options.out / "summary.json"
+    path.write_text(json.dumps({"settings": settings_of(options), "rows": rows}, indent=1))
+    print(f"wrote {path}")
+    return good
+
+
+def _median(values: list[float]) -> float | None:
+    return round(statistics.median(values), 2) if values else None
+
+
+def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES))
-    parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--steps", type=int, default=600, help="of a full training")
-    parser.add_argument("--frames", type=int, default=32)
-    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--steps", type=int, default=800, help="of a full training")
+    parser.add_argument("--frames", type=int, default=48)
+    parser.add_argument("--size", type=int, default=96)
+    parser.add_argument("--share", type=float, default=0.15, help="of training frames, held back")
     parser.add_argument("--criterion", choices=["one-se", "bic"], default="one-se")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    results: dict[str, list[dict[str, object]]] = {}
-    for name in options.only:
-        case = CASES[name]
-        for seed in range(options.seeds):
-            found = run(case, seed, options)
-            results.setdefault(name, []).append(found)
-            word = "right" if found["right"] else "WRONG"
-            print(f"{name} seed {seed}: {word} {found['chosen']} {found['seconds']} s", flush=True)
-            for line in found["because"] if isinstance(found["because"], list) else ():
-                print(f"    {line}", flush=True)
-    for name, rows in results.items():
-        print(f"{name}: right in {sum(bool(r['right']) for r in rows)} of {len(rows)}")
-    if options.json:
-        options.json.write_text(json.dumps(results, indent=1))
-    if not all(row["right"] for rows in results.values() for row in rows):
-        sys.exit(1)
+    parser.add_argument("--all", action="store_true", help="climb every ladder")
+    parser.add_argument("--jobs", type=int, default=1, help="searches at a time")
+    parser.add_argument("--threads", type=int, default=1, help="of each")
+    parser.add_argument("--minutes", type=float, help="stop then; the same command goes on")
+    parser.add_argument("--out", type=Path, default=Path("runs/needs-truth"))
+    parser.add_argument("--summary", action="store_true", help="only read what is done")
+    parser.add_argument("--cell", help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+def main() -> int:
+    options = parse()
+    if options.cell is not None:
+        name, _, seed = options.cell.rpartition("-")
+        found = run(CASES[name], int(seed), options)
+        write_cell(options.out, options.cell, settings_of(options), found)
+        print(f"{'right' if found['right'] else 'WRONG'} {found['chosen']}")
+        print("\n".join(found["because"]))
+        return 0
+    if not options.summary:
+        own = [f"--{key}={value}" for key, value in settings_of(options).items() if key != "all"]
+        run_cells(
+            cells_of(options), options.out, settings_of(options),
+            [*own, *(["--all"] if options.all else []), "--out", str(options.out)],
+            jobs=options.jobs, threads=options.threads, minutes=options.minutes,
+        )  # fmt: skip
+    return 0 if summary(options) else 1
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

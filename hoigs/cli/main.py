@@ -9,6 +9,7 @@ import typer
 from hoigs import __version__
 from hoigs.cli import (
     chart,
+    compress,
     demo,
     doctor,
     evaluate,
@@ -37,6 +38,7 @@ app.command("render")(render.render)
 app.command("tables")(tables.tables)
 app.command("chart")(chart.chart)
 app.command("needs")(needs.needs)
+app.command("compress")(compress.compress)
 app.add_typer(plugins.app, name="plugins")
 app.add_typer(spec.app, name="spec")
 app.command("doctor")(doctor.doctor)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,8 +15,13 @@ from hoigs.cli.common import (
     SetOption,
     overrides,
     pick_device,
+    print_table,
     progress_bar,
 )
+
+if TYPE_CHECKING:
+    from hoigs.studies.needs.search import Needs
+    from hoigs.training.session import Session
 
 
 def train(
@@ -54,7 +59,9 @@ def train(
     auto: Annotated[
         bool,
         typer.Option(
-            "--auto", help="First find how much of the spec this clip needs (`hoigs needs`)."
+            "--auto",
+            help="First find how much of the spec this clip needs (`hoigs needs`); prune and "
+            "compress what has been trained.",
         ),
     ] = False,
     evaluate: Annotated[
@@ -69,9 +76,10 @@ def train(
 
     where = pick_device(device)
     given = overrides(settings, rasterizer)
+    found: Needs | None = None
     if auto:
         out = out or Path("runs") / f"{clip_name(clip)}-{Path(spec).stem}-auto"
-        spec, given = _needed(clip, spec, out, given, where, overwrite, resume, allow_faults,
+        spec, given, found = _needed(clip, spec, out, given, where, overwrite, resume, allow_faults,
                               [reader, reader_set], plugin or ())  # fmt: skip
     session = Session.open(
         clip,
@@ -87,6 +95,8 @@ def train(
         reader_settings=reader_set or (),
     )
     run_session(session)
+    if auto:
+        _finish(session, found, where, overwrite, plugin or ())
     if evaluate:
         score_run(session.run.path, device=where, plugins=plugin or ())
 
@@ -102,8 +112,9 @@ def _needed(
     allow_faults: bool,
     of_reader: Sequence[object],
     plugins: Sequence[Path],
-) -> tuple[str, list[str]]:
-    """The spec that `--auto` trains, found beside the run folder, and what is left to lay over it.
+) -> tuple[str, list[str], Needs | None]:
+    """The spec that `--auto` trains, found beside the run folder, what is left to lay over it, and
+    the search.
 
     A run that goes on takes the answer that it was begun with.
     """
@@ -120,9 +131,12 @@ def _needed(
     if resume:
         if not Path(answer).is_file():
             raise HoigsError(f"{answer}: not there, so no run of --auto was begun in {out}")
-        return answer, list(given)
+        if RunFolder(out).provenance.is_file() and RunFolder(out).read_provenance().get("pruned"):
+            raise HoigsError(f"{out}: is trained and pruned; nothing is left to go on with")
+        return answer, list(given), None
     RunFolder(out).refuse_existing(overwrite)
-    find_needs(
+    RunFolder(compact_of(out)).refuse_existing(overwrite)
+    found = find_needs(
         clip,
         spec,
         folder,
@@ -132,7 +146,38 @@ def _needed(
         allow_faults=allow_faults,
         plugins=plugins,
     )
-    return answer, []
+    return answer, [], found
+
+
+def compact_of(run: Path) -> Path:
+    """Where the compact twin of a run of `--auto` stands."""
+    return run.with_name(f"{run.name}-compact")
+
+
+def _finish(
+    session: Session,
+    found: Needs | None,
+    device: str,
+    overwrite: bool,
+    plugins: Sequence[Path],
+) -> None:
+    """Prune the trained run, write its compact twin, and put both into the answer's table."""
+    from hoigs.studies.needs.after import add_to_answer, finish, sentences, table
+
+    out = session.run.path
+    clock = None if found is None else (found.seconds, session.trainer.elapsed, found.full_seconds)
+    typer.echo(f"pruning {out}:")
+    after = finish(
+        out, compact_of(out), device=device, plugins=plugins, overwrite=overwrite, clock=clock,
+        report=lambda line: typer.echo(f"  {line}"),
+    )  # fmt: skip
+    columns, rows = table(after)
+    print_table("after the training", columns, rows)
+    for sentence in sentences(after):
+        typer.echo(sentence)
+    answer = out.with_name(f"{out.name}-needs")
+    add_to_answer(after, answer)
+    typer.echo(f"run: {out}, in few bytes {compact_of(out)}; why: {answer / 'needs.md'}")
 
 
 def run_session(session: object) -> None:

@@ -65,9 +65,12 @@ class PairedPlanes(nn.Module):
 
     Args:
         channels: of each plane; 32 gives the paper's 96.
-        resolution: cells along each space axis. time_resolution: along time.
+        resolution: cells along each space axis. time_resolution: along time; 0 is no time planes,
+            as if all were one: phi = f.
         spread: standard deviation of the space planes at the start.
     """
+
+    time: nn.Parameter | None
 
     def __init__(
         self,
@@ -79,7 +82,8 @@ class PairedPlanes(nn.Module):
         super().__init__()
         self.width = 3 * channels
         self.space = nn.Parameter(torch.randn(3, resolution, resolution, channels) * spread)
-        self.time = nn.Parameter(torch.ones(3, time_resolution, resolution, channels))
+        timed = torch.ones(3, time_resolution, resolution, channels)
+        self.register_parameter("time", nn.Parameter(timed) if time_resolution else None)
 
     def forward(
         self, points: Float[Tensor, "N 3"], time: float | None = None
@@ -87,7 +91,7 @@ class PairedPlanes(nn.Module):
         """f at points in [-1, 1], or phi when a time in [0, 1] is given."""
         pairs = torch.stack([points[:, axes] for axes in SPACE_AXES])
         features = sample_planes(self.space, pairs)
-        if time is None:
+        if time is None or self.time is None:
             return features
         clock = points.new_full((len(points),), 2 * time - 1)
         pairs = torch.stack([torch.stack((points[:, axis], clock), -1) for axis in TIME_AXES])
@@ -95,11 +99,11 @@ class PairedPlanes(nn.Module):
 
     def time_smoothness(self) -> Float[Tensor, ""]:
         """Mean squared second difference of the time planes along time (4DGS)."""
-        return roughness(self.time)
+        return self.space.new_zeros(()) if self.time is None else roughness(self.time)
 
     def time_sparsity(self) -> Float[Tensor, ""]:
         """Mean distance of the time planes from one (4DGS): no motion where none is needed."""
-        return (self.time - 1).abs().mean()
+        return self.space.new_zeros(()) if self.time is None else (self.time - 1).abs().mean()
 
 
 class ProductPlanes(nn.Module):
@@ -107,7 +111,7 @@ class ProductPlanes(nn.Module):
 
     Args:
         channels: of each plane. resolution: cells along each space axis at the first scale.
-        time_resolution: along time, at every scale.
+        time_resolution: along time, at every scale; 0 is no time planes, as if all were one.
         scales: multiples of `resolution`; time keeps its own.
         spread: bounds of the uniform values at the start of space planes; time planes are one.
     """
@@ -127,7 +131,7 @@ class ProductPlanes(nn.Module):
             torch.empty(3, size, size, channels).uniform_(*spread) for size in sizes
         )
         self.time = nn.ParameterList(
-            torch.ones(3, time_resolution, size, channels) for size in sizes
+            torch.ones(3, time_resolution, size, channels) for size in sizes if time_resolution
         )
 
     def forward(self, points: Float[Tensor, "N 3"], clock: float) -> Float[Tensor, "N F"]:
@@ -136,9 +140,11 @@ class ProductPlanes(nn.Module):
         when = points.new_full((len(points),), clock)
         timed = torch.stack([torch.stack((points[:, axis], when), -1) for axis in range(3)])
         scales = []
-        for space, time in zip(self.space, self.time, strict=True):
-            planes = torch.cat((sample_planes(space, pairs), sample_planes(time, timed)), 1)
-            scales.append(planes.unflatten(1, (6, -1)).prod(1))
+        for scale, space in enumerate(self.space):
+            planes = sample_planes(space, pairs)
+            if len(self.time):
+                planes = torch.cat((planes, sample_planes(self.time[scale], timed)), 1)
+            scales.append(planes.unflatten(1, (3 + 3 * bool(len(self.time)), -1)).prod(1))
         return torch.cat(scales, dim=1)
 
     def smoothness(self) -> dict[str, Float[Tensor, ""]]:
@@ -153,4 +159,4 @@ class ProductPlanes(nn.Module):
             "time_smoothness": [roughness(planes) for planes in self.time],
             "l1_time_planes": [(planes - 1).abs().mean() for planes in self.time],
         }
-        return {name: 3 * torch.stack(terms).sum() for name, terms in sums.items()}
+        return {name: 3 * torch.stack(terms).sum() for name, terms in sums.items() if terms}

@@ -12,6 +12,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
 
+from hoigs.compression.compact import COMPOSED, read_compact
+from hoigs.compression.compact import FORMAT as COMPACT
 from hoigs.core.errors import CheckpointError
 from hoigs.core.scene import SceneModel
 
@@ -26,6 +28,8 @@ class Checkpoint:
     Attributes:
         tensors: "model.*", "optimizer.*", "density.*", "cameras.*", "rng.*".
         meta: format, version, step, counts, spec_hash, model_hash, sampler order.
+
+    One that was pruned or compressed has the model alone: it is drawn, but not trained on.
     """
 
     tensors: dict[str, torch.Tensor]
@@ -80,7 +84,8 @@ def load_checkpoint(meta_path: Path) -> Checkpoint:
         meta = json.loads(meta_path.read_text())
     except (OSError, json.JSONDecodeError) as error:
         raise CheckpointError(f"{meta_path}: cannot be read as JSON: {error}") from error
-    if meta.get("format") != FORMAT or meta.get("version") != VERSION:
+    compact = meta.get("format") == COMPACT
+    if not compact and (meta.get("format") != FORMAT or meta.get("version") != VERSION):
         raise CheckpointError(
             f"{meta_path}: format {meta.get('format')!r} version {meta.get('version')!r}, "
             f"expected {FORMAT!r} version {VERSION}"
@@ -91,6 +96,11 @@ def load_checkpoint(meta_path: Path) -> Checkpoint:
         raise CheckpointError(
             f"{meta_path.with_suffix('.safetensors')}: damaged or absent: {error}"
         ) from error
+    if compact:
+        try:
+            tensors = read_compact(tensors, meta)
+        except CheckpointError as error:
+            raise CheckpointError(f"{meta_path.with_suffix('.safetensors')}: {error}") from error
     return Checkpoint(tensors, meta)
 
 
@@ -116,8 +126,10 @@ def restore_model(model: SceneModel, checkpoint: Checkpoint, model_hash: str) ->
         )
     for name, count in counts.items():
         model.entity(name).resize(count)
+    composed = model.state_dict()
+    known = {name: composed[name] for name in checkpoint.meta.get(COMPOSED, ()) if name in composed}
     try:
-        model.load_state_dict(checkpoint.part("model"))
+        model.load_state_dict(known | checkpoint.part("model"))
     except RuntimeError as error:
         raise CheckpointError(f"checkpoint does not fit the model: {error}") from error
 

@@ -14,6 +14,7 @@ from hoigs.core.clip import Clip, Frame
 from hoigs.core.clip_health import depth_factor
 from hoigs.core.deformation import DeformationModel, StepEvidence
 from hoigs.core.density import DensityControl, DensityStatistics, check_rasterizer
+from hoigs.core.errors import CheckpointError
 from hoigs.core.moment import Moment
 from hoigs.core.scene import SceneModel
 from hoigs.core.train_spec import TrainSpec
@@ -258,7 +259,16 @@ class Trainer:
         return Checkpoint(tensors, meta)
 
     def resume(self, checkpoint: Checkpoint) -> None:
-        """Continue from a checkpoint; the rest of the run equals an unbroken one."""
+        """Continue from a checkpoint; the rest of the run equals an unbroken one.
+
+        Raises:
+            CheckpointError: it has the model alone.
+        """
+        if not checkpoint.part("optimizer"):
+            raise CheckpointError(
+                f"the checkpoint of step {checkpoint.meta['step']} was pruned or compressed: it "
+                "has a model to draw, but nothing of its optimizer to go on with"
+            )
         restore_model(self.model, checkpoint, self.identity["model_hash"])
         restore_cameras(self.cameras, checkpoint)
         self.optimizer.load_tensors(checkpoint.part("optimizer"))

@@ -112,3 +112,19 @@ def test_roughness():
     line = torch.arange(4.0).view(1, 4, 1, 1)
     assert roughness(line) == 0 and roughness(line[:, :2]) == 0
     assert roughness(line**2) == 4  # second difference 2, squared
+
+
+def test_no_time_planes_are_time_planes_of_one():
+    points = torch.rand(6, 3) * 2 - 1
+    for make in (
+        lambda time: PairedPlanes(2, 5, time),
+        lambda time: ProductPlanes(2, 4, time, scales=(1, 2)),
+    ):
+        torch.manual_seed(0)
+        ones, none = make(4), make(0)
+        stored = {k: v for k, v in ones.state_dict().items() if not k.startswith("time")}
+        assert len(stored) < len(ones.state_dict())
+        none.load_state_dict(stored)
+        torch.testing.assert_close(none(points, 0.3), ones(points, 0.3), rtol=0, atol=0)
+    assert PairedPlanes(2, 5, 0).time_sparsity() == PairedPlanes(2, 5, 0).time_smoothness() == 0
+    assert list(ProductPlanes(2, 4, 0).smoothness()) == ["plane_tv"]

@@ -24,7 +24,7 @@ class ScaledProductPlanes(nn.Module):
 
     Args:
         channels: of each plane. resolution: cells along each space axis of the finest scale.
-        time_resolution: along time, at every scale.
+        time_resolution: along time, at every scale; 0 is no time planes, as if all were one.
     """
 
     def __init__(self, channels: int, resolution: int, time_resolution: int) -> None:
@@ -36,7 +36,7 @@ class ScaledProductPlanes(nn.Module):
             torch.empty(3, size, size, channels).uniform_(0.1, 0.8) for size in sizes
         )
         self.time = nn.ParameterList(
-            torch.ones(3, time_resolution, size, channels) for size in sizes
+            torch.ones(3, time_resolution, size, channels) for size in sizes if time_resolution
         )
 
     def forward(
@@ -45,7 +45,7 @@ class ScaledProductPlanes(nn.Module):
         """f at points in [-1, 1], or phi when a time in [0, 1] is given."""
         pairs = torch.stack([points[:, axes] for axes in SPACE_AXES])
         features = [_product(space, pairs) for space in self.space]
-        if time is not None:
+        if time is not None and len(self.time):
             clock = points.new_full((len(points),), 2 * time - 1)
             pairs = torch.stack([torch.stack((points[:, axis], clock), -1) for axis in range(3)])
             timed = [_product(planes, pairs) for planes in self.time]
@@ -55,12 +55,14 @@ class ScaledProductPlanes(nn.Module):
     def time_smoothness(self) -> Float[Tensor, ""]:
         """Mean squared second difference of the time planes along time, mean over scales."""
         bends = [p[:, 2:] - 2 * p[:, 1:-1] + p[:, :-2] for p in self.time]
-        if bends[0].numel() == 0:
-            return bends[0].new_zeros(())
+        if not bends or bends[0].numel() == 0:
+            return self.space[0].new_zeros(())
         return torch.stack([b.square().mean() for b in bends]).mean()
 
     def time_sparsity(self) -> Float[Tensor, ""]:
         """Mean distance of the time planes from one, mean over scales."""
+        if not len(self.time):
+            return self.space[0].new_zeros(())
         return torch.stack([(p - 1).abs().mean() for p in self.time]).mean()
 
 

@@ -36,7 +36,7 @@ class HexPlaneFieldConfig(ComponentConfig):
 
     Attributes:
         channels, resolution, time_resolution, multires: of the planes; see ProductPlanes. A
-            time_resolution of None is half the clip's frames.
+            time_resolution of None is half the clip's frames; of 0, no time planes: offsets stay.
         width, depth: of the network behind them. heads: what it changes.
         time_span: "half" is 4DGS's code: time enters in [0, 1] where the planes span [-1, 1], so
             half of each time plane is never read; "whole" reads all of it.
@@ -46,7 +46,7 @@ class HexPlaneFieldConfig(ComponentConfig):
 
     channels: int = Field(16, ge=1)
     resolution: int = Field(64, ge=2)
-    time_resolution: int | None = Field(150, ge=1)
+    time_resolution: int | None = Field(150, ge=0)
     multires: tuple[int, ...] = (1, 2, 4)
     width: int = Field(128, ge=8)
     depth: int = Field(1, ge=0)
@@ -97,7 +97,8 @@ class HexPlaneField(DeformationModel):
     @classmethod
     def from_config(cls, config: HexPlaneFieldConfig, context: BuildContext) -> Self:
         settings = config.model_dump()
-        settings["time_resolution"] = config.time_resolution or half_the_frames(context)
+        if config.time_resolution is None:
+            settings["time_resolution"] = half_the_frames(context)
         return cls(**settings)
 
     def bind(self, rest: Gaussians) -> None:

@@ -52,7 +52,8 @@ class HexPlaneSkinningConfig(ComponentConfig):
             of the other axis and concatenates the three (HexPlane's own fusion); by default, as it
             gives the time-invariant f, 3 x 32, and phi from the same planes. "product" multiplies
             all six, at three resolutions (4DGS, K-Planes).
-        resolution, channels: of the feature planes. time_resolution: None is half the frames.
+        resolution, channels: of the feature planes. time_resolution: None is half the frames; 0 is
+            no time planes, for a human that nothing describes over time.
         box: side of the cube about the pelvis that the planes cover, metres.
         width: of psi_h. head: what psi_h predicts, see CanonicalHead.
         free_attributes: train each point's own colour, opacity and scale too, which psi_h then
@@ -78,7 +79,7 @@ class HexPlaneSkinningConfig(ComponentConfig):
     fusion: Fusion = "paired"
     resolution: int = Field(128, ge=2)
     channels: int = Field(32, ge=1)
-    time_resolution: int | None = Field(None, ge=1)
+    time_resolution: int | None = Field(None, ge=0)
     box: float = Field(2.5, gt=0)
     width: int = Field(128, ge=8)
     head: HeadKind = "full"

@@ -157,19 +157,19 @@ class KnotSchedule(nn.Module):
     def remove(self, curve: MovingCurve, rest: Gaussians) -> None:
         """Take out knots, the least missed first, as long as the refitted motion stays within
         `pixels` of what it was before the first went (SplineGS, with a stricter measure)."""
-        still = self._screen(curve, rest)
-        fit = self._sample_times()
+        still = self.screen(curve, rest)
+        fit = self.sample_times()
         while len(curve.knots) > self.config.minimum:
             times = curve.knots.tolist()
             trials = []
             for k in range(1, len(times) - 1):
-                with _Trial(curve) as trial:
+                with KnotTrial(curve) as trial:
                     trial.place(times[:k] + times[k + 1 :], ())
-                    trials.append((self._deviation(still, self._screen(curve, rest)), k))
+                    trials.append((self.deviation(still, self.screen(curve, rest)), k))
             for _, k in sorted(trials)[:3]:  # the refit is dear, so only the likeliest have one
-                with _Trial(curve) as trial:
+                with KnotTrial(curve) as trial:
                     trial.place(times[:k] + times[k + 1 :], fit)
-                    if self._deviation(still, self._screen(curve, rest)) <= self.config.pixels:
+                    if self.deviation(still, self.screen(curve, rest)) <= self.config.pixels:
                         trial.keep()
                         break
             else:
@@ -191,14 +191,14 @@ class KnotSchedule(nn.Module):
             return
         chosen = sorted(wide, key=lambda k: (-scores[k], k))[:count]
         added = times + [(times[k] + times[k + 1]) / 2 for k in chosen]
-        with _Trial(curve) as trial:
+        with KnotTrial(curve) as trial:
             trial.place(sorted(added), ())
             trial.keep()
 
     def _scores(self, curve: MovingCurve, rest: Gaussians, times: list[float]) -> list[float]:
         """How much each interval needs a knot."""
         if self.config.insert_by == "acceleration":
-            screen = self._screen(curve, rest)
+            screen = self.screen(curve, rest)
             bends = torch.zeros(len(self.frame_times))
             if len(screen) > 2:
                 second = screen[2:] - 2 * screen[1:-1] + screen[:-2]
@@ -215,12 +215,12 @@ class KnotSchedule(nn.Module):
             scores.append(score)
         return scores
 
-    def _sample_times(self) -> list[float]:
+    def sample_times(self) -> list[float]:
         """Every frame and every half frame."""
         count = 2 * (len(self.frame_times) - 1)
         return [i / count for i in range(count + 1)] if count > 0 else [0.0, 1.0]
 
-    def _screen(self, curve: MovingCurve, rest: Gaussians) -> Float[Tensor, "F P 2"]:
+    def screen(self, curve: MovingCurve, rest: Gaussians) -> Float[Tensor, "F P 2"]:
         """Pixels at which the probes stand in every frame; NaN where they are not in front."""
         points = curve.traced(rest, self.frame_times).float()
         turn, shift = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3]
@@ -229,13 +229,13 @@ class KnotSchedule(nn.Module):
         return torch.where(camera[..., 2:] > NEAR, pixels[..., :2] / pixels[..., 2:], torch.nan)
 
     @staticmethod
-    def _deviation(a: Float[Tensor, "F P 2"], b: Float[Tensor, "F P 2"]) -> float:
+    def deviation(a: Float[Tensor, "F P 2"], b: Float[Tensor, "F P 2"]) -> float:
         """Mean distance over the probes in the worst frame, pixels."""
         mean = (a - b).norm(dim=-1).nanmean(1)
         return float(mean.nan_to_num(0.0).max())
 
 
-class _Trial:
+class KnotTrial:
     """Other knots for a curve, undone on leaving unless kept."""
 
     def __init__(self, curve: MovingCurve) -> None:
@@ -243,7 +243,7 @@ class _Trial:
         self.times = curve.knots.tolist()
         self.values = {name: curve.get_parameter(name).data for name in curve.knot_axes}
 
-    def __enter__(self) -> _Trial:
+    def __enter__(self) -> KnotTrial:
         return self
 
     def place(self, times: Sequence[float], fit: Sequence[float]) -> None:

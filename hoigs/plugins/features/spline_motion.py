@@ -17,7 +17,7 @@ from hoigs.core.gaussians import Gaussians
 from hoigs.core.moment import Moment
 from hoigs.core.spline import catmull_rom, hermite_basis, keyframe_position, linear
 
-Embedding = Literal["per-gaussian", "shared", "low-rank"]
+Embedding = Literal["per-gaussian", "shared", "low-rank", "none"]
 Interpolation = Literal["catmull-rom", "zero-tangent", "linear"]
 Velocity = Literal["derivative", "keyframes"]
 
@@ -32,7 +32,7 @@ class SplineMotionConfig(ComponentConfig):
             supplement says ("for each keyframe Gaussian"): 29 N K floats, which is 73 % of a
             keyframed object (N = 20 000, K = 75: 174 MB, four times that with Adam). "shared" is
             one e_k for all, 29 K, as the main text may be read; "low-rank" mixes `rank` shared
-            ones by N * rank weights.
+            ones by N * rank weights; "none" leaves e out: tokens know velocity and time alone.
         interpolation: of e. "Interpolated by CHS" needs tangents, which e has none of; by
             default "catmull-rom" finite differences, smooth and free of parameters; or
             "zero-tangent", or "linear".
@@ -57,8 +57,8 @@ class SplineMotionConfig(ComponentConfig):
 class SplineMotionFeatures(FeatureExtractor):
     """f_o(t) = MLP([tau(t); e(t); t]), at each Gaussian's centre.
 
-    t is in [0, 1], tau in metres per keyframe interval. For readings of tau(t) and e(t) see
-    SplineMotionConfig. Positions carry no gradient.
+    Without an embedding f_o(t) = MLP([tau(t); t]). t is in [0, 1], tau in metres per keyframe
+    interval. For readings of tau(t) and e(t) see SplineMotionConfig. Positions carry no gradient.
     """
 
     requires = frozenset({"velocity"})
@@ -79,13 +79,13 @@ class SplineMotionFeatures(FeatureExtractor):
         self.width, self.kind, self.rank = width, embedding, rank
         self.embedding_width, self.keyframes = embedding_width, keyframes
         self.interpolation, self.tau = interpolation, velocity
-        self.mlp = nn.Sequential(
-            nn.Linear(3 + embedding_width + 1, hidden), nn.ReLU(), nn.Linear(hidden, width)
-        )
+        inputs = 4 if embedding == "none" else 3 + embedding_width + 1
+        self.mlp = nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, width))
         self.per_gaussian = {
             "per-gaussian": ("embedding",),
             "shared": (),
             "low-rank": ("mixture",),
+            "none": (),
         }[embedding]
 
     def bind(self, deformation: DeformationModel, rest: Gaussians) -> None:
@@ -98,6 +98,8 @@ class SplineMotionFeatures(FeatureExtractor):
                     f"{type(deformation).__name__} has no learned tangents tau_k for each Gaussian "
                     "at keyframes that stay; set `velocity: derivative` of features:spline-motion"
                 )
+        if self.kind == "none":
+            return
         keyframes = self.keyframes or getattr(deformation, "keyframes", None)
         if not isinstance(keyframes, int):
             raise ValueError(
@@ -139,9 +141,10 @@ class SplineMotionFeatures(FeatureExtractor):
 
     def forward(self, deformation: DeformationModel, rest: Gaussians, moment: Moment) -> Tokens:
         velocity = self._velocity(deformation, rest, moment)
-        code = self.embedded(len(rest), moment.time)
-        clock = velocity.new_full((len(rest), 1), moment.time)
-        features = self.mlp(torch.cat((velocity, code, clock), dim=-1))
+        known = [velocity, velocity.new_full((len(rest), 1), moment.time)]
+        if self.kind != "none":
+            known.insert(1, self.embedded(len(rest), moment.time))
+        features = self.mlp(torch.cat(known, dim=-1))
         with torch.no_grad():
             positions = deformation(rest, moment).means
         return Tokens(features, positions)

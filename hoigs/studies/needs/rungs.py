@@ -27,11 +27,14 @@ class Rung(ComponentConfig):
         name: for tables. why: what a scene has that needs this rung, "because …".
         overrides: dotted keys of a spec and their values. `{scene}`, `{human}` and `{object}` stand
             for the model blocks of that kind.
+        times: dotted keys of numbers, and what their value so far is multiplied with: a rung that
+            is smaller than the spec, whatever the spec has. Keys that the spec has not are left.
         cost: of one step of a trial, where a step of the full spec costs 1.
     """
 
     name: str
     overrides: Overrides = Field(default_factory=dict)
+    times: dict[str, float] = Field(default_factory=dict)
     cost: float = Field(1.0, gt=0)
     why: str
 
@@ -119,6 +122,28 @@ def expanded(overrides: Mapping[str, Any], blocks: Mapping[str, Sequence[str]]) 
             mark = "{" + kind + "}"
             keys = [k.replace(mark, name) for k in keys for name in (names if mark in k else [""])]
         found |= dict.fromkeys(keys, value)
+    return found
+
+
+def multiplied(times: Mapping[str, float], tree: Mapping[str, Any]) -> Overrides:
+    """`Rung.times`, its blocks expanded, as overrides of a spec.
+
+    Args:
+        tree: the spec so far, as `Spec.model_dump` gives it.
+
+    Raises:
+        HoigsError: what stands at a key is no number.
+    """
+    found: Overrides = {}
+    for key, factor in times.items():
+        value: Any = tree
+        for step in key.split("."):
+            value = value.get(step) if isinstance(value, Mapping) else None
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise HoigsError(f"{key}: {value!r} cannot be taken {factor:g} times; it is no number")
+        found[key] = max(1, round(value * factor)) if isinstance(value, int) else value * factor
     return found
 
 

@@ -14,7 +14,15 @@ from hoigs.core.registry import Registry, default_registry
 from hoigs.core.spec import Spec
 from hoigs.studies.needs.criterion import Criterion, Gain, Score, gain
 from hoigs.studies.needs.halving import SCORING, Climbed, Ledger, climb, plan
-from hoigs.studies.needs.rungs import Ladder, Overrides, Rung, as_settings, expanded, laid
+from hoigs.studies.needs.rungs import (
+    Ladder,
+    Overrides,
+    Rung,
+    as_settings,
+    expanded,
+    laid,
+    multiplied,
+)
 from hoigs.studies.needs.selection import SELECTION, selection_view
 from hoigs.studies.needs.trial import Trial, alone
 
@@ -208,7 +216,11 @@ class Search:
                 if not ladder.else_cheapest:
                     return Answer(ladder, block, None, skipped=why)
                 first = ladder.rungs[0]
-                return Answer(ladder, block, first, (), why, expanded(first.overrides, blocks))
+                return Answer(ladder, block, first, (), why, self._overrides(first, blocks))
+        if all(rung.times for rung in ladder.rungs) and not any(
+            self._overrides(rung, blocks) for rung in ladder.rungs
+        ):
+            return Answer(ladder, block, None, skipped="what has been chosen has none of it")
         held = len(self.held)
         longest = plan([r.cost for r in ladder.rungs], budget, held, self.most).steps
         trials, steps = self._trials(ladder, block, blocks, longest)
@@ -232,7 +244,13 @@ class Search:
         chosen = tried[place]
         rows = tuple(steps.get(rung.name, Step(rung)) for rung in ladder.rungs)
         why = "" if len(tried) > 1 else "no other of its rungs can be built here"
-        return Answer(ladder, block, chosen, rows, why, expanded(chosen.overrides, blocks))
+        return Answer(ladder, block, chosen, rows, why, self._overrides(chosen, blocks))
+
+    def _overrides(self, rung: Rung, blocks: Mapping[str, Sequence[str]]) -> Overrides:
+        """What a rung sets, over what has been found so far."""
+        own = expanded(rung.overrides, blocks)
+        so_far = self._spec(laid(self.found, own)).model_dump(mode="json")
+        return laid(own, multiplied(expanded(rung.times, blocks), so_far))
 
     def _trials(
         self, ladder: Ladder, block: str, blocks: Mapping[str, Sequence[str]], steps: int
@@ -243,7 +261,7 @@ class Search:
         failed: dict[str, Step] = {}
         for rung in ladder.rungs:
             overrides = laid(self.found, expanded(ladder.during, blocks))
-            overrides = laid(overrides, expanded(rung.overrides, blocks))
+            overrides = laid(overrides, self._overrides(rung, blocks))
             overrides = laid(overrides, alone(ladder.kind, names, self.blocks, steps))
             spec = self._spec(overrides)  # a rung that is no spec is a mistake, and is told at once
             try:

@@ -79,10 +79,15 @@ def selection_view(clip: Clip, share: float = 0.05, least: int = 3) -> Clip:
     """
     held = selection_frames(clip.split["train"], share, least)
     train = [p for p in clip.split["train"] if p not in set(held)]
+    return replace(sealed_view(clip), split={"train": train, SELECTION: held})
+
+
+def sealed_view(clip: Clip) -> Clip:
+    """`clip` with its training frames alone; of all others no pixel, mask or depth can be read."""
     sealed = set(range(len(clip))) - set(clip.split["train"])
     return replace(
         clip,
         store=SealedStore(clip.store, sealed),
-        split={"train": train, SELECTION: held},
+        split={"train": clip.split["train"]},
         held_out=None,
     )

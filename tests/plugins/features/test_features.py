@@ -208,3 +208,20 @@ def test_embedding_over_keyframes_is_linear_between_them(toy_body):
     torch.testing.assert_close(tokens.double(), expected, atol=1e-6, rtol=0)
     tokens.sum().backward()
     assert (table.grad[:, [0, 3, 4]] == 0).all() and (table.grad[:, 1:3] > 0).all()
+
+
+def test_tokens_without_an_embedding_know_velocity_and_time():
+    features = SplineMotionFeatures.from_config(
+        SplineMotionConfig(embedding="none"), BuildContext()
+    )
+    entity = thing(features)
+    moment = Moment(0.4)
+    tokens = entity.tokens(moment)
+    velocity = entity.deformation.velocity(entity.rest, moment)
+    clock = torch.full((12, 1), 0.4)
+    expected = features.mlp(torch.cat((velocity, clock), -1))
+    torch.testing.assert_close(tokens.features, expected)
+    assert {n.partition(".")[0] for n, _ in features.named_parameters()} == {"mlp"}
+    still = Entity(entity.rest, Static(), None)
+    with pytest.raises(ValueError, match="velocity"):
+        Entity(still.rest, Static(), SplineMotionFeatures(embedding="none"))

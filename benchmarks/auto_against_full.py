@@ -1,0 +1,172 @@
+"""Is `hoigs train --auto` as good as the whole spec, at a tenth of its parameters?
+
+    python benchmarks/auto_against_full.py --jobs 6 --threads 8 --minutes 60
+    python benchmarks/auto_against_full.py --clips lift-and-swing --steps 300 --width 64
+
+On each clip the whole spec is trained, and what `--auto` makes of it. Auto passes where its PSNR of
+people and things on test frames is within 0.15 dB of the whole spec's, with at most 10 % of its
+trained numbers and 50 % of its render time. A run that was stopped goes on with the same command;
+render times are measured at the end, when nothing else of this script runs, both models in turn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from many_cells import read_cell, run_cells, write_cell
+
+CLIPS = ("lift-and-swing", "carry", "throw-and-catch")
+KINDS = ("full", "auto")
+WITHIN_DB, PARAMETERS, RENDER = 0.15, 0.10, 0.50
+ROUNDS = 5
+
+
+def clip_of(name: str, options: argparse.Namespace) -> str:
+    knobs = f"?width={options.width}" if options.width else ""
+    return f"builtin:{name}{knobs}"
+
+
+def run_folder(name: str, kind: str, options: argparse.Namespace) -> Path:
+    return options.out / "runs" / f"{name}-{kind}"
+
+
+def train(name: str, kind: str, options: argparse.Namespace) -> dict[str, Any]:
+    """One training, gone on with where it had begun, and its scores on test frames."""
+    from hoigs.cli.train import compact_of
+    from hoigs.cli.train import train as train_verb
+    from hoigs.evaluation.evaluate import evaluate
+    from hoigs.training.checkpoint import has_checkpoint
+    from hoigs.training.run_folder import RunFolder
+    from hoigs.training.session import LoadedRun
+
+    run = run_folder(name, kind, options)
+    folder, began = RunFolder(run), time.perf_counter()
+    settings = [f"train.steps={options.steps}", f"train.seed={options.seed}",
+                "train.preview_every=0", *options.set]  # fmt: skip
+    begun = folder.path.exists() and has_checkpoint(folder.checkpoints)
+    finished = begun and kind == "auto" and bool(folder.read_provenance().get("pruned"))
+    answered = run.with_name(f"{run.name}-needs") / "spec.yaml"
+    if not finished:
+        resume = begun and (kind == "full" or answered.is_file())
+        train_verb(
+            Path(clip_of(name, options)), spec=options.spec, out=run, auto=kind == "auto",
+            settings=[] if resume and kind == "auto" else settings, device="cpu", resume=resume,
+            overwrite=not resume, evaluate=False,
+        )  # fmt: skip
+    found: dict[str, Any] = {"seconds": round(time.perf_counter() - began, 1), "resumed": begun}
+    for label, path in {"": run, "compact_": compact_of(run)}.items():
+        if label and kind == "full":
+            continue
+        loaded = LoadedRun.open(path)
+        scores = evaluate(loaded.model, loaded.clip, timing_frames=0, held_out=not label)
+        regions = ("human_object", "full", "background")
+        found[f"{label}psnr"] = {region: scores.score(region, "psnr") for region in regions}
+    loaded = LoadedRun.open(run)
+    found["parameters"] = sum(p.numel() for p in loaded.model.parameters() if p.requires_grad)
+    found["counts"] = loaded.model.count()
+    if kind == "auto":
+        data = json.loads((answered.parent / "needs.json").read_text())
+        found["because"] = [answer["because"] for answer in data["answers"]]
+        found["after"] = data["after"]
+    return found
+
+
+def render_times(name: str, options: argparse.Namespace) -> dict[str, float]:
+    """Milliseconds a frame of both, measured in turn: medians of the rounds."""
+    from hoigs.evaluation.measure import render_time
+    from hoigs.training.session import LoadedRun
+
+    loaded = {kind: LoadedRun.open(run_folder(name, kind, options)) for kind in KINDS}
+    times: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    for _ in range(ROUNDS):
+        for kind, run in loaded.items():
+            positions = list(run.clip.split["test"])
+            times[kind].append(
+                render_time(run.model, run.clip, positions, frames=20, warmup=3).total_ms
+            )
+    return {kind: round(statistics.median(values), 3) for kind, values in times.items()}
+
+
+def settings_of(options: argparse.Namespace) -> dict[str, Any]:
+    return {name: getattr(options, name) for name in ("spec", "steps", "width", "seed", "set")}
+
+
+def summary(options: argparse.Namespace) -> bool:
+    """Print and write the table of the clips that are done; whether all three rules hold on all."""
+    rows, good = [], True
+    print("| clip | people and things, dB: full | auto | difference | parameters | render time | "
+          "after compressing, dB | cost in full trainings | |")  # fmt: skip
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---|")
+    for name in options.clips:
+        cells = {kind: read_cell(options.out, f"{name}-{kind}", settings_of(options))
+                 for kind in KINDS}  # fmt: skip
+        full, auto = cells["full"], cells["auto"]
+        if full is None or auto is None:
+            missing = [kind for kind in KINDS if cells[kind] is None]
+            print(f"| {name} | not done: {', '.join(missing)} | | | | | | | |")
+            good = False
+            continue
+        difference = auto["psnr"]["human_object"] - full["psnr"]["human_object"]
+        share = auto["parameters"] / full["parameters"]
+        times = render_times(name, options)
+        render = times["auto"] / times["full"]
+        passed = difference >= -WITHIN_DB and share <= PARAMETERS and render <= RENDER
+        good &= passed
+        cost = auto["after"]["full_trainings"]
+        rows.append({"clip": name, "difference_db": difference, "parameters": share,
+                     "render": render, "render_ms": times, "passed": passed, **cells})  # fmt: skip
+        print(
+            f"| {name} | {full['psnr']['human_object']:.2f} | {auto['psnr']['human_object']:.2f} | "
+            f"{difference:+.2f} | {100 * share:.1f} % | {100 * render:.0f} % | "
+            f"{auto['compact_psnr']['human_object']:.2f} | "
+            f"{'–' if cost is None else f'{cost:.2f}'} | {'pass' if passed else 'FAIL'} |"
+        )
+    path = options.out / "summary.json"
+    path.write_text(json.dumps({"settings": settings_of(options), "rows": rows}, indent=1))
+    print(f"wrote {path}")
+    return good
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--clips", nargs="+", default=list(CLIPS), help="built-in ones, by name")
+    parser.add_argument("--spec", default="hoigs")
+    parser.add_argument("--steps", type=int, default=2000, help="of each training")
+    parser.add_argument("--width", type=int, help="of the clips' frames; default: their own")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--set", action="append", default=[], help="of both trainings")
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
+    parser.add_argument("--threads", type=int, default=1, help="of each")
+    parser.add_argument("--minutes", type=float, help="stop then; the same command goes on")
+    parser.add_argument("--out", type=Path, default=Path("runs/auto-against-full"))
+    parser.add_argument("--summary", action="store_true", help="only read what is done")
+    parser.add_argument("--cell", help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+def main() -> int:
+    options = parse()
+    if options.cell is not None:
+        name, _, kind = options.cell.rpartition("-")
+        write_cell(options.out, options.cell, settings_of(options), train(name, kind, options))
+        return 0
+    cells = [f"{name}-{kind}" for kind in reversed(KINDS) for name in options.clips]
+    if not options.summary:
+        own = [f"--spec={options.spec}", f"--steps={options.steps}", f"--seed={options.seed}",
+               f"--out={options.out}", *(f"--set={text}" for text in options.set)]  # fmt: skip
+        own += [f"--width={options.width}"] if options.width else []
+        run_cells(
+            cells, options.out, settings_of(options), own, jobs=options.jobs,
+            threads=options.threads, minutes=options.minutes,
+        )  # fmt: skip
+    return 0 if summary(options) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

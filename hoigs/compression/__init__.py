@@ -1,0 +1,1 @@
+"""Trained models in few bytes: quantised, squeezed, and read back. Never pickle."""

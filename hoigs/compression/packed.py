@@ -1,0 +1,120 @@
+"""A set of tensors in one safetensors file of zlib streams, described by JSON values.
+
+Every tensor is a stream of bytes. Floating ones are quantised first, and the high bytes of 16-bit
+levels stand before the low ones, which zlib likes better; all others are kept to the bit. The JSON
+says of each: shape, type, bits, CRC-32 of what the stream holds.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hoigs.compression.levels import Bits, Levels, bits_of, quantise, restore
+from hoigs.core.errors import CheckpointError
+
+EFFORT = 9  # of zlib
+FLOATS = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16,
+          "float64": torch.float64}  # fmt: skip
+EXACT = {"int64": torch.int64, "int32": torch.int32, "int16": torch.int16, "int8": torch.int8,
+         "uint8": torch.uint8, "bool": torch.bool}  # fmt: skip
+
+
+def pack(
+    tensors: Mapping[str, Tensor], bits: Callable[[str], Bits] = bits_of
+) -> tuple[dict[str, Tensor], dict[str, dict[str, Any]]]:
+    """Streams as uint8 tensors by name, and what describes them, JSON values.
+
+    Float64 tensors (times of knots) are kept to the bit, as are those that are no floats.
+
+    Args:
+        bits: how many a tensor of a name gets.
+
+    Raises:
+        ValueError: a value is not finite, or of a type that is not known.
+    """
+    streams: dict[str, Tensor] = {}
+    described: dict[str, dict[str, Any]] = {}
+    for name, tensor in tensors.items():
+        tensor = tensor.detach().cpu().contiguous()
+        kind = str(tensor.dtype).removeprefix("torch.")
+        record: dict[str, Any] = {"shape": list(tensor.shape), "dtype": kind}
+        if kind in FLOATS and kind != "float64":
+            try:
+                levels = quantise(tensor, bits(name))
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from error
+            data = _bytes(levels)
+            record |= {"bits": levels.bits}
+        elif kind in FLOATS | EXACT:
+            data = tensor.numpy().tobytes()
+        else:
+            raise ValueError(f"{name}: tensors of {kind} cannot be packed")
+        described[name] = {**record, "crc32": zlib.crc32(data)}
+        squeezed = np.frombuffer(zlib.compress(data, EFFORT), np.uint8)
+        streams[name] = torch.from_numpy(squeezed.copy())
+    return streams, described
+
+
+def unpack(
+    streams: Mapping[str, Tensor], described: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Tensor]:
+    """What `pack` was given, floats to their levels.
+
+    Raises:
+        CheckpointError: a stream is absent, damaged, or not what the description says.
+    """
+    found = {}
+    for name, record in described.items():
+        if name not in streams:
+            raise CheckpointError(f"{name}: described, but not in the file")
+        try:
+            data = zlib.decompress(streams[name].numpy().tobytes())
+        except zlib.error as error:
+            raise CheckpointError(f"{name}: damaged: {error}") from error
+        if zlib.crc32(data) != record["crc32"]:
+            raise CheckpointError(f"{name}: damaged: its checksum differs")
+        try:
+            found[name] = _tensor(data, record)
+        except (KeyError, ValueError) as error:
+            raise CheckpointError(f"{name}: not as its description says: {error}") from error
+    return found
+
+
+def _bytes(levels: Levels) -> bytes:
+    """Ranges of the channels (float64), then the levels, byte plane by byte plane."""
+    ranges = torch.stack((levels.low, levels.step)).numpy().tobytes()
+    codes = levels.codes.numpy()
+    # a column at a time: one channel's levels resemble each other
+    columns = codes.reshape(-1, codes.shape[-1]).T if codes.ndim > 1 else codes.reshape(1, -1)
+    flat = np.ascontiguousarray(columns).reshape(-1)
+    if levels.bits == 8:
+        return ranges + flat.astype(np.uint8).tobytes()
+    return ranges + (flat >> 8).astype(np.uint8).tobytes() + (flat & 255).astype(np.uint8).tobytes()
+
+
+def _tensor(data: bytes, record: Mapping[str, Any]) -> Tensor:
+    shape = [int(size) for size in record["shape"]]
+    if 0 in shape:
+        return torch.zeros(shape, dtype=(FLOATS | EXACT)[record["dtype"]])
+    if "bits" not in record:
+        dtype = (FLOATS | EXACT)[record["dtype"]]
+        kind = np.dtype(record["dtype"])
+        return torch.from_numpy(np.frombuffer(data, kind).copy().reshape(shape)).to(dtype)
+    channels = shape[-1] if len(shape) > 1 else 1
+    count = int(np.prod(shape, dtype=np.int64))
+    low, step = torch.from_numpy(
+        np.frombuffer(data, np.float64, 2 * channels).copy().reshape(2, channels)
+    )
+    planes = np.frombuffer(data, np.uint8, offset=16 * channels).astype(np.int32)
+    if len(planes) != count * record["bits"] // 8:
+        raise ValueError(f"{len(planes)} bytes of levels for {count} of {record['bits']} bits")
+    flat = planes if record["bits"] == 8 else (planes[:count] << 8) + planes[count:]
+    codes = np.ascontiguousarray(flat.reshape(channels, -1).T).reshape(shape)
+    levels = Levels(torch.from_numpy(codes), low, step, record["bits"])
+    return restore(levels, FLOATS[record["dtype"]])

@@ -1,0 +1,340 @@
+"""What a trained model can do without: Gaussians, knots, time planes, tokens, bits."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+
+from hoigs.core.clip import Clip
+from hoigs.core.compose import compose
+from hoigs.core.entity import Entity
+from hoigs.core.errors import CheckpointError, HoigsError
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.moment import Moment
+from hoigs.core.rasterizer import RenderRequest
+from hoigs.core.registry import default_registry
+from hoigs.core.scene import SceneModel
+from hoigs.core.spec import Spec
+from hoigs.core.topology import TopologyChange
+from hoigs.plugins.deformation.rigid_spline import RigidSpline
+from hoigs.plugins.deformation.static import Static
+from hoigs.plugins.features.spline_motion import SplineMotionFeatures
+from hoigs.rasterizers.oracle import OracleRasterizer
+from hoigs.studies.needs.after import add_to_answer, finish, table
+from hoigs.studies.needs.compact_run import compact_run
+from hoigs.studies.needs.halving import Ledger
+from hoigs.studies.needs.judge import Judge
+from hoigs.studies.needs.prune import Pruning
+from hoigs.studies.needs.prune_knots import fewer_uniform, is_knotted, measure, slowed
+from hoigs.studies.needs.prune_planes import as_one, from_one, time_planes
+from hoigs.studies.needs.prune_splats import rows_to_lose, sensitivities, take_out
+from hoigs.studies.needs.selection import SealedFrameError, sealed_view
+from hoigs.studies.needs.trained import Trained
+from hoigs.training.checkpoint import latest_checkpoint, load_checkpoint
+from hoigs.training.session import LoadedRun, Session, read_clip
+
+NAME = (
+    "builtin:lift-and-swing?frames=14&width=32&fps=4&samples=1&edge_samples=1&held_out_views=0"
+    "&test_frames=3&scene_points=300&object_points=120"
+)
+GIVEN = (
+    "train.steps=30",
+    "train.preview_every=0",
+    "model.human.points=200",
+    "model.human.deformation.resolution=8",
+)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> Clip:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOIGS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield read_clip(NAME)
+
+
+def as_composed(clip: Clip, *changes: str) -> Trained:
+    registry = default_registry()
+    spec = Spec.load("hoigs", overrides=(*GIVEN, *changes), registry=registry)
+    model = compose(spec, clip, registry)
+    model.eval()
+    model.set_progress(1.0)
+    return Trained(spec, model, clip, registry)
+
+
+def judge_of(clip: Clip) -> Judge:
+    return Judge(clip, clip.split["train"][2:8:3], Ledger(1e6))
+
+
+def drawn(trained: Trained, position: int) -> torch.Tensor:
+    with torch.no_grad():
+        return trained.model.render(
+            trained.clip.moments[position], trained.clip.cameras[position]
+        ).color
+
+
+# -- Gaussians -------------------------------------------------------------------------------------
+
+
+def scattered(clip: Clip, count: int = 12) -> SceneModel:
+    """A few large Gaussians before the camera of the clip, some behind others."""
+    camera = clip.cameras[0]
+    generator = torch.Generator().manual_seed(3)
+    ahead = torch.linalg.inv(camera.world_to_camera)
+    local = torch.rand(count, 3, generator=generator) * torch.tensor([1.2, 1.2, 1.0])
+    local += torch.tensor([-0.6, -0.6, 2.5])
+    points = local @ ahead[:3, :3].T + ahead[:3, 3]
+    rest = Gaussians.from_points(
+        points, torch.rand(count, 3, generator=generator), scales=0.25, opacity=0.5
+    )
+    return SceneModel({"scene": Entity(rest, Static())}, rasterizer=OracleRasterizer())
+
+
+def test_sensitivity_is_the_squared_change_of_the_picture(clip):
+    """Against drawing without each Gaussian in turn."""
+    model = scattered(clip)
+    found = sensitivities(model, clip, [0], probes=400)["scene"]
+    with torch.no_grad():
+        state = model(clip.moments[0]).joined()
+
+        def draw(subset):
+            request = RenderRequest(subset=subset)
+            return model.rasterizer.render(state, clip.cameras[0], request).color
+
+        whole = draw(None)
+        true = []
+        for row in range(len(state)):
+            subset = torch.ones(len(state), dtype=torch.bool)
+            subset[row] = False
+            true.append(float((draw(subset) - whole).square().sum()))
+    truth = torch.tensor(true).to(found)
+    assert truth.max() > 4 * truth.min()
+    torch.testing.assert_close(found, truth, rtol=0.35, atol=0.02 * float(truth.max()))
+    assert torch.corrcoef(torch.stack((found, truth)))[0, 1] > 0.98
+
+
+def test_gaussians_that_show_nowhere_go_and_others_stay(clip):
+    trained = as_composed(clip)
+    model, scene = trained.model, trained.model.entity("scene")
+    with torch.no_grad():
+        scene.opacity_logits[50:] = -12.0
+    judge = judge_of(clip)
+    before = judge.look(model)
+    scores = sensitivities(model, clip, clip.split["train"][:6])["scene"]
+    rows, cost = rows_to_lose(judge, model, "scene", scores, before, 0.01)
+    assert cost <= 0.01 and len(rows) >= 0.8 * (len(scene) - 50)
+    drawn_before = drawn(trained, clip.split["train"][3])
+    kept = torch.ones(len(scene), dtype=torch.bool)
+    kept[rows] = False
+    opacities = scene.opacities if hasattr(scene, "opacities") else scene.rest.opacities
+    assert opacities[~kept].max() <= opacities.median()
+    take_out(model, "scene", rows)
+    assert len(model.entity("scene")) == int(kept.sum())
+    change = (drawn(trained, clip.split["train"][3]) - drawn_before).square().mean()
+    assert change < 1e-3
+
+
+# -- knots -----------------------------------------------------------------------------------------
+
+
+def moving(clip: Clip, knots: int, path) -> Entity:
+    """A box of points on a path (time -> metres), with an uneven `SplineMotionFeatures`."""
+    torch.manual_seed(4)
+    points = torch.rand(40, 3) * 0.3 + torch.tensor([0.0, 0.9, 0.3])
+    features = SplineMotionFeatures(embedding="shared")
+    entity = Entity(Gaussians.from_points(points, scales=0.02), RigidSpline(knots), features)
+    times = [k / (knots - 1) for k in range(knots)]
+    with torch.no_grad():
+        places = torch.stack([path(t) for t in times])
+        entity.deformation.keyframe_translations.copy_(places)
+        entity.deformation.translation_tangents.copy_(
+            entity.deformation.knots.differences(places[None])[0]
+        )
+    return entity
+
+
+def test_an_even_motion_needs_two_knots_and_an_eight_more(clip):
+    schedule = measure(clip, 1.0)
+    even = moving(clip, 9, lambda t: torch.tensor([0.4 * t, 0.1 * t, 0.0]))
+    assert is_knotted(even.deformation) and not is_knotted(Static())
+    count, values = fewer_uniform(even.deformation, even.rest.detach(), schedule)
+    assert count == 2 and values["keyframe_translations"].shape == (2, 3)
+
+    def eight(t: float) -> torch.Tensor:
+        phase = 2 * math.pi * t
+        return torch.tensor([0.6 * math.sin(phase), 0.4 * math.sin(2 * phase), 0.0])
+
+    looped = moving(clip, 13, eight)
+    kept = looped.deformation.keyframe_translations.detach().clone()
+    count, values = fewer_uniform(looped.deformation, looped.rest.detach(), schedule)
+    assert 4 <= count < 13
+    assert len(looped.deformation.knots) == 13 and not looped.deformation.knots.movable
+    assert torch.equal(looped.deformation.keyframe_translations, kept)  # only asked, not changed
+    finer, _ = fewer_uniform(looped.deformation, looped.rest.detach(), measure(clip, 0.05))
+    assert finer > count
+
+
+def test_fewer_knots_move_alike_and_say_the_same(clip):
+    """Places within the pixel, velocities in tokens too, though their unit has changed."""
+    entity = moving(clip, 9, lambda t: torch.tensor([0.4 * t, 0.3 * t * t, 0.0]))
+    count, values = fewer_uniform(entity.deformation, entity.rest.detach(), measure(clip, 0.2))
+    assert count < 9
+    fewer = moving(clip, count, lambda t: torch.zeros(3))
+    state = entity.state_dict() | {f"deformation.{n}": v for n, v in values.items()}
+    state["features.mlp.0.weight"] = slowed(entity.features, 9, count)
+    state["features.embedding"] = fewer.features.embedding.detach() * 0
+    fewer.load_state_dict(state)
+    with torch.no_grad():
+        entity.features.embedding.zero_()
+    for time in (0.0, 0.31, 0.77, 1.0):
+        moment = Moment(time)
+        ours, theirs = fewer(moment), entity(moment)
+        assert (ours.means - theirs.means).norm(dim=-1).max() < 0.02
+    said, meant = (e.tokens(Moment(0.5)).features for e in (fewer, entity))
+    assert (said - meant).norm() < 0.05 * meant.norm()
+
+
+# -- planes, tokens --------------------------------------------------------------------------------
+
+
+def test_time_planes_that_are_one_go_without_a_trace(clip):
+    trained = as_composed(clip, "model.human.features=null", "interaction.use=interaction:none",
+                          "model.object.features=null")  # fmt: skip
+    planes = time_planes(trained.model.entity("human").deformation)
+    assert planes and from_one(planes) == 0
+    pruning = Pruning(trained, judge_of(clip))
+    pruning.planes()
+    after = pruning.trained
+    assert after.spec.model["human"].deformation.settings["time_resolution"] == 0
+    assert not time_planes(after.model.entity("human").deformation)
+    position = clip.split["train"][4]
+    torch.testing.assert_close(drawn(after, position), drawn(trained, position))
+    assert pruning.cuts[0].after == 0 and "one everywhere" in pruning.cuts[0].why
+
+
+def test_planes_come_back_after_a_look(clip):
+    planes = time_planes(as_composed(clip).model.entity("human").deformation)
+    with torch.no_grad():
+        planes[0].normal_()
+    kept = planes[0].detach().clone()
+    with as_one(planes):
+        assert from_one(planes) == 0
+    assert torch.equal(planes[0], kept)
+
+
+def test_interaction_that_does_nothing_goes_and_one_that_does_stays(clip):
+    for strong in (False, True):
+        trained = as_composed(clip)
+        trained.model.interaction_enabled = True
+        if strong:
+            with torch.no_grad():
+                for name, parameter in trained.model.interaction.named_parameters():
+                    if name.endswith("bias"):
+                        parameter += 3.0
+        pruning = Pruning(trained, judge_of(clip), visible=0.02)
+            pruning.tokens()
+        gone = pruning.trained.spec.interaction.use == "interaction:none"
+        moved = [r.pose is not None and bool(r.pose.abs().max() > 0.05)
+                 for r in trained.model(clip.moments[3]).residuals.values()]  # fmt: skip
+        assert strong == any(moved), "the test's own premise"
+        assert gone is not strong
+        assert (pruning.trained.spec.model["object"].features is None) is not strong
+
+
+def test_no_test_frame_is_looked_at(clip):
+    """What `finish` works on raises for them, so that a finished one has read none."""
+    view = sealed_view(clip)
+    model = as_composed(clip).model
+    with pytest.raises(SealedFrameError, match=f"frame {clip.split['test'][0]} is a test frame"):
+        Judge(view, clip.split["test"][:1], Ledger(1e6)).look(model)
+    assert Judge(view, clip.split["train"][:1], Ledger(1e6)).look(model).psnr
+    assert list(view.split) == ["train"] and view.held_out is None
+
+
+# -- a run -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, clip):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOIGS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        folder = tmp_path_factory.mktemp("runs") / "mine"
+        session = Session.open(NAME, "hoigs", out=folder, overrides=GIVEN)
+        session.train()
+        yield folder
+
+
+def test_a_compact_run_reads_back(run, tmp_path):
+    done = compact_run(run, tmp_path / "small")
+    assert done.bytes_after < 0.5 * done.bytes_before and abs(done.drop) < 0.1
+    whole, small = LoadedRun.open(run), LoadedRun.open(tmp_path / "small")
+    assert whole.spec == small.spec and whole.step == small.step
+    position = whole.clip.split["test"][1]
+    a, b = (m.model.render(m.clip.moments[position], m.clip.cameras[position]).color.detach()
+            for m in (whole, small))  # fmt: skip
+    assert (a - b).abs().mean() < 2 / 255 and not torch.equal(a, b)
+    size = sum(f.stat().st_size for f in (tmp_path / "small" / "checkpoints").iterdir())
+    assert size == done.bytes_after
+    with pytest.raises(HoigsError, match="already exists"):
+        compact_run(run, tmp_path / "small")
+    with pytest.raises(CheckpointError, match="pruned or compressed"):
+        Session.open(NAME, whole.spec, out=tmp_path / "small", resume=True)
+
+
+def test_a_damaged_compact_run_is_told(run, tmp_path):
+    compact_run(run, tmp_path / "small")
+    weights = next((tmp_path / "small" / "checkpoints").glob("*.safetensors"))
+    data = bytearray(weights.read_bytes())
+    data[-500] ^= 0x10
+    weights.write_bytes(bytes(data))
+    with pytest.raises(CheckpointError, match=r"step_000030\.safetensors: .*damaged"):
+        LoadedRun.open(tmp_path / "small")
+    weights.write_bytes(bytes(data[:-2000]))
+    with pytest.raises(CheckpointError, match="damaged or absent"):
+        load_checkpoint(latest_checkpoint(tmp_path / "small" / "checkpoints"))
+
+
+def test_a_pruned_run_is_a_run(run, tmp_path):
+    import shutil
+
+    mine = run.with_name("pruned")
+    shutil.copytree(run, mine)
+    compact = run.with_name("pruned-compact")
+    told: list[str] = []
+    after = finish(mine, compact, report=told.append, clock=(2.0, 4.0, 5.0))
+    again, small = LoadedRun.open(mine), LoadedRun.open(compact)
+    assert again.model.count() == small.model.count()
+    assert again.spec.model_hash() == small.spec.model_hash()
+    assert (
+        sum(p.numel() for p in again.model.parameters() if p.requires_grad) == (after.parameters[1])
+    )
+    assert after.parameters[1] <= after.parameters[0] and after.spent <= after.limit
+    assert after.whole_cost == pytest.approx((6.0 + after.seconds) / 5.0)
+    assert (mine / "metrics.jsonl").read_text() == (run / "metrics.jsonl").read_text()
+    assert not list(run.parent.glob(".*part"))
+    columns, rows = table(after)
+    assert {len(row) for row in rows} == {len(columns)}
+    answer = tmp_path / "answer"
+    answer.mkdir()
+    (answer / "needs.md").write_text("# What it needs\n")
+    (answer / "needs.json").write_text('{"clip": "x"}')
+    add_to_answer(after, answer)
+    add_to_answer(after, answer)
+    text = (answer / "needs.md").read_text()
+    assert text.count("## After the training") == 1 and "splats of scene" in text
+    assert "full trainings" in text
+    assert json.loads((answer / "needs.json").read_text())["after"]["bytes"][1] > 0
+
+
+def test_keeping_rows_is_what_pruning_does_to_every_entity(clip):
+    """Every deformation of the spec follows the loss of Gaussians and a checkpoint of it."""
+    trained = as_composed(clip)
+    for name in trained.model.entities:
+        entity = trained.model.entity(name)
+        mask = torch.arange(len(entity)) % 3 != 0
+        entity.apply_topology(TopologyChange.keep(mask), entity.rest[mask])
+    less = trained.asking_less({"train.seed": 1})
+    assert less.model.count() == trained.model.count()
+    torch.testing.assert_close(drawn(less, 2), drawn(trained, 2))
