@@ -29,10 +29,15 @@ BEYOND = ("articulated", "rigid and residual", "per Gaussian")
 
 @dataclass(frozen=True)
 class Case:
-    """A clip, and the rungs that are right for it, by ladder."""
+    """A clip, and the rungs that are right for it, by ladder.
+
+    Attributes:
+        knobs: of the clip, beside those that all have.
+    """
 
     clip: str
     right: dict[str, tuple[str, ...]]
+    knobs: str = ""
 
 
 CASES = {
@@ -41,7 +46,12 @@ CASES = {
     "eight": Case("figure-eight", {"object": RIGID_MANY}),
     "throw": Case("throw-and-catch", {"object": RIGID_MANY}),
     "bend": Case("bending-bar", {"object": BEYOND}),
-    "push": Case("jolted-push", {"interaction": ("object only", "both")}),
+    # jolts of two pixels, over a sweep that leaves the arms room for them
+    "push": Case(
+        "jolted-push",
+        {"interaction": ("object only", "both")},
+        "&object.jolt_metres=0.06&object.swing_degrees=20",
+    ),
 }
 
 
@@ -56,6 +66,7 @@ def run(case: Case, seed: int, options: argparse.Namespace) -> dict[str, Any]:
         f"builtin:{case.clip}?frames={options.frames}&fps={options.frames / 4}"
         f"&width={options.size}&samples=4&edge_samples=4&held_out_views=0"
         f"&test_frames={options.frames // 8}&scene_points=1000&object_points=600&seed={seed}"
+        f"{case.knobs}"
     )
     wanted = {"object", *case.right}  # what the others ask about
     ladders = [ladder for ladder in load_ladders() if options.all or ladder.name in wanted]
@@ -133,7 +144,7 @@ def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--steps", type=int, default=800, help="of a full training")
+    parser.add_argument("--steps", type=int, default=1200, help="of a full training")
     parser.add_argument("--frames", type=int, default=48)
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--share", type=float, default=0.15, help="of training frames, held back")

@@ -15,7 +15,7 @@ import torch
 
 from hoigs.core.registry import default_registry
 from hoigs.studies.needs.compact_run import Compacted, compact_run, put_in_place
-from hoigs.studies.needs.halving import SCORING, Ledger
+from hoigs.studies.needs.halving import Ledger
 from hoigs.studies.needs.judge import Judge, Look
 from hoigs.studies.needs.prune import Cut, Pruning
 from hoigs.studies.needs.search import AFTER
@@ -25,6 +25,7 @@ from hoigs.training.checkpoint import Checkpoint, latest_checkpoint, load_checkp
 from hoigs.training.run_folder import RunFolder
 from hoigs.training.session import LoadedRun
 
+LEAST = 40  # steps' worth that pruning needs, however short the training
 HEADING = "## After the training"
 
 
@@ -89,8 +90,7 @@ def finish(
     registry = default_registry(plugin_files=plugins)
     view = sealed_view(loaded.clip)
     positions = selection_frames(view.split["train"])
-    # the least pays for four looks
-    ledger = Ledger(max(AFTER * loaded.spec.train.steps, 4 * SCORING * len(positions)))
+    ledger = Ledger(max(AFTER * loaded.spec.train.steps, LEAST))
     judge = Judge(view, positions, ledger)
     start = Trained(loaded.spec, loaded.model, loaded.clip, registry)
     many = _trained_numbers(start)
@@ -138,7 +138,7 @@ def _replace(run: RunFolder, pruned: Trained) -> None:
 def table(after: After) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Columns and rows: one a cut, then the whole model, then the compact file."""
     columns = ("this scene needs", "of", "", "dB", "because")
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (f"{cut.after:,}", f"{cut.before:,}", f"{cut.unit}: {cut.what}",
          "–" if cut.drop is None else f"{-cut.drop:+.3f}", cut.why)
         for cut in after.cuts

@@ -200,6 +200,7 @@ class Pruning:
         frames = _spread(self.trained.clip.split["train"], VIEWS)
         views = min(len(frames), int(self.judge.ledger.left / 3))
         if views < 2:
+            self.report("splats: not asked, as nothing is left to pay for it")
             return
         self.judge.ledger.spend("sensitivities", views)
         model = self.trained.model

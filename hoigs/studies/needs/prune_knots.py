@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Protocol, TypeGuard
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from hoigs.core.clip import Clip
 from hoigs.core.context import BuildContext
@@ -64,8 +64,7 @@ def fewer_uniform(
     Each count is refitted to the motion as it is now, one fewer at a time, until one fails.
     """
     own, count = curve.knots, len(curve.knots)
-    best, values = count, {n: curve.get_parameter(n).detach().clone() for n in curve.knot_axes}
-    assert isinstance(curve, nn.Module)
+    best, values = count, _values(curve)
     curve.knots = Knots(count, movable=True).to(rest.means.device)
     try:
         still, fit = schedule.screen(curve, rest), schedule.sample_times()
@@ -75,7 +74,7 @@ def fewer_uniform(
                 if schedule.deviation(still, schedule.screen(curve, rest)) > schedule.config.pixels:
                     break
                 best = fewer
-                values = {n: curve.get_parameter(n).detach().clone() for n in curve.knot_axes}
+                values = _values(curve)
     finally:
         curve.knots = own
     if best == count:
@@ -84,9 +83,13 @@ def fewer_uniform(
     return best, {n: v * longer if "tangents" in n else v for n, v in values.items()}
 
 
+def _values(curve: Knotted) -> dict[str, Tensor]:
+    """What stands at the knots now."""
+    return {name: curve.get_parameter(name).detach().clone() for name in curve.knot_axes}
+
+
 def slowed(features: SplineMotionFeatures, count: int, fewer: int) -> Tensor:
     """The first weights of the token's network, for velocities per interval of fewer knots."""
-    weight = features.mlp[0].weight.detach().clone()
-    assert isinstance(weight, Tensor)
+    weight = features.mlp.get_parameter("0.weight").detach().clone()
     weight[:, :3] *= (fewer - 1) / (count - 1)
     return weight
