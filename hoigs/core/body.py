@@ -134,8 +134,16 @@ class BodyModel(nn.Module, ABC):
             (LEFT_SHOULDER, LEFT_ELBOW, LEFT_WRIST, 8),
             (RIGHT_SHOULDER, RIGHT_ELBOW, RIGHT_WRIST, 9),
         ):
-            hand = vertices[self.vertex_parts == part]
+            hand = vertices.index_select(0, self._vertices_of(part))
             tip = (hand - joints[wrist]).norm(dim=-1).max()
             upper = (joints[elbow] - joints[shoulder]).norm()
             lengths.append(upper + (joints[wrist] - joints[elbow]).norm() + tip)
         return torch.stack(lengths).mean()
+
+    def _vertices_of(self, part: int) -> Int[Tensor, " H"]:
+        """Rows of a part's vertices; found once, as finding them waits for the device."""
+        known: dict[Any, Tensor] = self.__dict__.setdefault("_rows_of_parts", {})
+        key = (part, self.vertex_parts.device)
+        if key not in known:
+            known[key] = (self.vertex_parts == part).nonzero().squeeze(1)
+        return known[key]

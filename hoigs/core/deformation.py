@@ -55,6 +55,7 @@ class DeformationModel(nn.Module, ABC):
         regularizer_weights: default weight of each penalty of `regularizers`; 0 where absent.
         residuals: which parts of a Residual it applies: "means", "pose". What it does not name
             changes nothing, or is refused with an error.
+        moves: False where the output is the rest at every moment, but for a residual.
         continuous: whether it is continuous in time: a small step of time is a small change.
         cut_gradients: rest fields, and prefixes of parameter names, whose gradient stops on some
             way to the output, by design; what arrives is not the derivative.
@@ -69,6 +70,7 @@ class DeformationModel(nn.Module, ABC):
     rates: ClassVar[Mapping[str, str]] = {}
     regularizer_weights: ClassVar[Mapping[str, float]] = {}
     residuals: frozenset[str] = frozenset({"means"})
+    moves: bool = True
     continuous: bool = True
     cut_gradients: frozenset[str] = frozenset()
     rest_space: Literal["canonical", "world"] = "canonical"
@@ -94,6 +96,19 @@ class DeformationModel(nn.Module, ABC):
             moment: time, and the body pose of this entity if it has one.
             residual: correction from the interaction module; None is no correction.
         """
+
+    def centers(self, rest: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
+        """The means alone of `forward` without a residual, for features that need no more."""
+        means: Tensor = self(rest, moment).means
+        return means
+
+    def hold(self, rest: Gaussians, moment: Moment) -> None:
+        """Called on a model in eval mode that changes no more, before many moments are asked of it
+        without gradients: a chance to compute once what depends on neither time nor pose.
+
+        Body shapes (`BodyPose.betas`) are those of `moment` from then on. `train()` ends it.
+        """
+        del rest, moment
 
     def set_progress(self, progress: float) -> None:
         """Called before each training step, and with 1 after the last."""

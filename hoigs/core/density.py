@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.clock import constant
 from hoigs.core.errors import RenderError
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.topology import TopologyChange
@@ -70,7 +71,7 @@ class DensityStatistics:
             absolute_gradient: as `RenderRequest.absolute_gradients` has it. loss: of the view.
         """
         visible = radii > 0
-        half = screen_gradient.new_tensor((width / 2, height / 2))
+        half = constant((width / 2, height / 2), screen_gradient)
         norm = (screen_gradient * half).norm(dim=-1)
         self.gradient_sum += torch.where(visible, norm, torch.zeros_like(norm))
         self.visible_count += visible

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.clock import constant
 from hoigs.core.errors import NotFiniteError
 from hoigs.core.rotation import multiply_quats, normalize_quats, quats_to_matrices
 
@@ -106,9 +107,8 @@ class Gaussians:
         """These Gaussians with a delta applied (see GaussianDelta for the rule of each field)."""
         quats = self.quats
         if delta.quats is not None:
-            identity = torch.zeros_like(delta.quats)
-            identity[:, 0] = 1.0
-            quats = multiply_quats(normalize_quats(identity + delta.quats), normalize_quats(quats))
+            turn = normalize_quats(delta.quats + constant((1.0, 0.0, 0.0, 0.0), delta.quats))
+            quats = multiply_quats(turn, normalize_quats(quats))
         plus = lambda raw, change: raw if change is None else raw + change  # noqa: E731
         return Gaussians(
             means=plus(self.means, delta.means),

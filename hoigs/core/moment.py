@@ -102,7 +102,9 @@ class Moment:
     """When to draw, and who stands how.
 
     Attributes:
-        time: in [0, 1] over the clip, t / (N_f - 1).
+        time: in [0, 1] over the clip, t / (N_f - 1). Playback, which asks a device for many moments
+            without waiting for it, puts a 0-d tensor here (`hoigs.core.clock`); what needs a number
+            takes `float(moment.time)`.
         index: frame number; for a time between frames, the nearest.
         poses: body pose by entity name, unbatched.
     """

@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hoigs.core.clock import Time, constant, filled
+
 # Axes (0 x, 1 y, 2 z) of the space planes xy, xz, yz, and the axis that each time plane pairs
 # with time so that the product of the two sees all four coordinates: xy*zt, xz*yt, yz*xt
 SPACE_AXES = ((0, 1), (0, 2), (1, 2))
@@ -28,17 +30,18 @@ def sample_planes(
         points: in [-1, 1]; first coordinate along W, second along H; outside is held.
     """
     count, height, width, channels = planes.shape
-    size = points.new_tensor((width - 1, height - 1))
+    size = constant((width - 1, height - 1), points)
     cell = ((points + 1) / 2).clamp(0, 1) * size
     corner = torch.minimum(cell.detach().floor(), size - 1).clamp_min(0)
     fx, fy = (cell - corner).unbind(-1)
     x, y = corner.long().unbind(-1)
-    offset = torch.arange(count, device=planes.device)[:, None] * (height * width)
+    offset = constant(tuple((i * height * width,) for i in range(count)), points, torch.long)
     # on a plane of one cell across, the neighbour is the cell itself
     right, below = min(1, width - 1), min(1, height - 1) * width
     first = offset + y * width + x
-    rows = torch.stack((first, first + right, first + below, first + below + right), dim=-1)
-    weights = torch.stack(((1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy), dim=-1)
+    rows = first[..., None] + constant((0, right, below, below + right), first)
+    across, down = torch.stack((1 - fx, fx), -1), torch.stack((1 - fy, fy), -1)
+    weights = (down[..., :, None] * across[..., None, :]).flatten(-2)
     # one gather of four contiguous rows a point: on CPUs half the time of grid_sample
     sampled = nn.functional.embedding_bag(
         rows.flatten(0, 1),
@@ -47,6 +50,22 @@ def sample_planes(
         mode="sum",
     )
     return sampled.unflatten(0, (count, -1)).transpose(0, 1).flatten(1)
+
+
+def axis_pairs(
+    points: Float[Tensor, "N 3"], axes: tuple[tuple[int, int], ...] = SPACE_AXES
+) -> Float[Tensor, "P N 2"]:
+    """Two coordinates of each point for each plane."""
+    flat = constant(tuple(axis for pair in axes for axis in pair), points, torch.long)
+    return points.index_select(1, flat).unflatten(1, (len(axes), 2)).transpose(0, 1)
+
+
+def timed_pairs(
+    points: Float[Tensor, "N 3"], clock: Time, axes: tuple[int, ...]
+) -> Float[Tensor, "P N 2"]:
+    """A coordinate of each point for each plane, and a time in [-1, 1] beside it."""
+    chosen = points.index_select(1, constant(axes, points, torch.long)).T
+    return torch.stack((chosen, filled(points, tuple(chosen.shape), clock)), -1)
 
 
 def roughness(planes: Float[Tensor, "P H W C"]) -> Float[Tensor, ""]:
@@ -86,15 +105,13 @@ class PairedPlanes(nn.Module):
         self.register_parameter("time", nn.Parameter(timed) if time_resolution else None)
 
     def forward(
-        self, points: Float[Tensor, "N 3"], time: float | None = None
+        self, points: Float[Tensor, "N 3"], time: Time | None = None
     ) -> Float[Tensor, "N F"]:
         """f at points in [-1, 1], or phi when a time in [0, 1] is given."""
-        pairs = torch.stack([points[:, axes] for axes in SPACE_AXES])
-        features = sample_planes(self.space, pairs)
+        features = sample_planes(self.space, axis_pairs(points))
         if time is None or self.time is None:
             return features
-        clock = points.new_full((len(points),), 2 * time - 1)
-        pairs = torch.stack([torch.stack((points[:, axis], clock), -1) for axis in TIME_AXES])
+        pairs = timed_pairs(points, 2 * time - 1, TIME_AXES)
         return features * sample_planes(self.time, pairs)
 
     def time_smoothness(self) -> Float[Tensor, ""]:
@@ -134,11 +151,9 @@ class ProductPlanes(nn.Module):
             torch.ones(3, time_resolution, size, channels) for size in sizes if time_resolution
         )
 
-    def forward(self, points: Float[Tensor, "N 3"], clock: float) -> Float[Tensor, "N F"]:
+    def forward(self, points: Float[Tensor, "N 3"], clock: Time) -> Float[Tensor, "N F"]:
         """Features at points in [-1, 1] and a time in [-1, 1], both held outside."""
-        pairs = torch.stack([points[:, axes] for axes in SPACE_AXES])
-        when = points.new_full((len(points),), clock)
-        timed = torch.stack([torch.stack((points[:, axis], when), -1) for axis in range(3)])
+        pairs, timed = axis_pairs(points), timed_pairs(points, clock, (0, 1, 2))
         scales = []
         for scale, space in enumerate(self.space):
             planes = sample_planes(space, pairs)

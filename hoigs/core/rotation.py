@@ -2,9 +2,70 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from hoigs.core.clock import constant
+
+# Products of quaternions and the matrices of their rotations are sums of a few products a_i b_j:
+# written as tables, each is two operations on all rows instead of thirty.
+_W, _X, _Y, _Z = range(4)
+
+
+def _table(sums: Sequence[Mapping[int, float]], rows: int) -> tuple[tuple[float, ...], ...]:
+    """[rows, len(sums)]: what each row gives to each of the sums."""
+    return tuple(tuple(terms.get(row, 0.0) for terms in sums) for row in range(rows))
+
+
+def _products(*terms: tuple[float, int, int]) -> dict[int, float]:
+    found: dict[int, float] = {}
+    for sign, i, j in terms:
+        found[4 * i + j] = found.get(4 * i + j, 0.0) + sign
+    return found
+
+
+HAMILTON = _table(
+    [
+        _products((1, _W, _W), (-1, _X, _X), (-1, _Y, _Y), (-1, _Z, _Z)),
+        _products((1, _W, _X), (1, _X, _W), (1, _Y, _Z), (-1, _Z, _Y)),
+        _products((1, _W, _Y), (-1, _X, _Z), (1, _Y, _W), (1, _Z, _X)),
+        _products((1, _W, _Z), (1, _X, _Y), (-1, _Y, _X), (1, _Z, _W)),
+    ],
+    16,
+)
+MATRIX_OF_PAIRS = _table(  # less the identity; rows of the matrix one after the other
+    [
+        _products((-2, _Y, _Y), (-2, _Z, _Z)),
+        _products((2, _X, _Y), (-2, _W, _Z)),
+        _products((2, _X, _Z), (2, _W, _Y)),
+        _products((2, _X, _Y), (2, _W, _Z)),
+        _products((-2, _X, _X), (-2, _Z, _Z)),
+        _products((2, _Y, _Z), (-2, _W, _X)),
+        _products((2, _X, _Z), (-2, _W, _Y)),
+        _products((2, _Y, _Z), (2, _W, _X)),
+        _products((-2, _X, _X), (-2, _Y, _Y)),
+    ],
+    16,
+)
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+# 4 q_i (w, x, y, z) for each pivot i, from a matrix's entries m_00, m_01, ... m_22
+_A, _B, _C = {7: 1.0, 5: -1.0}, {2: 1.0, 6: -1.0}, {3: 1.0, 1: -1.0}
+_D, _E, _F = {3: 1.0, 1: 1.0}, {2: 1.0, 6: 1.0}, {7: 1.0, 5: 1.0}
+PIVOTS = _table(
+    [
+        {0: 1.0, 4: 1.0, 8: 1.0}, _A, _B, _C,
+        _A, {0: 1.0, 4: -1.0, 8: -1.0}, _D, _E,
+        _B, _D, {0: -1.0, 4: 1.0, 8: -1.0}, _F,
+        _C, _E, _F, {0: -1.0, 4: -1.0, 8: 1.0},
+    ],
+    9,
+)  # fmt: skip
+UNIT_PIVOTS = (
+    (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+)  # fmt: skip
 
 
 def normalize_quats(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
@@ -16,28 +77,14 @@ def multiply_quats(
     a: Float[Tensor, "*batch 4"], b: Float[Tensor, "*batch 4"]
 ) -> Float[Tensor, "*batch 4"]:
     """Hamilton product a*b: rotate by b first, then by a."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        (
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ),
-        dim=-1,
-    )
+    return _pairs(a, b) @ constant(HAMILTON, a)
 
 
 def quats_to_matrices(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of quaternions, which need not be normalised."""
-    w, x, y, z = normalize_quats(quats).unbind(-1)
-    rows = (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    unit = normalize_quats(quats)
+    turn = _pairs(unit, unit) @ constant(MATRIX_OF_PAIRS, unit)
+    return (turn + constant(IDENTITY, unit)).unflatten(-1, (3, 3))
 
 
 def matrices_to_quats(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
@@ -45,24 +92,17 @@ def matrices_to_quats(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*
 
     Of the four classical formulas the one with the largest pivot is used (Shepperd, 1978).
     """
-    m = matrices
-    m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    squares = torch.stack(
-        (1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22), -1
-    )
-    a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
-    d, e, f = m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] + m[..., 1, 2]
-    candidates = torch.stack(
-        (
-            torch.stack((squares[..., 0], a, b, c), -1),
-            torch.stack((a, squares[..., 1], d, e), -1),
-            torch.stack((b, d, squares[..., 2], f), -1),
-            torch.stack((c, e, f, squares[..., 3]), -1),
-        ),
-        dim=-2,
-    )
-    pick = squares.detach().argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
+    flat = matrices.flatten(-2)
+    candidates = (flat @ constant(PIVOTS, flat)).unflatten(-1, (4, 4))
+    candidates = candidates + constant(UNIT_PIVOTS, flat)
+    squares = candidates.detach().diagonal(dim1=-2, dim2=-1)
+    pick = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
     return normalize_quats(candidates.gather(-2, pick).squeeze(-2))
+
+
+def _pairs(a: Tensor, b: Tensor) -> Tensor:
+    """All 16 products of a number of one and a number of the other."""
+    return (a[..., :, None] * b[..., None, :]).flatten(-2)
 
 
 def axis_angle_to_quats(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
@@ -114,10 +154,10 @@ def slerp(
     b = torch.where(dot < 0, -b, b)
     dot = dot.abs()
     near = dot > 0.9995
-    angle = torch.acos(torch.where(near, torch.full_like(dot, 0.5), dot).clamp(max=1.0))
+    angle = torch.acos(torch.where(near, 0.5, dot))
     sine = torch.sin(angle)
-    wa = torch.where(near, 1 - r + torch.zeros_like(dot), torch.sin((1 - r) * angle) / sine)
-    wb = torch.where(near, r + torch.zeros_like(dot), torch.sin(r * angle) / sine)
+    wa = torch.where(near, 1 - r, torch.sin((1 - r) * angle) / sine)
+    wb = torch.where(near, r, torch.sin(r * angle) / sine)
     return normalize_quats(wa * a + wb * b)
 
 

@@ -9,12 +9,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.clock import constant
 from hoigs.core.rotation import axis_angle_to_matrices
+
+UNMOVED = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
 @lru_cache(maxsize=32)
-def _levels(parents: tuple[int, ...]) -> tuple[list[tuple[list[int], list[int]]], list[int]]:
-    """Joints of each depth with their parent's place one depth above; and the order back."""
+def _ancestors(parents: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
+    """Places of each joint's ancestor 1, 2, 4, … above it, place 0 for none and j + 1 for joint j;
+    as many rounds as bring every joint to the root."""
     depth: list[int] = []
     for joint, parent in enumerate(parents):
         if parent >= joint or (parent < 0) != (joint == 0):
@@ -23,15 +27,12 @@ def _levels(parents: tuple[int, ...]) -> tuple[list[tuple[list[int], list[int]]]
                 "and every parent before its children"
             )
         depth.append(0 if parent < 0 else depth[parent] + 1)
-    place: dict[int, int] = {}
-    levels: list[tuple[list[int], list[int]]] = []
-    order: list[int] = []
-    for level in range(max(depth) + 1):
-        joints = [j for j, d in enumerate(depth) if d == level]
-        levels.append((joints, [place.get(parents[j], 0) for j in joints]))
-        place = {j: i for i, j in enumerate(joints)}
-        order += joints
-    return levels, [order.index(j) for j in range(len(parents))]
+    above = (0, *(parent + 1 for parent in parents))
+    rounds = []
+    for _ in range(max(depth).bit_length()):
+        rounds.append(above)
+        above = tuple(above[place] for place in above)
+    return tuple(rounds)
 
 
 def joint_transforms(
@@ -48,27 +49,25 @@ def joint_transforms(
         parents: -1 for joint 0, the root; parents before children (else ValueError).
         transl: added last, metres.
     """
-    matrices = axis_angle_to_matrices(rotations)
+    parents = tuple(parents)
+    rounds = _ancestors(parents)
     joints = joints.expand(rotations.shape)
-    bones = joints - joints[..., [max(p, 0) for p in parents], :]
-    levels, order = _levels(tuple(parents))
-    # a depth of the tree at a time: 11 steps for a body with hands, not 52
-    turn = matrices[..., :1, :, :]
-    place = joints[..., :1, :] + transl[..., None, :]
-    turns, places = [turn], [place]
-    for indices, above in levels[1:]:
-        base = turn[..., above, :, :]
-        place = place[..., above, :] + (base @ bones[..., indices, :, None])[..., 0]
-        turn = base @ matrices[..., indices, :, :]
-        turns.append(turn)
-        places.append(place)
-    rotation = torch.cat(turns, -3)[..., order, :, :]
-    position = torch.cat(places, -2)[..., order, :]
+    # before the root stands a joint without a transform: it is the parent of all that have none
+    bases = torch.cat((-transl[..., None, :], joints), -2)
+    above = constant(tuple(parent + 1 for parent in parents), joints, torch.long)
+    bones = joints - bases.index_select(-2, above)
+    local = torch.cat((axis_angle_to_matrices(rotations), bones[..., None]), -1)
+    last = constant((0.0, 0.0, 0.0, 1.0), local).expand(*local.shape[:-2], 1, 4)
+    local = torch.cat((local, last), -2)
+    none = constant(UNMOVED, local).expand(*local.shape[:-3], 1, 4, 4)
+    world = torch.cat((none, local), -3)
+    # each joint's chain doubles in a round: 4 products for a body with hands, not one a depth
+    for places in rounds:
+        world = world.index_select(-3, constant(places, world, torch.long)) @ world
+    top = world[..., 1:, :3, :]
+    rotation, position = top[..., :3], top[..., 3]
     shift = position - (rotation @ joints[..., None])[..., 0]
-    top = torch.cat((rotation, shift[..., None]), -1)
-    bottom = torch.zeros_like(top[..., :1, :])
-    bottom[..., 3] = 1.0
-    return torch.cat((top, bottom), -2)
+    return torch.cat((torch.cat((rotation, shift[..., None]), -1), last), -2)
 
 
 def transform_points(

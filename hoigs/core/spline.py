@@ -8,11 +8,13 @@ knots that it needs, never all K of them.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, overload
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from hoigs.core.clock import Time, constant
 
 
 def keyframe_count(num_frames: int, step: int) -> int:
@@ -25,7 +27,15 @@ def keyframe_count(num_frames: int, step: int) -> int:
     return max(2, math.floor((num_frames - 1) / step + 0.5) + 1)
 
 
-def keyframe_position(time: float, keyframes: int) -> tuple[int, float]:
+@overload
+def keyframe_position(time: float, keyframes: int) -> tuple[int, float]: ...
+
+
+@overload
+def keyframe_position(time: Tensor, keyframes: int) -> tuple[Tensor, Tensor]: ...
+
+
+def keyframe_position(time: Any, keyframes: int) -> tuple[Any, Any]:
     """First knot k and position r in [0, 1] of `time` within the interval [k, k + 1].
 
     t_s = t_n (K - 1), as in the paper, but k = min(floor(t_s), K - 2): its formula asks for the
@@ -33,12 +43,23 @@ def keyframe_position(time: float, keyframes: int) -> tuple[int, float]:
     """
     if keyframes < 2:
         raise ValueError(f"a spline needs at least 2 keyframes, got {keyframes}")
+    if isinstance(time, Tensor):
+        place = time.clamp(0.0, 1.0) * (keyframes - 1)
+        below = place.floor().clamp_max(keyframes - 2)
+        return below.long(), place - below
     scaled = min(max(time, 0.0), 1.0) * (keyframes - 1)
     k = min(math.floor(scaled), keyframes - 2)
     return k, scaled - k
 
 
-def hermite_basis(r: float) -> tuple[float, float, float, float]:
+def knot_pair(values: Float[Tensor, "N K ..."], k: Any) -> tuple[Tensor, Tensor]:
+    """Values at knots k and k + 1, where k is a number or a 0-d tensor."""
+    if isinstance(k, Tensor):
+        return values.index_select(1, k).squeeze(1), values.index_select(1, k + 1).squeeze(1)
+    return values[:, k], values[:, k + 1]
+
+
+def hermite_basis(r: Any) -> tuple[Any, Any, Any, Any]:
     """Weights of m_k, tau_k, m_{k+1}, tau_{k+1} at r in [0, 1] (HOIGS, equation of CHS)."""
     return (
         2 * r**3 - 3 * r**2 + 1,
@@ -48,7 +69,7 @@ def hermite_basis(r: float) -> tuple[float, float, float, float]:
     )
 
 
-def hermite_basis_derivative(r: float) -> tuple[float, float, float, float]:
+def hermite_basis_derivative(r: Any) -> tuple[Any, Any, Any, Any]:
     """Derivative of `hermite_basis` in r: per keyframe interval."""
     return 6 * r**2 - 6 * r, 3 * r**2 - 4 * r + 1, -6 * r**2 + 6 * r, 3 * r**2 - 2 * r
 
@@ -56,7 +77,7 @@ def hermite_basis_derivative(r: float) -> tuple[float, float, float, float]:
 def cubic_hermite(
     values: Float[Tensor, "N K D"],
     tangents: Float[Tensor, "N K D"],
-    time: float,
+    time: Time,
     *,
     derivative: bool = False,
 ) -> Float[Tensor, "N D"]:
@@ -68,13 +89,15 @@ def cubic_hermite(
     """
     k, r = keyframe_position(time, values.shape[1])
     weights = hermite_basis_derivative(r) if derivative else hermite_basis(r)
-    m, tau = values[:, k : k + 2], tangents[:, k : k + 2]
-    return (
-        weights[0] * m[:, 0]
-        + weights[1] * tau[:, 0]
-        + weights[2] * m[:, 1]
-        + (weights[3] * tau[:, 1])
-    )
+    return weighted(weights, knot_pair(values, k), knot_pair(tangents, k))
+
+
+def weighted(
+    weights: tuple[Any, Any, Any, Any], values: tuple[Tensor, Tensor], slopes: tuple[Tensor, Tensor]
+) -> Tensor:
+    """An interval's values and tangents, summed by the weights of `hermite_basis`."""
+    total: Tensor = weights[0] * values[0] + weights[1] * slopes[0] + weights[2] * values[1]
+    return total + weights[3] * slopes[1]
 
 
 def catmull_rom_tangents(values: Float[Tensor, "N K D"]) -> Float[Tensor, "N K D"]:
@@ -86,24 +109,33 @@ def catmull_rom_tangents(values: Float[Tensor, "N K D"]) -> Float[Tensor, "N K D
 
 
 def catmull_rom(
-    values: Float[Tensor, "N K D"], time: float, *, derivative: bool = False
+    values: Float[Tensor, "N K D"], time: Time, *, derivative: bool = False
 ) -> Float[Tensor, "N D"]:
     """`cubic_hermite` with `catmull_rom_tangents`, from the four knots about `time` alone."""
-    k, _ = keyframe_position(time, values.shape[1])
-    first, last = max(k - 1, 0), min(k + 2, values.shape[1] - 1)
-    window = values[:, first : last + 1]
-    count = window.shape[1]
-    # the time within the window at which its knots stand where they stood in the whole
-    scaled = min(max(time, 0.0), 1.0) * (values.shape[1] - 1) - first
-    tangents = catmull_rom_tangents(window)
-    return cubic_hermite(window, tangents, scaled / (count - 1), derivative=derivative)
+    last = values.shape[1] - 1
+    k, r = keyframe_position(time, last + 1)
+    weights = hermite_basis_derivative(r) if derivative else hermite_basis(r)
+    if isinstance(k, Tensor):
+        near = (k + constant((-1, 0, 1, 2), k)).clamp(0, last)
+        window = values.index_select(1, near)
+        # over two intervals, but over one at an end
+        spans = (near[2:] - near[:2])[:, None].to(values)
+        slopes = (window[:, 2:] - window[:, :2]) / spans
+        return weighted(weights, knot_pair(window, 1), knot_pair(slopes, 0))
+    window = values[:, max(k - 1, 0) : k + 3]
+    first, second = catmull_rom_tangents(window)[:, min(k, 1) : min(k, 1) + 2].unbind(1)
+    return weighted(weights, knot_pair(values, k), (first, second))
 
 
-def linear(values: Float[Tensor, "N K ..."], time: float) -> Float[Tensor, "N ..."]:
+def linear(values: Float[Tensor, "N K ..."], time: Time) -> Float[Tensor, "N ..."]:
     """Piecewise linear interpolation over the knots."""
     k, r = keyframe_position(time, values.shape[1])
-    pair = values[:, k : k + 2]
-    return torch.lerp(pair[:, 0], pair[:, 1], r)
+    return lerp(*knot_pair(values, k), r)
+
+
+def lerp(low: Tensor, high: Tensor, r: Any) -> Tensor:
+    """torch.lerp for a position r that is a number or a 0-d tensor of any type."""
+    return torch.lerp(low, high, r.to(low.dtype) if isinstance(r, Tensor) else r)
 
 
 def accelerations(values: Float[Tensor, "N K D"]) -> Float[Tensor, "N K2 D"]:

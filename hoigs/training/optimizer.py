@@ -77,7 +77,8 @@ def named_rates(model: SceneModel) -> Iterator[tuple[str, nn.Parameter, str, Ent
 
 
 class GroupedAdam:
-    """Adam with one group a parameter, so that each has its own schedule and name.
+    """Adam with a schedule for each parameter; those with the same one are a group, as a group
+    takes a few launches and a tenth of a millisecond, however many parameters it has.
 
     Args:
         cameras: its parameters take the rate "camera" and are named "cameras.…".
@@ -93,8 +94,7 @@ class GroupedAdam:
     ) -> None:
         self.names: dict[str, nn.Parameter] = {}
         self.roles: list[str] = []  # name of the rate of each, in the same order
-        self.schedules: list[Schedule] = []
-        groups = []
+        self.schedules: list[Schedule] = []  # of each, likewise
         views = [] if cameras is None else cameras.named_parameters(prefix="cameras")
         trained = chain(named_rates(model), ((name, p, "camera", None) for name, p in views))
         for name, parameter, rate, entity in trained:
@@ -112,14 +112,24 @@ class GroupedAdam:
             self.names[name] = parameter
             self.roles.append(rate)
             self.schedules.append(Schedule(start, final, begin))
-            groups.append({"params": [parameter], "lr": start})
+        groups: dict[Schedule, list[nn.Parameter]] = {}
+        for parameter, schedule in zip(self.names.values(), self.schedules, strict=True):
+            groups.setdefault(schedule, []).append(parameter)
         # eps as in 3DGS: gradients of single Gaussians are tiny, the default would damp them
-        self.adam = torch.optim.Adam(groups, lr=1e-3, eps=1e-15, fused=True)
+        self.adam = torch.optim.Adam(
+            [{"params": members, "lr": s.start, "schedule": s} for s, members in groups.items()],
+            lr=1e-3, eps=1e-15, fused=True,
+        )  # fmt: skip
         self.sh_rest = rates.sh_rest
 
     def set_progress(self, progress: float) -> None:
-        for group, schedule in zip(self.adam.param_groups, self.schedules, strict=True):
-            group["lr"] = schedule.at(progress)
+        for group in self.adam.param_groups:
+            group["lr"] = group["schedule"].at(progress)
+
+    def learning_rates(self) -> dict[str, float]:
+        """Of each parameter, now."""
+        now = {group["schedule"]: float(group["lr"]) for group in self.adam.param_groups}
+        return {name: now[s] for name, s in zip(self.names, self.schedules, strict=True)}
 
     def position_rate(self, entity: str) -> float:
         """Learning rate now of an entity's positions, metres a step.
@@ -127,16 +137,15 @@ class GroupedAdam:
         Of its rest means, or of the keyframes of a deformation that owns these; 0 when neither
         is trained.
         """
-        mine = {
-            name.removeprefix(f"entities.{entity}."): (role, group["lr"])
-            for name, role, group in zip(
-                self.names, self.roles, self.adam.param_groups, strict=True
-            )
-            if name.startswith(f"entities.{entity}.")
-        }
-        if "means" in mine:
-            return float(mine["means"][1])
-        return max((float(rate) for role, rate in mine.values() if role == "keyframes"), default=0)
+        prefix, rates = f"entities.{entity}.", self.learning_rates()
+        if f"{prefix}means" in rates:
+            return rates[f"{prefix}means"]
+        keyed = [
+            rates[name]
+            for name, role in zip(self.names, self.roles, strict=True)
+            if name.startswith(prefix) and role == "keyframes"
+        ]
+        return max(keyed, default=0.0)
 
     def step(self, sh_degree: int | None = None) -> None:
         """One update; harmonics above `sh_degree` wait, None waits for nothing."""

@@ -157,8 +157,10 @@ class Trainer:
         still = replace(camera, world_to_camera=camera.world_to_camera.detach())
         self._evolve(result, frame.moment, still)
         self._refine(result, camera.width, camera.height)
-        terms = {name: float(term.detach()) for name, term in result.terms.items()}
-        return {**terms, "total": float(result.total.detach())}
+        terms = {**result.terms, "total": result.total}
+        # one answer of the device, not one a term
+        values = torch.stack([term.detach().reshape(()) for term in terms.values()]).tolist()
+        return dict(zip(terms, values, strict=True))
 
     def _camera(self, frame: Frame) -> Camera:
         """Of a frame, as it has been refined so far."""

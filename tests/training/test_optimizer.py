@@ -48,8 +48,7 @@ def test_position_rate_of_the_scene_scales_with_its_extent():
     rates = RatesSpec(means=1e-3)
     adam = GroupedAdam(model, rates, WarmupSpec(), scene_extent=5.0)
     adam.set_progress(0.0)
-    index = list(adam.names).index("entities.scene.means")
-    assert adam.adam.param_groups[index]["lr"] == pytest.approx(5e-3)
+    assert adam.learning_rates()["entities.scene.means"] == pytest.approx(5e-3)
 
 
 def test_motion_does_not_move_before_its_warmup():
@@ -88,7 +87,7 @@ def test_which_rates_are_in_units_of_the_extent():
     rates = RatesSpec(means=1e-3, opacity=0.05, by_extent=("opacity",))
     adam = GroupedAdam(model, rates, WarmupSpec(), scene_extent=5.0)
     adam.set_progress(0.0)
-    rate = {n: g["lr"] for n, g in zip(adam.names, adam.adam.param_groups, strict=True)}
+    rate = adam.learning_rates()
     assert rate["entities.scene.means"] == pytest.approx(1e-3)
     assert rate["entities.scene.opacity_logits"] == pytest.approx(0.25)
     with pytest.raises(ValueError, match='no rate "opacit"; did you mean "opacity"'):
@@ -128,3 +127,25 @@ def test_harmonics_wait_for_their_degree():
     sh.grad = torch.ones_like(sh)
     adam.step()
     assert ((sh.detach() - before).abs().amax((0, 2)) > 0).all()
+
+
+def test_parameters_of_one_schedule_are_stepped_as_if_each_were_alone():
+    together, alone = make_model(), make_model()
+    alone.load_state_dict(together.state_dict())
+    ours = GroupedAdam(together, RatesSpec(), WarmupSpec(), scene_extent=2.0)
+    assert len(ours.adam.param_groups) < len(ours.names)
+    ours.set_progress(0.6)
+    rates = ours.learning_rates()
+    theirs = {name: p for name, p, _, _ in named_rates(alone)}
+    single = torch.optim.Adam(
+        [{"params": [p], "lr": rates[name]} for name, p in theirs.items()], eps=1e-15, fused=True
+    )
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(3):
+        for name, parameter in ours.names.items():
+            parameter.grad = torch.randn(parameter.shape, generator=generator)
+            theirs[name].grad = parameter.grad.clone()
+        ours.step()
+        single.step()
+    for name, parameter in ours.names.items():
+        assert torch.equal(parameter, theirs[name]), name

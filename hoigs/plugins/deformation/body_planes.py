@@ -9,7 +9,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from hoigs.core.body import PART_NAMES
-from hoigs.core.planes import SPACE_AXES, PairedPlanes, sample_planes
+from hoigs.core.clock import Time
+from hoigs.core.planes import PairedPlanes, axis_pairs, sample_planes, timed_pairs
 
 Fusion = Literal["paired", "product"]
 
@@ -40,14 +41,13 @@ class ScaledProductPlanes(nn.Module):
         )
 
     def forward(
-        self, points: Float[Tensor, "N 3"], time: float | None = None
+        self, points: Float[Tensor, "N 3"], time: Time | None = None
     ) -> Float[Tensor, "N F"]:
         """f at points in [-1, 1], or phi when a time in [0, 1] is given."""
-        pairs = torch.stack([points[:, axes] for axes in SPACE_AXES])
+        pairs = axis_pairs(points)
         features = [_product(space, pairs) for space in self.space]
         if time is not None and len(self.time):
-            clock = points.new_full((len(points),), 2 * time - 1)
-            pairs = torch.stack([torch.stack((points[:, axis], clock), -1) for axis in range(3)])
+            pairs = timed_pairs(points, 2 * time - 1, (0, 1, 2))
             timed = [_product(planes, pairs) for planes in self.time]
             features = [f * t for f, t in zip(features, timed, strict=True)]
         return torch.cat(features, dim=1)

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from hoigs.core import spline
 from hoigs.core.clip import ObjectTrack
+from hoigs.core.clock import Time
 from hoigs.core.config import ComponentConfig
 from hoigs.core.context import BuildContext
 from hoigs.core.deformation import DeformationModel, StepEvidence
@@ -186,7 +187,11 @@ class CubicHermite(Resizing, DeformationModel):
             moved = replace(moved, opacity_logits=logits)
         return moved
 
-    def _means(self, time: float, *, derivative: bool = False) -> Float[Tensor, "N 3"]:
+    def centers(self, rest: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
+        del rest
+        return self._means(moment.time)
+
+    def _means(self, time: Time, *, derivative: bool = False) -> Float[Tensor, "N 3"]:
         if self.learned:
             return self.knots.hermite(
                 self.keyframe_means, self.tangents, time, derivative=derivative

@@ -193,6 +193,7 @@ class HexPlaneSkinning(SkinnedBody):
         self.register_buffer("field_vertices", field, persistent=False)
         self._cached: tuple[object, CanonicalAttributes, Tensor] | None = None
         self._last: tuple[CanonicalAttributes, Tensor] | None = None
+        self._held: tuple[Gaussians, Tensor] | None = None
 
     @classmethod
     def from_config(cls, config: HexPlaneSkinningConfig, context: BuildContext) -> Self:
@@ -222,14 +223,18 @@ class HexPlaneSkinning(SkinnedBody):
     def forward(
         self, rest: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
-        attributes, weights = self._attributes(rest)
         pose = self.pose(moment)
+        vertices, joints = self.shaped(pose.betas)
+        if self._held is not None and self.held:
+            canonical, weights = self._held
+        else:
+            attributes, weights = self._attributes(rest)
+            canonical = self._canonical(rest, attributes, pose, vertices)
         if residual is not None and residual.pose is not None:
             pose = pose.with_residual(residual.pose, self.residual_rule)
         transforms = self.body.skinning_transforms(pose)
-        canonical = self._canonical(rest, attributes, pose)
         means = skin_points(canonical.means, weights, transforms)
-        pelvis = self.posed_joints(pose, transforms, [PELVIS])[0]
+        pelvis = self.posed_joints(joints, transforms, (PELVIS,))[0]
         means = self.scaled(means, pelvis, moment)
         if residual is not None and residual.means is not None:
             means = means + residual.means
@@ -240,6 +245,15 @@ class HexPlaneSkinning(SkinnedBody):
             quats=multiply_quats(turns, canonical.quats),
             log_scales=canonical.log_scales + self.log_alpha,
         )
+
+    @torch.no_grad()
+    def hold(self, rest: Gaussians, moment: Moment) -> None:
+        """As SkinnedBody, and the canonical Gaussians with it."""
+        super().hold(rest, moment)
+        pose = self.pose(moment)
+        attributes, weights = self._attributes(rest)
+        canonical = self._canonical(rest, attributes, pose, self.shaped(pose.betas)[0])
+        self._held = (canonical, weights)
 
     def _attributes(self, rest: Gaussians) -> tuple[CanonicalAttributes, Float[Tensor, "N J"]]:
         """psi_h of every canonical point, and its skinning weights. Neither depends on time, so
@@ -263,7 +277,9 @@ class HexPlaneSkinning(SkinnedBody):
         return attributes, weights
 
     def train(self, mode: bool = True) -> Self:
-        self._cached = None
+        self._cached = self._held = None
+        if not mode:
+            self._last = None  # of a step; a copy of the model could not be made with its graph
         return super().train(mode)
 
     def _remember(self, attributes: CanonicalAttributes, weights: Tensor) -> None:
@@ -278,12 +294,16 @@ class HexPlaneSkinning(SkinnedBody):
             attributes.offsets.register_hook(forget)
 
     def _canonical(
-        self, rest: Gaussians, attributes: CanonicalAttributes, pose: BodyPose
+        self,
+        rest: Gaussians,
+        attributes: CanonicalAttributes,
+        pose: BodyPose,
+        vertices: Float[Tensor, "V 3"],
     ) -> Gaussians:
-        """Gaussians of the zero pose, in the pose's shape."""
+        """Gaussians of the zero pose, in the pose's shape, which gives the vertices."""
         offsets = attributes.offsets
         if pose.betas.requires_grad or not torch.equal(pose.betas, self.betas):
-            change = self.shaped(pose.betas)[0] - self.rest_vertices
+            change = vertices - self.rest_vertices
             corners = change[self.body.faces[self.faces]]
             offsets = offsets + (corners * self.barycentric[..., None]).sum(1)
         bands = rest.sh.shape[1]
@@ -312,12 +332,11 @@ class HexPlaneSkinning(SkinnedBody):
         """
         del rest
         with torch.no_grad():
-            pose = self.pose(moment)
-            transforms = self.body.skinning_transforms(pose)
-            points = self.shaped(pose.betas)[0][self.field_vertices]
-            weights = self.body.skinning_weights[self.field_vertices]
-            posed = skin_points(points, weights, transforms)
-            pelvis = self.posed_joints(pose, transforms, [PELVIS])[0]
+            stance = self.stance(moment)
+            points = stance.vertices.index_select(0, self.field_vertices)
+            weights = self.body.skinning_weights.index_select(0, self.field_vertices)
+            posed = skin_points(points, weights, stance.transforms)
+            pelvis = self.posed_joints(stance.joints, stance.transforms, (PELVIS,))[0]
             places = self.scaled(posed, pelvis, moment)
         read = posed - pelvis if self.field_posed else points - self.rest_joints[PELVIS]
         return self.planes(read / self.half_box, moment.time), places
@@ -341,7 +360,7 @@ class HexPlaneSkinning(SkinnedBody):
         """Rows of the surface follow; a child keeps its parent's weights, part and face."""
         for name in ("log_weights", "parts", "faces", "barycentric"):
             setattr(self, name, getattr(self, name)[change.source].contiguous())
-        self.neighbours = self._cached = self._last = None
+        self.neighbours = self._cached = self._last = self._held = None
 
     def regularizers(self) -> dict[str, Tensor]:
         """Means over points (or cells) of squared quantities, but for the sparsity.

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core import spline
+from hoigs.core.clock import Time
 from hoigs.core.rotation import slerp
 from hoigs.plugins.deformation.resizing import Resizing
 
@@ -59,11 +60,18 @@ class Knots(Resizing):
         if self.movable:
             self._times = self.times.tolist()
 
-    def at(self, time: float) -> tuple[int, float, float]:
+    def at(self, time: Time) -> tuple[Any, Any, Any]:
         """First knot k, position r in [0, 1] within [k, k + 1], and that interval's length in
-        reference intervals."""
+        reference intervals: numbers, or 0-d tensors for a time that is one."""
         if not self.movable:
-            return *spline.keyframe_position(time, len(self)), 1.0
+            k, r = spline.keyframe_position(time, len(self))
+            return k, r, 1.0
+        if isinstance(time, Tensor):
+            time = time.clamp(0.0, 1.0)
+            first = torch.searchsorted(self.times, time, right=True) - 1
+            first = first.clamp(0, len(self) - 2)
+            low, high = (x.squeeze(0) for x in spline.knot_pair(self.times[None], first))
+            return first, (time - low) / (high - low), (high - low) / self.reference
         time = min(max(time, 0.0), 1.0)
         k = min(max(bisect_right(self._times, time) - 1, 0), len(self) - 2)
         length = self._times[k + 1] - self._times[k]
@@ -73,47 +81,51 @@ class Knots(Resizing):
         self,
         values: Float[Tensor, "N K D"],
         tangents: Float[Tensor, "N K D"],
-        time: float,
+        time: Time,
         *,
         derivative: bool = False,
     ) -> Float[Tensor, "N D"]:
         """Cubic Hermite spline with explicit tangents; its derivative is per reference interval."""
         k, r, h = self.at(time)
-        return _hermite(values[:, k : k + 2], tangents[:, k : k + 2], r, h, derivative)
+        pairs = spline.knot_pair(values, k), spline.knot_pair(tangents, k)
+        return _hermite(*pairs, r, h, derivative)
 
     def catmull_rom(
-        self, values: Float[Tensor, "N K D"], time: float, *, derivative: bool = False
+        self, values: Float[Tensor, "N K D"], time: Time, *, derivative: bool = False
     ) -> Float[Tensor, "N D"]:
         """`hermite` with `differences` for tangents, from the four knots about `time` alone."""
         k, r, h = self.at(time)
+        if isinstance(k, Tensor):  # which four is not known here: the tangents of all knots
+            return self.hermite(values, self.differences(values), time, derivative=derivative)
         first, last = max(k - 1, 0), min(k + 3, len(self))
         window = values[:, first:last]
-        tangents = self._differences(window, self._times[first:last])[:, k - first : k - first + 2]
-        return _hermite(values[:, k : k + 2], tangents, r, h, derivative)
+        tangents = self._differences(window, self.times[first:last])
+        slopes = spline.knot_pair(tangents, k - first)
+        return _hermite(spline.knot_pair(values, k), slopes, r, h, derivative)
 
     def differences(self, values: Float[Tensor, "N K D"]) -> Float[Tensor, "N K D"]:
         """Finite differences of the knots, one-sided at the ends; exact for parabolas between.
 
         With uniform knots (m_{k+1} - m_{k-1}) / 2, as `spline.catmull_rom_tangents`.
         """
-        return self._differences(values, self._times)
+        return self._differences(values, self.times)
 
-    def _differences(self, values: Tensor, times: Sequence[float]) -> Tensor:
+    def _differences(self, values: Tensor, times: Tensor) -> Tensor:
         if not self.movable:
             return spline.catmull_rom_tangents(values)
-        t = values.new_tensor(times) / self.reference
+        t = times.to(values) / self.reference
         h = (t[1:] - t[:-1])[:, None]
         slopes = (values[:, 1:] - values[:, :-1]) / h
         inner = (h[1:] * slopes[:, :-1] + h[:-1] * slopes[:, 1:]) / (h[1:] + h[:-1])
         return torch.cat((slopes[:, :1], inner, slopes[:, -1:]), dim=1)
 
-    def linear(self, values: Float[Tensor, "N K ..."], time: float) -> Float[Tensor, "N ..."]:
+    def linear(self, values: Float[Tensor, "N K ..."], time: Time) -> Float[Tensor, "N ..."]:
         k, r, _ = self.at(time)
-        return torch.lerp(values[:, k], values[:, k + 1], r)
+        return spline.lerp(*spline.knot_pair(values, k), r)
 
-    def slerp(self, quats: Float[Tensor, "N K 4"], time: float) -> Float[Tensor, "N 4"]:
+    def slerp(self, quats: Float[Tensor, "N K 4"], time: Time) -> Float[Tensor, "N 4"]:
         k, r, _ = self.at(time)
-        return slerp(quats[:, k], quats[:, k + 1], r)
+        return slerp(*spline.knot_pair(quats, k), r)
 
     def hermite_at(
         self,
@@ -180,15 +192,16 @@ class Knots(Resizing):
         return values, tangents
 
 
-def _hermite(values: Tensor, tangents: Tensor, r: float, h: float, derivative: bool) -> Tensor:
+def _hermite(
+    values: tuple[Tensor, Tensor],
+    tangents: tuple[Tensor, Tensor],
+    r: Any,
+    h: Any,
+    derivative: bool,
+) -> Tensor:
     """One interval of length h: two values, two tangents."""
     if derivative:
-        w = [x / h for x in spline.hermite_basis_derivative(r)]
+        first, second, third, fourth = (x / h for x in spline.hermite_basis_derivative(r))
     else:
-        w = list(spline.hermite_basis(r))
-    return (
-        w[0] * values[:, 0]
-        + (w[1] * h) * tangents[:, 0]
-        + w[2] * values[:, 1]
-        + (w[3] * h) * tangents[:, 1]
-    )
+        first, second, third, fourth = spline.hermite_basis(r)
+    return spline.weighted((first, second * h, third, fourth * h), values, tangents)

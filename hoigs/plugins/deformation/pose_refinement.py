@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hoigs.core.clock import Time
 from hoigs.core.moment import BodyPose
 from hoigs.plugins.deformation.trained_frames import TrainedFrames
 
@@ -34,16 +35,11 @@ class PoseRefinement(nn.Module):
         """Frames whose corrections are learned; the others are interpolated from these."""
         self.frames.set(indices)
 
-    def neighbours(self, time: float) -> tuple[int, int, float]:
-        """Trained frames about `time` and the position between them; held at the ends."""
-        return self.frames.neighbours(time)
-
-    def forward(self, pose: BodyPose, time: float) -> BodyPose:
+    def forward(self, pose: BodyPose, time: Time) -> BodyPose:
         """`pose` with the corrections at `time`; rotations are added as axis-angle, which is
         close to composing them while corrections stay small."""
-        low, high, r = self.neighbours(time)
-        turn: Float[Tensor, "52 3"] = torch.lerp(self.pose[low], self.pose[high], r)
-        shift = torch.lerp(self.transl[low], self.transl[high], r)
+        turn: Float[Tensor, "52 3"] = self.frames.between(self.pose, time)
+        shift = self.frames.between(self.transl, time)
         return pose.with_residual(turn[1:]).replace(
             global_orient=pose.global_orient + turn[0],
             transl=pose.transl + shift,

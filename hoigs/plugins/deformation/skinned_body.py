@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from jaxtyping import Float
@@ -19,10 +19,12 @@ from hoigs.core.body import (
     BodySurface,
 )
 from hoigs.core.clip import Clip
+from hoigs.core.clock import Time, constant
 from hoigs.core.context import BuildContext
 from hoigs.core.deformation import DeformationModel
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.moment import BodyPose, Moment
+from hoigs.core.skinning import transform_points
 from hoigs.plugins.deformation.pose_refinement import PoseRefinement
 from hoigs.plugins.deformation.skinning import ancestry
 
@@ -30,6 +32,20 @@ ScaleAbout = Literal["pelvis", "camera"]
 
 APART = 0.05  # metres; rest made with another seed is decimetres off, a padded one centimetres
 ANCHORS = (PELVIS, LEFT_WRIST, RIGHT_WRIST, LEFT_FOOT, RIGHT_FOOT)
+
+
+class Stance(NamedTuple):
+    """A body at a moment, without the interaction and without gradients.
+
+    Attributes:
+        pose: refined. transforms: of its joints [J, 4, 4].
+        vertices [V, 3], joints [J, 3]: of the zero pose, in the pose's shape, metres.
+    """
+
+    pose: BodyPose
+    transforms: Tensor
+    vertices: Tensor
+    joints: Tensor
 
 
 class SkinnedBody(DeformationModel):
@@ -93,6 +109,8 @@ class SkinnedBody(DeformationModel):
             self.register_buffer(name, value, persistent=False)
         self._shape: tuple[Tensor, Tensor, Tensor] | None = None
         self._arm: tuple[Tensor, Tensor] | None = None
+        self._asked: tuple[Moment, list[tuple[int, int]], Stance] | None = None
+        self.held = False  # see `hold`
 
     @property
     def body(self) -> BodyModel:
@@ -100,8 +118,21 @@ class SkinnedBody(DeformationModel):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         self.body._apply(fn, recurse)
-        self._shape = self._arm = None
+        self._shape = self._arm = self._asked = None
         return super()._apply(fn, recurse)
+
+    @torch.no_grad()
+    def hold(self, rest: Gaussians, moment: Moment) -> None:
+        """Shape and arm length of this moment's person, from now on."""
+        self.held = False
+        betas = self.pose(moment).betas.detach().clone()
+        self._shape = (betas, *self.body.shaped(betas))
+        self.arm_length()
+        self.held = True
+
+    def train(self, mode: bool = True) -> Self:
+        self.held, self._asked = False, None
+        return super().train(mode)
 
     def set_trained_frames(self, indices: Sequence[int]) -> None:
         """Frames whose poses are refined; the others are interpolated from these."""
@@ -120,18 +151,39 @@ class SkinnedBody(DeformationModel):
 
     def shaped(self, betas: Float[Tensor, " B"]) -> tuple[Tensor, Tensor]:
         """Vertices and joints of the zero pose; the last shape without gradient is kept."""
+        if self.held and self._shape is not None:
+            return self._shape[1], self._shape[2]
+        if self.training and self.refinement is not None:  # another one at every step
+            return self.body.shaped(betas)
         if betas.requires_grad and torch.is_grad_enabled():
             return self.body.shaped(betas)
         if self._shape is None or not torch.equal(self._shape[0], betas):
             self._shape = (betas.detach().clone(), *self.body.shaped(betas.detach()))
         return self._shape[1], self._shape[2]
 
+    @torch.no_grad()
+    def stance(self, moment: Moment) -> Stance:
+        """The body at `moment`; kept for `anchors`, which the same forward pass asks for next."""
+        pose = self.pose(moment)
+        found = Stance(pose, self.body.skinning_transforms(pose), *self.shaped(pose.betas))
+        self._asked = (moment, self._state(), found)
+        return found
+
+    def _state(self) -> list[tuple[int, int]]:
+        """Changes with the values that a pose is made of, unless a fused optimizer made them."""
+        if self.refinement is None:
+            return []
+        return [(p.data_ptr(), p._version) for p in self.refinement.parameters()]
+
     def posed_joints(
-        self, pose: BodyPose, transforms: Float[Tensor, "J 4 4"], joints: list[int]
+        self,
+        places: Float[Tensor, "J 3"],
+        transforms: Float[Tensor, "J 4 4"],
+        joints: tuple[int, ...],
     ) -> Float[Tensor, "A 3"]:
-        """World positions of some joints, before alpha."""
-        places, turns = self.shaped(pose.betas)[1][joints], transforms[joints]
-        return (turns[:, :3, :3] @ places[..., None]).squeeze(-1) + turns[:, :3, 3]
+        """World positions of some joints, before alpha; `places` of all in the zero pose."""
+        chosen = constant(joints, places, torch.long)
+        return transform_points(transforms.index_select(0, chosen), places.index_select(0, chosen))
 
     def scaled(
         self, points: Float[Tensor, "N 3"], pelvis: Float[Tensor, " 3"], moment: Moment
@@ -139,23 +191,28 @@ class SkinnedBody(DeformationModel):
         """alpha: points scaled about the pelvis, or along the rays of the camera."""
         center = pelvis
         if self.camera_centers is not None:
-            last = len(self.camera_centers) - 1
-            center = self.camera_centers[min(max(round(moment.time * last), 0), last)]
+            center = at_frame(self.camera_centers, moment.time)
         return center + self.log_alpha.exp() * (points - center)
 
     @torch.no_grad()
     def anchors(self, moment: Moment) -> Float[Tensor, "A 3"]:
         """Pelvis, wrists and feet in the world, without gradient."""
-        pose = self.pose(moment)
-        transforms = self.body.skinning_transforms(pose)
-        joints = self.posed_joints(pose, transforms, list(ANCHORS))
+        asked = self._asked
+        known = asked is not None and asked[0] is moment and asked[1] == self._state()
+        stance = asked[2] if asked is not None and known else self.stance(moment)
+        self._asked = None  # handed out once: fused optimizers change poses without a trace
+        joints = self.posed_joints(stance.joints, stance.transforms, ANCHORS)
         return self.scaled(joints, joints[0], moment)
 
     def arm_length(self) -> Float[Tensor, ""]:
+        if self.held and self._arm is not None:
+            return self._arm[1] * self.log_alpha.exp()
         betas = self.betas
         if self.refinement is not None:
             betas = betas + self.refinement.betas.detach()
-        if self._arm is None or not torch.equal(self._arm[0], betas):
+        # in training the shape changes at every step, and comparing would wait for the device
+        always = self.training and self.refinement is not None
+        if always or self._arm is None or not torch.equal(self._arm[0], betas):
             self._arm = (betas.clone(), self.body.arm_length(betas))
         return self._arm[1] * self.log_alpha.exp()
 
@@ -197,6 +254,15 @@ def checked_surface(surface: BodySurface, rest: Gaussians) -> BodySurface:
             "and seed, or pass its `surface`"
         )
     return surface
+
+
+def at_frame(values: Float[Tensor, "F ..."], time: Time) -> Float[Tensor, "..."]:
+    """The value of the frame nearest to a time in [0, 1]."""
+    last = len(values) - 1
+    if isinstance(time, Tensor):
+        nearest = (time * last).round().clamp(0, last).long()
+        return values.index_select(0, nearest).squeeze(0)
+    return values[min(max(round(time * last), 0), last)]
 
 
 def clip_settings(clip: Clip) -> dict[str, Any]:

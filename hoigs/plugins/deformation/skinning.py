@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.clock import constant
 from hoigs.core.rotation import matrices_to_quats, normalize_quats
 
 
@@ -44,7 +45,8 @@ def skin_quats(
     """
     quats = matrices_to_quats(transforms[:, :3, :3])
     with torch.no_grad():
-        above = quats[[max(p, 0) for p in parents]]
+        above = constant(tuple(max(p, 0) for p in parents), quats, torch.long)
+        above = quats.index_select(0, above)
         flipped = ((quats * above).sum(-1) < 0).to(quats)
         signs = 1 - 2 * torch.remainder(ancestors @ flipped, 2)
     return normalize_quats(weights @ (quats * signs[:, None]))

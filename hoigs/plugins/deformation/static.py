@@ -19,6 +19,7 @@ class Static(DeformationModel):
     """The rest Gaussians at every moment, displaced only by a residual if there is one."""
 
     rest_space = "world"
+    moves = False
 
     def forward(
         self, rest: Gaussians, moment: Moment, residual: Residual | None = None

@@ -88,7 +88,8 @@ class SurfaceBody(SkinnedBody):
 
     def shape_change(self, pose: BodyPose) -> Float[Tensor, "N 3"] | None:
         """How far each point moves at rest because the pose has other betas; None for not."""
-        if not pose.betas.requires_grad and torch.equal(pose.betas, self.betas):
+        held = self.held and self._shape is not None
+        if not (held or pose.betas.requires_grad) and torch.equal(pose.betas, self.betas):
             return None
         change = self.shaped(pose.betas)[0] - self.rest_vertices
         return (change[self.body.faces[self.faces]] * self.barycentric[..., None]).sum(1)
@@ -104,7 +105,8 @@ class SurfaceBody(SkinnedBody):
         """Gaussians of the zero pose, in the world."""
         transforms = self.body.skinning_transforms(pose)
         means = skin_points(canonical.means, weights, transforms)
-        means = self.scaled(means, self.posed_joints(pose, transforms, [PELVIS])[0], moment)
+        joints = self.shaped(pose.betas)[1]
+        means = self.scaled(means, self.posed_joints(joints, transforms, (PELVIS,))[0], moment)
         if residual is not None and residual.means is not None:
             means = means + residual.means
         turns = skin_quats(weights, transforms, self.body.parents, self.ancestors)

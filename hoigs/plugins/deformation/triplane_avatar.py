@@ -18,7 +18,7 @@ from hoigs.core.context import BuildContext
 from hoigs.core.gaussians import SH_C0, Gaussians
 from hoigs.core.interaction import Residual
 from hoigs.core.moment import BodyPose, Moment
-from hoigs.core.planes import SPACE_AXES, sample_planes
+from hoigs.core.planes import axis_pairs, sample_planes
 from hoigs.core.rotation import axis_angle_to_matrices, multiply_quats, quats_to_matrices
 from hoigs.core.topology import TopologyChange
 from hoigs.plugins.deformation.avatar_heads import (
@@ -170,7 +170,7 @@ class TriplaneAvatar(SurfaceBody):
     def features(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N F"]:
         """The three planes' values at canonical points, concatenated."""
         places = (points - self.rest_joints[PELVIS]) / self.half_box
-        return sample_planes(self.planes, torch.stack([places[:, axes] for axes in SPACE_AXES]))
+        return sample_planes(self.planes, axis_pairs(places))
 
     def forward(
         self, rest: Gaussians, moment: Moment, residual: Residual | None = None

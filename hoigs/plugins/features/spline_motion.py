@@ -10,12 +10,20 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
+from hoigs.core.clock import Time, filled
 from hoigs.core.config import ComponentConfig
 from hoigs.core.deformation import DeformationModel, ProvidesVelocity
 from hoigs.core.features import FeatureExtractor, Tokens
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.moment import Moment
-from hoigs.core.spline import catmull_rom, hermite_basis, keyframe_position, linear
+from hoigs.core.spline import (
+    catmull_rom,
+    hermite_basis,
+    keyframe_position,
+    knot_pair,
+    lerp,
+    linear,
+)
 
 Embedding = Literal["per-gaussian", "shared", "low-rank", "none"]
 Interpolation = Literal["catmull-rom", "zero-tangent", "linear"]
@@ -112,20 +120,20 @@ class SplineMotionFeatures(FeatureExtractor):
         if self.kind == "low-rank":
             self.mixture = nn.Parameter(torch.randn(len(rest), self.rank).to(rest.means))
 
-    def embedded(self, count: int, time: float) -> Float[Tensor, "N E"]:
+    def embedded(self, count: int, time: Time) -> Float[Tensor, "N E"]:
         """e(t) of each of `count` Gaussians."""
         codes = self._between(self.embedding, time)
         if self.kind == "low-rank":
             return self.mixture @ codes / self.rank**0.5
         return codes.expand(count, -1)
 
-    def _between(self, values: Float[Tensor, "N K D"], time: float) -> Float[Tensor, "N D"]:
+    def _between(self, values: Float[Tensor, "N K D"], time: Time) -> Float[Tensor, "N D"]:
         """Values of the keyframes at `time`."""
         if self.interpolation == "linear":
             return linear(values, time)
         if self.interpolation == "zero-tangent":
             k, r = keyframe_position(time, values.shape[1])
-            return torch.lerp(values[:, k], values[:, k + 1], hermite_basis(r)[2])
+            return lerp(*knot_pair(values, k), hermite_basis(r)[2])
         return catmull_rom(values, time)
 
     def _velocity(
@@ -141,10 +149,10 @@ class SplineMotionFeatures(FeatureExtractor):
 
     def forward(self, deformation: DeformationModel, rest: Gaussians, moment: Moment) -> Tokens:
         velocity = self._velocity(deformation, rest, moment)
-        known = [velocity, velocity.new_full((len(rest), 1), moment.time)]
+        known = [velocity, filled(velocity, (len(rest), 1), moment.time)]
         if self.kind != "none":
             known.insert(1, self.embedded(len(rest), moment.time))
         features = self.mlp(torch.cat(known, dim=-1))
         with torch.no_grad():
-            positions = deformation(rest, moment).means
+            positions = deformation.centers(rest, moment)
         return Tokens(features, positions)
