@@ -13,7 +13,7 @@ from hoigs.core.errors import SpecError
 from hoigs.core.registry import Registry, default_registry
 from hoigs.core.spec import Spec
 from hoigs.studies.needs.criterion import Criterion, Gain, Score, gain
-from hoigs.studies.needs.halving import SCORING, Climbed, Ledger, climb, plan
+from hoigs.studies.needs.halving import SCORING, BudgetError, Climbed, Ledger, climb, plan
 from hoigs.studies.needs.rungs import (
     Ladder,
     Overrides,
@@ -134,7 +134,7 @@ class Search:
 
         Raises:
             SpecError, ClipError, BudgetError: the base spec is none, there are too few training
-                frames, or too few steps.
+                frames, or too few steps to ask anything.
         """
         self.registry = self.registry or default_registry()
         full = Spec.load(self.base, overrides=self.given, registry=self.registry)
@@ -222,7 +222,10 @@ class Search:
         ):
             return Answer(ladder, block, None, skipped="what has been chosen has none of it")
         held = len(self.held)
-        longest = plan([r.cost for r in ladder.rungs], budget, held, self.most).steps
+        try:
+            longest = plan([r.cost for r in ladder.rungs], budget, held, self.most).steps
+        except BudgetError as error:
+            return Answer(ladder, block, None, skipped=str(error))
         trials, steps = self._trials(ladder, block, blocks, longest)
         tried = [rung for rung in ladder.rungs if rung.name in trials]
         place = 0

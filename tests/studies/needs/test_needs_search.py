@@ -198,6 +198,12 @@ def test_a_still_object_needs_no_interaction(clip):
     assert told(answers[1]) == "interaction: off, because object is static"
 
 
+def test_what_cannot_be_paid_is_left_as_it_was_and_told(clip):
+    found = Search(clip, "hoigs", (OBJECT,), (*GIVEN, "train.steps=11")).run()
+    assert found.answers[0].chosen is None and found.overrides == {}
+    assert "unchanged, because 2 rungs need 9 steps at least, but get" in told(found.answers[0])
+
+
 def test_regions(clip):
     frame = clip[clip.split["train"][0]]
     own = region_of(frame, clip, "own", ["object"])
