@@ -61,9 +61,12 @@ class Changed(RightDensity):
         return None if found is None else self.amend(found, step)
 
 
-class OneRowLess(Changed):
+class CountsFromTheEnd(Changed):
     def amend(self, decision, step):
-        return Refinement(decision.change, decision.rest[:-1])
+        change = decision.change
+        count = int((~change.fresh).sum())  # no row goes
+        source = change.source - count * change.fresh
+        return Refinement(TopologyChange(source, change.fresh, change.offsets), decision.rest)
 
 
 class NoCap(RightDensity):
@@ -140,9 +143,8 @@ class SecretlyAbsolute(RightDensity):
         return statistics.mean_absolute_gradient > 6e-4
 
 
-ALSO = {"N01": ("N03", "N04")}  # which compare row by row
 MUTANTS = {
-    "N01": OneRowLess,
+    "N01": CountsFromTheEnd,
     "N02": NoCap,
     "N03": ShrinksAll,
     "N04": HidesOffsets,

@@ -16,26 +16,26 @@ from hoigs.testing import body, density, features, interaction, reader
 from hoigs.testing.checks import run_checks
 from hoigs.testing.material.body import TinyBody
 
-# kind: its package, mutants, the right one, settings, and who else may find a mutant
+# kind: its package, mutants, the right one, settings
 KINDS: dict[str, tuple[Any, ...]] = {
     "density": (
         density.CHECKS, density.DensitySubject, density_mutants.MUTANTS,
-        density_mutants.RightDensity, density_mutants.RightDensityConfig(), density_mutants.ALSO,
+        density_mutants.RightDensity, density_mutants.RightDensityConfig(),
     ),
     "body": (
-        body.CHECKS, body.BodySubject, body_mutants.MUTANTS, TinyBody, body_mutants.TinyConfig(), {}
+        body.CHECKS, body.BodySubject, body_mutants.MUTANTS, TinyBody, body_mutants.TinyConfig(),
     ),
     "reader": (
         reader.CHECKS, reader.ReaderSubject, reader_mutants.MUTANTS, ClipFolderReader,
-        ClipFolderReaderConfig(), {},
+        ClipFolderReaderConfig(),
     ),
     "interaction": (
         interaction.CHECKS, interaction.InteractionSubject, interaction_mutants.MUTANTS,
-        interaction_mutants.Right, interaction_mutants.RightConfig(), {},
+        interaction_mutants.Right, interaction_mutants.RightConfig(),
     ),
     "features": (
         features.CHECKS, features.FeaturesSubject, features_mutants.MUTANTS,
-        features_mutants.Right, features_mutants.RightConfig(), {},
+        features_mutants.Right, features_mutants.RightConfig(),
     ),
 }  # fmt: skip
 CASES = [(kind, id) for kind, (_, _, mutants, *_) in KINDS.items() for id in mutants]
@@ -43,7 +43,7 @@ CASES = [(kind, id) for kind, (_, _, mutants, *_) in KINDS.items() for id in mut
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_right_one_passes_and_every_check_has_a_mutant(kind) -> None:
-    checks, subject, mutants, right, config, _ = KINDS[kind]
+    checks, subject, mutants, right, config = KINDS[kind]
     report = run_checks(checks, subject(right, config))
     assert report.ok and report.run == len(checks), report
     assert set(mutants) == {check.id for check in checks}
@@ -51,5 +51,5 @@ def test_the_right_one_passes_and_every_check_has_a_mutant(kind) -> None:
 
 @pytest.mark.parametrize(("kind", "id"), CASES, ids=[id for _, id in CASES])
 def test_a_check_kills_its_mutant_alone(kind, id, kill) -> None:
-    checks, subject, mutants, _, config, also = KINDS[kind]
-    kill(checks, subject(mutants[id], config), id, mutants[id].__name__, also.get(id, ()))
+    checks, subject, mutants, _, config = KINDS[kind]
+    kill(checks, subject(mutants[id], config), id, mutants[id].__name__)
