@@ -39,8 +39,8 @@ class MlpConfig(ComponentConfig):
         zero_heads: start at rest; D3DGS starts with torch's default weights.
         start: share of the run in which nothing moves (D3DGS: its first 3000 steps).
         time_noise: standard deviation, in frames, of the noise on the time of a training step at
-            the start (D3DGS: 0.1 for real scenes); it falls linearly to 0 at the share
-            `noise_until` of the run.
+            the start (D3DGS: 0.1 for real scenes); it falls linearly to 0 at `noise_until`.
+        noise_until: share of the run after which there is no `time_noise`.
     """
 
     width: int = Field(256, ge=8)

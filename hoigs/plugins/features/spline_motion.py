@@ -48,7 +48,7 @@ class SplineMotionConfig(ComponentConfig):
             spline; "keyframes" interpolates the learned tangents tau_k as e is, as the words say:
             it equals the derivative at the keyframes alone, and needs learned tangents of every
             Gaussian at keyframes that stay.
-        embedding_width: of e. hidden: of the MLP.
+        embedding_width: of e. rank: how many codes "low-rank" mixes. hidden: of the MLP.
         keyframes: of the embedding; None takes the deformation's.
     """
 

@@ -31,18 +31,18 @@ MARGIN = 0.2  # of the reference image is empty about the object
 class DistillationConfig(ComponentConfig):
     """How Gaussians are distilled; defaults are DreamGaussian's and DreamScene4D's."""
 
-    steps: int = Field(default=500, ge=1)
+    steps: int = Field(default=500, ge=1, description="of the optimizer")
     count: int = Field(default=5_000, ge=4, description="Gaussians in the first ball")
     batch: int = Field(default=1, ge=1, description="random views a step; DreamScene4D: 16")
     radius: float = Field(default=2.0, gt=0.6, description="of the orbit, canonical units")
-    fov_degrees: float = Field(default=49.1, gt=0, lt=120)
+    fov_degrees: float = Field(default=49.1, gt=0, lt=120, description="of every view, vertical")
     elevation_degrees: float = Field(
         default=0.0, ge=-80, le=80, description="of the reference camera, above the object"
     )
     reach_degrees: float = Field(
         default=30.0, gt=0, le=80, description="views go at least so far up and down"
     )
-    sds_weight: float = Field(default=1.0, ge=0)
+    sds_weight: float = Field(default=1.0, ge=0, description="of the diffusion model's loss")
     image_weight: float = Field(default=10_000.0, ge=0, description="of the reference view's RGB")
     mask_weight: float = Field(default=1_000.0, ge=0, description="of the reference view's alpha")
     min_opacity: float = Field(default=0.05, gt=0, lt=1, description="fainter ones go at the end")

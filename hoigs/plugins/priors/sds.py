@@ -53,12 +53,14 @@ class SdsPriorConfig(PlacingConfig):
     path: Path = Field(description="folder of a diffusers pipeline, with .safetensors weights")
     condition: Condition = Field(default="text", description="what the pipeline is told")
     prompt: str = Field(default="", description='condition: text: what it is, "a brown box"')
-    negative_prompt: str = ""
+    negative_prompt: str = Field(default="", description="condition: text: what it is not")
     guidance: float | None = Field(
         default=None, ge=1, description="classifier-free; by default 100 for text, else 5"
     )
     distillation: DistillationConfig = DistillationConfig()
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        default="auto", description="that distils; auto: CUDA where there is some"
+    )
     half: bool | None = Field(default=None, description="float16; by default on CUDA")
     cache: bool = Field(default=True, description="keep the shape in $HOIGS_CACHE, ~/.cache/hoigs")
 

@@ -44,8 +44,12 @@ class MediapipeConfig(ComponentConfig):
         default=1, ge=0, le=2, description="of the model; 1 comes with mediapipe, it downloads 0, 2"
     )
     smooth: bool = Field(default=True, description="MediaPipe's filter over time")
-    detection_confidence: float = Field(default=0.5, ge=0, le=1)
-    tracking_confidence: float = Field(default=0.5, ge=0, le=1)
+    detection_confidence: float = Field(
+        default=0.5, ge=0, le=1, description="below it a frame shows nobody"
+    )
+    tracking_confidence: float = Field(
+        default=0.5, ge=0, le=1, description="below it the person is looked for anew"
+    )
 
 
 class MediapipePrior(VideoPrior):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import torch
+from pydantic import Field
 
 from hoigs.core.camera import Camera
 from hoigs.core.config import ComponentConfig
@@ -19,9 +20,16 @@ from hoigs.rasterizers.warp.inputs import Door
 class WarpConfig(ComponentConfig):
     """Settings of WarpRasterizer; see there."""
 
-    cpu_kernels: Literal["auto", "native", "portable"] = "auto"
-    scheduler: Literal["threads", "openmp", "auto", "serial"] = "threads"
-    threads: int | None = None
+    cpu_kernels: Literal["auto", "native", "portable"] = Field(
+        "auto",
+        description="native are fast, portable those of CUDA; auto: native where they compile",
+    )
+    scheduler: Literal["threads", "openmp", "auto", "serial"] = Field(
+        "threads", description="how CPU work is spread over cores; serial is the calling thread"
+    )
+    threads: int | None = Field(
+        None, description="CPU cores to use; torch.get_num_threads() if None"
+    )
 
 
 class WarpRasterizer(Rasterizer):
