@@ -26,18 +26,30 @@ if TYPE_CHECKING:
 
 def train(
     clip: Annotated[
-        Path, typer.Argument(help="Clip folder, as `hoigs prepare` makes it, or builtin:NAME.")
-    ],
+        Path | None,
+        typer.Argument(
+            help="Clip folder, as `hoigs prepare` makes it, or builtin:NAME. Default with "
+            "--resume: the run's."
+        ),
+    ] = None,
     spec: Annotated[
-        str, typer.Option("--spec", help="A built-in spec's name or a file; @PROFILE may follow.")
-    ] = "hoigs",
+        str | None,
+        typer.Option(
+            "--spec",
+            help="A built-in spec's name or a file; @PROFILE may follow. Default hoigs; with "
+            "--resume the run's.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Run folder; default runs/CLIP-SPEC.")
     ] = None,
     settings: SetOption = None,
     rasterizer: RasterizerOption = None,
     device: DeviceOption = "auto",
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on with the run in --out, by its own spec and clip."),
+    ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the run in --out.")
     ] = False,
@@ -71,15 +83,20 @@ def train(
 ) -> None:
     """Fit a model to a clip; then score it and write report.html."""
     from hoigs.cli.evaluate import score_run
+    from hoigs.core.errors import HoigsError
     from hoigs.training.clip_source import clip_name
+    from hoigs.training.resuming import DEFAULT_SPEC, NO_CLIP
     from hoigs.training.session import Session
 
     where = pick_device(device)
     given = overrides(settings, rasterizer)
     found: Needs | None = None
     if auto:
-        out = out or Path("runs") / f"{clip_name(clip)}-{Path(spec).stem}-auto"
-        spec, given, found = _needed(clip, spec, out, given, where, overwrite, resume, allow_faults,
+        if clip is None:
+            raise HoigsError(f"{NO_CLIP}; without --auto, --resume takes the run's own")
+        asked = spec or DEFAULT_SPEC
+        out = out or Path("runs") / f"{clip_name(clip)}-{Path(asked).stem}-auto"
+        spec, given, found = _needed(clip, asked, out, given, where, overwrite, resume, allow_faults,
                               [reader, reader_set], plugin or ())  # fmt: skip
     session = Session.open(
         clip,
@@ -195,6 +212,8 @@ def run_session(session: object) -> None:
         f"{len(session.clip.split['train'])} frames of "
         f"{session.clip.cameras[0].width}x{session.clip.cameras[0].height}"
     )
+    for change in session.changes:
+        typer.echo(f"changed on resuming: {change}")
     for fault in session.faults:
         typer.echo(f"warning: {fault}", err=True)
     latest: dict[str, float] = {}

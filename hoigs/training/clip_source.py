@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from hoigs.core.errors import ClipError
 from hoigs.core.registry import Registry, default_registry
 from hoigs.synthesis.named import PREFIX, is_named, named_clip
 
@@ -28,3 +29,9 @@ def clip_name(clip: str | Path) -> str:
         short, _, query = str(clip).removeprefix(PREFIX).partition("?")
         return "-".join([short, *filter(None, query.replace("=", "-").split("&"))])
     return Path(clip).resolve().name
+
+
+def require_folder(folder: Path) -> None:
+    """ClipError if there is no such folder."""
+    if not folder.is_dir():
+        raise ClipError(f"{folder}: no such folder; `hoigs prepare VIDEO --out {folder}` makes one")

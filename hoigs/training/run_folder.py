@@ -83,9 +83,13 @@ class RunFolder:
         temporary.replace(self.path)
         shutil.rmtree(old, ignore_errors=True)
 
-    def go_on(self, spec_text: str, spec_hash: str) -> None:
-        """A resumed run is from now on one of this spec: more steps, another density cap."""
-        record = self.read_provenance() | {"spec_hash": spec_hash}
+    def go_on(self, spec_text: str, changed: dict[str, Any]) -> None:
+        """A resumed run is from now on one of this spec (more steps, another cap) and clip.
+
+        Args:
+            changed: of its provenance.
+        """
+        record = self.read_provenance() | changed
         for path, text in ((self.spec, spec_text), (self.provenance, json.dumps(record, indent=1))):
             temporary = path.with_name(f".{path.name}.part")
             temporary.write_text(text)

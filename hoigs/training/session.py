@@ -12,7 +12,7 @@ import torch
 from hoigs.core.clip import Clip
 from hoigs.core.clip_health import examine
 from hoigs.core.compose import compose, compose_density
-from hoigs.core.errors import ClipError, HoigsError
+from hoigs.core.errors import HoigsError
 from hoigs.core.fault import Fault
 from hoigs.core.registry import Registry, default_registry
 from hoigs.core.scene import SceneModel
@@ -26,8 +26,15 @@ from hoigs.training.checkpoint import (
     restore_cameras,
     restore_model,
 )
-from hoigs.training.clip_source import clip_folder, clip_name
+from hoigs.training.clip_source import clip_folder, require_folder
 from hoigs.training.reader_choice import ReaderChoice, choose_reader, recorded_reader
+from hoigs.training.resuming import (
+    DEFAULT_SPEC,
+    changes_of,
+    clip_and_reader,
+    default_out,
+    own_spec,
+)
 from hoigs.training.run_folder import RunFolder, versions
 from hoigs.training.trainer import StepReport, Trainer
 
@@ -65,12 +72,6 @@ def read_clip(
     return clip.resized(width)
 
 
-def require_folder(folder: Path) -> None:
-    """ClipError if there is no such folder."""
-    if not folder.is_dir():
-        raise ClipError(f"{folder}: no such folder; `hoigs prepare VIDEO --out {folder}` makes one")
-
-
 @dataclass
 class Session:
     """One training run, ready to start.
@@ -78,6 +79,7 @@ class Session:
     Attributes:
         faults: of the clip, which training goes on with; in the run's provenance too.
         reader: key of the reader that read the clip.
+        changes: of a run that goes on: what of its spec is another now, "train.steps: 10 -> 20".
     """
 
     spec: Spec
@@ -86,12 +88,13 @@ class Session:
     trainer: Trainer
     faults: list[Fault] = field(default_factory=list)
     reader: str = ""
+    changes: list[str] = field(default_factory=list)
 
     @classmethod
     def open(
         cls,
-        clip: Path | str,
-        spec: str | Path | Spec,
+        clip: Path | str | None = None,
+        spec: str | Path | Spec | None = None,
         *,
         out: Path | None = None,
         overrides: Sequence[str] = (),
@@ -106,7 +109,13 @@ class Session:
     ) -> Session:
         """Check the spec, the clip and the output folder, compose the model, then make the run.
 
+        A run that goes on (`resume`) keeps its own spec, clip, reader and allowed faults; what is
+        given stands in their place.
+
         Args:
+            clip: a folder or "builtin:NAME". spec: by default "hoigs".
+            out: the run; by default runs/CLIP-SPEC.
+            overrides: "a.b=value", laid over the spec.
             allow_faults: train without masks, images and depth that are absent or broken.
             reader: its name; by default the one that knows the clip's layout.
             reader_settings: of that reader, "key=value".
@@ -115,20 +124,23 @@ class Session:
             HoigsError: anything wrong with the input; no folder has been made by then.
         """
         registry = default_registry(plugin_files=plugins)
+        if spec is None:
+            spec = own_spec(out or default_out(clip, DEFAULT_SPEC)) if resume else DEFAULT_SPEC
         if not isinstance(spec, Spec):
             spec = Spec.load(spec, overrides=overrides, registry=registry)
         torch.manual_seed(spec.train.seed)
-        folder = clip_folder(clip, registry)
-        require_folder(folder)
-        choice = choose_reader(folder, registry, reader, reader_settings)
+        run = RunFolder(out or default_out(clip, spec.name))
+        begun: dict[str, Any] = {}  # provenance of the run that goes on
+        if resume:
+            run.require()
+            begun = run.read_provenance()
+        else:
+            run.refuse_existing(overwrite)
+        folder, choice = clip_and_reader(clip, run, begun, registry, reader, reader_settings)
+        allow_faults = allow_faults or bool(begun.get("allow_faults"))
         source = read_clip(
             folder, registry, spec.train.width, allow_faults=allow_faults, reader=choice
         )
-        run = RunFolder(out or Path("runs") / f"{clip_name(clip)}-{spec.name}")
-        if resume:
-            run.require()
-        else:
-            run.refuse_existing(overwrite)
         faults = examine(source)
         model = compose(spec, source, registry).to(device)
         trainer = Trainer(
@@ -140,30 +152,34 @@ class Session:
             identity={"spec_name": spec.name, "model_hash": spec.model_hash()},
             lpips=_perceptual(spec, lpips_weights, device),
         )
+        record = {
+            "spec_hash": spec.hash(),
+            "clip": {
+                "name": source.name,
+                "path": run.relative(folder),
+                "reader": choice.record(run.relative),
+            },
+            "allow_faults": allow_faults,
+            "clip_faults": [fault.to_dict() for fault in faults],
+        }
+        changes = changes_of(run.spec, spec) if resume else []
         if resume:
             if has_checkpoint(run.checkpoints):
                 trainer.resume(load_checkpoint(latest_checkpoint(run.checkpoints)))
             else:  # stopped before the first one: from the beginning
                 run.cut_metrics(0)
-            run.go_on(spec.dump(), spec.hash())
+            run.go_on(spec.dump(), record)
         else:
             provenance = {
                 "versions": versions(),
                 "components": registry.provenance(spec)
                 | {f"body of {n}": registry.origin(t.model) for n, t in source.bodies.items()},
-                "spec_hash": spec.hash(),
-                "clip": {
-                    "name": source.name,
-                    "path": run.relative(folder),
-                    "reader": choice.record(run.relative),
-                },
+                **record,
                 "clip_provenance": dict(source.provenance),
-                "allow_faults": allow_faults,
-                "clip_faults": [fault.to_dict() for fault in faults],
                 "device": device,
             }
             run.create(spec.dump(), provenance, overwrite)
-        return cls(spec, source, run, trainer, faults, choice.key)
+        return cls(spec, source, run, trainer, faults, choice.key, changes)
 
     def train(self, on_step: Callable[[StepReport], None] | None = None) -> None:
         self.trainer.train(on_step)

@@ -55,7 +55,7 @@ def test_every_command_and_option_is_there(made):
     page = made.cli_page()
     for command in ("train", "prepare", "plugins new", "plugins show", "spec check", "tables"):
         assert f"## hoigs {command}\n" in page
-    assert "| `--resume` | Go on with the run in --out. |  |" in page
+    assert "| `--resume` | Go on with the run in --out, by its own spec and clip. |  |" in page
     assert "| `--path` | The clip's own cameras, or an orbit while it plays. | `playback` |" in page
 
 
