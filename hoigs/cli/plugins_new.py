@@ -55,7 +55,8 @@ def new(
     typer.echo(f"  cd {folder}\n  pip install -e '.[test]'\n  pytest")
     typer.echo(f"  hoigs plugins show {kind}:{name}")
     if (folder / f"{name}.yaml").is_file():
-        typer.echo(f"  hoigs train CLIP --spec {name}.yaml")
+        typer.echo(f"  hoigs train builtin:carry --spec {name}.yaml")
+        typer.echo(f"  hoigs chart builtin:carry --specs hoigs,{name}.yaml --budgets 300 --seeds 1")
 
 
 def write_package(name: str, kind: NewKind, out: Path) -> Path:
