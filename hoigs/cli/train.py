@@ -96,8 +96,10 @@ def train(
             raise HoigsError(f"{NO_CLIP}; without --auto, --resume takes the run's own")
         asked = spec or DEFAULT_SPEC
         out = out or Path("runs") / f"{clip_name(clip)}-{Path(asked).stem}-auto"
-        spec, given, found = _needed(clip, asked, out, given, where, overwrite, resume, allow_faults,
-                              [reader, reader_set], plugin or ())  # fmt: skip
+        spec, given, found = _needed(
+            clip, asked, out, given, where, overwrite, resume, allow_faults,
+            [reader, reader_set], plugin or (),
+        )  # fmt: skip
     session = Session.open(
         clip,
         spec,
