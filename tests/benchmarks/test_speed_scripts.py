@@ -1,0 +1,43 @@
+"""Frame rate and training speed on a few splats: that the scripts run and what they write."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+TINY = ["--device", "cpu", "--size", "64x36", "--splats", "200", "100", "50", "--frames", "6"]
+
+
+def report(script: str, out: Path, *more: str) -> dict[str, Any]:
+    command = [sys.executable, f"benchmarks/{script}.py", *TINY, *more, "--json", str(out)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(out.read_text())
+
+
+def test_frame_rate(tmp_path: Path) -> None:
+    found = report("frame_rate", tmp_path / "rate.json", "--sweep", "3", "--rounds", "1")
+    assert set(found["ways"]) == {"plain", "cached"}
+    assert "CUDA graphs need a CUDA device" in found["left_out"]["graph"]
+    assert found["splats"] == {"scene": 200, "human": 100, "object": 50}
+    assert found["drawn_in_the_middle"] > 100
+    for row in found["ways"].values():
+        assert 0 < row["deform_ms"] < row["total_ms"]
+        assert row["fps"] > 0
+
+
+def test_train_speed(tmp_path: Path) -> None:
+    found = report("train_speed", tmp_path / "speed.json", "--steps", "2", "--warmup", "1")
+    assert found["step_ms"] > 0 and len(found["blocks_ms"]) == 2
+    parts = {"frame", "deform", "raster", "loss", "backward", "guard", "optimiser", "density"}
+    assert parts <= set(found["host_ms"]) and parts <= set(found["waited_ms"])
+    assert all(found["waited_ms"][part] > 0 for part in parts)
+    assert 500 < found["operations"] < 1600  # it was 2422 before launches were counted
