@@ -28,6 +28,7 @@ from hoigs.synthesis.generate import (
 from hoigs.synthesis.knobs import SceneKnobs
 from hoigs.synthesis.noise import noisy_camera, noisy_depth, noisy_mask, noisy_poses, noisy_track
 from hoigs.synthesis.person import betas_of
+from hoigs.synthesis.shutter import with_shutter
 
 PROVENANCE = "synthetic truth"
 SOURCES_OF_POINTS = 8  # frames from which the initial scene points are back-projected
@@ -123,7 +124,7 @@ def write_scene(
         entities={"human": "human", "object": "object"},
         depth_kind="metric",
     ) as writer:
-        for view, held_out in scene.views():
+        for view, held_out in with_shutter(scene.views(), knobs.camera.shutter_frames):
             # held-out views judge, so they stay exact
             for other in held_out:
                 masks = {name: other.mask(name) for name in ENTITIES}

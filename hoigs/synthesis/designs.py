@@ -99,6 +99,15 @@ def window_view(rng: np.random.Generator, height: int, width: int) -> Array:
     return np.clip(np.where(bar[..., None], np.array([0.97, 0.96, 0.94]), image), 0, 1)
 
 
+def faded(image: Array, contrast: float) -> Array:
+    """An image drawn towards its mean colour; a contrast of 1 leaves it as it is."""
+    if contrast == 1:
+        return image
+    mean = image.mean((0, 1))
+    faded: Array = mean + contrast * (image - mean)
+    return faded
+
+
 def crate_faces(rng: np.random.Generator, size: int, textured: bool = True) -> list[Array]:
     """Six faces (+x -x +y -y +z -z) of the handled box, each with a pattern of its own, so that a
     turn is always visible."""

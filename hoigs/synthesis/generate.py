@@ -18,7 +18,7 @@ from hoigs.core.body import BodyModel
 from hoigs.core.camera import Camera
 from hoigs.core.moment import BodyPose
 from hoigs.synthesis.clothes import DressedBody, dress
-from hoigs.synthesis.designs import crate_faces
+from hoigs.synthesis.designs import crate_faces, faded
 from hoigs.synthesis.knobs import SceneKnobs
 from hoigs.synthesis.meshes import TexturedMesh, box, smooth_normals
 from hoigs.synthesis.objects import MOTIONS, ObjectScript, bent_mesh
@@ -99,12 +99,14 @@ class SyntheticScene:
         """Person, object and furniture of a frame, ready for rays."""
         vertices, faces = self.body_vertices[frame], self.dressed.faces
         normals = smooth_normals(vertices, faces)[faces]
-        thing = self.object_at(frame)
         person = TexturedMesh(
             vertices, faces, normals, np.zeros((len(faces), 3, 2)), np.full(len(faces), -1)
         )
-        numbers = np.repeat([1, 2, 0], [len(faces), len(thing.faces), len(self.props.faces)])
-        return Layer.build(TexturedMesh.join([person, thing, self.props]), numbers, self._fine)
+        parts = [(1, person), (0, self.props)]
+        if frame >= self.knobs.object.appears * (self.knobs.frames - 1):
+            parts.insert(1, (2, self.object_at(frame)))
+        numbers = np.repeat([n for n, _ in parts], [len(mesh.faces) for _, mesh in parts])
+        return Layer.build(TexturedMesh.join([mesh for _, mesh in parts]), numbers, self._fine)
 
     def render(self, frame: int, camera: Camera, layer: Layer | None = None) -> TrueView:
         """The moment `frame` from any camera."""
@@ -154,6 +156,7 @@ def generate(knobs: SceneKnobs, body: BodyModel) -> SyntheticScene:
     script = script.in_world()
     room, atlas = _furnished(script.stands, knobs.seed)
     sides = crate_faces(np.random.default_rng(knobs.seed + 1), 256, knobs.object.textured)
+    sides = [faded(side, knobs.object.contrast) for side in sides]
     columns = 24 if knobs.object.motion == "bending" else 1
     numbers = [len(atlas.levels) + i for i in range(6)]
     thing = box(knobs.object.size, numbers, columns)

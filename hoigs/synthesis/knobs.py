@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from hoigs.core.config import ComponentConfig
 
@@ -34,6 +34,16 @@ class CameraKnobs(ComponentConfig):
     principal_point_shift: tuple[float, float] = Field(
         (0.0, 0.0), description="of (cx, cy) from the middle, as fractions of width and height"
     )
+    shutter_frames: int = Field(
+        1, ge=1, description="odd; each image is the mean of so many frames about its own"
+    )
+
+    @field_validator("shutter_frames")
+    @classmethod
+    def _is_odd(cls, frames: int) -> int:
+        if frames % 2 == 0:
+            raise ValueError(f"shutter_frames is {frames}: expected an odd number, as 1, 3 or 5")
+        return frames
 
 
 class ObjectKnobs(ComponentConfig):
@@ -44,6 +54,14 @@ class ObjectKnobs(ComponentConfig):
         (0.34, 0.25, 0.26), description="between the hands, height, depth; metres"
     )
     textured: bool = Field(True, description="False paints it in one colour")
+    contrast: float = Field(1.0, ge=0, le=1, description="of its patterns; 0 leaves mean colours")
+    cycles: float = Field(1.0, gt=0, description="of a figure-eight in the clip")
+    throw_turns: float = Field(1.0, ge=0, description="of a thrown object about x in its flight")
+    hidden_share: float | None = Field(
+        None, ge=0, le=0.6, description="of the clip with the back turned; None is carry's own walk"
+    )
+    regrips: int = Field(0, ge=0, description="times that the hands leave a pushed object")
+    appears: float = Field(0.0, ge=0, lt=1, description="share of the clip before it is there")
     swing_degrees: float = Field(52.0, ge=0, le=60, description="yaw of the swing to either side")
     tilt_degrees: float = Field(20.0, ge=0, le=45, description="roll and pitch while it swings")
     lift_height: float = Field(1.22, gt=0, description="of the centre at the top of the swing")
@@ -76,6 +94,9 @@ class NoiseKnobs(ComponentConfig):
     """
 
     mask_boundary: float = Field(0.0, ge=0, le=1, description="share of boundary pixels flipped")
+    mask_edge_pixels: int = Field(
+        0, ge=0, description="each mask grows or shrinks by up to so many pixels, frame by frame"
+    )
     mask_missing: float = Field(0.0, ge=0, le=1, description="share of masks that are all zero")
     mask_absent: float = Field(0.0, ge=0, le=1, description="share of masks that are no file")
     depth_relative: float = Field(0.0, ge=0, description="std as a share of the depth")
@@ -88,6 +109,7 @@ class NoiseKnobs(ComponentConfig):
     frames_absent: float = Field(0.0, ge=0, lt=1, description="share of images that are no file")
     pose_degrees: float = Field(0.0, ge=0, description="std of each joint's rotation")
     pose_metres: float = Field(0.0, ge=0, description="std of the body's place")
+    betas: float = Field(0.0, ge=0, description="std of the body's shape coefficients")
     object_degrees: float = Field(0.0, ge=0, description="std of the object's rotation")
     object_metres: float = Field(0.0, ge=0, description="std of the object's place")
     camera_degrees: float = Field(0.0, ge=0, description="std of each camera's rotation")

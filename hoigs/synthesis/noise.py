@@ -25,9 +25,14 @@ Array = np.ndarray
 def noisy_mask(
     mask: Bool[Array, "H W"], noise: NoiseKnobs, rng: np.random.Generator
 ) -> Bool[Array, "H W"]:
-    """Flips a share of the pixels within 2 px of the boundary, or loses the whole mask."""
+    """Moves the boundary, flips a share of the pixels within 2 px of it, or loses the mask."""
     if rng.uniform() < noise.mask_missing:
         return np.zeros_like(mask)
+    if noise.mask_edge_pixels:
+        grow = int(rng.integers(-noise.mask_edge_pixels, noise.mask_edge_pixels + 1))
+        if grow:
+            change = ndimage.binary_dilation if grow > 0 else ndimage.binary_erosion
+            mask = change(mask, iterations=abs(grow))
     if noise.mask_boundary == 0:
         return mask
     band = ndimage.binary_dilation(mask, iterations=2) & ~ndimage.binary_erosion(mask, iterations=2)
@@ -59,7 +64,11 @@ def noisy_camera(camera: Camera, noise: NoiseKnobs, rng: np.random.Generator) ->
 
 
 def noisy_poses(poses: BodyPose, noise: NoiseKnobs, rng: np.random.Generator) -> BodyPose:
-    """Independent Gaussian turns of body joints and shifts of the body, frame by frame."""
+    """Independent Gaussian turns of body joints and shifts of the body, frame by frame; and one
+    error of its shape for all frames."""
+    if noise.betas:
+        off = noise.betas * rng.normal(size=poses.betas.shape)
+        poses = poses.replace(betas=poses.betas + torch.from_numpy(off).to(poses.betas))
     if noise.pose_degrees == 0 and noise.pose_metres == 0:
         return poses
 

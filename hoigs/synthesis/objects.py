@@ -157,7 +157,7 @@ class Held(ObjectMotion):
 
 
 class Thrown(ObjectMotion):
-    """Lifted, thrown up with one turn about x in true free fall, caught and put down."""
+    """Lifted, thrown up with a turn about x in true free fall, caught and put down."""
 
     def script(self) -> ObjectScript:
         low, chest = self.rest_height, 0.5 * (self.rest_height + self.object.lift_height)
@@ -180,7 +180,9 @@ class Thrown(ObjectMotion):
         hold = self.path(keys)
         r = np.clip((self.u - up) / share, 0, 1)
         rise = 4 * self.object.throw_height * r * (1 - r)
-        turned = hold.rotations @ about(np.array([1, 0, 0]), -2 * np.pi * r)
+        turned = hold.rotations @ about(
+            np.array([1, 0, 0]), -2 * np.pi * self.object.throw_turns * r
+        )
         track = Track(turned, hold.translations + rise[:, None] * np.array([0, 1.0, 0]))
         free = self.ramp((0, 1), (up, 1), (0.5 * (up + down), 0.25), (down, 1), (1, 1))
         return self.scripted(track, hold, self.lift_grip() * free, (self.stand(0),))
@@ -205,7 +207,16 @@ class Pushed(ObjectMotion):
             rng = np.random.default_rng([self.knobs.seed, 21])
             jolts = self.object.jolt_metres * rng.normal(size=len(self.u))
             track.translations[:, 0] += jolts * self.lift_grip()
-        return self.scripted(track, track, self.lift_grip(), (self.stand(0, width=1.15),))
+        grip = self.lift_grip() * self._regripping()
+        return self.scripted(track, track, grip, (self.stand(0, width=1.15),))
+
+    def _regripping(self) -> Array:
+        """1, and 0 at evenly spread moments at which both hands are off the object."""
+        count = self.object.regrips
+        off = [0.15 + 0.7 * (i + 0.5) / count for i in range(count)]
+        half = 0.25 * 0.7 / max(1, count)
+        points = [(0.0, 1.0), *((u + d, float(d != 0)) for u in off for d in (-half, 0, half))]
+        return self.ramp(*points, (1.0, 1.0))
 
 
 class Bending(ObjectMotion):
@@ -240,7 +251,7 @@ class FigureEight(ObjectMotion):
     """Held before the chest and led along an eight that lies on its side."""
 
     def script(self) -> ObjectScript:
-        phase = 2 * np.pi * self.u
+        phase = 2 * np.pi * self.object.cycles * self.u
         height = 0.86 * self.object.lift_height + 0.15 * np.sin(2 * phase)
         place = np.stack((0.24 * np.sin(phase), height, np.full_like(phase, 0.5)), -1)
         roll = np.radians(self.object.tilt_degrees) * np.sin(phase)
@@ -271,7 +282,17 @@ class Carried(ObjectMotion):
         )
         track = self.path(held)
         script = self.scripted(track, track, np.ones(len(self.u)))
-        return replace(script, walk=walking(len(self.u), WINDING, 1.9, (-0.06, -0.1)))
+        return replace(script, walk=walking(len(self.u), self._winding(), 1.9, (-0.06, -0.1)))
+
+    def _winding(self) -> Array:
+        """WINDING, or the same way with the back turned for a share of the clip."""
+        share = self.object.hidden_share
+        if share is None:
+            return WINDING
+        away, back = 0.55 - share / 2, 0.55 + share / 2
+        keys = WINDING.copy()
+        keys[1:6, 0] = (0.25 * away, 0.6 * away, away, back, back + 0.6 * (1 - back))
+        return keys
 
 
 class Static(ObjectMotion):
