@@ -135,7 +135,7 @@ def depth_loss(
     """
     if kind == "none":
         return None
-    valid = (prior > 0) & (alpha.detach() > 0.5)
+    valid = (prior > 0) & torch.isfinite(prior) & (alpha.detach() > 0.5)
     if int(valid.sum()) < 16:
         return None
     expected = depth[valid] / alpha[valid].clamp_min(1e-6)
