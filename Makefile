@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test lint docs charts changelog format clean
+.PHONY: demo test lint docs charts stress changelog format clean
 
 demo: $(INSTALLED)
 	$(BIN)/hoigs demo --out runs/demo --overwrite
@@ -34,6 +34,20 @@ charts: $(INSTALLED)
 		--seeds $(CHART_SEEDS) --out $(CHART_OUT)
 	mkdir -p docs/results/chart
 	cp $(CHART_OUT)/chart* docs/results/chart/
+
+# where methods break, into docs/results/stress; likewise
+STRESS_CASES ?= all
+STRESS_SPECS ?= hoigs,4dgs@matched,d3dgs@matched,e-d3dgs@matched,ex4dgs@matched,exavatar@matched,static-3dgs@matched
+STRESS_SEEDS ?= 3
+STRESS_STEPS ?= 300
+STRESS_JOBS ?= 1
+STRESS_OUT ?= runs/results-stress
+stress: $(INSTALLED)
+	$(BIN)/hoigs stress --cases "$(STRESS_CASES)" --specs "$(STRESS_SPECS)" \
+		--seeds $(STRESS_SEEDS) --steps $(STRESS_STEPS) --jobs $(STRESS_JOBS) --threads 1 \
+		--out $(STRESS_OUT)
+	mkdir -p docs/results/stress
+	cp $(STRESS_OUT)/stress* docs/results/stress/
 
 # fragments of changelog.d, collected into CHANGELOG.md
 changelog: $(INSTALLED)

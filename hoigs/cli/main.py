@@ -18,6 +18,7 @@ from hoigs.cli import (
     prepare,
     render,
     spec,
+    stress,
     tables,
     train,
 )
@@ -37,6 +38,7 @@ app.command("eval")(evaluate.evaluate)
 app.command("render")(render.render)
 app.command("tables")(tables.tables)
 app.command("chart")(chart.chart)
+app.command("stress")(stress.stress)
 app.command("needs")(needs.needs)
 app.command("compress")(compress.compress)
 app.add_typer(plugins.app, name="plugins")

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self, TypeVar
 
 from hoigs.core.errors import CheckpointError
 from hoigs.core.spec import Spec
@@ -35,7 +35,10 @@ class Job:
         spec: name or file. settings: laid over it, seed and steps included.
         spec_hash: of the resolved spec. run: its run folder.
         device, lpips_weights, plugins: as for `hoigs train`.
+        worker: module that runs it, in a process of its own.
     """
+
+    worker: ClassVar[str] = "hoigs.studies.worker"
 
     clip: str
     clip_label: str
@@ -84,10 +87,13 @@ class Job:
     def dump(self) -> str:
         return json.dumps(asdict(self))
 
-    @staticmethod
-    def parse(text: str) -> Job:
+    @classmethod
+    def parse(cls, text: str) -> Self:
         data: dict[str, Any] = json.loads(text)
-        return Job(**(data | {k: tuple(v) for k, v in data.items() if isinstance(v, list)}))
+        return cls(**(data | {k: tuple(v) for k, v in data.items() if isinstance(v, list)}))
+
+
+J = TypeVar("J", bound=Job)
 
 
 def make_job(
@@ -97,8 +103,10 @@ def make_job(
     clip_digest: str,
     spec: str,
     settings: Sequence[str],
+    *,
+    kind: type[J] = Job,  # type: ignore[assignment]
     **more: Any,
-) -> Job:
+) -> J:
     """A job in its own run folder under `out`: clip, spec and a piece of its hash.
 
     The hash covers seed, steps and all settings, so the same training is one job in every table,
@@ -113,7 +121,7 @@ def make_job(
     loaded = Spec.load(spec, overrides=list(settings), registry=registry)
     name = f"{loaded.name.partition('@')[0]}-seed{loaded.train.seed}-{loaded.hash()[:8]}"
     run = out / "runs" / clip_label / name
-    return Job(
+    return kind(
         clip=str(clip),
         clip_label=clip_label,
         clip_digest=clip_digest,

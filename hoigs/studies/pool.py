@@ -6,7 +6,8 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from hoigs.studies.job import Job, JobState
@@ -17,6 +18,7 @@ THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 OUT_OF_TIME = "the time limit came first; run the same command again"
 
 Report = Callable[[Job, str], None]
+Follow = Callable[[Job, str | None], Sequence[Job]]
 Running = tuple[Job, subprocess.Popen[bytes]]
 
 
@@ -27,6 +29,7 @@ def run_jobs(
     threads: int = 1,
     limit_s: float | None = None,
     report: Report | None = None,
+    follow: Follow | None = None,
 ) -> Mapping[str, str]:
     """Run what is not done yet; a job that fails stops no other.
 
@@ -34,6 +37,8 @@ def run_jobs(
         workers: processes at a time. threads: of each, by OMP_NUM_THREADS.
         limit_s: stop after so many seconds; the next call goes on.
         report: called with a job and "done before", "started", "done", "stopped" or "failed: why".
+        follow: called with each job that has ended, and why if it failed; what it returns is run
+            too, before what waits.
 
     Returns:
         Why a job failed, by run folder; those that are not there are done. Processes are ended
@@ -41,13 +46,23 @@ def run_jobs(
     """
     deadline = None if limit_s is None else time.monotonic() + limit_s
     tell = report or (lambda job, word: None)
-    waiting: list[Job] = []
-    for job in jobs:
-        if job.state() is JobState.done:
-            tell(job, "done before")
-        else:
-            waiting.append(job)
+    waiting: deque[Job] = deque()
     failed: dict[str, str] = {}
+
+    def sort(found: Iterable[Job]) -> None:
+        """What is done goes on to what follows it; the rest waits."""
+        todo = deque(found)
+        late: list[Job] = []
+        while todo:
+            job = todo.popleft()
+            if job.state() is JobState.done:
+                tell(job, "done before")
+                todo.extend(follow(job, None) if follow else ())
+            else:
+                late.append(job)
+        waiting.extendleft(reversed(late))
+
+    sort(jobs)
     running: list[Running] = []
     try:
         while waiting or running:
@@ -55,7 +70,7 @@ def run_jobs(
                 _stop(running, tell)
                 return failed | {job.run: OUT_OF_TIME for job in (*waiting, *_jobs(running))}
             while waiting and len(running) < workers:
-                job = waiting.pop(0)
+                job = waiting.popleft()
                 tell(job, "started")
                 running.append((job, _start(job, threads, workers)))
             time.sleep(POLL_S)
@@ -66,6 +81,8 @@ def run_jobs(
                 else:
                     failed[job.run] = _why(job.log, process.returncode)
                     tell(job, f"failed: {failed[job.run]}")
+                if follow:
+                    sort(follow(job, failed.get(job.run)))
     finally:
         for _, process in running:
             process.terminate()
@@ -88,7 +105,7 @@ def _start(job: Job, threads: int, workers: int) -> subprocess.Popen[bytes]:
     job.log.parent.mkdir(parents=True, exist_ok=True)
     environment = os.environ | dict.fromkeys(THREADS, str(threads))
     numbers = (str(workers), str(os.getpid()))
-    command = [sys.executable, "-m", "hoigs.studies.worker", job.dump(), *numbers]
+    command = [sys.executable, "-m", job.worker, job.dump(), *numbers]
     with job.log.open("wb") as log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
 

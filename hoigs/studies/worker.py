@@ -6,7 +6,9 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from hoigs.core.errors import HoigsError
 from hoigs.studies.cost import train_measured
@@ -65,11 +67,11 @@ def run_job(job: Job, runs_at_once: int = 1) -> None:
     evaluation.save(job.folder / SCORES)
 
 
-def main() -> None:
+def main(kind: type[Job] = Job, run: Callable[[Any, int], None] = run_job) -> None:
     """Exit code 2 and one message for what a user can mend, as the command line does."""
     threading.Thread(target=_end_with, args=(int(sys.argv[3]),), daemon=True).start()
     try:
-        run_job(Job.parse(sys.argv[1]), int(sys.argv[2]))
+        run(kind.parse(sys.argv[1]), int(sys.argv[2]))
     except HoigsError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

@@ -1,0 +1,121 @@
+"""`hoigs stress`: 56 named ways to fail, for every spec that they concern."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hoigs.cli.common import DeviceOption, PluginOption, SetOption, pick_device
+
+
+def stress(
+    cases: Annotated[
+        str,
+        typer.Option(
+            "--cases", help="F01,F10, families (motion, camera, human …) or all, commas between."
+        ),
+    ] = "all",
+    specs: Annotated[
+        str, typer.Option("--specs", help="As for `hoigs chart`: hoigs,4dgs@matched,mine.yaml.")
+    ] = "hoigs,static",
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Runs of each, seeds 0, 1 …")] = 3,
+    steps: Annotated[int, typer.Option("--steps", min=1, help="Of every training.")] = 300,
+    points: Annotated[
+        int, typer.Option("--points", min=50, help="Gaussians of every model at its start.")
+    ] = 4000,
+    width: Annotated[int, typer.Option("--width", min=32, help="Of the clips, pixels.")] = 96,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="Go on to harder values after a seed has broken.")
+    ] = False,
+    out: Annotated[Path, typer.Option("--out", help="Folder of runs and results.")] = Path(
+        "runs/stress"
+    ),
+    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Runs at a time.")] = 1,
+    threads: Annotated[
+        int | None, typer.Option("--threads", min=1, help="Of each run; default cores / jobs.")
+    ] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option("--minutes", help="Stop then, draw what there is; the same command goes on."),
+    ] = None,
+    settings: SetOption = None,
+    device: DeviceOption = "cpu",
+    plugin: PluginOption = None,
+) -> None:
+    """Turn each way to fail into a verdict; what is done stays done, what failed is tried again.
+
+    Direct checks of our own code take seconds. Cases with a knob train on clips that are made
+    harder until a spec breaks. Writes stress.md, .csv and .json, stress-matrix.png and .svg, and
+    stress-curves.png and .svg. Leaves with 1 if a check of our own code fails.
+    """
+    from hoigs.studies.chart_plan import definition, parse_variants
+    from hoigs.studies.job import Job
+    from hoigs.studies.stress.case import choose_cases
+    from hoigs.studies.stress.plan import BASE, StressStudy
+    from hoigs.studies.stress.run import run_stress
+    from hoigs.studies.stress.table import make_table
+    from hoigs.studies.stress.write import write_stress
+
+    study = StressStudy(
+        cases=choose_cases(cases),
+        specs=parse_variants(specs),
+        out=out.resolve(),
+        seeds=seeds,
+        steps=steps,
+        points=points,
+        base=BASE.replace("width=96", f"width={width}"),
+        whole=whole,
+        settings=tuple(settings or ()),
+        device=pick_device(device),
+        plugins=tuple(p.resolve() for p in plugin or ()),
+    )
+    each = threads or max(1, (os.cpu_count() or 1) // jobs)
+
+    def report(job: Job, word: str) -> None:
+        typer.echo(f"{job.clip_label}/{job.folder.name}: {word}")
+
+    before = signal.signal(signal.SIGTERM, _stop)  # so that a plain kill ends the runs too
+    try:
+        limit = None if minutes is None else 60 * minutes
+        verdicts = run_stress(
+            study, workers=jobs, threads=each, limit_s=limit, report=report, tell=typer.echo
+        )
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    definitions = {row.label: definition(row) for row in study.specs}
+    table = make_table(study.cases, definitions, verdicts, _about(study, jobs, each))
+    for path in write_stress(table, study.out):
+        typer.echo(f"wrote {path}")
+    broken = sorted({v.case for v in verdicts if v.ours and v.status == "fail"})
+    if any(v.status == "not run" for v in verdicts):
+        typer.echo("some trainings are not done; the same command goes on")
+    if broken:
+        typer.echo(f"checks of our own code fail: {', '.join(broken)}")
+        raise typer.Exit(1)
+
+
+def _stop(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _about(study: object, jobs: int, threads: int) -> dict[str, object]:
+    from datetime import UTC, datetime
+
+    from hoigs.studies.machine import cpu_model
+    from hoigs.studies.stress.plan import StressStudy
+    from hoigs.training.run_folder import versions
+
+    assert isinstance(study, StressStudy)
+    return {
+        "date": datetime.now(UTC).date().isoformat(),
+        "direct checks": f"on {cpu_model()}",
+        "trainings": f"{study.steps} steps from {study.points} Gaussians, seeds 0 to "
+        f"{study.seeds - 1}, on built-in clips with {study.base.replace('&', ', ')}",
+        "settings": " ".join(study.settings) or "none",
+        "runs at a time": f"{jobs}, {threads} threads each, on {study.device}",
+        "versions": ", ".join(f"{name} {value}" for name, value in versions().items()),
+    }

@@ -1,0 +1,222 @@
+"""Cases F01 … F56: what sets each failure off, whom it concerns, how it is judged; from YAML."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from hoigs.core.config import ComponentConfig
+from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.spec_loader import load_yaml
+from hoigs.studies.stress.capability import Capability
+from hoigs.studies.stress.measures import MEASURES
+
+FOLDER = Path(__file__).with_name("cases")
+FAMILIES = ("motion", "camera", "human", "interaction", "optimisation")
+COUNT = 56
+
+Kind = Literal["unit", "per spec", "knob", "not applicable"]
+
+
+class Criterion(ComponentConfig):
+    """One number of a training against a bound; exactly one bound is given.
+
+    Attributes:
+        measure: a key of `measures.MEASURES`.
+        loses: most that it may be below the same spec and seed at the first value.
+        ratio: most that it may be, as a share of the same spec's and seed's at the first value.
+        at_most, at_least: bounds of the number itself.
+    """
+
+    measure: str
+    loses: float | None = None
+    ratio: float | None = None
+    at_most: float | None = None
+    at_least: float | None = None
+
+    @model_validator(mode="after")
+    def _one_bound(self) -> Criterion:
+        if self.measure not in MEASURES:
+            raise ValueError(f"no measure {self.measure!r}{did_you_mean(self.measure, MEASURES)}")
+        bounds = [b for b in (self.loses, self.ratio, self.at_most, self.at_least) if b is not None]
+        if len(bounds) != 1:
+            raise ValueError(f"{self.measure}: give one of loses, ratio, at_most, at_least")
+        return self
+
+    def holds(self, value: float, first: float) -> bool:
+        """Whether `value` is within the bound; `first` is the one at the first value."""
+        if self.loses is not None:
+            return first - value <= self.loses
+        if self.ratio is not None:
+            return value <= self.ratio * first
+        if self.at_most is not None:
+            return value <= self.at_most
+        assert self.at_least is not None
+        return value >= self.at_least
+
+    @property
+    def words(self) -> str:
+        measure = MEASURES[self.measure]
+        unit = f" {measure.unit}" if measure.unit else ""
+        if self.loses is not None:
+            return f"{measure.title} loses at most {self.loses:g}{unit}"
+        if self.ratio is not None:
+            return f"{measure.title} at most {self.ratio:g} times the first"
+        if self.at_most is not None:
+            return f"{measure.title} at most {self.at_most:g}{unit}"
+        return f"{measure.title} at least {self.at_least:g}{unit}"
+
+
+class Knob(ComponentConfig):
+    """A knob of the clip's generator, or of a spec, that is turned until a method breaks.
+
+    Attributes:
+        clip: built-in clip with any settings of its own: "carry?camera.arc_degrees=20".
+        sets: settings of the clip's name, `{}` standing for the value: "object.cycles={}".
+        blocks: settings in every model block that has one of that name, likewise:
+            "deformation.keyframe_step".
+        values: easiest first; the first is what the others are compared with.
+        asked: the hardest value that a method has to stand; None is the last.
+        unit: of the values, for axes and tables.
+        judged: "own", by the clip's own test frames; "first", by those of the first value's clip,
+            where the knob spoils what training is given and not what happens.
+        faults: whether the clip is broken, so that training has to be told to go on.
+        criteria: all have to hold.
+        draws: measure of breakdown curves; None is the first criterion's.
+    """
+
+    clip: str
+    sets: tuple[str, ...] = ()
+    blocks: dict[str, str] = Field(default_factory=dict)
+    values: tuple[float, ...] = Field(min_length=2)
+    asked: float | None = None
+    unit: str
+    judged: Literal["own", "first"] = "own"
+    faults: bool = False
+    criteria: tuple[Criterion, ...] = Field(min_length=1)
+    draws: str | None = None
+
+    @property
+    def drawn(self) -> str:
+        """The measure of breakdown curves."""
+        return self.draws or self.criteria[0].measure
+
+    @model_validator(mode="after")
+    def _asked_is_a_value(self) -> Knob:
+        if self.asked is not None and self.asked not in self.values[1:]:
+            raise ValueError(f"asked is {self.asked}, which is none of {self.values[1:]}")
+        if not self.sets and not self.blocks:
+            raise ValueError("a knob sets something: give sets or blocks")
+        if self.drawn not in MEASURES:
+            raise ValueError(f"no measure {self.drawn!r}{did_you_mean(self.drawn, MEASURES)}")
+        return self
+
+    @property
+    def must_stand(self) -> float:
+        return self.values[-1] if self.asked is None else self.asked
+
+
+class Case(ComponentConfig):
+    """One way to fail. At least one of `check`, `per_spec`, `knob` and `why_not` is given.
+
+    Attributes:
+        title: what fails. trigger: what sets it off. criterion: what passes, in words.
+        concerns: what a composed model must have for this to mean anything; () is every model.
+        check: name of a direct check of our own code (`checks.CHECKS`).
+        per_spec: name of a check of a composed model (`checks.PER_SPEC`).
+        knob: what is turned, with short trainings.
+        nature: a model with one of these (or without, "no keyed opacity") that fails does what its
+            method does; () is none.
+        advice: what to do about it.
+        why_not: why there is nothing to check here.
+    """
+
+    id: str = Field(pattern=r"^F\d\d$")
+    title: str
+    trigger: str
+    criterion: str
+    concerns: tuple[Capability, ...] = ()
+    check: str | None = None
+    per_spec: str | None = None
+    knob: Knob | None = None
+    nature: tuple[Capability | Literal["no keyed opacity"], ...] = ()
+    advice: str = ""
+    why_not: str | None = None
+
+    @model_validator(mode="after")
+    def _does_something(self) -> Case:
+        done = [x for x in (self.check, self.per_spec, self.knob) if x is not None]
+        if bool(done) == (self.why_not is not None):
+            raise ValueError("give what is checked (check, per_spec, knob), or why_not")
+        if self.per_spec is not None and self.knob is not None:
+            raise ValueError("per_spec and knob would both decide; give one")
+        return self
+
+    def is_nature(self, has: frozenset[Capability]) -> bool:
+        """Whether failing this is what a model with these does."""
+        flat = "keyed opacity" not in has
+        return any(flat if word == "no keyed opacity" else word in has for word in self.nature)
+
+    @property
+    def kind(self) -> Kind:
+        if self.knob is not None:
+            return "knob"
+        if self.per_spec is not None:
+            return "per spec"
+        return "unit" if self.check is not None else "not applicable"
+
+
+class _File(ComponentConfig):
+    cases: tuple[Case, ...]
+
+
+@cache
+def load_cases() -> Mapping[str, tuple[Case, ...]]:
+    """All cases by family, in order.
+
+    Raises:
+        HoigsError: a file of this package is wrong.
+    """
+    found = {}
+    for family in FAMILIES:
+        path = FOLDER / f"{family}.yaml"
+        try:
+            data = load_yaml(path.read_text(encoding="utf-8"), str(path)).data
+            found[family] = _File.model_validate(data).cases
+        except ValidationError as error:
+            lines = [f"{path} {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
+            raise HoigsError("\n".join(lines)) from error
+    return found
+
+
+def all_cases() -> tuple[Case, ...]:
+    return tuple(case for cases in load_cases().values() for case in cases)
+
+
+def choose_cases(text: str) -> tuple[Case, ...]:
+    """`--cases`: "all", or ids and families with commas between.
+
+    Raises:
+        HoigsError: a name that is neither.
+    """
+    known = all_cases()
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    if not words or "all" in words:
+        return known
+    wanted: set[str] = set()
+    by_word: dict[str, Sequence[Case]] = {case.id: [case] for case in known}
+    by_word |= load_cases()
+    for word in words:
+        key = next((k for k in by_word if k.lower() == word.lower()), None)
+        if key is None:
+            near = did_you_mean(word.upper() if word[1:].isdigit() else word.lower(), by_word)
+            raise HoigsError(
+                f"--cases: no case {word!r}{near}; there are F01 to F{COUNT}, "
+                f"{', '.join(FAMILIES)} and all"
+            )
+        wanted |= {case.id for case in by_word[key]}
+    return tuple(case for case in known if case.id in wanted)

@@ -1,0 +1,124 @@
+"""A study of two specs, end to end, twice; and what composed models owe."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from hoigs.core.errors import HoigsError
+from hoigs.core.spec import Spec
+from hoigs.studies.chart_plan import parse_variants
+from hoigs.studies.job import Job
+from hoigs.studies.stress.bench import Bench
+from hoigs.studies.stress.case import choose_cases
+from hoigs.studies.stress.checks import PER_SPEC, per_spec
+from hoigs.studies.stress.plan import StressStudy, plan_chains, turned_blocks
+from hoigs.studies.stress.run import run_stress
+from hoigs.studies.stress.sizes import small_settings
+
+BASE = (
+    "width=32&frames=8&fps=4&samples=1&edge_samples=1&held_out_views=1&test_frames=2"
+    "&scene_points=300&object_points=100"
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOIGS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.delenv("HOIGS_LPIPS_WEIGHTS", raising=False)
+        patch.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch")))
+        yield
+
+
+def study(out: Path, cases: str, specs: str = "static", **more: object) -> StressStudy:
+    return StressStudy(
+        choose_cases(cases), parse_variants(specs), out, seeds=2, steps=4, points=100, base=BASE,
+        **more,
+    )  # type: ignore[arg-type]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_study_is_run_once_and_goes_on(tmp_path: Path) -> None:
+    told: list[str] = []
+    wanted = study(tmp_path, "F04,F20,F49,F47,F56")
+
+    def report(job: Job, word: str) -> None:
+        told.append(word)
+
+    stopped = run_stress(wanted, workers=1, limit_s=0.0, report=report)
+    by_case = {v.case: v for v in stopped}
+    assert by_case["F49"].status == "not run" and not any(t == "done" for t in told)
+    assert by_case["F20"].status == "pass" and by_case["F20"].ours
+    assert by_case["F56"].status == "pass" and not by_case["F56"].ours
+    assert by_case["F04"].status == by_case["F47"].status == "not applicable"
+    assert "rotations at keyframes" in by_case["F04"].measured
+
+    told.clear()
+    (verdict,) = run_stress(study(tmp_path, "F49"), workers=2, report=report)
+    assert verdict.status in ("pass", "nature") and len(verdict.seeds) == 2
+    assert verdict.machines and "2 frames of split 'test'" in verdict.protocol[0]
+    values = [level.value for level in verdict.seeds[0].levels]
+    assert values == list(choose_cases("F49")[0].knob.values)[: len(values)]
+    level = verdict.seeds[0].levels[0]
+    scores = json.loads((tmp_path / level.run / "evaluation.json").read_text())
+    (full,) = [s for s in scores["scores"] if (s["view"], s["region"], s["metric"]) ==
+               ("test frames", "full", "psnr")]  # fmt: skip
+    assert level.values["psnr_full"] == full["value"]
+    assert told.count("done") == sum(len(s.levels) for s in verdict.seeds)
+
+    told.clear()
+    (again,) = run_stress(study(tmp_path, "F49"), workers=2, report=report)
+    assert again == verdict and set(told) == {"done before"}
+
+
+@pytest.mark.slow
+def test_composed_models_owe_what_they_owe() -> None:
+    bench = Bench.compose("hoigs")
+    assert {"body", "object", "interaction", "free knots", "time planes"} <= bench.capabilities
+    failed = {n: f.measured for n in PER_SPEC if not (f := per_spec(n)(bench)).passed}
+    assert not failed
+    half = Bench.compose("4dgs")
+    assert "whole picture" in half.capabilities and "body" not in half.capabilities
+    assert not per_spec("composed:unused_rows")(half).passed, "its code reads half of its planes"
+    constant = Bench.compose("ex4dgs")
+    assert not per_spec("composed:motion_rate")(constant).passed
+
+
+def test_a_spec_is_made_small_by_what_it_has() -> None:
+    whole = Spec.load("ex4dgs")
+    settings = dict(s.split("=") for s in small_settings(whole, 1000, 400))
+    assert settings["model.scene.points"] == "1000"
+    assert settings["model.scene.density.cap"] == "2000"
+    assert settings["model.scene.deformation.promote_from"] == "5"  # 500 of 40 000
+    parts = dict(s.split("=") for s in small_settings(Spec.load("hoigs"), 1000, 400))
+    points = [int(parts[f"model.{n}.points"]) for n in ("scene", "human", "object")]
+    assert points == [600, 300, 100]
+    assert "model.human.density.cap" not in parts
+
+
+def test_knobs_of_a_spec_are_set_where_it_has_them() -> None:
+    (case,) = choose_cases("F03")
+    assert case.knob is not None
+    assert turned_blocks(Spec.load("hoigs"), case.knob, 2) == [
+        "model.object.deformation.keyframe_step=2"
+    ]
+    assert turned_blocks(Spec.load("ex4dgs"), case.knob, 1) == [
+        "model.scene.deformation.interval=1"
+    ]
+
+
+@pytest.mark.slow
+def test_chains_share_what_they_have_in_common(tmp_path: Path) -> None:
+    wanted = study(tmp_path, "F01,F49", "static,hoigs")
+    has = {"static": frozenset({"scene"}), "hoigs": frozenset({"scene", "moves"})}
+    chains = plan_chains(wanted, has)  # type: ignore[arg-type]
+    assert {(c.case.id, c.spec.label) for c in chains} == {
+        ("F01", "hoigs"), ("F49", "hoigs"), ("F49", "static")
+    }  # fmt: skip
+    runs = {c.case.id: c.jobs[0].run for c in chains if c.spec.label == "hoigs" and c.seed == 0}
+    assert runs["F01"] == runs["F49"], "one clean clip, one training"
+    with pytest.raises(HoigsError, match="did you mean"):
+        plan_chains(study(tmp_path, "F49", "statik"), {"statik": frozenset()})
