@@ -9,7 +9,16 @@ from typing import Annotated
 
 import typer
 
-from hoigs.cli.common import DeviceOption, PluginOption, SetOption, pick_device
+from hoigs.cli.common import (
+    DeviceOption,
+    JobsOption,
+    MinutesOption,
+    PluginOption,
+    SeedsOption,
+    SetOption,
+    ThreadsOption,
+    pick_device,
+)
 
 
 def stress(
@@ -22,7 +31,7 @@ def stress(
     specs: Annotated[
         str, typer.Option("--specs", help="As for `hoigs chart`: hoigs,4dgs@matched,mine.yaml.")
     ] = "hoigs,static",
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Runs of each, seeds 0, 1 …")] = 3,
+    seeds: SeedsOption = 3,
     steps: Annotated[int, typer.Option("--steps", min=1, help="Of every training.")] = 300,
     points: Annotated[
         int, typer.Option("--points", min=50, help="Gaussians of every model at its start.")
@@ -34,14 +43,9 @@ def stress(
     out: Annotated[Path, typer.Option("--out", help="Folder of runs and results.")] = Path(
         "runs/stress"
     ),
-    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Runs at a time.")] = 1,
-    threads: Annotated[
-        int | None, typer.Option("--threads", min=1, help="Of each run; default cores / jobs.")
-    ] = None,
-    minutes: Annotated[
-        float | None,
-        typer.Option("--minutes", help="Stop then, draw what there is; the same command goes on."),
-    ] = None,
+    jobs: JobsOption = 1,
+    threads: ThreadsOption = None,
+    minutes: MinutesOption = None,
     settings: SetOption = None,
     device: DeviceOption = "cpu",
     plugin: PluginOption = None,

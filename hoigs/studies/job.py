@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self
 
 from hoigs.core.errors import CheckpointError
 from hoigs.core.spec import Spec
@@ -93,9 +93,6 @@ class Job:
         return cls(**(data | {k: tuple(v) for k, v in data.items() if isinstance(v, list)}))
 
 
-J = TypeVar("J", bound=Job)
-
-
 def make_job(
     out: Path,
     clip: Path,
@@ -104,9 +101,9 @@ def make_job(
     spec: str,
     settings: Sequence[str],
     *,
-    kind: type[J] = Job,  # type: ignore[assignment]
+    kind: type[Job] = Job,
     **more: Any,
-) -> J:
+) -> Job:
     """A job in its own run folder under `out`: clip, spec and a piece of its hash.
 
     The hash covers seed, steps and all settings, so the same training is one job in every table,

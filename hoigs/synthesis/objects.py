@@ -289,7 +289,8 @@ class Carried(ObjectMotion):
         share = self.object.hidden_share
         if share is None:
             return WINDING
-        away, back = 0.55 - share / 2, 0.55 + share / 2
+        away = 0.55 - share / 2
+        back = max(0.55 + share / 2, away + 0.02)  # a turn that does not stop takes time too
         keys = WINDING.copy()
         keys[1:6, 0] = (0.25 * away, 0.6 * away, away, back, back + 0.6 * (1 - back))
         return keys

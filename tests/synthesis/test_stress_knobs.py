@@ -54,8 +54,8 @@ def test_the_back_is_turned_for_its_share() -> None:
         return float((heading > 140).mean())
 
     shares = [away(s) for s in (0.0, 0.15, 0.3, 0.5)]
-    assert shares == sorted(shares) and shares[0] < 0.2
-    assert shares[3] - shares[0] == pytest.approx(0.5, abs=0.12)
+    assert shares == sorted(shares)
+    assert shares[0] < 0.3 and shares[3] > 0.5
     default = script("carried", 400)
     assert away(None) == pytest.approx(float((np.degrees(default.walk.heading) > 140).mean()))
 

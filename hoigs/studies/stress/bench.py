@@ -98,7 +98,7 @@ class Bench:
         with torch.no_grad():
             for name, parameter in self.model.named_parameters():
                 if name.rpartition(".")[2] not in FIELDS or ".deformation." in name:
-                    parameter += size * torch.randn(parameter.shape, generator=generator)
+                    parameter.add_(size * torch.randn(parameter.shape, generator=generator))
         return self.model
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,9 +79,17 @@ def plan_chains(
     Args:
         capabilities: of each spec, by label.
     """
-    folders = ClipFolders()
+    from hoigs.core.registry import default_registry
+
+    folders, registry = ClipFolders(), default_registry(list(study.plugins))
+    own = {
+        row.label: Spec.load(
+            str(row.spec), overrides=[*study.settings, *row.settings], registry=registry
+        )
+        for row in study.specs
+    }
     return [
-        _chain(study, case, row, seed, folders)
+        _chain(study, case, row, own[row.label], seed, folders)
         for case in study.cases
         if case.knob is not None
         for row in study.specs
@@ -91,14 +98,12 @@ def plan_chains(
     ]
 
 
-def _chain(study: StressStudy, case: Case, row: Row, seed: int, folders: ClipFolders) -> Chain:
-    from hoigs.core.registry import default_registry
-
+def _chain(
+    study: StressStudy, case: Case, row: Row, spec: Spec, seed: int, folders: ClipFolders
+) -> Chain:
     knob = case.knob
     assert knob is not None and row.spec is not None
-    registry = default_registry(list(study.plugins))
     laid = [*study.settings, *row.settings]
-    spec = Spec.load(row.spec, overrides=laid, registry=registry)
     small = small_settings(spec, study.points, study.steps)
     names = clip_names(knob, study.base)
     first = folders.get(names[0])[0]
@@ -106,15 +111,17 @@ def _chain(study: StressStudy, case: Case, row: Row, seed: int, folders: ClipFol
     for name, value in zip(names, knob.values, strict=True):
         folder, _, digest = folders.get(name)
         judge = str(first) if knob.judged == "first" and folder != first else ""
-        label = f"{knob.clip.partition('?')[0]}-{_short(name)}" + ("-judged" if judge else "")
+        # by what the clip is: the easiest value of many cases is one clip, trained on once
+        key = folder.name.removeprefix("builtin-")[:8]
+        label = f"{knob.clip.partition('?')[0]}-{key}" + ("-judged" if judge else "")
         settings = [*small, *laid, *turned_blocks(spec, knob, value), f"train.seed={seed}"]
-        jobs.append(
-            make_job(
-                study.out, folder, label, digest, row.spec, settings, kind=StressJob,
-                device=study.device, plugins=tuple(map(str, study.plugins)), judge=judge,
-                allow_faults=knob.faults,
-            )
+        job = make_job(
+            study.out, folder, label, digest, row.spec, settings, kind=StressJob,
+            device=study.device, plugins=tuple(map(str, study.plugins)), judge=judge,
+            allow_faults=knob.faults,
         )  # fmt: skip
+        assert isinstance(job, StressJob)
+        jobs.append(job)
     return Chain(case, row, seed, tuple(jobs))
 
 
@@ -127,7 +134,3 @@ def turned_blocks(spec: Spec, knob: Knob, value: float) -> list[str]:
             if key in getattr(spec.model[name], part).settings:
                 found.append(f"model.{name}.{place}={template.replace('{}', f'{value:g}')}")
     return found
-
-
-def _short(name: str) -> str:
-    return hashlib.sha256(name.encode()).hexdigest()[:8]

@@ -6,10 +6,13 @@ import pytest
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.rotation import normalize_quats
+from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.studies.stress.case import COUNT, Case, Criterion, Knob, all_cases, choose_cases
 from hoigs.studies.stress.checks import CHECKS, PER_SPEC, check, density, motion
 from hoigs.studies.stress.plan import BASE, clip_names
 from hoigs.synthesis.named import clip_knobs
+from hoigs.synthesis.objects import MOTIONS
+from hoigs.synthesis.person import Choreographer
 
 CASES = all_cases()
 
@@ -61,6 +64,20 @@ def test_every_value_of_a_knob_is_a_clip():
             assert all(k.width == 96 and k.frames == 24 for k in knobs), case.id
             turned = len({k.digest() for k in knobs})
             assert turned == (len(knobs) if case.knob.sets else 1), case.id
+
+
+def test_the_person_reaches_what_every_clip_asks_for():
+    body = AnnyBody()
+    knobs = {
+        clip_knobs(name).digest(): clip_knobs(name)
+        for case in CASES
+        if case.knob is not None
+        for name in clip_names(case.knob, BASE)
+    }
+    for own in knobs.values():
+        script = MOTIONS[own.object.motion](own).script()
+        poses = Choreographer(body, own).perform(script, own)
+        assert poses.body.isfinite().all(), own
 
 
 def test_cases_are_chosen_by_id_and_family():

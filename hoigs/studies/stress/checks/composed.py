@@ -78,7 +78,7 @@ def unused_rows(bench: Bench) -> Finding:
     for time in torch.linspace(0, 1, 2 * rows + 1).tolist():
         model.zero_grad(set_to_none=True)
         state = model(bench.at(time)).joined()
-        sum(v.sin().sum() for v in vars(state).values()).backward()  # type: ignore[union-attr]
+        sum(v.sin().sum() for v in vars(state).values()).backward()
         for name, parameter in planes.items():
             if parameter.grad is not None:
                 touched[name] |= parameter.grad.abs().sum((0, 2, 3)) > 0
@@ -111,7 +111,7 @@ def large_first_splats(bench: Bench) -> Finding:
     bench = bench.anew()
     with torch.no_grad():
         for name in bench.model.entities:
-            bench.model.entity(name).log_scales += torch.log(torch.tensor(100.0))
+            bench.model.entity(name).log_scales.add_(torch.log(torch.tensor(100.0)))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     trainer = bench.trained()
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024

@@ -27,7 +27,7 @@ def _module(**settings: object) -> CrossAttention:
         made.bind(WIDTHS, KINDS)  # type: ignore[arg-type]
         with torch.no_grad():
             for parameter in made.parameters():
-                parameter += 0.1 * torch.randn_like(parameter)
+                parameter.add_(0.1 * torch.randn_like(parameter))
     return made
 
 
@@ -76,7 +76,7 @@ def bounded_pose() -> Finding:
     made = _module()
     with torch.no_grad():
         for parameter in made.parameters():
-            parameter *= 1e3
+            parameter.mul_(1e3)
     out = _run(made, _thing(500))
     pose, means = _largest(_pose(out)), _largest(_means(out))
     passed = 0.29 < pose <= made.pose_bound and 0.09 < means <= made.means_bound
