@@ -17,6 +17,7 @@ from hoigs.studies.stress.verdict import MEANING, Status
 DPI = 160
 ROW, COLUMN = 0.25, 1.22  # inches of a cell
 LEFT, RIGHT, LINE = 4.5, 0.3, 0.19  # inches of the titles, the margin, a line of notes
+NARROWEST = 9.6  # inches at which the legend has two lines
 HEAD, GAP = 1.2, 0.36  # inches above the first row, and above each family
 
 # fill and ink, dark enough to be read on it (WCAG AA)
@@ -32,7 +33,7 @@ COLORS: dict[Status, tuple[str, str]] = {
 def matrix(table: Table, title: str) -> Figure:
     """One row a case, by family; each cell says what it stood."""
     families = table.families()
-    width = LEFT + COLUMN * len(table.specs) + RIGHT
+    width = max(NARROWEST, LEFT + COLUMN * len(table.specs) + RIGHT)
     notes = [line for note in table.notes for line in textwrap.wrap(note, int(width * 15))]
     body = sum(GAP + ROW * len(cases) for cases in families.values())
     height = HEAD + body + 0.45 + LINE * len(notes)
@@ -68,7 +69,7 @@ def _head(axes: Any, table: Table, title: str, width: float) -> None:
         axes.text(x + 0.23, y, words, size=8.5, color=QUIET, va="center")
         x += 0.45 + 0.066 * len(words)
     for i, spec in enumerate(table.specs):
-        lines = textwrap.wrap(spec.replace("@", " @"), 15)
+        lines = textwrap.wrap(spec.replace("@", " @"), 12)
         axes.text(LEFT + COLUMN * (i + 0.5), HEAD + 0.22, "\n".join(lines), size=9, weight="bold",
                   ha="center", va="bottom")  # fmt: skip
 
