@@ -97,7 +97,7 @@ class DeformationModel(nn.Module, ABC):
             residual: correction from the interaction module; None is no correction.
         """
 
-    def centers(self, rest: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
+    def means_at(self, rest: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
         """The means alone of `forward` without a residual, for features that need no more."""
         means: Tensor = self(rest, moment).means
         return means

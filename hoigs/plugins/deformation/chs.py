@@ -187,7 +187,7 @@ class CubicHermite(Resizing, DeformationModel):
             moved = replace(moved, opacity_logits=logits)
         return moved
 
-    def centers(self, rest: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
+    def means_at(self, rest: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
         del rest
         return self._means(moment.time)
 

@@ -154,5 +154,5 @@ class SplineMotionFeatures(FeatureExtractor):
             known.insert(1, self.embedded(len(rest), moment.time))
         features = self.mlp(torch.cat(known, dim=-1))
         with torch.no_grad():
-            positions = deformation.centers(rest, moment)
+            positions = deformation.means_at(rest, moment)
         return Tokens(features, positions)
