@@ -88,10 +88,11 @@ class RatesSpec(_Strict):
 
     Sources: 3DGS (Kerbl 2023) for the Gaussian fields, ExAvatar (Moon 2024) for networks and
     poses, 4DGS (Wu 2024) for planes, E-D3DGS (Bae 2024) for embeddings; methods A.10, D.4. Those
-    of means, sh, planes and networks are 2 to 6 times the published ones, because runs here take
-    thousands of steps, not tens of thousands: against means 1.6e-4, sh 5e-3, planes 5e-3, networks
-    1e-3 they gain 0.7 dB (full frame) and 0.4 dB (human and object) in 1500 steps on the built-in
-    clip (docs/results/README.md).
+    of sh, planes and networks are 2 to 6 times the published ones and those of means 15 times,
+    because runs here take thousands of steps, not tens of thousands: means 8e-4, sh 1e-2, planes
+    1e-2, networks 2e-3 gain 0.7 dB (full frame) and 0.4 dB (human and object) over the published
+    in 1500 steps on the built-in clip; means 2.4e-3 as much as 0.1 dB on real clips and lose no
+    more on that one (docs/results/README.md).
     `*_final` rates are reached log-linearly at the last step.
 
     Attributes:
@@ -102,8 +103,8 @@ class RatesSpec(_Strict):
             metres, where the human's deformation refines them.
     """
 
-    means: float = Field(8e-4, ge=0)
-    means_final: float = Field(8e-6, ge=0)
+    means: float = Field(2.4e-3, ge=0)
+    means_final: float = Field(2.4e-5, ge=0)
     sh: float = Field(1e-2, ge=0)
     sh_rest: float = Field(1.0, ge=0, le=1)
     opacity: float = Field(0.05, ge=0)

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from hoigs.core.context import BuildContext
 
-PER_PIXEL = 0.4  # Gaussians a pixel: what real clips of 0.18 to 0.23 megapixels still gain from
+PER_PIXEL = 0.57  # Gaussians a pixel: what real clips of 0.18 to 0.23 megapixels still gain from
 LEAST, MOST = 10_000, 1_000_000
 
 
@@ -17,7 +17,7 @@ Cap = Annotated[int, Field(ge=1)] | Annotated[str, Field(pattern=r"^auto(\+\d+)?
 
 
 def cap_in(context: BuildContext, cap: int | str) -> int:
-    """`cap`; of "auto", 0.4 Gaussians for each pixel of one frame, within 10,000 and 1,000,000;
+    """`cap`; of "auto", 0.57 Gaussians for each pixel of one frame, within 10,000 and 1,000,000;
     of "auto+N", N more.
 
     Raises:
