@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from hoigs.core.body import BODY_JOINT_PARTS, BodyModel, BodyOutput, BodySurface
+from hoigs.core.clock import constant
 from hoigs.core.moment import BodyPose
 from hoigs.core.skinning import joint_transforms, skin, transform_points
 
@@ -68,8 +69,8 @@ class TinyBody(BodyModel):
     def shaped(
         self, betas: Float[Tensor, "*batch B"]
     ) -> tuple[Float[Tensor, "*batch V 3"], Float[Tensor, "*batch J 3"]]:
-        size = 1 + 0.1 * betas[..., :1] + 0.1 * betas[..., 1:2] * betas.new_tensor((0.0, 1.0, 0.0))
-        size = size[..., None, :]
+        taller = constant((0.0, 1.0, 0.0), like=betas)
+        size = (1 + 0.1 * betas[..., :1] + 0.1 * betas[..., 1:2] * taller)[..., None, :]
         return self.template.to(betas) * size, self.joints.to(betas) * size
 
     def skinning_transforms(self, pose: BodyPose) -> Float[Tensor, "*batch J 4 4"]:
