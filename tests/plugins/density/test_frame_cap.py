@@ -21,7 +21,7 @@ def clip():
 
 
 @pytest.mark.parametrize(
-    ("width", "height", "cap"), [(368, 480, 70_656), (64, 64, LEAST), (4000, 3000, MOST)]
+    ("width", "height", "cap"), [(368, 480, 100_684), (64, 64, LEAST), (4000, 3000, MOST)]
 )
 def test_it_goes_by_the_pixels_within_bounds(clip, width, height, cap):
     cameras = [c.resized(width, height) for c in clip.cameras]
