@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, cast
+from dataclasses import fields, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -14,23 +14,14 @@ from torch import Tensor
 from hoigs.core.camera import Camera
 from hoigs.core.errors import RenderError
 from hoigs.core.gaussians import Gaussians
-from hoigs.core.moment import BodyPose, HandConvention, Moment
+from hoigs.core.moment import Moment
+from hoigs.core.moment_layout import MomentLayout
 from hoigs.core.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.scene import SceneModel, SceneState
 
 Mode = Literal["auto", "graph", "cached", "plain"]
 
-POSE = ("global_orient", "body", "left_hand", "right_hand", "transl")
 AGREE = 1e-4  # largest difference of a number of a Gaussian (metres, logits, …) to the plain path
-
-
-@dataclass(frozen=True)
-class _Person:
-    """What a recording takes from a pose for good."""
-
-    betas: Tensor  # as given, on the host
-    convention: HandConvention
-    shapes: tuple[torch.Size, ...]  # of the fields in POSE
 
 
 class Playback:
@@ -214,16 +205,9 @@ class Playback:
         for name in self._model.entities:
             entity = self._model.entity(name)
             entity.deformation.hold(entity.rest, on_device)
-        self._people = {
-            name: _Person(
-                pose.betas.detach().cpu().clone(),
-                pose.hand_pose_convention,
-                tuple(getattr(pose, f).shape for f in POSE),
-            )
-            for name, pose in moment.poses.items()
-            if name in self._model.entities
-        }
-        self._betas = {n: on_device.poses[n].betas.clone() for n in self._people}
+        self._layout = MomentLayout.of(moment, self._model.entities)
+        self._betas = {n: moment.poses[n].betas.detach().cpu().clone() for n in self._layout.people}
+        self._given = {n: {"betas": on_device.poses[n].betas.clone()} for n in self._betas}
         state = self._model(on_device, self._names)
         self._joined = state.joined(self._names).clone()
         self._rows = {
@@ -238,40 +222,29 @@ class Playback:
         return residual is not None and residual.means is not None
 
     def _check_people(self, moment: Moment) -> None:
-        for name, person in self._people.items():
+        for name in self._layout.people:
             if name not in moment.poses:
                 raise RenderError(
                     f'Playback: the moment has no body pose for "{name}"; it has '
                     f"{sorted(moment.poses) or 'none'}"
                 )
-            pose = moment.poses[name]
-            same = pose.hand_pose_convention == person.convention
-            if not (same and torch.equal(pose.betas.cpu(), person.betas)):
-                self._model.eval()
-                self._hold(moment)
-                if self.mode == "graph":
-                    self._record()
-                return
+        same = self._layout.fits(moment) and all(
+            torch.equal(moment.poses[name].betas.cpu(), betas)
+            for name, betas in self._betas.items()
+        )
+        if not same:
+            self._model.eval()
+            self._hold(moment)
+            if self.mode == "graph":
+                self._record()
 
     def _pack(self, moment: Moment, camera: Camera) -> Tensor:
         """View, intrinsics, time and poses, one after the other, on the host."""
-        parts = [camera.world_to_camera, camera.K, torch.tensor([float(moment.time)]).double()]
-        for name in self._people:
-            parts += [getattr(moment.poses[name], f) for f in POSE]
-        return torch.cat([x.detach().reshape(-1).to("cpu", torch.float64) for x in parts])
+        return self._layout.pack(moment, camera.world_to_camera, camera.K)
 
     def _moment(self) -> Moment:
         """The moment that stands in the buffer."""
-        single = self._packed.to(self._joined.means.dtype)
-        poses, start = {}, 26
-        for name, person in self._people.items():
-            values: dict[str, Any] = {}
-            for f, shape in zip(POSE, person.shapes, strict=True):
-                values[f] = single[start : start + shape.numel()].view(shape)
-                start += shape.numel()
-            values["betas"] = self._betas[name]
-            poses[name] = BodyPose(**values, hand_pose_convention=person.convention)
-        return Moment(cast(float, self._packed[25]), 0, poses)
+        return self._layout.unpack(self._packed[25:], self._joined.means.dtype, self._given)
 
     def _deform(self) -> None:
         """From the buffer to the Gaussians that move."""
