@@ -8,7 +8,7 @@ built-in clip whose frames are decoded once before. Its parts are timed by wrapp
 it calls; a part does not include the parts inside it.
 
     frame      the clip's frame, its upload and its crops are in `loss`
-    deform     SceneModel: features, interaction, deformation
+    deform     SceneModel: features, interaction, deformation, or the replay of them
     raster     all forward renders of the step
     loss       the objective, without the two above
     backward   all of it, rasterizer included
@@ -18,6 +18,9 @@ it calls; a part does not include the parts inside it.
 spends in each part meanwhile; `waited_ms`, from other steps, has the device finish each part before
 the next. Operations are those that a dispatch mode sees in a step, views apart; the profiler counts
 launches, on CUDA.
+
+`--graphs` is `train.graphs`; "both" measures first without and then with CUDA graphs, on one model,
+and has the first under `without_graphs`.
 """
 
 from __future__ import annotations
@@ -49,13 +52,14 @@ from benchmarks.at_size import (
     write,
 )
 from hoigs.core.clip import Clip
+from hoigs.training.recorded import RecordedScene
 from hoigs.training.session import Session
 from hoigs.training.trainer import Trainer
 
 LONG_RUN = 30_000
 # what is wrapped: attribute path from the trainer, and the part that its time counts as
 WRAPPED = (
-    ("model.forward", "deform"),
+    ("objective._deform", "deform"),
     ("model.rasterizer.render", "raster"),
     ("objective", "loss"),
     ("optimizer.step", "optimiser"),
@@ -202,6 +206,18 @@ def measure(trainer: Trainer, steps: int) -> dict[str, Any]:
     }
 
 
+def measured(trainer: Trainer, steps: int) -> dict[str, Any]:
+    """All figures of the trainer as it is, and whether graphs were replayed."""
+    found = measure(trainer, steps) | operations(trainer, min(4, steps))
+    recorded = trainer.objective.recorded
+    found["graphs"] = {
+        "mode": recorded.mode,
+        "reason": recorded.reason,
+        "recordings": recorded.recordings,
+    }
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -210,12 +226,15 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=300, help="that are timed unwatched")
     parser.add_argument("--warmup", type=int, default=20, help="steps before the first timed one")
     parser.add_argument("--frames", type=int, default=16, help="of the built-in clip")
+    parser.add_argument("--graphs", choices=("auto", "on", "off", "both"), default="auto")
     parser.add_argument("--out", type=Path, help="keep the run, for frame_rate.py --run")
     options = parser.parse_args()
     size, splats = Size.parse(options.size), tuple(options.splats)
-    total = 2 * options.steps + options.warmup + 100
+    rounds = 2 if options.graphs == "both" else 1
+    total = rounds * (2 * options.steps + options.warmup + 100)
     settings = [
         f"train.steps={total}",
+        f"train.graphs={'on' if options.graphs == 'both' else options.graphs}",
         # what only a whole run is long enough for: all parts take part from the first step
         *(f"train.warmup.{part}=0" for part in ("motion", "interaction", "poses", "cameras")),
         f"train.checkpoint_every={10 * total}",
@@ -235,14 +254,21 @@ def main() -> None:
         trainer = session.trainer
         for frame in session.clip:  # decoded and kept
             assert frame.image.shape[1] == size.width
+        objective, without = trainer.objective, {}
+        if options.graphs == "both":
+            recorded = objective.recorded
+            objective.recorded = RecordedScene(trainer.model, "off", objective.weight_of)
+            run(trainer, options.warmup)
+            without = {"without_graphs": measured(trainer, options.steps)}
+            objective.recorded = recorded
         run(trainer, options.warmup)
         report = {
             "machine": machine(trainer.model.device),
             "size": options.size,
             "splats": trainer.model.count(),
             "steps": options.steps,
-            **measure(trainer, options.steps),
-            **operations(trainer, min(4, options.steps)),
+            **measured(trainer, options.steps),
+            **without,
             "splats_at_the_end": trainer.model.count(),
         }
         if options.out is not None:
@@ -250,6 +276,9 @@ def main() -> None:
             trainer.checkpoint().save(session.run.checkpoints)
     print(f"{options.size}; {sum(report['splats'].values())} splats: {report['splats']}")
     print(f"{report['step_ms']:.2f} ms a step: 30,000 take {report['minutes_of_30k_steps']} min")
+    if without:
+        print(f"{report['without_graphs']['step_ms']:.2f} ms a step without graphs")
+    print(f"graphs: {report['graphs']['mode']}, {report['graphs']['reason']}")
     print(f"{report['operations']:.0f} operations a step, {report['views']:.0f} views beside them")
     for name in report["host_ms"]:
         host, waited = report["host_ms"][name], report["waited_ms"][name]

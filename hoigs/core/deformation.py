@@ -62,6 +62,7 @@ class DeformationModel(nn.Module, ABC):
         rest_space: where it expects the rest Gaussians: "canonical" (a body in its zero pose, an
             object about its centre), when it knows the body or the track that places them; else
             "world". May be set on the instance.
+        recordable: whether training may record it as a CUDA graph (`hoigs.core.recordable`).
     """
 
     provides: frozenset[str] = frozenset()
@@ -74,6 +75,7 @@ class DeformationModel(nn.Module, ABC):
     continuous: bool = True
     cut_gradients: frozenset[str] = frozenset()
     rest_space: Literal["canonical", "world"] = "canonical"
+    recordable: bool = False
     progress: float = 1.0
 
     @classmethod

@@ -40,11 +40,13 @@ class FeatureExtractor(nn.Module, ABC):
         per_gaussian: names of this module's parameters whose first axis is the Gaussian.
         rates: as DeformationModel.rates.
         width: D, the width of the tokens.
+        recordable: as DeformationModel.recordable.
     """
 
     requires: frozenset[str] = frozenset()
     per_gaussian: tuple[str, ...] = ()
     rates: ClassVar[Mapping[str, str]] = {}
+    recordable: bool = False
     width: int
 
     @classmethod

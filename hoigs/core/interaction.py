@@ -48,7 +48,13 @@ class Role:
 
 
 class InteractionModule(nn.Module, ABC):
-    """Couples entities. One that finds nothing in reach returns zero residuals, never NaN."""
+    """Couples entities. One that finds nothing in reach returns zero residuals, never NaN.
+
+    Attributes:
+        recordable: as DeformationModel.recordable.
+    """
+
+    recordable: bool = False
 
     @classmethod
     def from_config(cls, config: Any, context: BuildContext) -> Self:

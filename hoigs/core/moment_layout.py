@@ -40,9 +40,7 @@ class MomentLayout:
         """For moments like this one. `names`: of the entities that matter; `betas`: in the row."""
         chosen, fields = set(names), (*POSE, "betas") if betas else POSE
         people = {
-            name: Person(
-                pose.hand_pose_convention, tuple(getattr(pose, f).shape for f in fields)
-            )
+            name: Person(pose.hand_pose_convention, tuple(getattr(pose, f).shape for f in fields))
             for name, pose in moment.poses.items()
             if name in chosen
         }

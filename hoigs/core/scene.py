@@ -23,15 +23,19 @@ class SceneState:
 
     Attributes:
         gaussians: by entity, world, in the scene's order. residuals, tokens: by entity.
+        whole: all of `gaussians` joined, where that has been done already.
     """
 
     gaussians: Mapping[str, Gaussians]
     residuals: Mapping[str, Residual]
     tokens: Mapping[str, Tokens]
+    whole: Gaussians | None = None
 
     def joined(self, only: Iterable[str] | None = None) -> Gaussians:
         """The Gaussians of all entities, or of some, in the scene's order."""
         names = set(self.gaussians if only is None else only)
+        if self.whole is not None and names >= set(self.gaussians):
+            return self.whole
         return Gaussians.cat([g for name, g in self.gaussians.items() if name in names])
 
     def slices(self, only: Iterable[str] | None = None) -> dict[str, slice]:

@@ -186,8 +186,9 @@ class Spec(_Strict):
         return dump_yaml(self.model_dump(mode="json"))
 
     def hash(self) -> str:
-        """SHA-256 of the whole spec, names and summary left out."""
-        return self._digest([f for f in type(self).model_fields if f not in ("name", "summary")])
+        """SHA-256 of what a result depends on: not names and summary, nor how it is computed."""
+        sections = [f for f in type(self).model_fields if f not in ("name", "summary")]
+        return self._digest(sections, {"train": {"graphs"}})
 
     def model_hash(self) -> str:
         """SHA-256 of what decides which tensors the model has; checkpoints carry it.

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from hoigs.core.errors import did_you_mean
 
+Graphs = Literal["auto", "on", "off"]
 TestPose = Literal["given", "interpolated", "fitted"]
 
 
@@ -146,6 +147,10 @@ class TrainSpec(_Strict):
             trains all from the start.
         checkpoint_every, log_every, preview_every: steps; the last step always writes both.
             preview_every scores a few test frames for the curve in the report (0 = never).
+        graphs: replay the model's part of a step, forward and backward, as CUDA graphs: the same
+            values and gradients but for rounding, without what Python costs. "auto" does on CUDA
+            where every component allows it, and goes on without, with a warning, where that fails;
+            "on" insists; "off" never does, nor does anything on a CPU.
     """
 
     steps: int = Field(2000, ge=1)
@@ -158,6 +163,7 @@ class TrainSpec(_Strict):
     checkpoint_every: int = Field(1000, ge=1)
     log_every: int = Field(25, ge=1)
     preview_every: int = Field(250, ge=0)
+    graphs: Graphs = "auto"
 
 
 class EvaluationSpec(_Strict):

@@ -14,9 +14,10 @@ from hoigs.core.clip import Frame
 from hoigs.core.density import DensityControl
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.interaction import Residual
+from hoigs.core.moment import Moment
 from hoigs.core.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.scene import SceneModel, SceneState
-from hoigs.core.train_spec import LossSpec
+from hoigs.core.train_spec import Graphs, LossSpec
 from hoigs.evaluation.lpips import Lpips
 from hoigs.training.camera_refinement import CameraRefinement
 from hoigs.training.face import FaceTexture, face_loss, visible
@@ -27,8 +28,10 @@ from hoigs.training.losses import (
     scene_only_loss,
     term_weights,
 )
+from hoigs.training.recorded import Deformed, RecordedScene
 from hoigs.training.regions import Crop, crop_around, dilate, inside, union
 
+RESTRAINED = ("residual_pose", "residual_means")  # penalties of what the interaction asks for
 CAMERA_WEIGHT = 0.1  # of the penalty on camera corrections: holds what no image decides
 
 
@@ -71,16 +74,20 @@ class JointObjective:
         faces: Mapping[str, FaceTexture] | None = None,
         cameras: CameraRefinement | None = None,
         depth_scale: float = 1.0,
+        graphs: Graphs = "off",
     ) -> None:
         self.model, self.spec, self.depth_kind, self.lpips = model, spec, depth_kind, lpips
         self.density = dict(density or {})  # whose regularisers count too
         self.faces = dict(faces or {})
         self.cameras, self.depth_scale = cameras, depth_scale
         self.weights = term_weights(spec)
+        restrained = any(spec.regularizers.get(key, 0.0) > 0 for key in RESTRAINED)
+        self.recorded = RecordedScene(model, graphs, self.weight_of, restrained=restrained)
 
     def __call__(self, frame: Frame, camera: Camera, generator: torch.Generator) -> ObjectiveResult:
         device = camera.K.device
-        state = self.model(frame.moment.to(device))
+        deformed = self._deform(frame.moment)
+        state = deformed.state
         offsets = torch.zeros(
             sum(len(g) for g in state.gaussians.values()), 2, device=device, requires_grad=True
         )
@@ -118,7 +125,8 @@ class JointObjective:
                     terms.update(self._human(name, frame, crop, camera, image, state, composite))
         weights = {name: self.weights[name.partition("/")[0]] for name in terms}
         for name in self.model.entities:
-            self._regularize(name, state.gaussians[name], terms, weights)
+            own = None if deformed.penalties is None else deformed.penalties[name]
+            self._regularize(name, state.gaussians[name], own, terms, weights)
         if self.cameras is not None:
             terms["regularizer/camera"] = self.cameras.penalty(frame.position)
             weights["regularizer/camera"] = self.spec.regularizers.get("camera", CAMERA_WEIGHT)
@@ -128,6 +136,17 @@ class JointObjective:
         for name, term in terms.items():
             total = total + weights[name] * term
         return ObjectiveResult(terms, total, state, composite, offsets, weights, absolutes)
+
+    def _deform(self, moment: Moment) -> Deformed:
+        """Apart, so that it can be timed apart."""
+        return self.recorded(moment)
+
+    def weight_of(self, name: str, penalty: str) -> float:
+        """Weight of a penalty of an entity's deformation or density control."""
+        weight = self.model.entity(name).deformation.regularizer_weights.get(penalty, 0.0)
+        if name in self.density:
+            weight = self.density[name].regularizer_weights.get(penalty, weight)
+        return self.spec.regularizers.get(penalty, weight)
 
     def _scene(
         self,
@@ -210,23 +229,26 @@ class JointObjective:
         self, name: str, residual: Residual, terms: dict[str, Tensor], weights: dict[str, float]
     ) -> None:
         """Penalties of what the interaction asked for: mean squared, radians or metres."""
-        for key, value in (("residual_pose", residual.pose), ("residual_means", residual.means)):
+        for key, value in zip(RESTRAINED, (residual.pose, residual.means), strict=True):
             weight = self.spec.regularizers.get(key, 0.0)
             if weight > 0 and value is not None:
                 terms[f"regularizer/{name}/{key}"] = value.square().sum(-1).mean()
                 weights[f"regularizer/{name}/{key}"] = weight
 
     def _regularize(
-        self, name: str, current: Gaussians, terms: dict[str, Tensor], weights: dict[str, float]
+        self,
+        name: str,
+        current: Gaussians,
+        own: Mapping[str, Tensor] | None,
+        terms: dict[str, Tensor],
+        weights: dict[str, float],
     ) -> None:
-        defaults = dict(self.model.entity(name).deformation.regularizer_weights)
-        penalties = self.model.entity(name).regularizers()
+        """`own`: the penalties of the deformation that count, where they are known already."""
+        penalties = dict(self.model.entity(name).regularizers() if own is None else own)
         if name in self.density:
-            control = self.density[name]
-            defaults |= control.regularizer_weights
-            penalties |= control.regularizers(current)
+            penalties |= self.density[name].regularizers(current)
         for key, value in penalties.items():
-            weight = self.spec.regularizers.get(key, defaults.get(key, 0.0))
+            weight = self.weight_of(name, key)
             if weight > 0:
                 terms[f"regularizer/{name}/{key}"] = value
                 weights[f"regularizer/{name}/{key}"] = weight

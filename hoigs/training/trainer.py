@@ -88,8 +88,9 @@ class Trainer:
             self.cameras = CameraRefinement.of(clip).to(model.device)
         scale = 1 / depth_factor(clip) if spec.loss.depth_fit == "auto" else 1.0
         self.objective = JointObjective(
-            model, spec.loss, clip.depth_kind, lpips, density, faces, self.cameras, scale
-        )
+            model, spec.loss, clip.depth_kind, lpips, density, faces, self.cameras, scale,
+            spec.graphs,
+        )  # fmt: skip
         scene_extent = clip.extent()
         self.optimizer = GroupedAdam(model, spec.rates, spec.warmup, scene_extent, self.cameras)
         self.density = {

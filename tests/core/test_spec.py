@@ -153,6 +153,11 @@ def test_a_name_changes_no_hash(parse):
     assert other != parse() and other.hash() == parse().hash()
 
 
+def test_how_a_step_is_computed_changes_no_hash(parse):
+    other = parse(TEXT.replace("steps: 7", "steps: 7, graphs: off"))
+    assert other.train.graphs == "off" and other.hash() == parse().hash()
+
+
 AT_LEAST_1 = "must be greater than or equal to 1, got 0"
 NO_INT = "must be a valid integer, unable to parse string as an integer, got "
 NO_NUMBER = "must be a valid number, unable to parse string as a number, got "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Literal
 
 import torch
@@ -69,7 +70,8 @@ class ScaledProductPlanes(nn.Module):
 def _product(
     planes: Float[Tensor, "P H W C"], points: Float[Tensor, "P N 2"]
 ) -> Float[Tensor, "N C"]:
-    return sample_planes(planes, points).unflatten(1, (len(planes), -1)).prod(1)
+    # not `prod`, whose gradient asks a device whether there are zeros
+    return functools.reduce(torch.mul, sample_planes(planes, points).chunk(len(planes), 1))
 
 
 def body_planes(

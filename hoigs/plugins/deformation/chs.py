@@ -78,6 +78,7 @@ class CubicHermite(Resizing, DeformationModel):
     """
 
     provides = frozenset({"velocity"})
+    recordable = True
     rates: ClassVar[Mapping[str, str]] = {
         "keyframe_means": "keyframes",
         "tangents": "keyframes",

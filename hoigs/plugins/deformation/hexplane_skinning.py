@@ -195,6 +195,12 @@ class HexPlaneSkinning(SkinnedBody):
         self._last: tuple[CanonicalAttributes, Tensor] | None = None
         self._held: tuple[Gaussians, Tensor] | None = None
 
+    @property
+    def recordable(self) -> bool:  # type: ignore[override]
+        """Only while poses are refined: a shape that is not learned is compared with the one that
+        was kept, and the answer waits for the device."""
+        return self.refinement is not None
+
     @classmethod
     def from_config(cls, config: HexPlaneSkinningConfig, context: BuildContext) -> Self:
         settings = context_settings(context, "deformation:hexplane-skinning")

@@ -211,8 +211,9 @@ class SkinnedBody(DeformationModel):
         if self.refinement is not None:
             betas = betas + self.refinement.betas.detach()
         # in training the shape changes at every step, and comparing would wait for the device
-        always = self.training and self.refinement is not None
-        if always or self._arm is None or not torch.equal(self._arm[0], betas):
+        if self.training and self.refinement is not None:
+            return self.body.arm_length(betas) * self.log_alpha.exp()
+        if self._arm is None or not torch.equal(self._arm[0], betas):
             self._arm = (betas.clone(), self.body.arm_length(betas))
         return self._arm[1] * self.log_alpha.exp()
 

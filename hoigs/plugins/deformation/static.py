@@ -20,6 +20,7 @@ class Static(DeformationModel):
 
     rest_space = "world"
     moves = False
+    recordable = True
 
     def forward(
         self, rest: Gaussians, moment: Moment, residual: Residual | None = None

@@ -47,9 +47,10 @@ def mesh_roughness(values: Float[Tensor, "V D"], edges: Int[Tensor, "E 2"]) -> F
     Args:
         edges: `mesh_edges` of the mesh.
     """
-    degree = torch.bincount(edges[:, 0], minlength=len(values))
+    # not bincount, which waits for a device to know how many bins there are
+    degree = values.new_zeros(len(values)).index_add(0, edges[:, 0], values.new_ones(len(edges)))
     sums = torch.zeros_like(values).index_add(0, edges[:, 0], values[edges[:, 1]])
-    means = torch.where(degree[:, None] > 0, sums / degree.clamp_min(1)[:, None].to(values), values)
+    means = torch.where(degree[:, None] > 0, sums / degree.clamp_min(1)[:, None], values)
     return (values - means).square().sum(-1).mean()
 
 

@@ -39,6 +39,7 @@ class BodyPartFeatures(FeatureExtractor):
     """
 
     requires = frozenset({"field"})
+    recordable = True
     averages: Tensor
 
     def bind(self, deformation: DeformationModel, rest: Gaussians) -> None:

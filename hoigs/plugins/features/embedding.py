@@ -44,6 +44,7 @@ class EmbeddingFeatures(FeatureExtractor):
     """
 
     rates: ClassVar[Mapping[str, str]] = {"embedding": "embedding"}
+    recordable = True
     averages: Tensor | None
 
     def __init__(

@@ -70,6 +70,7 @@ class SplineMotionFeatures(FeatureExtractor):
     """
 
     requires = frozenset({"velocity"})
+    recordable = True
     rates: ClassVar[Mapping[str, str]] = {"embedding": "embedding", "mixture": "embedding"}
 
     def __init__(

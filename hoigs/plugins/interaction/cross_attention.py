@@ -11,6 +11,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from hoigs.core.body import BODY_JOINT_PARTS, PART_NAMES
+from hoigs.core.clock import constant
 from hoigs.core.config import ComponentConfig
 from hoigs.core.features import Tokens
 from hoigs.core.interaction import EntityKind, InteractionModule, Residual, Role
@@ -76,6 +77,8 @@ class CrossAttention(InteractionModule):
     Both heads start at zero. Entities of one kind with tokens of one width share their weights.
     Object tokens are one a Gaussian, human tokens one a body part.
     """
+
+    recordable = True
 
     def __init__(
         self,
@@ -167,7 +170,7 @@ class CrossAttention(InteractionModule):
     ) -> Float[Tensor, "51 3"]:
         """delta theta: of all tokens flattened, or of each joint's own part; bounded, gated."""
         if self.local:
-            parts = torch.tensor(JOINT_PARTS, device=attended.device)
+            parts = constant(JOINT_PARTS, attended, torch.long)
             every = self.pose_head(attended).unflatten(1, (POSE_JOINTS, 3))
             raw = every[parts, torch.arange(POSE_JOINTS, device=parts.device)]
             return gates[parts, None] * self.pose_bound * torch.tanh(raw)

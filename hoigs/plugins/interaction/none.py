@@ -16,6 +16,8 @@ class NoInteractionConfig(ComponentConfig):
 class NoInteraction(InteractionModule):
     """No residuals."""
 
+    recordable = True
+
     def forward(
         self, tokens: Mapping[str, Tokens], roles: Mapping[str, Role]
     ) -> Mapping[str, Residual]:

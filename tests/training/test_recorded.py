@@ -1,0 +1,542 @@
+"""Recorded training steps: the plain path's values, gradients and trajectories, or a reason."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from hoigs.core.camera import Camera
+from hoigs.core.clip import Clip, FrameStore, ObjectTrack
+from hoigs.core.deformation import DeformationModel
+from hoigs.core.entity import Entity
+from hoigs.core.errors import HoigsError
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.interaction import Residual
+from hoigs.core.moment import BodyPose, Moment
+from hoigs.core.scene import SceneModel
+from hoigs.core.train_spec import LossSpec, TrainSpec, WarmupSpec
+from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
+from hoigs.plugins.deformation.static import Static
+from hoigs.plugins.density.adc import AdaptiveDensity
+from hoigs.plugins.features.body_parts import BodyPartFeatures
+from hoigs.plugins.features.embedding import EmbeddingFeatures
+from hoigs.plugins.features.spline_motion import SplineMotionFeatures
+from hoigs.plugins.interaction.cross_attention import CrossAttention
+from hoigs.rasterizers.torch_tiles import TorchRasterizer
+from hoigs.testing.material.body import TinyBody
+from hoigs.training.recorded import RecordedScene
+from hoigs.training.trainer import Trainer
+
+FRAMES, SIZE, STEPS = 6, 24, 30
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """Numbers this few are computed faster by one thread."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def scene(
+    human: dict[str, Any] | None = None,
+    thing: dict[str, Any] | None = None,
+    attention: dict[str, Any] | None = None,
+    *,
+    plain_tokens: bool = False,
+) -> SceneModel:
+    """All parts of the hoigs spec, small, every head and correction away from its start."""
+    torch.manual_seed(0)
+    body = TinyBody()
+    wall = Gaussians.from_points(torch.rand(40, 3) + torch.tensor((-0.5, -0.5, 1.5)), sh_degree=1)
+    box = Gaussians.from_points(0.2 * torch.rand(20, 3) + torch.tensor((0.6, 0.3, 0.0)))
+    turns = torch.linspace(0, 1, FRAMES)
+    track = ObjectTrack(
+        points=box.means,
+        colors=torch.rand(20, 3),
+        rotations=torch.stack([_about_y(float(t)) for t in turns]),
+        translations=torch.stack((turns, turns.square(), 0 * turns), 1),
+        observed=torch.ones(FRAMES, dtype=torch.bool),
+    )
+    settings = {"refine_poses": True, "num_frames": FRAMES, "trained_frames": (0, 1, 3, 4)}
+    person = HexPlaneSkinning(
+        body, resolution=8, channels=4, time_resolution=4, field_points=64, width=16,
+        **(settings | (human or {})),
+    )  # fmt: skip
+    motion = CubicHermite(4, track=track, **(thing or {}))
+    model = SceneModel(
+        {
+            "scene": Entity(wall, Static(), kind="scene"),
+            "human": Entity(
+                body.rest(80), person, EmbeddingFeatures() if plain_tokens else BodyPartFeatures()
+            ),
+            "object": Entity(
+                box,
+                motion,
+                EmbeddingFeatures(keyframes=3) if plain_tokens else SplineMotionFeatures(hidden=8),
+                kind="object",
+            ),
+        },
+        interaction=CrossAttention(hidden=16, reach=3.0, **(attention or {})),
+        rasterizer=TorchRasterizer(),
+    )
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            if "planes" not in name and name.rpartition(".")[2] not in ("means", "log_scales"):
+                parameter += 0.03 * torch.randn_like(parameter)
+    return model.train()
+
+
+def _about_y(angle: float) -> Tensor:
+    c, s = math.cos(angle), math.sin(angle)
+    return torch.tensor(((c, 0.0, s), (0.0, 1.0, 0.0), (-s, 0.0, c)))
+
+
+def at(frame: float) -> Moment:
+    time = frame / (FRAMES - 1)
+    generator = torch.Generator().manual_seed(round(1000 * time))
+    pose = BodyPose.zeros(betas=2).replace(
+        body=0.3 * torch.randn(21, 3, generator=generator),
+        transl=torch.tensor((0.2 * time, 0.0, 0.0)),
+        betas=torch.tensor((0.5, -0.3 + 0.1 * time)),  # clips may have another one a frame
+    )
+    return Moment(time, round(frame), {"human": pose})
+
+
+def weight_of(model: SceneModel) -> Any:
+    return lambda name, key: model.entity(name).deformation.regularizer_weights.get(key, 0.0)
+
+
+def loss(recorded: RecordedScene, model: SceneModel, moment: Moment) -> Tensor:
+    """One that every Gaussian's every number is part of, alone and joined, and all penalties."""
+    deformed = recorded(moment)
+    total = torch.zeros((), device=model.device)
+    for part in (deformed.state.joined(), deformed.state.gaussians["human"]):
+        for value in vars(part).values():
+            ramp = torch.linspace(-1, 2, value.numel(), device=value.device).view(value.shape)
+            total = total + (ramp * value.sin()).sum()
+    for name in model.entities:
+        known = deformed.penalties and deformed.penalties[name]
+        for key, value in (known or model.entity(name).regularizers()).items():
+            total = total + weight_of(model)(name, key) * value
+    return total
+
+
+def gradients(model: SceneModel) -> dict[str, Tensor | None]:
+    return {n: None if p.grad is None else p.grad.clone() for n, p in model.named_parameters()}
+
+
+def apart(ours: Tensor, theirs: Tensor) -> float:
+    return float((ours - theirs).norm() / theirs.norm().clamp_min(1e-12))
+
+
+def compared(model: SceneModel, recorded: RecordedScene, moments: list[Moment]) -> None:
+    """Values and gradients of a recorded model at moments, against the plain path's."""
+    plain = RecordedScene(model, "off", weight_of(model))
+    for moment in moments:
+        found = []
+        for way in (recorded, plain):
+            model.zero_grad(set_to_none=True)
+            value = loss(way, model, moment)
+            value.backward()
+            found.append((value.detach(), gradients(model)))
+        (ours, mine), (theirs, wanted) = found
+        assert apart(ours, theirs) < 1e-6
+        largest = max(float(g.norm()) for g in wanted.values() if g is not None)
+        for name, gradient in wanted.items():
+            other = mine[name]
+            assert (other is None) == (gradient is None), name
+            if gradient is not None and other is not None:
+                difference = float((other - gradient).norm())
+                assert difference < 2e-6 * float(gradient.norm()) + 1e-8 * largest, name
+
+
+def recording(model: SceneModel) -> RecordedScene:
+    made = RecordedScene(model, "auto", weight_of(model), launches=True)
+    assert made.mode == "cached", made.reason
+    return made
+
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "hoigs": {},
+    "product planes": {"human": {"fusion": "product"}},
+    "canonical field, exavatar head": {"human": {"field_at": "canonical", "head": "exavatar"}},
+    "mesh laplacian": {"human": {"laplacian": "mesh", "residual_rule": "compose"}},
+    "finite differences": {"thing": {"tangents": "finite-difference", "opacity": "constant"}},
+    "heads": {"attention": {"pose_head": "per-part", "object_residual": "both", "gate": "hard"}},
+    "plain tokens": {"plain_tokens": True},
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_values_and_gradients_are_the_plain_paths(variant: str) -> None:
+    model = scene(**VARIANTS[variant])
+    recorded = recording(model)
+    compared(model, recorded, [at(f) for f in (0, 1, 2.3, 3, 5, 0)])
+    assert (recorded.mode, recorded.recordings) == ("cached", 1), recorded.reason
+
+
+class Waits(TorchDispatchMode):
+    """Names what would wait for a GPU, or bring it numbers from the host: no graph can hold it."""
+
+    names = (
+        "_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equal", "bincount",
+        "lift_fresh", "lift_fresh_copy", "_unique2", "unique_dim", "repeat_interleave",
+    )  # fmt: skip
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[str] = set()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = str(func).split(".")[1]
+        masked = name in ("index", "index_put", "_index_put_impl_") and any(
+            x is not None and x.dtype == torch.bool for x in args[1]
+        )
+        if name in self.names or masked:
+            self.seen.add(str(func))
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_nothing_recorded_waits_for_a_device(variant: str) -> None:
+    model = scene(**VARIANTS[variant])
+    recorded = recording(model)
+    for frame in (0, 1):
+        recorded(at(frame))
+    made = recorded._recording
+    assert made is not None
+    with Waits() as waits:
+        turn = made.replay()
+        made.replay_backward([torch.ones_like(x) for x in made.live.values()], turn)
+    assert not waits.seen
+    with Waits() as waits:
+        float(model.entity("scene").means.detach().sum())
+        model.entity("scene").means[torch.ones(40, dtype=torch.bool)]
+    assert {name.split(".")[1] for name in waits.seen} == {"_local_scalar_dense", "index"}
+
+
+def test_state_is_the_plain_paths() -> None:
+    model = scene()
+    recorded = RecordedScene(model, "auto", weight_of(model), restrained=True, launches=True)
+    recorded(at(1))
+    state, plain = recorded(at(2)).state, model(at(2))
+    assert recorded.recordings == 1
+    assert list(state.gaussians) == list(plain.gaussians) and state.slices() == plain.slices()
+    assert state.whole is not None and state.joined() is state.whole
+    for only in (None, ["scene"], ["object", "human"]):
+        for name, value in vars(plain.joined(only)).items():
+            torch.testing.assert_close(getattr(state.joined(only), name), value)
+    for name, residual in plain.residuals.items():
+        for part, value in vars(residual).items():
+            ours = getattr(state.residuals[name], part)
+            assert (ours is None) == (value is None)
+            if value is not None:
+                torch.testing.assert_close(ours, value)
+                assert ours.requires_grad
+    for name, tokens in plain.tokens.items():
+        torch.testing.assert_close(state.tokens[name].features, tokens.features)
+
+
+def test_recorded_anew_only_when_something_changed() -> None:
+    model = scene()
+    recorded = recording(model)
+    compared(model, recorded, [at(f) for f in (0, 1, 2)])
+    model.interaction_enabled = False
+    compared(model, recorded, [at(f) for f in (0, 1, 2)])
+    assert recorded.recordings == 2
+    wall = model.entity("scene")
+    wall.resize(55)
+    compared(model, recorded, [at(f) for f in (0, 1)])
+    wall.resize(70)  # at every step: not worth a recording
+    compared(model, recorded, [at(0)])
+    wall.resize(50)
+    compared(model, recorded, [at(0)])
+    assert recorded.recordings == 3
+    compared(model, recorded, [at(0)])
+    model.entity("human").sh.requires_grad_(False)
+    compared(model, recorded, [at(0), at(1)])
+    assert recorded.recordings == 5
+    with torch.no_grad():  # previews and evaluation are the model's own
+        assert recorded(at(0)).penalties is None
+    model.eval()
+    assert recorded(at(0)).penalties is None
+    model.train()
+    compared(model, recorded, [at(3)])
+    assert recorded.recordings == 5
+
+
+def test_gradients_are_the_callers_own() -> None:
+    """Neither the next step nor an accumulated gradient meets the recording's memory."""
+    model = scene()
+    recorded = recording(model)
+    loss(recorded, model, at(0)).backward()
+    model.zero_grad(set_to_none=True)
+    loss(recorded, model, at(1)).backward()
+    once, kept = gradients(model), {n: p.grad for n, p in model.named_parameters()}
+    loss(recorded, model, at(1)).backward()  # added to what is there
+    for name, gradient in once.items():
+        if gradient is not None:
+            torch.testing.assert_close(kept[name], 2 * gradient, rtol=1e-5, atol=1e-5)
+    # an output that the loss does not use has no part in it, though it had one before
+    model.zero_grad(set_to_none=True)
+    recorded(at(1)).state.gaussians["human"].means.sum().backward()
+    mine = gradients(model)
+    model.zero_grad(set_to_none=True)
+    model(at(1)).gaussians["human"].means.sum().backward()
+    for name, gradient in gradients(model).items():
+        ours = mine[name]
+        assert ours is not None or gradient is None
+        if ours is not None:
+            wanted = torch.zeros_like(ours) if gradient is None else gradient
+            torch.testing.assert_close(ours, wanted, rtol=1e-5, atol=1e-5)
+
+
+def test_overwritten_outputs_have_no_gradient() -> None:
+    model = scene()
+    recorded = recording(model)
+    recorded(at(0))
+    first = loss(recorded, model, at(1))
+    loss(recorded, model, at(2))
+    with pytest.raises(RuntimeError, match="overwritten by a later one"):
+        first.backward()
+
+
+class Noisy(Static):
+    """Says nothing about recordings, so what Static said does not hold for it."""
+
+
+class Forgetful(DeformationModel):
+    """Claims what is not so: a recording keeps its first time, or has no gradient."""
+
+    recordable = True
+
+    def __init__(self, cut: bool) -> None:
+        super().__init__()
+        self.cut = cut
+
+    def forward(
+        self, rest: Gaussians, moment: Moment, residual: Residual | None = None
+    ) -> Gaussians:
+        if not isinstance(moment.time, Tensor):
+            return replace(rest, means=rest.means + moment.time)
+        means = rest.means.detach() + moment.time.float() if self.cut else rest.means + 1
+        return replace(rest, means=means)
+
+
+def test_what_cannot_be_recorded_says_why() -> None:
+    def of(deformation: DeformationModel, **kwargs: Any) -> RecordedScene:
+        rest = Gaussians.from_points(torch.rand(10, 3), scales=0.1)
+        model = SceneModel({"wall": Entity(rest, deformation)}, rasterizer=TorchRasterizer())
+        return RecordedScene(model.train(), kwargs.pop("graphs", "auto"), lambda *_: 0, **kwargs)
+
+    assert of(Noisy()).reason == "wall.deformation, a Noisy, is not recordable"
+    assert "need a CUDA device" in of(Static()).reason
+    assert of(Static(), graphs="off").reason == "train.graphs is off"
+    with pytest.raises(HoigsError, match=r"train.graphs is on, but CUDA graphs need a CUDA device"):
+        of(Static(), graphs="on")
+    recorded = RecordedScene(scene({"refine_poses": False}), "auto", lambda *_: 0, launches=True)
+    assert "human.deformation, a HexPlaneSkinning" in recorded.reason
+    wrong = of(Forgetful(cut=False), launches=True)
+    wrong(at(2))
+    with pytest.warns(UserWarning, match="without CUDA graphs: means of .* differs by"):
+        values = wrong(at(2)).state.joined().means
+    assert wrong.mode == "plain" and "differs" in wrong.reason
+    assert torch.equal(values, wrong._model(at(2)).joined().means)
+    wrong = of(Forgetful(cut=True), launches=True)
+    wrong(at(2))
+    with pytest.warns(UserWarning, match="does not have the plain path's outputs|has a gradient"):
+        wrong(at(2))
+    insisting = of(Forgetful(cut=False), launches=True, graphs="on")
+    insisting(at(2))
+    with pytest.raises(HoigsError, match=r"train.graphs is on, but means of"):
+        insisting(at(2))
+
+
+class Pictures(FrameStore):
+    """Coloured noise, and masks of the middle."""
+
+    def __init__(self) -> None:
+        generator = torch.Generator().manual_seed(3)
+        self.images = torch.randint(0, 256, (FRAMES, SIZE, SIZE, 3), generator=generator)
+
+    def image(self, position: int) -> Tensor:
+        return self.images[position].to(torch.uint8)
+
+    def mask(self, entity: str, position: int) -> Tensor:
+        mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+        mask[6:18, 6:12] = entity == "human"
+        mask[6:18, 12:18] = entity == "object"
+        return mask
+
+    def depth(self, position: int) -> Tensor | None:
+        return None
+
+
+def trainer(device: str = "cpu", graphs: Any = "auto") -> Trainer:
+    cameras = [
+        Camera.look_at(
+            torch.tensor((0.2 * i - 0.5, 0.2, -2.5)), torch.tensor((0.0, 0.0, 0.5)),
+            width=SIZE, height=SIZE, fov_y=0.9, up=(0.0, -1.0, 0.0),
+        )
+        for i in range(FRAMES)
+    ]  # fmt: skip
+    clip = Clip(
+        "noise",
+        Pictures(),
+        cameras,
+        [at(f) for f in range(FRAMES)],
+        kinds={"human": "human", "object": "object"},
+        bodies={},
+        objects={},
+        points=torch.rand(9, 3),
+        point_colors=torch.rand(9, 3),
+        split={"train": [0, 1, 3, 4], "test": [2, 5]},
+    )
+    spec = TrainSpec(
+        steps=STEPS,
+        preview_every=0,
+        graphs=graphs,
+        warmup=WarmupSpec(motion=0.2, interaction=0.5, poses=0.1),
+        loss=LossSpec(ssim="torch", regularizers={"residual_pose": 0.1}),
+    )
+    density = {"scene": AdaptiveDensity(interval=8, stop=0.9, threshold=1e-9, cap=110)}
+    return Trainer(scene().to(device), clip, spec, density=density)
+
+
+def by_launches(made: Trainer) -> Trainer:
+    """What a GPU does by default, without graphs."""
+    objective = made.objective
+    assert objective.recorded.mode == "plain" and "CUDA" in objective.recorded.reason
+    objective.recorded = RecordedScene(
+        made.model, "auto", objective.weight_of, restrained=True, launches=True
+    )
+    return made
+
+
+def test_a_training_run_takes_the_same_way() -> None:
+    """Adam, density control, warm-ups and pose refinement included."""
+    plain, recorded = trainer(graphs="off"), by_launches(trainer())
+    scenes, counts, compared = recorded.objective.recorded, set(), 0
+    pose = recorded.model.entity("human").get_parameter("deformation.refinement.pose")
+    before = pose.detach().clone()
+    while recorded.step < STEPS:
+        if recorded.step:  # Adam makes whole steps of what is but rounding
+            plain.resume(recorded.checkpoint())
+        for run in (plain, recorded):
+            run.train(until=run.step + 1)
+        assert recorded.model.count() == plain.model.count()
+        counts.add(recorded.model.count()["scene"])
+        ours, theirs = gradients(recorded.model), gradients(plain.model)
+        largest = max(float(g.norm()) for g in theirs.values() if g is not None)
+        for name, gradient in theirs.items():
+            mine = ours[name]
+            assert (mine is None) == (gradient is None), name
+            if mine is not None and gradient is not None:
+                difference = float((mine - gradient).norm())
+                assert difference < 1e-5 * float(gradient.norm()) + 1e-8 * largest, name
+                compared += 1
+    assert len(counts) > 2 and compared > 20 * STEPS  # topology did change
+    assert scenes.mode == "cached", scenes.reason
+    assert len(counts) <= scenes.recordings <= len(counts) + 1
+    states = [set(run.checkpoint().tensors) for run in (plain, recorded)]
+    assert states[0] == states[1]  # Adam's too: what has no gradient has no state
+    assert not torch.equal(pose.detach(), before)
+
+
+def test_recorded_runs_resume() -> None:
+    whole = by_launches(trainer())
+    whole.train(until=12)
+    stored = whole.checkpoint()
+    stored = replace(stored, tensors={k: v.clone() for k, v in stored.tensors.items()})
+    whole.train(until=20)
+    resumed = by_launches(trainer())
+    resumed.resume(stored)
+    resumed.train(until=20)
+    assert resumed.objective.recorded.recordings == 2  # the shapes of steps 12 and 16
+    for name, value in whole.checkpoint().tensors.items():
+        if value.is_floating_point() and not name.startswith("density"):
+            assert apart(resumed.checkpoint().tensors[name], value) < 1e-4, name
+    copy.deepcopy(whole.model)  # nothing of a recording hangs on the model
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_cuda_graphs_equal_the_plain_path(variant: str) -> None:
+    model = scene(**VARIANTS[variant]).to("cuda")
+    recorded = RecordedScene(model, "on", weight_of(model))
+    plain = RecordedScene(model, "off", weight_of(model))
+    for frame in (0, 1, 2.3, 3, 5, 0):
+        found = []
+        for way in (recorded, plain):
+            model.zero_grad(set_to_none=True)
+            loss(way, model, at(frame)).backward()
+            found.append(gradients(model))
+        mine, wanted = found
+        largest = max(float(g.norm()) for g in wanted.values() if g is not None)
+        for name, gradient in wanted.items():
+            ours = mine[name]
+            assert (ours is None) == (gradient is None), name
+            if ours is not None and gradient is not None:
+                difference = float((ours - gradient).norm())
+                assert difference < 1e-4 * float(gradient.norm()) + 1e-6 * largest, name
+    assert (recorded.mode, recorded.recordings) == ("graph", 1), recorded.reason
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_cuda_training_by_graphs() -> None:
+    """Through density control and warm-ups; memory of old recordings goes back."""
+    plain, recorded = trainer("cuda", graphs="off"), trainer("cuda", graphs="on")
+    counts, memory = set(), []
+    while plain.step < STEPS:
+        for run in (plain, recorded):
+            run.train(until=run.step + 1)
+        counts.add(recorded.model.count()["scene"])
+        memory.append(torch.cuda.memory_allocated())
+    scenes = recorded.objective.recorded
+    assert scenes.mode == "graph", scenes.reason
+    assert len(counts) > 2 and 2 <= scenes.recordings <= len(counts) + 1
+    assert memory[-1] < memory[len(memory) // 2] + (64 << 20)
+    for name, value in plain.model.state_dict().items():
+        ours = recorded.model.state_dict()[name]
+        if value.is_floating_point() and ours.shape == value.shape:
+            assert apart(ours, value) < 1e-2, name
+
+
+class Reads(Static):
+    """Claims to be recordable, and asks the device for a number."""
+
+    recordable = True
+
+    def forward(
+        self, rest: Gaussians, moment: Moment, residual: Residual | None = None
+    ) -> Gaussians:
+        return replace(rest, means=rest.means * float(rest.means.detach().square().mean()))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_cuda_capture_that_fails_leaves_the_plain_path() -> None:
+    rest = Gaussians.from_points(torch.rand(10, 3), scales=0.1)
+    model = SceneModel({"wall": Entity(rest, Reads())}, rasterizer=TorchRasterizer())
+    model = model.to("cuda").train()
+    recorded = RecordedScene(model, "auto", lambda *_: 0.0)
+    recorded(at(2))
+    with pytest.warns(UserWarning, match="training goes on without CUDA graphs"):
+        values = recorded(at(2)).state.joined().means
+    assert recorded.mode == "plain"
+    assert torch.equal(values, model(at(2).to("cuda")).joined().means)
+    values.sum().backward()  # the device is none the worse
+    assert torch.isfinite(model.entity("wall").means.grad).all()
