@@ -16,11 +16,11 @@ from hoigs.core.features import Tokens
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.interaction import Residual
 from hoigs.core.moment import Moment
-from hoigs.core.moment_layout import MomentLayout
 from hoigs.core.recordable import why_not_recordable
 from hoigs.core.scene import SceneModel, SceneState
 from hoigs.core.train_spec import Graphs
 from hoigs.training.recording import Key, Recording, leaves_of
+from hoigs.training.stamp import Stamp
 
 Mode = Literal["graph", "cached", "plain"]
 
@@ -82,7 +82,7 @@ class RecordedScene:
     ) -> None:
         self._model, self._whole = model, _Whole(model, weight_of, restrained)
         self._insisted = graphs == "on"
-        self._stamp: _Stamp | None = None
+        self._stamp: Stamp | None = None
         self._recording: Recording | None = None
         self._compared: set[object] = set()
         self._stream: torch.cuda.Stream | None = None
@@ -109,7 +109,7 @@ class RecordedScene:
             return self._plain(moment)
         if self._stamp is None or not self._stamp.holds(self._model, moment):
             self._let_go()
-            self._stamp = _Stamp(self._model, moment)
+            self._stamp = Stamp(self._model, moment)
             return self._plain(moment)
         if self._recording is None:
             self._record(moment, self._stamp)
@@ -143,7 +143,7 @@ class RecordedScene:
         joined = Gaussians(**parts["joined",])
         return Deformed(SceneState(gaussians, residuals, tokens, joined), penalties)
 
-    def _record(self, moment: Moment, stamp: _Stamp) -> None:
+    def _record(self, moment: Moment, stamp: Stamp) -> None:
         """Record and, if this set of parts is new, compare; or be plain from now on."""
         trained = {
             f"scene.{name}": p for name, p in self._model.named_parameters() if p.requires_grad
@@ -246,39 +246,6 @@ class _Whole(nn.Module):
         if penalties:
             found["penalties",] = torch.stack(list(penalties.values()))
         return found
-
-
-class _Stamp:
-    """What a recording holds for: memory and kind of all tensors, parts in use, people."""
-
-    def __init__(self, model: SceneModel, moment: Moment) -> None:
-        self._enabled = model.interaction_enabled
-        self.layout = MomentLayout.of(moment, model.entities, betas=True)
-        stores = [s for m in model.modules() for s in (m._parameters, m._buffers)]
-        self._sizes = [(store, len(store)) for store in stores if store]
-        # detached, which keeps the memory: no other tensor can come to stand at the same address
-        self._tensors = [
-            (store, name, x, None if x is None else x.detach(), x is not None and x.requires_grad)
-            for store in stores
-            for name, x in store.items()
-        ]
-        people = tuple((name, p.convention) for name, p in self.layout.people.items())
-        kinds = tuple((name, x is None, trained) for _, name, x, _, trained in self._tensors)
-        self.parts = (self._enabled, people, kinds)
-
-    def holds(self, model: SceneModel, moment: Moment) -> bool:
-        if model.interaction_enabled != self._enabled or not self.layout.fits(moment):
-            return False
-        if any(len(store) != size for store, size in self._sizes):
-            return False
-        for store, name, tensor, memory, trained in self._tensors:
-            if store.get(name) is not tensor:
-                return False
-            if tensor is not None and memory is not None:
-                same = tensor.data_ptr() == memory.data_ptr() and tensor.shape == memory.shape
-                if not same or tensor.requires_grad != trained:
-                    return False
-        return True
 
 
 def _differing(pairs: Mapping[str, tuple[Tensor, Tensor]], allowed: float) -> str | None:

@@ -424,12 +424,9 @@ def by_launches(made: Trainer) -> Trainer:
     return made
 
 
-def test_a_training_run_takes_the_same_way() -> None:
-    """Adam, density control, warm-ups and pose refinement included."""
-    plain, recorded = trainer(graphs="off"), by_launches(trainer())
-    scenes, counts, compared = recorded.objective.recorded, set(), 0
-    pose = recorded.model.entity("human").get_parameter("deformation.refinement.pose")
-    before = pose.detach().clone()
+def side_by_side(recorded: Trainer, plain: Trainer, allowed: float) -> set[int]:
+    """Train, and at every step compare gradients; the counts that the scene had."""
+    counts, compared = set(), 0
     while recorded.step < STEPS:
         if recorded.step:  # Adam makes whole steps of what is but rounding
             plain.resume(recorded.checkpoint())
@@ -444,13 +441,23 @@ def test_a_training_run_takes_the_same_way() -> None:
             assert (mine is None) == (gradient is None), name
             if mine is not None and gradient is not None:
                 difference = float((mine - gradient).norm())
-                assert difference < 1e-5 * float(gradient.norm()) + 1e-8 * largest, name
+                floor = 1e-3 * allowed * largest
+                assert difference < allowed * float(gradient.norm()) + floor, name
                 compared += 1
     assert len(counts) > 2 and compared > 20 * STEPS  # topology did change
+    # Adam's too: what has no gradient has no state
+    assert set(recorded.checkpoint().tensors) == set(plain.checkpoint().tensors)
+    return counts
+
+
+def test_a_training_run_takes_the_same_way() -> None:
+    """Adam, density control, warm-ups and pose refinement included."""
+    plain, recorded = trainer(graphs="off"), by_launches(trainer())
+    pose = recorded.model.entity("human").get_parameter("deformation.refinement.pose")
+    before = pose.detach().clone()
+    counts, scenes = side_by_side(recorded, plain, 1e-5), recorded.objective.recorded
     assert scenes.mode == "cached", scenes.reason
     assert len(counts) <= scenes.recordings <= len(counts) + 1
-    states = [set(run.checkpoint().tensors) for run in (plain, recorded)]
-    assert states[0] == states[1]  # Adam's too: what has no gradient has no state
     assert not torch.equal(pose.detach(), before)
 
 
@@ -497,22 +504,22 @@ def test_cuda_graphs_equal_the_plain_path(variant: str) -> None:
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_cuda_training_by_graphs() -> None:
-    """Through density control and warm-ups; memory of old recordings goes back."""
+    """Through density control and warm-ups; the memory of old recordings goes back."""
     plain, recorded = trainer("cuda", graphs="off"), trainer("cuda", graphs="on")
-    counts, memory = set(), []
-    while plain.step < STEPS:
-        for run in (plain, recorded):
-            run.train(until=run.step + 1)
-        counts.add(recorded.model.count()["scene"])
-        memory.append(torch.cuda.memory_allocated())
-    scenes = recorded.objective.recorded
+    counts, scenes = side_by_side(recorded, plain, 1e-3), recorded.objective.recorded
     assert scenes.mode == "graph", scenes.reason
-    assert len(counts) > 2 and 2 <= scenes.recordings <= len(counts) + 1
-    assert memory[-1] < memory[len(memory) // 2] + (64 << 20)
-    for name, value in plain.model.state_dict().items():
-        ours = recorded.model.state_dict()[name]
-        if value.is_floating_point() and ours.shape == value.shape:
-            assert apart(ours, value) < 1e-2, name
+    assert len(counts) <= scenes.recordings <= len(counts) + 1
+    taken = []
+    for size in (50, 60, 50, 60, 50):
+        recorded.model.entity("scene").resize(size)
+        recorded.model.train()
+        recorded.optimizer.zero_grad()
+        for frame in (0, 1, 2):
+            loss(scenes, recorded.model, at(frame)).backward()
+            recorded.optimizer.zero_grad()
+        taken.append(torch.cuda.memory_allocated())
+    assert scenes.recordings >= len(taken)
+    assert taken[4] < taken[2] + (1 << 20)  # of the same size again
 
 
 class Reads(Static):
