@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Run folder.")] = Path("runs/demo"),
-    steps: Annotated[int, typer.Option("--steps", help="Training steps of each model.")] = 1000,
+    steps: Annotated[int, typer.Option("--steps", help="Training steps of each model.")] = 800,
     settings: SetOption = None,
     rasterizer: RasterizerOption = None,
     device: DeviceOption = "auto",

@@ -77,6 +77,19 @@ class Frame:
         """RGB in [0, 1]."""
         return self.image.float() / 255.0
 
+    def to(self, device: torch.device | str) -> Frame:
+        """The same view with its moment, camera and pixels on a device."""
+        depth, ignored = self.depth, self.ignored
+        return replace(
+            self,
+            moment=self.moment.to(device),
+            camera=self.camera.to(device),
+            image=self.image.to(device),
+            masks={name: mask.to(device) for name, mask in self.masks.items()},
+            depth=None if depth is None else depth.to(device),
+            ignored=None if ignored is None else ignored.to(device),
+        )
+
 
 @dataclass(frozen=True)
 class BodyTrack:

@@ -99,14 +99,14 @@ class JointObjective:
             camera,
             RenderRequest(screen_offsets=offsets, absolute_gradients=absolutes),
         )
-        image = frame.image.to(device).float() / 255.0
-        blank = None if frame.ignored is None else frame.ignored.to(device)
+        there = frame.to(device)
+        image = there.rgb
         terms: dict[str, Tensor] = {}
-        terms.update(self._scene(frame, camera, image, blank, state, composite))
-        if frame.depth is not None and self.weights["depth"] > 0:
-            prior = frame.depth.to(device) * self.depth_scale
-            if blank is not None:
-                prior = prior.masked_fill(blank, 0.0)  # 0 = unknown
+        terms.update(self._scene(there, image, camera, state, composite))
+        if there.depth is not None and self.weights["depth"] > 0:
+            prior = there.depth * self.depth_scale
+            if there.ignored is not None:
+                prior = prior.masked_fill(there.ignored, 0.0)  # 0 = unknown
             depth = depth_loss(
                 composite.depth, composite.alpha, prior, self.depth_kind, self.spec.depth_fit
             )
@@ -116,13 +116,13 @@ class JointObjective:
             for name in self.model.names(kind):
                 crop = None
                 if name in frame.masks:
-                    crop = crop_around(frame, camera, name, device)
+                    crop = crop_around(frame, camera, name, there)
                 if crop is None:  # not seen in this frame: the terms are skipped, not zero
                     continue
                 if kind == "object" or self.spec.human_image != "composite":
                     terms.update(self._alone(name, kind, crop, state, generator))
                 if kind == "human":
-                    terms.update(self._human(name, frame, crop, camera, image, state, composite))
+                    terms.update(self._human(name, there, crop, camera, image, state, composite))
         weights = {name: self.weights[name.partition("/")[0]] for name in terms}
         for name in self.model.entities:
             own = None if deformed.penalties is None else deformed.penalties[name]
@@ -151,13 +151,13 @@ class JointObjective:
     def _scene(
         self,
         frame: Frame,
-        camera: Camera,
         image: Tensor,
-        blank: Tensor | None,
+        camera: Camera,
         state: SceneState,
         composite: RenderOutput,
     ) -> dict[str, Tensor]:
         terms = {}
+        blank = frame.ignored
         dssim = (self.spec.lambda_dssim, self.spec.ssim)
         if self.spec.scene_loss in ("full", "both"):
             drawn = composite.color
@@ -171,7 +171,7 @@ class JointObjective:
             modelled = [m for n, m in frame.masks.items() if n in self.model.entities]
             dynamic = union(modelled)
             if dynamic is not None:
-                dynamic = dilate(dynamic, self.spec.dilate).to(image.device)
+                dynamic = dilate(dynamic, self.spec.dilate)
             hidden = union(m for m in (dynamic, blank) if m is not None)
             terms["scene/masked"] = scene_only_loss(alone.color, image, hidden, *dssim)
         return terms
@@ -210,7 +210,7 @@ class JointObjective:
         if self.spec.human_image != "alone":
             render = inside(composite.color, crop, camera)
             if frame.ignored is not None:
-                hidden = inside(frame.ignored[..., None].to(image.device), crop, camera)
+                hidden = inside(frame.ignored[..., None], crop, camera)
                 render = torch.where(hidden, crop.image, render)
             dssim = (self.spec.lambda_dssim, self.spec.ssim)
             terms[f"human/{name}/composite"] = image_loss(render, crop.image, *dssim)
@@ -218,7 +218,7 @@ class JointObjective:
                 perceived = self.spec.lpips * self.lpips(render, crop.image)
                 terms[f"human/{name}/composite/lpips"] = perceived
         if name in self.faces and self.spec.face > 0:
-            mask = visible(frame, name).to(image.device)
+            mask = visible(frame, name)
             entity, posed = self.model.entity(name), state.gaussians[name]
             face = face_loss(self.faces[name], entity, posed, camera, image, mask)
             if face is not None:

@@ -49,11 +49,15 @@ def union(masks: Iterable[Bool[Tensor, "H W"]]) -> Bool[Tensor, "H W"] | None:
 
 
 def crop_around(
-    frame: Frame, camera: Camera, entity: str, device: torch.device, margin: float = 0.15
+    frame: Frame, camera: Camera, entity: str, there: Frame | None = None, margin: float = 0.15
 ) -> Crop | None:
-    """The box of an entity's mask with a margin of its size; None where it is not seen."""
-    mask = frame.masks[entity]
-    flat = mask.cpu().numpy()  # whose any() is ten times quicker
+    """The box of an entity's mask with a margin of its size; None where it is not seen.
+
+    Args:
+        frame: on the host, where the box is found. there: the same on the device of the crop:
+            whole frames go over once, and are cut there.
+    """
+    flat = frame.masks[entity].cpu().numpy()  # whose any() is ten times quicker
     rows, columns = np.flatnonzero(flat.any(1)), np.flatnonzero(flat.any(0))
     if len(rows) == 0:
         return None
@@ -63,16 +67,17 @@ def crop_around(
     top, left = max(0, top - pad), max(0, left - pad)
     bottom, right = min(camera.height, bottom + pad), min(camera.width, right + pad)
     box = (slice(top, bottom), slice(left, right))
-    others = union(m[box] for name, m in frame.masks.items() if name != entity)
-    inside = mask[box]
+    there = there or frame
+    others = union(m[box] for name, m in there.masks.items() if name != entity)
+    inside = there.masks[entity][box]
     ignore = torch.zeros_like(inside) if others is None else others & ~inside
-    if frame.ignored is not None:
-        ignore = ignore | frame.ignored[box]
+    if there.ignored is not None:
+        ignore = ignore | there.ignored[box]
     return Crop(
         camera=camera.cropped(left, top, right - left, bottom - top),
-        image=frame.image[box].to(device).float() / 255.0,
-        mask=inside.to(device),
-        ignore=ignore.to(device),
+        image=there.image[box].float() / 255.0,
+        mask=inside,
+        ignore=ignore,
     )
 
 

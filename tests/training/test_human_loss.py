@@ -141,7 +141,7 @@ def test_which_image_of_the_human_is_compared():
     assert of(both) == {"human/human", "human/human/composite"}
     torch.testing.assert_close(both["human/human"], alone["human/human"])
     frame = portrait()[1][1]
-    crop = crop_around(frame, frame.camera, "human", torch.device("cpu"))
+    crop = crop_around(frame, frame.camera, "human")
     with torch.no_grad():
         drawn = portrait()[0].render(frame.moment, frame.camera).color
     part = inside(drawn, crop, frame.camera)
