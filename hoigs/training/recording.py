@@ -138,9 +138,9 @@ class Recording:
         stream.wait_stream(current)
         graphs = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
         settings: dict[str, Any] = {"stream": stream, "capture_error_mode": "thread_local"}
-        with torch.cuda.device(stream.device):
-            with torch.cuda.stream(stream):
-                self._rehearse()
+        # the stream outside too: a capture that fails does not restore the one before
+        with torch.cuda.device(stream.device), torch.cuda.stream(stream):
+            self._rehearse()
             with torch.cuda.graph(graphs[0], **settings):
                 self._run()
             with torch.cuda.graph(graphs[1], pool=graphs[0].pool(), **settings):

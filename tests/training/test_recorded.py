@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 import torch
+from emulated_graphs import emulate
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from hoigs.core.camera import Camera
 from hoigs.core.clip import Clip, FrameStore, ObjectTrack
@@ -186,44 +186,27 @@ def test_values_and_gradients_are_the_plain_paths(variant: str) -> None:
     assert (recorded.mode, recorded.recordings) == ("cached", 1), recorded.reason
 
 
-class Waits(TorchDispatchMode):
-    """Names what would wait for a GPU, or bring it numbers from the host: no graph can hold it."""
-
-    names = (
-        "_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equal", "bincount",
-        "lift_fresh", "lift_fresh_copy", "_unique2", "unique_dim", "repeat_interleave",
-    )  # fmt: skip
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seen: set[str] = set()
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        name = str(func).split(".")[1]
-        masked = name in ("index", "index_put", "_index_put_impl_") and any(
-            x is not None and x.dtype == torch.bool for x in args[1]
-        )
-        if name in self.names or masked:
-            self.seen.add(str(func))
-        return func(*args, **(kwargs or {}))
+def emulated(model: SceneModel, monkeypatch: pytest.MonkeyPatch, **kwargs: Any) -> RecordedScene:
+    """By graphs that a CPU can replay."""
+    emulate(monkeypatch)
+    made = RecordedScene(model, "auto", weight_of(model), launches=True, **kwargs)
+    made.mode = "graph"
+    return made
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_nothing_recorded_waits_for_a_device(variant: str) -> None:
+def test_what_is_captured_holds_for_every_moment(
+    variant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No number of the captured step stays in it, and nothing in it waits for a device."""
     model = scene(**VARIANTS[variant])
-    recorded = recording(model)
-    for frame in (0, 1):
-        recorded(at(frame))
-    made = recorded._recording
-    assert made is not None
-    with Waits() as waits:
-        turn = made.replay()
-        made.replay_backward([torch.ones_like(x) for x in made.live.values()], turn)
-    assert not waits.seen
-    with Waits() as waits:
-        float(model.entity("scene").means.detach().sum())
-        model.entity("scene").means[torch.ones(40, dtype=torch.bool)]
-    assert {name.split(".")[1] for name in waits.seen} == {"_local_scalar_dense", "index"}
+    recorded = emulated(model, monkeypatch)
+    compared(model, recorded, [at(f) for f in (0, 1, 2.3, 5, 0)])
+    with torch.no_grad():  # as an optimizer does
+        for parameter in model.parameters():
+            parameter += 0.01 * torch.randn_like(parameter)
+    compared(model, recorded, [at(4)])
+    assert (recorded.mode, recorded.recordings) == ("graph", 1), recorded.reason
 
 
 def test_state_is_the_plain_paths() -> None:
@@ -363,6 +346,27 @@ def test_what_cannot_be_recorded_says_why() -> None:
         insisting(at(2))
 
 
+class Reads(Static):
+    """Claims to be recordable, and asks the device for a number."""
+
+    recordable = True
+
+    def forward(
+        self, rest: Gaussians, moment: Moment, residual: Residual | None = None
+    ) -> Gaussians:
+        return replace(rest, means=rest.means * float(rest.means.detach().square().mean()))
+
+
+def test_a_capture_that_fails_leaves_the_plain_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    rest = Gaussians.from_points(torch.rand(10, 3), scales=0.1)
+    model = SceneModel({"wall": Entity(rest, Reads())}, rasterizer=TorchRasterizer()).train()
+    recorded = emulated(model, monkeypatch)
+    recorded(at(2))
+    with pytest.warns(UserWarning, match="not permitted when stream is capturing"):
+        values = recorded(at(2)).state.joined().means
+    assert recorded.mode == "plain" and torch.equal(values, model(at(2)).joined().means)
+
+
 class Pictures(FrameStore):
     """Coloured noise, and masks of the middle."""
 
@@ -461,6 +465,16 @@ def test_a_training_run_takes_the_same_way() -> None:
     assert not torch.equal(pose.detach(), before)
 
 
+def test_a_training_run_by_captured_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    emulate(monkeypatch)
+    plain, recorded = trainer(graphs="off"), by_launches(trainer())
+    scenes = recorded.objective.recorded
+    scenes.mode = "graph"
+    counts = side_by_side(recorded, plain, 1e-5)
+    assert scenes.mode == "graph", scenes.reason
+    assert len(counts) <= scenes.recordings <= len(counts) + 1
+
+
 def test_recorded_runs_resume() -> None:
     whole = by_launches(trainer())
     whole.train(until=12)
@@ -520,17 +534,6 @@ def test_cuda_training_by_graphs() -> None:
         taken.append(torch.cuda.memory_allocated())
     assert scenes.recordings >= len(taken)
     assert taken[4] < taken[2] + (1 << 20)  # of the same size again
-
-
-class Reads(Static):
-    """Claims to be recordable, and asks the device for a number."""
-
-    recordable = True
-
-    def forward(
-        self, rest: Gaussians, moment: Moment, residual: Residual | None = None
-    ) -> Gaussians:
-        return replace(rest, means=rest.means * float(rest.means.detach().square().mean()))
 
 
 @pytest.mark.gpu
