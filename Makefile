@@ -25,8 +25,8 @@ docs: $(INSTALLED)
 
 # accuracy against cost, into docs/results/chart; a kill loses nothing, the same command goes on
 CHART_CLIPS ?= builtin:lift-and-swing builtin:carry builtin:throw-and-catch
-CHART_SPECS ?= hoigs,4dgs,d3dgs,e-d3dgs,exavatar,hugs,k-planes-gs,static-3dgs
-CHART_BUDGETS ?= 500,2000
+CHART_SPECS ?= hoigs,hoigs-no-interaction,hoigs-object-mlp,4dgs@matched,d3dgs@matched,e-d3dgs@matched,ex4dgs@matched,exavatar@matched,hugs@matched,static-3dgs@matched
+CHART_BUDGETS ?= 1200
 CHART_SEEDS ?= 3
 CHART_OUT ?= runs/results-chart
 charts: $(INSTALLED)

@@ -55,7 +55,7 @@ def tables(
     """
     from hoigs.studies.job import Job
     from hoigs.studies.table_sets import choose_sets
-    from hoigs.studies.tables import Study, protocols, run_study
+    from hoigs.studies.tables import Study, circumstances, protocols, run_study
     from hoigs.studies.write_tables import write_tables
     from hoigs.training.run_folder import versions
 
@@ -93,7 +93,7 @@ def tables(
         "steps": "each spec's own" if steps is None else steps,
         "settings": " ".join(study.settings) or "none",
         "spread": "sample standard deviation over seeds (± in the tables)",
-        "times": f"measured beside {jobs - 1} other runs, {each} threads each, on {study.device}",
+        "times": circumstances(study, results),
         "versions": ", ".join(f"{name} {value}" for name, value in versions().items()),
     }
     for clip, sentences in protocols(study, results).items():

@@ -11,6 +11,7 @@ from typing import Any
 from hoigs.core.errors import HoigsError
 from hoigs.evaluation.protocol import Protocol
 from hoigs.studies.clip_folders import ClipFolders
+from hoigs.studies.cost import read_cost
 from hoigs.studies.job import SCORES, Job, JobState, make_job
 from hoigs.studies.pool import Report, run_jobs
 from hoigs.studies.results import Measure, RowResult, TableResult, measures_of
@@ -154,6 +155,27 @@ def _row_result(
             cache[cell.job.run] = measures_of(cell.job.scores())
         by_seed[cell.seed] = cache[cell.job.run]
     return RowResult(row, clip, by_seed, missing, runs)
+
+
+def circumstances(study: Study, results: Sequence[TableResult]) -> str:
+    """On which machines the runs with scores were trained and timed, and beside how many others."""
+    done = {
+        row.runs[seed]
+        for result in results
+        for rows in result.rows.values()
+        for row in rows
+        for seed in row.by_seed
+    }
+    costs = [read_cost(study.out / run) for run in sorted(done)]
+    machines = sorted({word for cost in costs for word in cost.machines})
+    beside = sorted({cost.runs_at_once - 1 for cost in costs})
+    if not machines:
+        return "no machine is on record"
+    return f"measured on {' and '.join(machines)}, beside {_span(beside)} other runs"
+
+
+def _span(numbers: Sequence[int]) -> str:
+    return str(numbers[0]) if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]}"
 
 
 def protocols(study: Study, results: Sequence[TableResult]) -> dict[str, list[str]]:
