@@ -272,12 +272,12 @@ class Playback:
         graphs = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
         side = torch.cuda.Stream(device)
         side.wait_stream(torch.cuda.current_stream(device))
-        with torch.no_grad(), torch.cuda.device(device):
-            with torch.cuda.stream(side):  # kernels are compiled, caches filled, splats counted
-                for moment, camera in self._views:
-                    self._packed.copy_(self._pack(moment, camera))
-                    self._deform()
-                    self._draw()
+        # the stream outside too: a capture that fails does not restore the one before
+        with torch.no_grad(), torch.cuda.device(device), torch.cuda.stream(side):
+            for moment, camera in self._views:  # kernels compile, caches fill, splats are counted
+                self._packed.copy_(self._pack(moment, camera))
+                self._deform()
+                self._draw()
             with torch.cuda.graph(graphs[0], stream=side, capture_error_mode="thread_local"):
                 self._deform()
             with torch.cuda.graph(graphs[1], stream=side, capture_error_mode="thread_local"):
