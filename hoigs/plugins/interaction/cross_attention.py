@@ -21,9 +21,11 @@ from hoigs.plugins.interaction.gates import DistanceGate, GateKind, Granularity,
 Values = Literal["gated", "swapped"]
 ObjectResidual = Literal["per-gaussian", "rigid", "both"]
 PoseHead = Literal["flat", "per-part"]
+Places = Literal["none", "hands"]
 
 POSE_JOINTS = 51  # 21 of the body, 15 of each hand
 LEFT_HAND, RIGHT_HAND = 8, 9
+PLACE_UNIT = 0.1  # metres: of the size of corrections
 # part of each joint that has a correction; the root has none
 JOINT_PARTS = (*BODY_JOINT_PARTS[1:], *(LEFT_HAND,) * 15, *(RIGHT_HAND,) * 15)
 
@@ -48,6 +50,12 @@ class CrossAttentionConfig(ComponentConfig):
         pose_bound: largest correction of a joint's axis-angle, radians an axis: beyond small
             ones, adding axis-angles is no composition, and unbounded ones run away.
         means_bound: largest displacement of an object's Gaussian, metres an axis.
+        places: what the residuals are told of geometry. "none" is the paper: tokens alone.
+            "hands", which the spec hoigs sets, adds to F'_O and F'_H a linear map of where both
+            hands are from the object's centre, world axes, gated as all that comes from another.
+            Without it an object does not follow hands off its spline: phi, read in planes where
+            a hand is, tells of that place only in frames that were trained on, and no token tells
+            where the spline has put the object.
     """
 
     width: int = Field(32, ge=1)
@@ -62,6 +70,7 @@ class CrossAttentionConfig(ComponentConfig):
     hidden: int = Field(128, ge=1)
     pose_bound: float = Field(0.3, gt=0)
     means_bound: float = Field(0.1, gt=0)
+    places: Places = "none"
 
 
 class CrossAttention(InteractionModule):
@@ -73,6 +82,8 @@ class CrossAttention(InteractionModule):
     Gaussians. B is the logarithm of the distance gate; as a softmax ignores what all its entries
     share, the gate g (the widest of a row) also multiplies every residual: what is out of reach
     has a residual of zero, whose gradients are zero too. Gates carry no gradient.
+
+    With `places` "hands" both get + sum over the others of g (W d + b), d from `from_object`.
 
     Both heads start at zero. Entities of one kind with tokens of one width share their weights.
     Object tokens are one a Gaussian, human tokens one a body part.
@@ -94,6 +105,7 @@ class CrossAttention(InteractionModule):
         hidden: int = 128,
         pose_bound: float = 0.3,
         means_bound: float = 0.1,
+        places: Places = "none",
     ) -> None:
         super().__init__()
         self.width, self.gated = width, values == "gated"
@@ -109,6 +121,10 @@ class CrossAttention(InteractionModule):
             self.means_head = zero_headed(width, hidden, 3)
         if self.rigid:
             self.twist_head = zero_headed(width, hidden, 6)
+        self.places = nn.ModuleDict()
+        if places == "hands":
+            self.places["human"] = nn.Linear(6, width)
+            self.places["object"] = nn.Linear(6, width)
 
     def bind(self, widths: Mapping[str, int], kinds: Mapping[str, EntityKind]) -> None:
         for name, width in widths.items():
@@ -133,14 +149,21 @@ class CrossAttention(InteractionModule):
         log_gates = {
             (h, o): self.gate.log(h, roles[h], tokens[h], tokens[o]) for h in humans for o in things
         }
+        offsets = {(h, o): from_object(tokens[h], tokens[o]) for h in humans for o in things}
         residuals = {}
         for h in humans:
             bias = torch.cat([log_gates[h, o] for o in things], dim=1)
             attended, gates = self._attend(projected[h], [projected[o] for o in things], bias)
+            attended = self._placed("human", attended, [
+                (offsets[h, o], log_gates[h, o].amax(1)) for o in things
+            ])  # fmt: skip
             residuals[h] = Residual(pose=self._pose(attended, gates))
         for o in things:
             bias = torch.cat([log_gates[h, o].mT for h in humans], dim=1)
             attended, gates = self._attend(projected[o], [projected[h] for h in humans], bias)
+            attended = self._placed("object", attended, [
+                (offsets[h, o], log_gates[h, o].amax(0)) for h in humans
+            ])  # fmt: skip
             means = self._means(attended, gates, tokens[o].positions.detach())
             residuals[o] = Residual(means=means)
         return residuals
@@ -164,6 +187,18 @@ class CrossAttention(InteractionModule):
         weights = (query @ keys.mT / self.width**0.5 + bias).softmax(-1)
         attended = gates[:, None] * (weights @ values)
         return (value + attended if self.gated else attended), gates
+
+    def _placed(
+        self,
+        kind: EntityKind,
+        attended: Float[Tensor, "M d"],
+        pairs: list[tuple[Tensor, Tensor]],
+    ) -> Float[Tensor, "M d"]:
+        """F' and what places add: offsets [6] and log-gates [M], for each entity of the other."""
+        if kind not in self.places:
+            return attended
+        added = [log[:, None].exp() * self.places[kind](offset) for offset, log in pairs]
+        return attended + torch.stack(added).sum(0)
 
     def _pose(
         self, attended: Float[Tensor, "M d"], gates: Float[Tensor, " M"]
@@ -194,6 +229,12 @@ class CrossAttention(InteractionModule):
             arms = positions - positions.mean(0)
             means = means + arms @ turn.mT - arms + self.means_bound * twist[3:]
         return means
+
+
+def from_object(human: Tokens, thing: Tokens) -> Float[Tensor, "6"]:
+    """Both hands of a human seen from an object's centre, world axes, in PLACE_UNIT."""
+    hands = human.positions[LEFT_HAND : RIGHT_HAND + 1].detach()
+    return ((hands - thing.positions.detach().mean(0)) / PLACE_UNIT).flatten()
 
 
 def zero_headed(entry: int, hidden: int, out: int) -> nn.Sequential:
