@@ -21,6 +21,7 @@ POLL_S = 0.2
 
 def write_cell(folder: Path, name: str, settings: dict[str, Any], result: dict[str, Any]) -> None:
     """One cell's JSON, whole or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
     temporary = folder / f".{name}.{os.getpid()}.part"
     temporary.write_text(json.dumps({"settings": settings, **result}, indent=1))
     temporary.replace(folder / f"{name}.json")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import random
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +14,9 @@ from hoigs.core.deformation import DeformationModel
 from hoigs.core.topology import reindex
 from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning, HexPlaneSkinningConfig
 from hoigs.plugins.deformation.lbs import Lbs, LbsConfig
+
+# no dice: two that are built one after the other always differ, and never by what others see
+BUILT = itertools.count()
 
 
 class RightConfig(ComponentConfig):
@@ -157,7 +160,7 @@ class StartIsNotSaved(Right):
 class OwnDice(Right):
     def __init__(self, size: float = 1.0) -> None:
         super().__init__(size)
-        self.sway.data += 1e-7 * random.random()
+        self.sway.data += 2e-8 * (next(BUILT) % 5)
 
 
 class CopyIsItself(Right):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import random
+import itertools
 from dataclasses import replace
 
 import torch
@@ -11,6 +11,9 @@ from torch import nn
 from hoigs.core.config import ComponentConfig
 from hoigs.core.features import FeatureExtractor, Tokens
 from hoigs.core.topology import reindex
+
+# no dice: two that are built one after the other always differ, and never by what others see
+BUILT = itertools.count()
 
 
 class RightConfig(ComponentConfig):
@@ -102,7 +105,7 @@ class StartIsNotSaved(Right):
 class OwnDice(Right):
     def __init__(self) -> None:
         super().__init__()
-        self.mix.weight.data += 1e-7 * random.random()
+        self.mix.bias.data += 2e-8 * (next(BUILT) % 5)
 
 
 class CopyIsItself(Right):

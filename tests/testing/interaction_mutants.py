@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import random
+import itertools
 from dataclasses import replace
 
 import torch
@@ -10,6 +10,9 @@ from torch import nn
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.interaction import InteractionModule, Residual
+
+# no dice: two that are built one after the other always differ, and never by what others see
+BUILT = itertools.count()
 
 
 class RightConfig(ComponentConfig):
@@ -145,7 +148,7 @@ class UnsavedScale(Right):
 class OwnDice(Right):
     def __init__(self) -> None:
         super().__init__()
-        self.to_pose.weight.data += 1e-7 * random.random()
+        self.to_pose.weight.data += 2e-8 * (next(BUILT) % 5)
 
 
 class RemembersCompany(Right):
