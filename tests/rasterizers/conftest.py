@@ -1,36 +1,15 @@
-"""The backends that the conformance checks run on, each on every device that it declares."""
+"""Fixtures of the rasterizers' tests: a backend on a device."""
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 import torch
+from backends import BACKENDS, cases
 
-from hoigs.core.rasterizer import Rasterizer
-from hoigs.rasterizers.gsplat import GsplatRasterizer
-from hoigs.rasterizers.oracle import OracleRasterizer
-from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.rasterizers.warp import WarpRasterizer
 from hoigs.testing.rasterizer import RasterizerSubject
-
-BACKENDS: dict[str, Callable[[], Rasterizer]] = {
-    "torch": TorchRasterizer,
-    "oracle": lambda: OracleRasterizer(cutoffs=True),
-    "warp": lambda: WarpRasterizer(threads=2),
-    # CUDA's kernels, on the CPU
-    "warp-portable": lambda: WarpRasterizer(cpu_kernels="portable", threads=2),
-    "gsplat": GsplatRasterizer,
-}
-
-
-def cases() -> Iterator[pytest.ParameterSet]:
-    for name, make in BACKENDS.items():
-        devices = {"cpu"} if name == "warp-portable" else make().capabilities.devices
-        for device in sorted(devices):
-            marks = [pytest.mark.gpu] if device == "cuda" else []
-            yield pytest.param((name, device), id=f"{name}-{device}", marks=marks)
 
 
 @pytest.fixture(scope="session", params=list(cases()))

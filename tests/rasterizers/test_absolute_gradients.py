@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from backends import cases
 from raster_scenes import Backend, a_camera, front_camera, one_gaussian, random_scene
 from torch import Tensor
 
@@ -12,6 +13,9 @@ from hoigs.core.rasterizer import RenderOutput, RenderRequest
 from hoigs.rasterizers.oracle import OracleRasterizer
 
 CAMERA = a_camera(width=20, height=14)
+able = pytest.mark.parametrize(
+    "backend", list(cases(lambda r: r.capabilities.absolute_gradients)), indirect=True
+)
 
 
 def a_loss(output: RenderOutput) -> Tensor:
@@ -22,12 +26,6 @@ def a_loss(output: RenderOutput) -> Tensor:
     features = output.features if output.features is not None else output.color[..., :2]
     parts = (output.color, output.alpha[..., None], output.depth[..., None], features)
     return (weights * torch.cat(parts, -1)).sum(-1)
-
-
-def capable(backend: Backend) -> Backend:
-    if not backend.rasterizer.capabilities.absolute_gradients:
-        pytest.skip("this backend says that it cannot")
-    return backend
 
 
 def watched(backend: Backend, scene, camera, **fields: Tensor) -> Tensor:
@@ -47,9 +45,9 @@ def one_pixel_at_a_time(scene, camera, **fields: Tensor) -> tuple[Tensor, Tensor
     return torch.stack(rows).abs().sum(0), torch.stack(rows).sum(0)
 
 
+@able
 @pytest.mark.parametrize("with_features", [False, True])
 def test_they_are_the_sum_of_each_pixels_own(backend: Backend, with_features: bool) -> None:
-    backend = capable(backend)
     scene = random_scene(40, degree=1)
     fields = {"features": torch.randn(40, 2, generator=torch.Generator().manual_seed(1))}
     fields = fields if with_features else {}
@@ -70,8 +68,8 @@ def test_the_oracle_gives_them_too() -> None:
     torch.testing.assert_close(absolutes.grad.double(), expected, rtol=1e-5, atol=1e-6)
 
 
+@able
 def test_opposite_pulls_cancel_only_in_the_signed_gradient(backend: Backend) -> None:
-    backend = capable(backend)
     offsets = torch.zeros(1, 2, device=backend.device, requires_grad=True)
     absolutes = torch.zeros(1, 2, device=backend.device, requires_grad=True)
     request = RenderRequest(screen_offsets=offsets, absolute_gradients=absolutes)
@@ -83,8 +81,8 @@ def test_opposite_pulls_cancel_only_in_the_signed_gradient(backend: Backend) -> 
     assert float(offsets.grad.abs().max()) < 1e-4
 
 
+@able
 def test_they_leave_picture_and_other_gradients_alone(backend: Backend) -> None:
-    backend = capable(backend)
     found = []
     for asked in (False, True):
         scene = random_scene(40, degree=1).map(lambda x: x.clone().requires_grad_())
@@ -97,8 +95,8 @@ def test_they_leave_picture_and_other_gradients_alone(backend: Backend) -> None:
         assert torch.equal(plain, other)
 
 
+@able
 def test_culled_rows_receive_nothing(backend: Backend) -> None:
-    backend = capable(backend)
     scene = random_scene(12, degree=0)
     subset = torch.arange(12) % 3 != 0
     found = watched(backend, scene, CAMERA, subset=subset)
@@ -115,8 +113,8 @@ def test_a_backend_that_cannot_says_so(backend: Backend, monkeypatch: pytest.Mon
         backend.render(random_scene(12), CAMERA, request)
 
 
+@able
 def test_their_shape_is_checked(backend: Backend) -> None:
-    backend = capable(backend)
     with pytest.raises(RenderError, match=r"absolute_gradients has shape \[11, 2\]"):
         backend.render(
             random_scene(12), CAMERA, RenderRequest(absolute_gradients=torch.zeros(11, 2))

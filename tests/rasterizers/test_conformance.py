@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import pytest
+from backends import cases_with_checks
 
 from hoigs.testing.checks import Check
-from hoigs.testing.rasterizer import CHECKS, RasterizerSubject
+from hoigs.testing.rasterizer import RasterizerSubject
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
-@pytest.mark.parametrize("check", [pytest.param(check, id=check.id) for check in CHECKS])
+@pytest.mark.parametrize(("backend", "check"), list(cases_with_checks()), indirect=["backend"])
 def test_conforms(backend: RasterizerSubject, check: Check[RasterizerSubject]) -> None:
-    missing = check.missing(backend)
-    if missing is not None:
-        pytest.skip(missing)
     check.run(backend)

@@ -12,13 +12,14 @@ from dataclasses import replace
 import gsplat_twin
 import pytest
 import torch
+from backends import declared
 
 from hoigs.core.errors import RenderError
 from hoigs.core.rasterizer import RenderRequest
 from hoigs.rasterizers import gsplat as adapter
 from hoigs.rasterizers.gsplat import GsplatConfig, GsplatRasterizer
 from hoigs.testing.checks import Check
-from hoigs.testing.rasterizer import CHECKS, RasterizerSubject
+from hoigs.testing.rasterizer import RasterizerSubject
 from hoigs.testing.rasterizer.scenes import a_camera, random_gaussians
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -30,16 +31,15 @@ class OverTwin(GsplatRasterizer):
     capabilities = replace(GsplatRasterizer.capabilities, devices=frozenset({"cpu"}))
 
 
-@pytest.mark.parametrize("check", [pytest.param(check, id=check.id) for check in CHECKS])
+ON_CPU = RasterizerSubject(OverTwin(), torch.device("cpu"))
+
+
+@pytest.mark.parametrize("check", [pytest.param(c, id=c.id) for c in declared(ON_CPU)])
 def test_the_adapter_conforms_over_a_twin_of_gsplat(
     check: Check[RasterizerSubject], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(adapter, "_import_gsplat", lambda: gsplat_twin)
-    subject = RasterizerSubject(OverTwin(), torch.device("cpu"))
-    missing = check.missing(subject)
-    if missing is not None:
-        pytest.skip(missing)
-    check.run(subject)
+    check.run(ON_CPU)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

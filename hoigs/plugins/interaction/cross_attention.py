@@ -149,21 +149,20 @@ class CrossAttention(InteractionModule):
         log_gates = {
             (h, o): self.gate.log(h, roles[h], tokens[h], tokens[o]) for h in humans for o in things
         }
-        offsets = {(h, o): from_object(tokens[h], tokens[o]) for h in humans for o in things}
+        there = [o for o in things if len(tokens[o].positions)]
+        offsets = {(h, o): from_object(tokens[h], tokens[o]) for h in humans for o in there}
         residuals = {}
         for h in humans:
             bias = torch.cat([log_gates[h, o] for o in things], dim=1)
             attended, gates = self._attend(projected[h], [projected[o] for o in things], bias)
-            attended = self._placed("human", attended, [
-                (offsets[h, o], log_gates[h, o].amax(1)) for o in things
-            ])  # fmt: skip
+            seen = [(offsets[h, o], log_gates[h, o].amax(1)) for o in there]
+            attended = self._placed("human", attended, seen)
             residuals[h] = Residual(pose=self._pose(attended, gates))
         for o in things:
             bias = torch.cat([log_gates[h, o].mT for h in humans], dim=1)
             attended, gates = self._attend(projected[o], [projected[h] for h in humans], bias)
-            attended = self._placed("object", attended, [
-                (offsets[h, o], log_gates[h, o].amax(0)) for h in humans
-            ])  # fmt: skip
+            seen = [(offsets[h, o], log_gates[h, o].amax(0)) for h in humans if o in there]
+            attended = self._placed("object", attended, seen)
             means = self._means(attended, gates, tokens[o].positions.detach())
             residuals[o] = Residual(means=means)
         return residuals
@@ -195,7 +194,7 @@ class CrossAttention(InteractionModule):
         pairs: list[tuple[Tensor, Tensor]],
     ) -> Float[Tensor, "M d"]:
         """F' and what places add: offsets [6] and log-gates [M], for each entity of the other."""
-        if kind not in self.places:
+        if kind not in self.places or not pairs:
             return attended
         added = [log[:, None].exp() * self.places[kind](offset) for offset, log in pairs]
         return attended + torch.stack(added).sum(0)
