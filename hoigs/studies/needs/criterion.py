@@ -13,6 +13,7 @@ CRITERIA: tuple[Criterion, ...] = ("one-se", "bic")
 # pixels that speak as one: a square of twice the radius of a small splat's blur (methods G.5)
 CORRELATED = (2 * 1.5) ** 2
 MSE_FLOOR = 1e-10
+PATIENCE = 1.5  # standard errors within which a rung is not given up before the last round
 
 
 @dataclass(frozen=True)
@@ -71,12 +72,12 @@ def bic(score: Score) -> float:
     return count * math.log(max(score.mse, MSE_FLOOR)) + score.parameters * math.log(count)
 
 
-def near_best(scores: Sequence[Score], least: float = 0.0) -> list[bool]:
-    """Whether each is as good as the best: within one standard error of the paired difference,
-    or within `least` dB, which nobody would see and another seed might turn."""
+def near_best(scores: Sequence[Score], least: float = 0.0, errors: float = 1.0) -> list[bool]:
+    """Whether each is as good as the best: within so many standard errors of the paired
+    difference, or within `least` dB, which nobody would see and another seed might turn."""
     best = max(scores, key=lambda score: score.mean)
     gains = [gain(best, score) for score in scores]
-    return [g.mean <= max(g.error, least) for g in gains]
+    return [g.mean <= max(errors * g.error, least) for g in gains]
 
 
 def choose(scores: Sequence[Score], criterion: Criterion = "one-se", least: float = 0.0) -> int:
@@ -88,11 +89,15 @@ def choose(scores: Sequence[Score], criterion: Criterion = "one-se", least: floa
 
 
 def ranked(scores: Sequence[Score], criterion: Criterion, least: float) -> list[int]:
-    """Places from the likeliest choice to the least: those as good as the best by cost, then the
-    others by score."""
+    """Places from the likeliest choice to the least: those that may be as good as the best by
+    cost, then the others by score.
+
+    Early scores say who learns fast, not who is enough, so that here a rung may be `PATIENCE`
+    errors behind, where the last choice allows one.
+    """
     if criterion == "bic":
         return sorted(range(len(scores)), key=lambda k: (bic(scores[k]), k))
-    near = near_best(scores, least)
+    near = near_best(scores, least, PATIENCE)
     return sorted(
         range(len(scores)), key=lambda k: (not near[k], k if near[k] else -scores[k].mean)
     )
