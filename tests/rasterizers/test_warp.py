@@ -292,7 +292,7 @@ torch.save((output.color.detach(), scene.means.grad), {str(tmp_path / "found.pt"
     done = subprocess.run(command, capture_output=True, text=True, cwd=root, check=False)
     assert done.returncode == 0, done.stderr
     assert f"vectors of {lanes} floats" in done.stdout
-    color, gradient = torch.load(tmp_path / "found.pt")
+    color, gradient = torch.load(tmp_path / "found.pt", weights_only=True)
     scene = random_scene(700).map(lambda x: x.requires_grad_())
     output = WarpRasterizer().render(scene, a_camera(150, 90))
     (output.color.square().sum() + output.depth.sum()).backward()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -11,32 +10,38 @@ from typing import Any
 import pytest
 import torch
 from emulated_graphs import emulate
+from recorded_scene import (
+    FRAMES,
+    VARIANTS,
+    apart,
+    at,
+    compared,
+    gradients,
+    loss,
+    recording,
+    same_gradients,
+    scene,
+    weight_of,
+)
 from torch import Tensor
 
 from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip, FrameStore, ObjectTrack
+from hoigs.core.clip import Clip, FrameStore
 from hoigs.core.deformation import DeformationModel
 from hoigs.core.entity import Entity
 from hoigs.core.errors import HoigsError
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.interaction import Residual
-from hoigs.core.moment import BodyPose, Moment
+from hoigs.core.moment import Moment
 from hoigs.core.scene import SceneModel
 from hoigs.core.train_spec import LossSpec, TrainSpec, WarmupSpec
-from hoigs.plugins.deformation.chs import CubicHermite
-from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.density.adc import AdaptiveDensity
-from hoigs.plugins.features.body_parts import BodyPartFeatures
-from hoigs.plugins.features.embedding import EmbeddingFeatures
-from hoigs.plugins.features.spline_motion import SplineMotionFeatures
-from hoigs.plugins.interaction.cross_attention import CrossAttention
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.testing.material.body import TinyBody
 from hoigs.training.recorded import RecordedScene
 from hoigs.training.trainer import Trainer
 
-FRAMES, SIZE, STEPS = 6, 24, 30
+SIZE, STEPS = 24, 30
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -46,136 +51,6 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
-
-
-def scene(
-    human: dict[str, Any] | None = None,
-    thing: dict[str, Any] | None = None,
-    attention: dict[str, Any] | None = None,
-    *,
-    plain_tokens: bool = False,
-) -> SceneModel:
-    """All parts of the hoigs spec, small, every head and correction away from its start."""
-    torch.manual_seed(0)
-    body = TinyBody()
-    wall = Gaussians.from_points(torch.rand(40, 3) + torch.tensor((-0.5, -0.5, 1.5)), sh_degree=1)
-    box = Gaussians.from_points(0.2 * torch.rand(20, 3) + torch.tensor((0.6, 0.3, 0.0)))
-    turns = torch.linspace(0, 1, FRAMES)
-    track = ObjectTrack(
-        points=box.means,
-        colors=torch.rand(20, 3),
-        rotations=torch.stack([_about_y(float(t)) for t in turns]),
-        translations=torch.stack((turns, turns.square(), 0 * turns), 1),
-        observed=torch.ones(FRAMES, dtype=torch.bool),
-    )
-    settings = {"refine_poses": True, "num_frames": FRAMES, "trained_frames": (0, 1, 3, 4)}
-    person = HexPlaneSkinning(
-        body, resolution=8, channels=4, time_resolution=4, field_points=64, width=16,
-        **(settings | (human or {})),
-    )  # fmt: skip
-    motion = CubicHermite(4, track=track, **(thing or {}))
-    model = SceneModel(
-        {
-            "scene": Entity(wall, Static(), kind="scene"),
-            "human": Entity(
-                body.rest(80), person, EmbeddingFeatures() if plain_tokens else BodyPartFeatures()
-            ),
-            "object": Entity(
-                box,
-                motion,
-                EmbeddingFeatures(keyframes=3) if plain_tokens else SplineMotionFeatures(hidden=8),
-                kind="object",
-            ),
-        },
-        interaction=CrossAttention(hidden=16, reach=3.0, **(attention or {})),
-        rasterizer=TorchRasterizer(),
-    )
-    with torch.no_grad():
-        for name, parameter in model.named_parameters():
-            if "planes" not in name and name.rpartition(".")[2] not in ("means", "log_scales"):
-                parameter += 0.03 * torch.randn_like(parameter)
-    return model.train()
-
-
-def _about_y(angle: float) -> Tensor:
-    c, s = math.cos(angle), math.sin(angle)
-    return torch.tensor(((c, 0.0, s), (0.0, 1.0, 0.0), (-s, 0.0, c)))
-
-
-def at(frame: float) -> Moment:
-    time = frame / (FRAMES - 1)
-    generator = torch.Generator().manual_seed(round(1000 * time))
-    pose = BodyPose.zeros(betas=2).replace(
-        body=0.3 * torch.randn(21, 3, generator=generator),
-        transl=torch.tensor((0.2 * time, 0.0, 0.0)),
-        betas=torch.tensor((0.5, -0.3 + 0.1 * time)),  # clips may have another one a frame
-    )
-    return Moment(time, round(frame), {"human": pose})
-
-
-def weight_of(model: SceneModel) -> Any:
-    return lambda name, key: model.entity(name).deformation.regularizer_weights.get(key, 0.0)
-
-
-def loss(recorded: RecordedScene, model: SceneModel, moment: Moment) -> Tensor:
-    """One that every Gaussian's every number is part of, alone and joined, and all penalties."""
-    deformed = recorded(moment)
-    total = torch.zeros((), device=model.device)
-    for part in (deformed.state.joined(), deformed.state.gaussians["human"]):
-        for value in vars(part).values():
-            ramp = torch.linspace(-1, 2, value.numel(), device=value.device).view(value.shape)
-            total = total + (ramp * value.sin()).sum()
-    for name in model.entities:
-        known = deformed.penalties and deformed.penalties[name]
-        for key, value in (known or model.entity(name).regularizers()).items():
-            total = total + weight_of(model)(name, key) * value
-    return total
-
-
-def gradients(model: SceneModel) -> dict[str, Tensor | None]:
-    return {n: None if p.grad is None else p.grad.clone() for n, p in model.named_parameters()}
-
-
-def apart(ours: Tensor, theirs: Tensor) -> float:
-    return float((ours - theirs).norm() / theirs.norm().clamp_min(1e-12))
-
-
-def compared(model: SceneModel, recorded: RecordedScene, moments: list[Moment]) -> None:
-    """Values and gradients of a recorded model at moments, against the plain path's."""
-    plain = RecordedScene(model, "off", weight_of(model))
-    for moment in moments:
-        found = []
-        for way in (recorded, plain):
-            model.zero_grad(set_to_none=True)
-            value = loss(way, model, moment)
-            value.backward()
-            found.append((value.detach(), gradients(model)))
-        (ours, mine), (theirs, wanted) = found
-        assert apart(ours, theirs) < 1e-6
-        largest = max(float(g.norm()) for g in wanted.values() if g is not None)
-        for name, gradient in wanted.items():
-            other = mine[name]
-            assert (other is None) == (gradient is None), name
-            if gradient is not None and other is not None:
-                difference = float((other - gradient).norm())
-                assert difference < 2e-6 * float(gradient.norm()) + 1e-8 * largest, name
-
-
-def recording(model: SceneModel) -> RecordedScene:
-    made = RecordedScene(model, "auto", weight_of(model), launches=True)
-    assert made.mode == "cached", made.reason
-    return made
-
-
-VARIANTS: dict[str, dict[str, Any]] = {
-    "hoigs": {},
-    "product planes": {"human": {"fusion": "product"}},
-    "canonical field, exavatar head": {"human": {"field_at": "canonical", "head": "exavatar"}},
-    "mesh laplacian": {"human": {"laplacian": "mesh", "residual_rule": "compose"}},
-    "finite differences": {"thing": {"tangents": "finite-difference", "opacity": "constant"}},
-    "heads": {"attention": {"pose_head": "per-part", "object_residual": "both", "gate": "hard"}},
-    "plain tokens": {"plain_tokens": True},
-}
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -504,14 +379,7 @@ def test_cuda_graphs_equal_the_plain_path(variant: str) -> None:
             model.zero_grad(set_to_none=True)
             loss(way, model, at(frame)).backward()
             found.append(gradients(model))
-        mine, wanted = found
-        largest = max(float(g.norm()) for g in wanted.values() if g is not None)
-        for name, gradient in wanted.items():
-            ours = mine[name]
-            assert (ours is None) == (gradient is None), name
-            if ours is not None and gradient is not None:
-                difference = float((ours - gradient).norm())
-                assert difference < 1e-4 * float(gradient.norm()) + 1e-6 * largest, name
+        same_gradients(*found, 1e-4, 1e-6)
     assert (recorded.mode, recorded.recordings) == ("graph", 1), recorded.reason
 
 
