@@ -56,18 +56,18 @@ def train(name: str, kind: str, options: argparse.Namespace) -> dict[str, Any]:
         resume = begun and (kind == "full" or answered.is_file())
         train_verb(
             Path(clip_of(name, options)), spec=options.spec, out=run, auto=kind == "auto",
-            settings=[] if resume and kind == "auto" else settings, device="cpu", resume=resume,
-            overwrite=not resume, evaluate=False,
+            settings=[] if resume and kind == "auto" else settings, device=options.device,
+            resume=resume, overwrite=not resume, evaluate=False,
         )  # fmt: skip
     found: dict[str, Any] = {"seconds": round(time.perf_counter() - began, 1), "resumed": begun}
     for label, path in {"": run, "compact_": compact_of(run)}.items():
         if label and kind == "full":
             continue
-        loaded = LoadedRun.open(path)
+        loaded = LoadedRun.open(path, device=options.device)
         scores = evaluate(loaded.model, loaded.clip, timing_frames=0, held_out=not label)
         regions = ("human_object", "full", "background")
         found[f"{label}psnr"] = {region: scores.score(region, "psnr") for region in regions}
-    loaded = LoadedRun.open(run)
+    loaded = LoadedRun.open(run, device=options.device)
     found["parameters"] = sum(p.numel() for p in loaded.model.parameters() if p.requires_grad)
     found["counts"] = loaded.model.count()
     if kind == "auto":
@@ -82,7 +82,10 @@ def render_times(name: str, options: argparse.Namespace) -> dict[str, float]:
     from hoigs.evaluation.measure import render_time
     from hoigs.training.session import LoadedRun
 
-    loaded = {kind: LoadedRun.open(run_folder(name, kind, options)) for kind in KINDS}
+    loaded = {
+        kind: LoadedRun.open(run_folder(name, kind, options), device=options.device)
+        for kind in KINDS
+    }
     times: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for _ in range(ROUNDS):
         for kind, run in loaded.items():
@@ -94,7 +97,9 @@ def render_times(name: str, options: argparse.Namespace) -> dict[str, float]:
 
 
 def settings_of(options: argparse.Namespace) -> dict[str, Any]:
-    return {name: getattr(options, name) for name in ("spec", "steps", "width", "seed", "set")}
+    return {
+        name: getattr(options, name) for name in ("spec", "steps", "width", "seed", "set", "device")
+    }
 
 
 def summary(options: argparse.Namespace) -> bool:
@@ -141,6 +146,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--width", type=int, help="of the clips' frames; default: their own")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--set", action="append", default=[], help="of both trainings")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
     parser.add_argument("--threads", type=int, default=1, help="of each")
     parser.add_argument("--minutes", type=float, help="stop then; the same command goes on")
@@ -159,7 +165,8 @@ def main() -> int:
     cells = [f"{name}-{kind}" for kind in reversed(KINDS) for name in options.clips]
     if not options.summary:
         own = [f"--spec={options.spec}", f"--steps={options.steps}", f"--seed={options.seed}",
-               f"--out={options.out}", *(f"--set={text}" for text in options.set)]  # fmt: skip
+               f"--out={options.out}", f"--device={options.device}",
+               *(f"--set={text}" for text in options.set)]  # fmt: skip
         own += [f"--width={options.width}"] if options.width else []
         run_cells(
             cells, options.out, settings_of(options), own, jobs=options.jobs,

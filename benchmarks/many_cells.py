@@ -17,6 +17,7 @@ from typing import Any
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 POLL_S = 0.2
+ALONE_S = 45.0
 
 
 def write_cell(folder: Path, name: str, settings: dict[str, Any], result: dict[str, Any]) -> None:
@@ -48,7 +49,8 @@ def run_cells(
 ) -> list[str]:
     """Run what is not done, `jobs` at a time.
 
-    The first cell that is not done runs alone, so that kernels are compiled once and not by all.
+    The first cell that is not done runs alone for `ALONE_S` at most: kernels are compiled once, not
+    by all.
 
     Args:
         arguments: of each child, beside `--cell NAME`. minutes: after which what still runs is
@@ -75,6 +77,7 @@ def run_cells(
                 if not warmed:
                     break
             time.sleep(POLL_S)
+            warmed = warmed or any(time.time() - start > ALONE_S for start in begun.values())
             for name in [n for n, process in running.items() if process.poll() is not None]:
                 code = running.pop(name).returncode
                 warmed = True

@@ -25,6 +25,8 @@ PARTS = (
      "gsplat's CUDA kernels, with their fixed cut-offs"),
     ("deformation:static", f"{DEFORMATION}.static", "Static", "StaticConfig",
      "does not move"),
+    ("deformation:shared-harmonics", f"{DEFORMATION}.shared_harmonics", "SharedHarmonics",
+     "SharedHarmonicsConfig", "does not move; its shine is a mixture of a few shared lobes"),
     ("deformation:mlp", f"{DEFORMATION}.mlp", "MlpDeformation", "MlpConfig",
      "an MLP of position and time, as in Deformable 3D Gaussians"),
     ("deformation:hexplane-field", f"{DEFORMATION}.hexplane_field", "HexPlaneField",

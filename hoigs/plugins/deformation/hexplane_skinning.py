@@ -57,7 +57,9 @@ class HexPlaneSkinningConfig(ComponentConfig):
         box: side of the cube about the pelvis that the planes cover, metres.
         width: of psi_h. head: what psi_h predicts, see CanonicalHead.
         free_attributes: train each point's own colour, opacity and scale too, which psi_h then
-            adds to; they converge sooner. False is the paper: all comes from the planes.
+            adds to; they converge sooner. "all" trains its place and turn as well, so that it is
+            no longer bound to the template's surface. False is the paper: all comes from the
+            planes.
         refine_poses: learn per-frame corrections of pose and translation, and one of shape.
         scale_about: the fixed point of alpha, which the paper leaves open (the world's origin would
             carry the person off). "pelvis", the default, changes their size, which images can tell;
@@ -83,7 +85,7 @@ class HexPlaneSkinningConfig(ComponentConfig):
     box: float = Field(2.5, gt=0)
     width: int = Field(128, ge=8)
     head: HeadKind = "full"
-    free_attributes: bool = True
+    free_attributes: bool | Literal["all"] = True
     refine_poses: bool = True
     scale_about: ScaleAbout = "pelvis"
     alpha_start: AlphaStart = "one"
@@ -155,7 +157,7 @@ class HexPlaneSkinning(SkinnedBody):
         box: float = 2.5,
         width: int = 128,
         head: HeadKind = "full",
-        free_attributes: bool = True,
+        free_attributes: bool | Literal["all"] = True,
         refine_poses: bool = False,
         scale_about: ScaleAbout = "pelvis",
         field_points: int = 1536,
@@ -185,7 +187,8 @@ class HexPlaneSkinning(SkinnedBody):
             time_resolution = max(8, (num_frames or 64) // 2)
         self.planes = body_planes(fusion, channels, resolution, time_resolution)
         self.head = CanonicalHead(self.planes.width, len(body.parents), width, head)
-        owned = {"means", "quats"} | ({"opacity_logits"} if self.opaque else set())
+        owned: set[str] = set() if free_attributes == "all" else {"means", "quats"}
+        owned |= {"opacity_logits"} if self.opaque else set()
         self.owns = frozenset(
             owned if free_attributes else {"means", "quats", "log_scales", "opacity_logits", "sh"}
         )

@@ -222,7 +222,11 @@ class KnotSchedule(nn.Module):
 
     def screen(self, curve: MovingCurve, rest: Gaussians) -> Float[Tensor, "F P 2"]:
         """Pixels at which the probes stand in every frame; NaN where they are not in front."""
-        points = curve.traced(rest, self.frame_times).float()
+        return self.on_screen(curve.traced(rest, self.frame_times))
+
+    def on_screen(self, points: Float[Tensor, "F P 3"]) -> Float[Tensor, "F P 2"]:
+        """Pixels of world points, a row a frame; NaN where they are not in front."""
+        points = points.float()
         turn, shift = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3]
         camera = points @ turn.mT + shift[:, None]
         pixels = camera @ self.intrinsics.mT

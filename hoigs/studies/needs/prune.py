@@ -9,9 +9,11 @@ from typing import Any
 
 from torch import Tensor
 
+from hoigs.plugins.deformation.knot_schedule import KnotSchedule, KnotTrial
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.studies.needs.judge import Judge, Look
 from hoigs.studies.needs.prune_knots import (
+    Knotted,
     fewer_uniform,
     is_knotted,
     measure,
@@ -24,7 +26,7 @@ from hoigs.studies.needs.trained import Trained, state_prefix
 from hoigs.training.trainer import Trainer
 
 VISIBLE = 0.05  # dB that one cut may cost in any region, before the model is tuned to it
-PIXELS = 1.0  # that nothing may move by when knots go
+PIXELS = (1.0, 0.5, 0.25)  # that nothing may move by when knots go, until nobody sees it
 VIEWS = 16  # training frames whose pictures tell which Gaussians matter
 
 NO_INTERACTION = "interaction:none"
@@ -139,61 +141,84 @@ class Pruning:
             self._take(less, what, "values", cells, 0, drop, why, after)
 
     def knots(self) -> None:
-        """Spline knots, by the refit of one pixel."""
-        schedule = None
+        """Spline knots, by a refit that moves nothing by a pixel, nor the picture by `visible`."""
         for key, names in self.trained.blocks().items():
             curves = {n: self.trained.model.entity(n).deformation for n in names}
             if not all(is_knotted(curve) for curve in curves.values()):
                 continue
-            schedule = schedule or measure(self.trained.clip, PIXELS).to(self.trained.model.device)
             movable = [c.knots.movable for c in curves.values() if is_knotted(c)]
             if all(movable):
                 for name, curve in curves.items():
                     assert is_knotted(curve)
-                    before = len(curve.knots)
-                    rest = self.trained.model.entity(name).rest
-                    gone = remove_movable(curve, rest, schedule)
-                    self._knots_told(f"knots of {name}", before, before - gone)
+                    self._movable(name, curve)
             elif len(names) == 1 and not any(movable):
-                self._uniform(key, names[0], schedule)
+                self._uniform(key, names[0])
 
-    def _uniform(self, key: str, name: str, schedule: Any) -> None:
+    def _schedule(self, pixels: float) -> KnotSchedule:
+        return measure(self.trained.clip, pixels).to(self.trained.model.device)
+
+    def _movable(self, name: str, curve: Knotted) -> None:
+        """Knots of one adaptive spline."""
+        rest, before = self.trained.model.entity(name).rest, len(curve.knots)
+        what, drop = f"knots of {name}", 0.0
+        for pixels in PIXELS:
+            if not self.judge.affordable:
+                return
+            with KnotTrial(curve) as trial:
+                gone = remove_movable(curve, rest, self._schedule(pixels))
+                if not gone:
+                    break
+                after = self.judge.look(self.trained.model)
+                drop = self.now.drop_to(after)
+                if drop <= self.visible:
+                    trial.keep()
+                    self.now = after
+                    why = f"refitted with {before - gone}, nothing moves by {pixels:g} pixel"
+                    self._tell(Cut(what, "knots", before, before - gone, drop, why))
+                    return
+        self._knots_kept(what, before, drop)
+
+    def _uniform(self, key: str, name: str) -> None:
+        """Knots of one uniform spline, and what of its tokens goes by them."""
         entity = self.trained.model.entity(name)
         curve, features = entity.deformation, entity.features
         assert is_knotted(curve)
         if isinstance(features, SplineMotionFeatures) and features.tau == "keyframes":
             return  # its tokens are the tangents themselves
-        before = len(curve.knots)
-        count, values = fewer_uniform(curve, entity.rest.detach(), schedule)
-        if count == before:
-            self._knots_told(f"knots of {key}", before, before)
-            return
-        place = state_prefix(name)
+        before, drop, what = len(curve.knots), 0.0, f"knots of {key}"
+        for pixels in PIXELS:
+            count, values = fewer_uniform(curve, entity.rest.detach(), self._schedule(pixels))
+            if count == before:
+                break
+            less = self._with_knots(key, name, before, count, values)
+            if not self.judge.affordable:
+                return
+            after = self.judge.look(less.model)
+            drop = self.now.drop_to(after)
+            if drop <= self.visible:
+                why = f"refitted with {count}, nothing moves by {pixels:g} pixel"
+                self._take(less, what, "knots", before, count, drop, why, after)
+                return
+        self._knots_kept(what, before, drop)
+
+    def _with_knots(
+        self, key: str, name: str, before: int, count: int, values: dict[str, Tensor]
+    ) -> Trained:
+        """The model with other uniform knots, and features to match."""
+        features, place = self.trained.model.entity(name).features, state_prefix(name)
         changed: dict[str, Tensor] = {f"{place}deformation.{n}": v for n, v in values.items()}
         overrides: dict[str, Any] = {f"model.{key}.deformation.keyframes": count}
         if isinstance(features, SplineMotionFeatures):
             changed[f"{place}features.mlp.0.weight"] = slowed(features, before, count)
             if features.kind != "none":
                 overrides[f"model.{key}.features.keyframes"] = features.keyframes or before
-        less = self.trained.asking_less(overrides, changed)
-        if not self.judge.affordable:
-            return
-        after = self.judge.look(less.model)
-        drop = self.now.drop_to(after)
-        what = f"knots of {key}"
-        if drop > self.visible:
-            self._keep(what, "knots", before, drop, f"with {count} it is {drop:.2f} dB worse")
-            return
-        self._take(less, what, "knots", before, count, drop,
-                   f"refitted with {count}, nothing moves by {PIXELS:g} pixel", after)  # fmt: skip
+        return self.trained.asking_less(overrides, changed)
 
-    def _knots_told(self, what: str, before: int, after: int) -> None:
-        why = (
-            f"one fewer would move it by more than {PIXELS:g} pixel"
-            if after == before
-            else f"refitted with {after}, nothing moves by {PIXELS:g} pixel"
-        )
-        self._tell(Cut(what, "knots", before, after, None, why))
+    def _knots_kept(self, what: str, count: int, drop: float) -> None:
+        why = f"one fewer would move it by more than {PIXELS[-1]:g} pixel"
+        if drop > self.visible:
+            why = f"with fewer it is {drop:.2f} dB worse"
+        self._keep(what, "knots", count, drop, why)
 
     def splats(self) -> None:
         """Gaussians by sensitivity, entity by entity."""

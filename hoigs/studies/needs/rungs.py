@@ -29,7 +29,8 @@ class Rung(ComponentConfig):
             for the model blocks of that kind.
         times: dotted keys of numbers, and what their value so far is multiplied with: a rung that
             is smaller than the spec, whatever the spec has. Keys that the spec has not are left.
-        cost: of one step of a trial, where a step of the full spec costs 1.
+        cost: of one step of a trial, where a step of the full spec costs 1
+            (`benchmarks/rung_costs.py` measures it).
     """
 
     name: str
@@ -50,6 +51,7 @@ class Ladder(ComponentConfig):
             entity; "contact": of objects, and of humans within a twentieth of the image of them.
         rungs: cheapest first.
         share: of the search's budget, against the other ladders.
+        least: dB within which a cheaper rung is taken; None goes by the search's settings.
         during: laid under each rung while it is tried, and no longer.
         unless: ladder to rungs; a ladder is left out where one of these has been chosen.
         else_cheapest: a ladder that is left out takes its first rung, else it changes nothing.
@@ -60,6 +62,7 @@ class Ladder(ComponentConfig):
     region: Region = "own"
     rungs: tuple[Rung, ...] = Field(min_length=2)
     share: float = Field(1.0, gt=0)
+    least: float | None = Field(None, ge=0)
     during: Overrides = Field(default_factory=dict)
     unless: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     else_cheapest: bool = False

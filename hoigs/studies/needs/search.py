@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hoigs.core.clip import Clip
@@ -14,6 +14,7 @@ from hoigs.core.registry import Registry, default_registry
 from hoigs.core.spec import Spec
 from hoigs.studies.needs.criterion import Criterion, Gain, Score, gain
 from hoigs.studies.needs.halving import SCORING, BudgetError, Climbed, Ledger, climb, plan
+from hoigs.studies.needs.refit import UNSEEN, cheapest_refit
 from hoigs.studies.needs.rungs import (
     Ladder,
     Overrides,
@@ -72,7 +73,8 @@ class Answer:
 
     Attributes:
         block: key below `model`, or "" of a pair. chosen: its rung, None where nothing changes.
-        skipped: why the ladder was not climbed. overrides: of the chosen rung.
+        skipped: why the ladder was not climbed. overrides: of the chosen rung. refitted: rung that
+            scored best, whose motion the chosen one holds (`refit`).
     """
 
     ladder: Ladder
@@ -81,6 +83,7 @@ class Answer:
     steps: tuple[Step, ...] = ()
     skipped: str = ""
     overrides: Overrides = field(default_factory=dict)
+    refitted: str = ""
 
     def step(self, rung: Rung) -> Step:
         return next(s for s in self.steps if s.rung is rung)
@@ -196,7 +199,8 @@ class Search:
         trial = {"train.preview_every": 0, "train.loss.depth_fit": "scale",
                  "train.loss.lpips": 0.0, "train.loss.face": 0.0}  # fmt: skip
         self.ledger.spend("pace of a full training", steps + SCORING * len(self.held))
-        model = Trial(self._spec(trial), self.view, "background", names, self._registry())
+        spec, registry = self._spec(trial), self._registry()
+        model = Trial(spec, self.view, "background", names, registry, self.device)
         model.trainer.train(until=2)
         began = time.perf_counter()
         model.trainer.train(until=steps)
@@ -228,7 +232,7 @@ class Search:
             return Answer(ladder, block, None, skipped=str(error))
         trials, steps = self._trials(ladder, block, blocks, longest)
         tried = [rung for rung in ladder.rungs if rung.name in trials]
-        place = 0
+        place, refitted = 0, ""
         if len(tried) > 1:
             costs = [rung.cost for rung in tried]
             climbed = climb(
@@ -239,15 +243,18 @@ class Search:
                 self.ledger,
                 what=f"{ladder.name} {block}".strip(),
                 criterion=self.settings.criterion,
-                least=self.settings.least,
+                least=self.settings.least if ladder.least is None else ladder.least,
             )
-            place = climbed.chosen
+            place = cheapest_refit(tried, climbed.chosen, trials, self.clip)
+            if place != climbed.chosen:
+                refitted = tried[climbed.chosen].name
+                climbed = replace(climbed, chosen=place)
             for k, rung in enumerate(tried):
                 steps[rung.name] = _step(rung, k, climbed, trials[rung.name].seconds)
         chosen = tried[place]
         rows = tuple(steps.get(rung.name, Step(rung)) for rung in ladder.rungs)
         why = "" if len(tried) > 1 else "no other of its rungs can be built here"
-        return Answer(ladder, block, chosen, rows, why, self._overrides(chosen, blocks))
+        return Answer(ladder, block, chosen, rows, why, self._overrides(chosen, blocks), refitted)
 
     def _overrides(self, rung: Rung, blocks: Mapping[str, Sequence[str]]) -> Overrides:
         """What a rung sets, over what has been found so far."""
@@ -322,6 +329,8 @@ def told(answer: Answer) -> str:
     if answer.skipped:
         return f"{name}: {answer.chosen.name}, because {answer.skipped}"
     reasons = [answer.chosen.why]
+    if answer.refitted:
+        reasons.append(f"the motion of {answer.refitted} fits it within {UNSEEN:g} pixel")
     rungs = list(answer.ladder.rungs)
     place = rungs.index(answer.chosen)
     cheaper = [s for s in answer.steps[:place] if s.over_chosen is not None]

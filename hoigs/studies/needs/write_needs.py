@@ -13,6 +13,7 @@ from typing import Any
 from hoigs.core.errors import HoigsError
 from hoigs.core.registry import Registry
 from hoigs.studies.needs.plot import draw
+from hoigs.studies.needs.refit import UNSEEN
 from hoigs.studies.needs.search import Answer, Needs, Step, told
 from hoigs.studies.needs.write_spec import checked_spec, spec_text
 
@@ -104,6 +105,8 @@ def method(needs: Needs) -> list[str]:
         "sealed: reading one is an error.",
         f"- Criterion: {rule}. ± is the standard error of the paired differences over these frames "
         "alone: another seed of the training is not in it.",
+        f"- A rigid motion whose refit with the knots of a cheaper rung moves nothing by "
+        f"{UNSEEN:g} pixel gets that rung, whatever these few frames say.",
         "- Each rung is trained alone, in its own region. Rungs refused early were trained for "
         "fewer steps; they stand against the chosen one as it was then.",
         f"- Search: {needs.ledger.spent:.0f} steps' worth of the {needs.ledger.limit:.0f} that it "
@@ -153,5 +156,6 @@ def _answer(answer: Answer) -> dict[str, Any]:
         "chosen": answer.chosen.name if answer.chosen else None,
         "because": told(answer),
         "skipped": answer.skipped,
+        "refitted": answer.refitted,
         "rungs": rungs,
     }

@@ -1,0 +1,58 @@
+"""deformation:shared-harmonics: what shines in a few ways needs few numbers for it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from hoigs.core.entity import Entity
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.moment import Moment
+from hoigs.core.topology import TopologyChange
+from hoigs.plugins.deformation.shared_harmonics import SharedHarmonics
+
+COUNT = 30
+
+
+def entity(lobes: int = 3) -> Entity:
+    torch.manual_seed(0)
+    rest = Gaussians.from_points(torch.randn(COUNT, 3, dtype=torch.float64), scales=0.1)
+    return Entity(rest, SharedHarmonics(lobes))
+
+
+def test_starts_as_the_base_colour_and_learns_any_mixture_of_so_many_lobes():
+    made = entity()
+    assert made(Moment(0.3)).sh.shape == (COUNT, 9, 3)
+    assert not made(Moment(0.3)).sh[:, 1:].any()
+    goal = torch.randn(COUNT, 3, dtype=torch.float64) @ torch.randn(3, 24, dtype=torch.float64)
+    errors = {}
+    for count in (2, 3):
+        made = entity(count)
+        adam = torch.optim.LBFGS(made.deformation.parameters(), max_iter=400)
+
+        def loss(made=made, adam=adam) -> torch.Tensor:
+            adam.zero_grad()
+            error = (made(Moment(0.3)).sh[:, 1:].flatten(1) - goal).square().mean()
+            error.backward()
+            return error
+
+        adam.step(loss)
+        errors[count] = float(loss().detach()) / float(goal.square().mean())
+    assert errors[3] < 1e-4 and errors[2] > 0.02
+
+
+def test_rows_take_their_shares_along():
+    made = entity()
+    torch.nn.init.normal_(made.deformation.shares)
+    before = made(Moment(0.0)).sh
+    mask = torch.arange(COUNT) % 3 == 0
+    made.apply_topology(TopologyChange.keep(mask), made.rest[mask])
+    torch.testing.assert_close(made(Moment(1.0)).sh, before[mask])
+
+
+def test_wants_a_base_without_bands_and_lobes_that_can_differ():
+    rest = Gaussians.from_points(torch.randn(4, 3), scales=0.1, sh_degree=2)
+    with pytest.raises(ValueError, match=r"9 bands of its own: set sh_degree: 0"):
+        Entity(rest, SharedHarmonics())
+    with pytest.raises(ValueError, match="10 lobes of degree 1: more than 9"):
+        SharedHarmonics(10, degree=1)
