@@ -31,11 +31,12 @@ class SharedHarmonicsConfig(ComponentConfig):
 
 
 class SharedHarmonics(DeformationModel):
-    """sh_i = [base_i, sum_k share_ik lobe_k]: bands above the base are of rank `lobes`.
+    """sh_i = [base_i, sum_k share_ik lobe_k]: bands above the base colour are of rank `lobes`.
 
     A room is lit by few lamps and shines in few ways, yet 3DGS learns 24 numbers for it at each
     Gaussian (degree 2); here these are `shares` [N, lobes], and `lobes` [lobes, B - 1, 3] once for
-    all. Base colours, and everything else, are the rest Gaussians', which must be of degree 0.
+    all. Everything else is the rest Gaussians': give them `sh_degree: 0`; bands of their own, if they
+    have some, are added to.
 
     Args:
         lobes, degree: as SharedHarmonicsConfig.
@@ -65,11 +66,6 @@ class SharedHarmonics(DeformationModel):
         return cls(config.lobes, config.degree)
 
     def bind(self, rest: Gaussians) -> None:
-        if rest.sh.shape[1] != 1:
-            raise ValueError(
-                f"deformation:shared-harmonics brings the bands above the base colour; the rest "
-                f"has {rest.sh.shape[1]} bands of its own: set sh_degree: 0 beside it"
-            )
         start = torch.empty(self.count, 3 * self.bands)
         nn.init.orthogonal_(start)  # lobes that differ, each of length 1
         self.lobes = nn.Parameter(start.unflatten(1, (self.bands, 3)).to(rest.sh))
@@ -83,7 +79,10 @@ class SharedHarmonics(DeformationModel):
         self, rest: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
         del moment
-        moved = replace(rest, sh=torch.cat((rest.sh, self.harmonics()), dim=1))
+        shine = nn.functional.pad(self.harmonics(), (0, 0, 1, 0))
+        missing = rest.sh.shape[1] - shine.shape[1]
+        shine = nn.functional.pad(shine, (0, 0, 0, max(missing, 0)))
+        moved = replace(rest, sh=nn.functional.pad(rest.sh, (0, 0, 0, max(-missing, 0))) + shine)
         if residual is None or residual.means is None:
             return moved
         return replace(moved, means=rest.means + residual.means)

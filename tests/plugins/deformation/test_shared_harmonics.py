@@ -50,9 +50,21 @@ def test_rows_take_their_shares_along():
     torch.testing.assert_close(made(Moment(1.0)).sh, before[mask])
 
 
-def test_wants_a_base_without_bands_and_lobes_that_can_differ():
-    rest = Gaussians.from_points(torch.randn(4, 3), scales=0.1, sh_degree=2)
-    with pytest.raises(ValueError, match=r"9 bands of its own: set sh_degree: 0"):
-        Entity(rest, SharedHarmonics())
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_bands_that_the_rest_has_are_added_to(degree):
+    torch.manual_seed(0)
+    rest = Gaussians.from_points(torch.randn(4, 3), scales=0.1, sh_degree=degree)
+    rest = rest.replace(sh=torch.randn_like(rest.sh))
+    made = Entity(rest, SharedHarmonics(3, degree=2))
+    torch.nn.init.normal_(made.deformation.shares)
+    found, own = made(Moment(0.0)).sh, (degree + 1) ** 2
+    assert found.shape[1] == max(own, 9)
+    both = torch.zeros(4, max(own, 9), 3)
+    both[:, :own] += rest.sh
+    both[:, 1:9] += made.deformation.harmonics()
+    torch.testing.assert_close(found, both)
+
+
+def test_lobes_have_to_differ():
     with pytest.raises(ValueError, match="10 lobes of degree 1: more than 9"):
         SharedHarmonics(10, degree=1)
