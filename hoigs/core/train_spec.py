@@ -58,6 +58,8 @@ class LossSpec(_Strict):
             a shift), "affine" both.
         scene_loss: "full" compares the composite with the whole image (the supplement's formula),
             "masked" draws the scene alone and leaves out the dilated masks (its text), "both".
+            "background" also leaves out people and things that are in the clip and not in the
+            model.
         background: colour behind masked terms. "random" is drawn anew at each step.
         dilate: pixels by which masks grow before they cut a hole into the scene term.
         regularizers: weight by name of the penalties that components offer, over their defaults;
@@ -78,7 +80,7 @@ class LossSpec(_Strict):
     lpips_net: Literal["alex", "vgg"] | None = None
     face: float = Field(0.0, ge=0)
     depth_fit: Literal["auto", "scale", "affine"] = "auto"
-    scene_loss: Literal["full", "masked", "both"] = "full"
+    scene_loss: Literal["full", "masked", "both", "background"] = "full"
     background: Literal["random", "black"] = "random"
     dilate: int = Field(3, ge=0, le=64)
     regularizers: dict[str, float] = Field(default_factory=dict)

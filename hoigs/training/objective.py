@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from hoigs.core.camera import Camera
@@ -102,7 +102,7 @@ class JointObjective:
         there = frame.to(device)
         image = there.rgb
         terms: dict[str, Tensor] = {}
-        terms.update(self._scene(there, image, camera, state, composite))
+        terms.update(self._scene(there, image, camera, state, composite, offsets, absolutes))
         if there.depth is not None and self.weights["depth"] > 0:
             prior = there.depth * self.depth_scale
             if there.ignored is not None:
@@ -155,6 +155,8 @@ class JointObjective:
         camera: Camera,
         state: SceneState,
         composite: RenderOutput,
+        offsets: Tensor,
+        absolutes: Tensor | None,
     ) -> dict[str, Tensor]:
         terms = {}
         blank = frame.ignored
@@ -164,12 +166,19 @@ class JointObjective:
             if blank is not None:
                 drawn = torch.where(blank[..., None], image, drawn)
             terms["scene"] = image_loss(drawn, image, *dssim)
-        scenes = self.model.names("scene")
-        untold = frame.unknown & set(self.model.entities)  # what to leave out is not known
-        if self.spec.scene_loss in ("masked", "both") and scenes and not untold:
-            alone = self.model.rasterizer.render(state.joined(scenes), camera)
-            modelled = [m for n, m in frame.masks.items() if n in self.model.entities]
-            dynamic = union(modelled)
+        scenes, kind = self.model.names("scene"), self.spec.scene_loss
+        modelled = {n: m for n, m in frame.masks.items() if n in self.model.entities}
+        left_out = frame.masks if kind == "background" else modelled
+        told = not frame.unknown & {*left_out, *self.model.entities}  # what to leave out is known
+        if kind in ("masked", "both", "background") and scenes and told:
+            request = RenderRequest()
+            if kind != "both":  # where the composite is not compared, density control looks here
+                request = RenderRequest(
+                    screen_offsets=_of(scenes, state, offsets),
+                    absolute_gradients=None if absolutes is None else _of(scenes, state, absolutes),
+                )
+            alone = self.model.rasterizer.render(state.joined(scenes), camera, request)
+            dynamic = union(left_out.values())
             if dynamic is not None:
                 dynamic = dilate(dynamic, self.spec.dilate)
             hidden = union(m for m in (dynamic, blank) if m is not None)
@@ -252,3 +261,9 @@ class JointObjective:
             if weight > 0:
                 terms[f"regularizer/{name}/{key}"] = value
                 weights[f"regularizer/{name}/{key}"] = weight
+
+
+def _of(names: Sequence[str], state: SceneState, values: Shaped[Tensor, "N C"]) -> Tensor:
+    """Rows of some entities, of what has one for each Gaussian of `state.joined()`."""
+    parts = [values[rows] for name, rows in state.slices().items() if name in names]
+    return parts[0] if len(parts) == 1 else torch.cat(parts)

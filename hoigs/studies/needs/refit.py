@@ -10,14 +10,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from hoigs.core.clip import Clip
 from hoigs.core.gaussians import Gaussians
 from hoigs.plugins.deformation.knot_schedule import KnotSchedule, KnotTrial
 from hoigs.plugins.deformation.knots import Knots
-from hoigs.plugins.deformation.rigid_residual import RigidResidual
 from hoigs.plugins.deformation.rigid_spline import RigidSpline
 from hoigs.plugins.deformation.static import Static
 from hoigs.studies.needs.prune_knots import measure
@@ -32,8 +29,8 @@ def cheapest_refit(
 ) -> int:
     """Place of the cheapest rung whose knots hold the motion of the chosen one.
 
-    Asked where that is a rigid spline, with a residual or without. Cheaper rungs that can hold it
-    are `deformation:rigid-spline`, and `deformation:static`: as it stands halfway through the clip.
+    Asked where that is a `deformation:rigid-spline`. Cheaper rungs that can hold it are others of
+    fewer uniform knots, and `deformation:static`: as it stands halfway through the clip.
 
     Args:
         rungs: that were tried, cheapest first. place: of the chosen one. trials: by name of rung.
@@ -41,7 +38,7 @@ def cheapest_refit(
     chosen = trials[rungs[place].name]
     entities = [chosen.model.entity(name) for name in chosen.names]
     curves = [entity.deformation for entity in entities]
-    if not all(type(curve) in (RigidSpline, RigidResidual) for curve in curves):
+    if not all(type(curve) is RigidSpline for curve in curves):
         return place
     schedule = measure(clip, UNSEEN).to(chosen.model.device)
     for cheaper in range(place):
@@ -64,18 +61,14 @@ def _knots(deformation: object) -> int | None:
 
 @torch.no_grad()
 def _held(curve: Any, rest: Gaussians, count: int, schedule: KnotSchedule) -> bool:
-    """Whether nothing moves by `UNSEEN` pixels when `count` uniform knots have to do, and no
-    Gaussian moves within the object."""
-    times = schedule.frame_times
-    shapes = torch.stack([curve.shape(rest, time)[0] for time in times])
-    still = schedule.on_screen(_world(curve, rest, shapes, times))
-    rest = rest.replace(means=shapes.mean(0))
+    """Whether nothing moves by `UNSEEN` pixels when `count` uniform knots have to do."""
+    still = schedule.screen(curve, rest)
     if count == 1:
-        middle = curve.traced(rest, [0.5] * len(times))
+        middle = curve.traced(rest, [0.5] * len(schedule.frame_times))
         return schedule.deviation(still, schedule.on_screen(middle)) <= UNSEEN
     own = curve.knots
     if count >= len(own):
-        return schedule.deviation(still, schedule.screen(curve, rest)) <= UNSEEN
+        return False
     curve.knots = Knots(len(own), movable=True).to(rest.means.device)
     curve.knots.place(own.tolist())
     try:
@@ -84,14 +77,3 @@ def _held(curve: Any, rest: Gaussians, count: int, schedule: KnotSchedule) -> bo
             return schedule.deviation(still, schedule.screen(curve, rest)) <= UNSEEN
     finally:
         curve.knots = own
-
-
-def _world(
-    curve: Any, rest: Gaussians, shapes: Float[Tensor, "F N 3"], times: Sequence[float]
-) -> Float[Tensor, "F P 3"]:
-    """Where some Gaussians are when the object has these shapes at these times."""
-    paths = [
-        curve.traced(rest.replace(means=shape), [time])[0]
-        for shape, time in zip(shapes, times, strict=True)
-    ]
-    return torch.stack(paths)

@@ -245,7 +245,9 @@ class Search:
                 criterion=self.settings.criterion,
                 least=self.settings.least if ladder.least is None else ladder.least,
             )
-            place = cheapest_refit(tried, climbed.chosen, trials, self.clip)
+            place = climbed.chosen
+            if ladder.kind == "object":
+                place = cheapest_refit(tried, place, trials, self.clip)
             if place != climbed.chosen:
                 refitted = tried[climbed.chosen].name
                 climbed = replace(climbed, chosen=place)

@@ -46,7 +46,7 @@ def alone(
         "train.rates.camera": 0.0,
     }
     if kind == "scene":
-        found["train.loss.scene_loss"] = "masked"
+        found["train.loss.scene_loss"] = "background"
     else:
         found["train.loss.scene"] = 0.0
     if kind != "pair":
