@@ -48,6 +48,38 @@ def test_what_is_painted_there_changes_no_gradient() -> None:
         assert near(clean, dirty, dim=0) > near(clean, blind, dim=0) + 0.05
 
 
+def test_a_scene_drawn_alone_tells_density_control_where_to_grow() -> None:
+    """`screen_offsets` take part in the picture that is compared, whichever that is."""
+    clip = small_clip()
+    scene, frame = model(clip), clip[2]
+    found = {}
+    for loss in ("full", "masked", "background"):
+        spec = LossSpec(scene_loss=loss, ssim="torch")  # type: ignore[arg-type]
+        result = JointObjective(scene, spec, "none")(frame, frame.camera, torch.Generator())
+        result.total.backward()
+        found[loss] = result.screen_offsets.grad
+    assert found["full"] is not None and found["full"].norm() > 0
+    for loss in ("masked", "background"):  # nothing is masked here: the same picture
+        torch.testing.assert_close(found[loss], found["full"], rtol=1e-3, atol=1e-7)
+
+
+def test_a_background_learns_nothing_from_people_that_the_model_has_not() -> None:
+    clip = small_clip()
+    scene, frame = model(clip), clip[2]
+    person = torch.zeros(frame.image.shape[:2], dtype=torch.bool)
+    person[:, :40] = True
+    frame = replace(frame, masks={"human": person})
+    painted = frame.image.clone()
+    painted[person] = 255 - painted[person]
+    for loss, learns in (("background", False), ("masked", True)):
+        before = gradient(scene, frame, loss)
+        after = gradient(scene, replace(frame, image=painted), loss)
+        assert bool((before - after).norm() > 0.05 * before.norm()) == learns
+    unknown = replace(frame, unknown=frozenset({"human"}))
+    objective = JointObjective(scene, LossSpec(scene_loss="background", ssim="torch"), "none")
+    assert not objective(unknown, frame.camera, torch.Generator()).terms
+
+
 def test_scores_leave_them_out_and_say_so() -> None:
     clip = small_clip()
     scene = model(clip)

@@ -39,6 +39,15 @@ def test_a_scene_that_shows_more_gets_more(clip):
         AdaptiveDensityConfig(cap="many")
 
 
+def test_a_scene_that_needs_less_gets_a_part(clip):
+    context = BuildContext(entity="scene", clip=clip)
+    assert cap_in(context, "auto/2") == LEAST // 2
+    assert cap_in(context, "auto/4+500") == LEAST // 4 + 500
+    assert AdaptiveDensityConfig(cap="auto/2").cap == "auto/2"
+    with pytest.raises(ValueError, match="auto"):
+        AdaptiveDensityConfig(cap="auto/0")
+
+
 def test_a_number_stays():
     assert cap_in(BuildContext(), 123) == 123
 

@@ -3,50 +3,31 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 
 import pytest
 import torch
+from small_models import GIVEN, NAME, as_composed, drawn, judge_of
 
 from hoigs.core.clip import Clip, FrameStore
-from hoigs.core.compose import compose
 from hoigs.core.entity import Entity
 from hoigs.core.errors import CheckpointError, HoigsError
 from hoigs.core.gaussians import Gaussians
-from hoigs.core.moment import Moment
 from hoigs.core.rasterizer import RenderRequest
-from hoigs.core.registry import default_registry
 from hoigs.core.scene import SceneModel
-from hoigs.core.spec import Spec
 from hoigs.core.topology import TopologyChange
-from hoigs.plugins.deformation.rigid_spline import RigidSpline
 from hoigs.plugins.deformation.static import Static
-from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.rasterizers.oracle import OracleRasterizer
 from hoigs.studies.needs.after import add_to_answer, finish, table
 from hoigs.studies.needs.compact_run import compact_run
 from hoigs.studies.needs.halving import Ledger
 from hoigs.studies.needs.judge import Judge
 from hoigs.studies.needs.prune import Pruning
-from hoigs.studies.needs.prune_knots import fewer_uniform, is_knotted, measure, slowed
 from hoigs.studies.needs.prune_planes import as_one, from_one, time_planes
 from hoigs.studies.needs.prune_splats import rows_to_lose, sensitivities, take_out
 from hoigs.studies.needs.selection import SealedFrameError, sealed_view
-from hoigs.studies.needs.trained import Trained
 from hoigs.training.checkpoint import latest_checkpoint, load_checkpoint
 from hoigs.training.session import LoadedRun, Session, read_clip
-
-NAME = (
-    "builtin:lift-and-swing?frames=14&width=32&fps=4&samples=1&edge_samples=1&held_out_views=0"
-    "&test_frames=3&scene_points=300&object_points=120"
-)
-GIVEN = (
-    "train.steps=30",
-    "train.preview_every=0",
-    "model.human.points=200",
-    "model.human.deformation.resolution=8",
-)
 
 
 @pytest.fixture(scope="module")
@@ -54,26 +35,6 @@ def clip(tmp_path_factory) -> Clip:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOIGS_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield read_clip(NAME)
-
-
-def as_composed(clip: Clip, *changes: str) -> Trained:
-    registry = default_registry()
-    spec = Spec.load("hoigs", overrides=(*GIVEN, *changes), registry=registry)
-    model = compose(spec, clip, registry)
-    model.eval()
-    model.set_progress(1.0)
-    return Trained(spec, model, clip, registry)
-
-
-def judge_of(clip: Clip) -> Judge:
-    return Judge(clip, clip.split["train"][2:8:3], Ledger(1e6))
-
-
-def drawn(trained: Trained, position: int) -> torch.Tensor:
-    with torch.no_grad():
-        return trained.model.render(
-            trained.clip.moments[position], trained.clip.cameras[position]
-        ).color
 
 
 # -- Gaussians -------------------------------------------------------------------------------------
@@ -135,67 +96,6 @@ def test_gaussians_that_show_nowhere_go_and_others_stay(clip):
     assert len(model.entity("scene")) == int(kept.sum())
     change = (drawn(trained, clip.split["train"][3]) - drawn_before).square().mean()
     assert change < 1e-3
-
-
-# -- knots -----------------------------------------------------------------------------------------
-
-
-def moving(clip: Clip, knots: int, path) -> Entity:
-    """A box of points on a path (time -> metres), with an uneven `SplineMotionFeatures`."""
-    torch.manual_seed(4)
-    points = torch.rand(40, 3) * 0.3 + torch.tensor([0.0, 0.9, 0.3])
-    features = SplineMotionFeatures(embedding="shared")
-    entity = Entity(Gaussians.from_points(points, scales=0.02), RigidSpline(knots), features)
-    times = [k / (knots - 1) for k in range(knots)]
-    with torch.no_grad():
-        places = torch.stack([path(t) for t in times])
-        entity.deformation.keyframe_translations.copy_(places)
-        entity.deformation.translation_tangents.copy_(
-            entity.deformation.knots.differences(places[None])[0]
-        )
-    return entity
-
-
-def test_an_even_motion_needs_two_knots_and_an_eight_more(clip):
-    schedule = measure(clip, 1.0)
-    even = moving(clip, 9, lambda t: torch.tensor([0.4 * t, 0.1 * t, 0.0]))
-    assert is_knotted(even.deformation) and not is_knotted(Static())
-    count, values = fewer_uniform(even.deformation, even.rest.detach(), schedule)
-    assert count == 2 and values["keyframe_translations"].shape == (2, 3)
-
-    def eight(t: float) -> torch.Tensor:
-        phase = 2 * math.pi * t
-        return torch.tensor([0.6 * math.sin(phase), 0.4 * math.sin(2 * phase), 0.0])
-
-    looped = moving(clip, 13, eight)
-    kept = looped.deformation.keyframe_translations.detach().clone()
-    schedule = measure(clip, 0.2)
-    count, values = fewer_uniform(looped.deformation, looped.rest.detach(), schedule)
-    assert 4 <= count < 13
-    assert len(looped.deformation.knots) == 13 and not looped.deformation.knots.movable
-    assert torch.equal(looped.deformation.keyframe_translations, kept)  # only asked, not changed
-    finer, _ = fewer_uniform(looped.deformation, looped.rest.detach(), measure(clip, 0.02))
-    assert finer > count
-
-
-def test_fewer_knots_move_alike_and_say_the_same(clip):
-    """Places within the pixel, velocities in tokens too, though their unit has changed."""
-    entity = moving(clip, 9, lambda t: torch.tensor([0.4 * t, 0.3 * t * t, 0.0]))
-    count, values = fewer_uniform(entity.deformation, entity.rest.detach(), measure(clip, 0.2))
-    assert count < 9
-    fewer = moving(clip, count, lambda t: torch.zeros(3))
-    state = entity.state_dict() | {f"deformation.{n}": v for n, v in values.items()}
-    state["features.mlp.0.weight"] = slowed(entity.features, 9, count)
-    state["features.embedding"] = fewer.features.embedding.detach() * 0
-    fewer.load_state_dict(state)
-    with torch.no_grad():
-        entity.features.embedding.zero_()
-    for time in (0.0, 0.31, 0.77, 1.0):
-        moment = Moment(time)
-        ours, theirs = fewer(moment), entity(moment)
-        assert (ours.means - theirs.means).norm(dim=-1).max() < 0.02
-    said, meant = (e.tokens(Moment(0.5)).features for e in (fewer, entity))
-    assert (said - meant).norm() < 0.05 * meant.norm()
 
 
 # -- planes, tokens --------------------------------------------------------------------------------
