@@ -157,6 +157,7 @@ class RecordedScene:
             if stamp.parts not in self._compared:
                 failed = self._difference(recording, moment)
         except (RuntimeError, TypeError, ValueError, NotImplementedError) as error:
+            # what CUDA or a component says of being recorded; raised or warned of below
             failed = _words(error)
         if failed is None:
             self._recording = recording

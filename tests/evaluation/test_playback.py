@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import copy
-import math
 from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
+from whole_scene import away_from_start, person_of, things
 
 from hoigs.core.camera import Camera
-from hoigs.core.clip import ObjectTrack
 from hoigs.core.deformation import DeformationModel
 from hoigs.core.entity import Entity
 from hoigs.core.errors import RenderError
@@ -22,13 +20,11 @@ from hoigs.core.rasterizer import Rasterizer
 from hoigs.core.scene import SceneModel
 from hoigs.evaluation.playback import Playback
 from hoigs.plugins.deformation.chs import CubicHermite
-from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.features.body_parts import BodyPartFeatures
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.plugins.interaction.cross_attention import CrossAttention
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.testing.material.body import TinyBody
 
 FRAMES, SIZE = 9, 24
 TIMES = (0.0, 1 / 8, 0.3, 0.5, 0.77, 1.0)
@@ -36,23 +32,8 @@ TIMES = (0.0, 1 / 8, 0.3, 0.5, 0.77, 1.0)
 
 def scene(rasterizer: Rasterizer, **human: object) -> SceneModel:
     """All parts of the hoigs spec, small, with every head and correction away from its start."""
-    torch.manual_seed(0)
-    body = TinyBody()
-    wall = Gaussians.from_points(torch.rand(40, 3) + torch.tensor((-0.5, -0.5, 1.5)), sh_degree=1)
-    box = Gaussians.from_points(0.2 * torch.rand(20, 3) + torch.tensor((0.6, 0.3, 0.0)))
-    turns = torch.linspace(0, 1, FRAMES)
-    track = ObjectTrack(
-        points=box.means,
-        colors=torch.rand(20, 3),
-        rotations=torch.stack([_about_y(float(t)) for t in turns]),
-        translations=torch.stack((turns, turns.square(), 0 * turns), 1),
-        observed=torch.ones(FRAMES, dtype=torch.bool),
-    )
-    settings = {"refine_poses": True, "num_frames": FRAMES, "trained_frames": (0, 1, 3, 6, 7)}
-    person = HexPlaneSkinning(
-        body, resolution=8, channels=4, time_resolution=4, field_points=64, width=16,
-        **(settings | human),
-    )  # fmt: skip
+    body, wall, box, track = things(FRAMES)
+    person = person_of(body, FRAMES, (0, 1, 3, 6, 7), **human)
     model = SceneModel(
         {
             "scene": Entity(wall, Static(), kind="scene"),
@@ -62,16 +43,7 @@ def scene(rasterizer: Rasterizer, **human: object) -> SceneModel:
         interaction=CrossAttention(hidden=16, reach=3.0),
         rasterizer=rasterizer,
     )
-    with torch.no_grad():
-        for name, parameter in model.named_parameters():
-            if "planes" not in name and name.rpartition(".")[2] not in ("means", "log_scales"):
-                parameter += 0.03 * torch.randn_like(parameter)
-    return model.eval()
-
-
-def _about_y(angle: float) -> Tensor:
-    c, s = math.cos(angle), math.sin(angle)
-    return torch.tensor(((c, 0.0, s), (0.0, 1.0, 0.0), (-s, 0.0, c)))
+    return away_from_start(model).eval()
 
 
 def view(time: float) -> tuple[Moment, Camera]:

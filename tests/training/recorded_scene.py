@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor
+from whole_scene import away_from_start, person_of, things
 
-from hoigs.core.clip import ObjectTrack
 from hoigs.core.entity import Entity
-from hoigs.core.gaussians import Gaussians
 from hoigs.core.moment import BodyPose, Moment
 from hoigs.core.scene import SceneModel
 from hoigs.plugins.deformation.chs import CubicHermite
-from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.features.body_parts import BodyPartFeatures
 from hoigs.plugins.features.embedding import EmbeddingFeatures
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.plugins.interaction.cross_attention import CrossAttention
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.testing.material.body import TinyBody
 from hoigs.training.recorded import RecordedScene
 
 FRAMES = 6
@@ -35,23 +31,8 @@ def scene(
     plain_tokens: bool = False,
 ) -> SceneModel:
     """All parts of the hoigs spec, small, every head and correction away from its start."""
-    torch.manual_seed(0)
-    body = TinyBody()
-    wall = Gaussians.from_points(torch.rand(40, 3) + torch.tensor((-0.5, -0.5, 1.5)), sh_degree=1)
-    box = Gaussians.from_points(0.2 * torch.rand(20, 3) + torch.tensor((0.6, 0.3, 0.0)))
-    turns = torch.linspace(0, 1, FRAMES)
-    track = ObjectTrack(
-        points=box.means,
-        colors=torch.rand(20, 3),
-        rotations=torch.stack([_about_y(float(t)) for t in turns]),
-        translations=torch.stack((turns, turns.square(), 0 * turns), 1),
-        observed=torch.ones(FRAMES, dtype=torch.bool),
-    )
-    settings = {"refine_poses": True, "num_frames": FRAMES, "trained_frames": (0, 1, 3, 4)}
-    person = HexPlaneSkinning(
-        body, resolution=8, channels=4, time_resolution=4, field_points=64, width=16,
-        **(settings | (human or {})),
-    )  # fmt: skip
+    body, wall, box, track = things(FRAMES)
+    person = person_of(body, FRAMES, (0, 1, 3, 4), **(human or {}))
     motion = CubicHermite(4, track=track, **(thing or {}))
     model = SceneModel(
         {
@@ -69,16 +50,7 @@ def scene(
         interaction=CrossAttention(hidden=16, reach=3.0, **(attention or {})),
         rasterizer=TorchRasterizer(),
     )
-    with torch.no_grad():
-        for name, parameter in model.named_parameters():
-            if "planes" not in name and name.rpartition(".")[2] not in ("means", "log_scales"):
-                parameter += 0.03 * torch.randn_like(parameter)
-    return model.train()
-
-
-def _about_y(angle: float) -> Tensor:
-    c, s = math.cos(angle), math.sin(angle)
-    return torch.tensor(((c, 0.0, s), (0.0, 1.0, 0.0), (-s, 0.0, c)))
+    return away_from_start(model).train()
 
 
 def at(frame: float) -> Moment:
@@ -121,8 +93,10 @@ def apart(ours: Tensor, theirs: Tensor) -> float:
 
 def same_gradients(
     mine: dict[str, Tensor | None], wanted: dict[str, Tensor | None], allowed: float, floor: float
-) -> None:
-    """Norms of differences: `allowed` of each gradient's own, and `floor` of the largest."""
+) -> int:
+    """Norms of differences: `allowed` of each gradient's own, and `floor` of the largest; how many
+    there were."""
+    compared = 0
     largest = max(float(g.norm()) for g in wanted.values() if g is not None)
     for name, gradient in wanted.items():
         other = mine[name]
@@ -130,6 +104,8 @@ def same_gradients(
         if gradient is not None and other is not None:
             difference = float((other - gradient).norm())
             assert difference < allowed * float(gradient.norm()) + floor * largest, name
+            compared += 1
+    return compared
 
 
 def compared(model: SceneModel, recorded: RecordedScene, moments: list[Moment]) -> None:

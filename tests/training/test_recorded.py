@@ -314,15 +314,7 @@ def side_by_side(recorded: Trainer, plain: Trainer, allowed: float) -> set[int]:
         assert recorded.model.count() == plain.model.count()
         counts.add(recorded.model.count()["scene"])
         ours, theirs = gradients(recorded.model), gradients(plain.model)
-        largest = max(float(g.norm()) for g in theirs.values() if g is not None)
-        for name, gradient in theirs.items():
-            mine = ours[name]
-            assert (mine is None) == (gradient is None), name
-            if mine is not None and gradient is not None:
-                difference = float((mine - gradient).norm())
-                floor = 1e-3 * allowed * largest
-                assert difference < allowed * float(gradient.norm()) + floor, name
-                compared += 1
+        compared += same_gradients(ours, theirs, allowed, 1e-3 * allowed)
     assert len(counts) > 2 and compared > 20 * STEPS  # topology did change
     # Adam's too: what has no gradient has no state
     assert set(recorded.checkpoint().tensors) == set(plain.checkpoint().tensors)

@@ -212,7 +212,7 @@ def glorot(net: nn.Module) -> None:
     """Every layer as flax starts it in Nerfies and HyperNeRF: `glorot_uniform`, no bias.
 
     PyTorch's own start shrinks what differs between places and times by sqrt(6) a layer: behind six
-    of them the field sees one constant, and stays still for thousands of steps.
+    of them all places and times look alike to the field.
     """
     for layer in net.modules():
         if isinstance(layer, nn.Linear):

@@ -6,6 +6,8 @@ long quiet clip does not hide one jerk (as `KnotSchedule` has it).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol, TypeGuard
 
 import torch
@@ -46,6 +48,19 @@ def measure(clip: Clip, pixels: float) -> KnotSchedule:
     return KnotSchedule.from_context(config, BuildContext(clip=clip))
 
 
+@contextmanager
+def as_movable(curve: Knotted, rest: Gaussians) -> Iterator[None]:
+    """Uniform knots that can be tried elsewhere, where they are; movable ones are left, as tangents
+    are per interval of the knots that they began with."""
+    own = curve.knots
+    if not own.movable:
+        curve.knots = Knots(len(own), movable=True).to(rest.means.device)
+    try:
+        yield
+    finally:
+        curve.knots = own
+
+
 @torch.no_grad()
 def remove_movable(curve: Knotted, rest: Gaussians, schedule: KnotSchedule) -> int:
     """Take out knots of an adaptive spline; how many went."""
@@ -63,10 +78,9 @@ def fewer_uniform(
 
     Each count is refitted to the motion as it is now, one fewer at a time, until one fails.
     """
-    own, count = curve.knots, len(curve.knots)
+    count = len(curve.knots)
     best, values = count, _values(curve)
-    curve.knots = Knots(count, movable=True).to(rest.means.device)
-    try:
+    with as_movable(curve, rest):
         still, fit = schedule.screen(curve, rest), schedule.sample_times()
         for fewer in range(count - 1, FEWEST - 1, -1):
             with KnotTrial(curve) as trial:
@@ -75,8 +89,6 @@ def fewer_uniform(
                     break
                 best = fewer
                 values = _values(curve)
-    finally:
-        curve.knots = own
     if best == count:
         return count, values
     longer = (count - 1) / (best - 1)  # tangents are displacements per interval, which is longer

@@ -245,9 +245,7 @@ class Search:
                 criterion=self.settings.criterion,
                 least=self.settings.least if ladder.least is None else ladder.least,
             )
-            place = climbed.chosen
-            if ladder.kind == "object":
-                place = cheapest_refit(tried, place, trials, self.clip)
+            place = cheapest_refit(tried, climbed.chosen, trials, self.clip)
             if place != climbed.chosen:
                 refitted = tried[climbed.chosen].name
                 climbed = replace(climbed, chosen=place)

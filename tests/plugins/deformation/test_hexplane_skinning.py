@@ -228,6 +228,14 @@ def test_paper_pure_trains_no_rest(toy_body):
     assert not any(p.requires_grad for n, p in entity.named_parameters() if "." not in n)
 
 
+@pytest.mark.parametrize(("head", "owned"), [("full", set()), ("exavatar", {"opacity_logits"})])
+def test_places_and_turns_can_be_trained_too(toy_body, toy_pose, head, owned):
+    entity = perturb(human(toy_body, free_attributes="all", head=head))
+    assert entity.deformation.owns == owned
+    entity(Moment(0.2, 1, {"human": toy_pose(3)})).means.square().sum().backward()
+    assert entity.means.grad.abs().max() > 0
+
+
 def test_gradcheck(toy_body, toy_pose):
     entity = perturb(human(toy_body, channels=2, resolution=4, width=8)).double()
     pose = toy_pose(7, dtype=torch.float64)

@@ -79,3 +79,15 @@ def test_slices_change_looks_and_not_motion():
     assert (one.opacity_logits - two.opacity_logits).abs().max() > 1e-3
     later = entity(Moment(0.9))
     assert (one.opacity_logits - later.opacity_logits).abs().max() > 1e-4
+
+
+def test_a_deep_field_tells_places_and_times_apart_from_the_start():
+    """As flax starts it; by PyTorch's own start all of them look alike."""
+    torch.manual_seed(0)
+    model = Se3Field([0.0, 1.0], window_until=0)
+    points = torch.rand(200, 3) * 2 - 1
+    with torch.no_grad():
+        here, then = (model.trunk(model._entry(points, time)) for time in (0.0, 1.0))
+    spread = here.std(0).norm() / here.norm(dim=1).mean()
+    change = (then - here).norm(dim=1).mean() / here.norm(dim=1).mean()
+    assert spread > 0.3 and change > 0.01

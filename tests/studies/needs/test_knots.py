@@ -15,13 +15,14 @@ from hoigs.core.gaussians import Gaussians
 from hoigs.core.moment import Moment
 from hoigs.core.scene import SceneModel
 from hoigs.plugins.deformation.knot_schedule import KnotTrial
+from hoigs.plugins.deformation.knots import Knots
 from hoigs.plugins.deformation.rigid_spline import RigidSpline
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.rasterizers.oracle import OracleRasterizer
 from hoigs.studies.needs.judge import Look
 from hoigs.studies.needs.prune import Pruning
-from hoigs.studies.needs.prune_knots import fewer_uniform, is_knotted, measure, slowed
+from hoigs.studies.needs.prune_knots import as_movable, fewer_uniform, is_knotted, measure, slowed
 from hoigs.studies.needs.refit import cheapest_refit
 from hoigs.studies.needs.rungs import Rung
 from hoigs.training.session import read_clip
@@ -146,6 +147,21 @@ def test_a_motion_that_fewer_knots_hold_gets_fewer(clip):
     assert rung_of(lambda t: torch.zeros(3)) == 0
     eight = lambda t: torch.tensor([math.sin(6.3 * t), 0.7 * math.sin(12.6 * t), 0.0])  # noqa: E731
     assert rung_of(eight) == 3
+
+
+def test_a_refit_of_movable_knots_leaves_their_tangents_what_they_are(clip):
+    """They are per interval of the knots that it began with, however many there are now."""
+    entity = moving(clip, 5, lambda t: torch.tensor([0.4 * t, 0.1 * t, 0.0]))
+    curve = entity.deformation
+    curve.knots = Knots(5, movable=True)
+    with KnotTrial(curve) as trial:
+        trial.place([k / 11 for k in range(12)], ())
+        trial.keep()
+    before = curve.traced(entity.rest, [0.13, 0.5, 0.77])
+    with as_movable(curve, entity.rest):
+        torch.testing.assert_close(curve.traced(entity.rest, [0.13, 0.5, 0.77]), before)
+        count, _ = fewer_uniform(curve, entity.rest.detach(), measure(clip, 0.3))
+    assert count == 2
 
 
 def test_fewer_knots_move_alike_and_say_the_same(clip):

@@ -146,6 +146,12 @@ def test_a_box_that_is_swung_moves(needs):
     assert "because it moves as one piece; static is -" in told(answer)
 
 
+def test_a_ladder_may_be_content_with_less(clip):
+    patient = OBJECT.model_copy(update={"least": 1e3})
+    (answer,) = Search(clip, "hoigs", (patient,), GIVEN).run().answers
+    assert answer.chosen is STATIC and answer.step(SPLINE).over_chosen.mean > 1
+
+
 def test_the_budget_is_kept(needs):
     assert needs.ledger.limit == pytest.approx(1.4 * 40)
     trained = [step for a in needs.answers for step in a.steps]
