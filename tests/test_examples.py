@@ -48,7 +48,7 @@ def test_rasterizers_agree(run):
 
 def test_a_spec_by_name(run):
     said = run("03", TINY)
-    assert re.search(r"model.object.deformation +deformation:chs\n", said)
+    assert re.search(r"model.object.deformation +deformation:tracked-chs\n", said)
     error = float(re.search(r"mean error (\S+) of 1", said)[1])
     assert 0.01 < error < 0.5
 

@@ -102,8 +102,9 @@ class RatesSpec(_Strict):
         by_extent: rates in units of the entity's extent (3DGS: means; 4DGS: planes and networks
             too). sh_rest: rate of the harmonics above the first, as a share of `sh` (3DGS: 1/20).
         camera: of each frame's correction of its camera, radians and scene extents a step; 0 takes
-            cameras as they are (docs/reference/refinement.md). pose: of body poses, radians and
-            metres, where the human's deformation refines them.
+            cameras as they are (docs/reference/refinement.md). pose: of corrections of given poses,
+            radians and metres: a body's where the human's deformation refines them, an object's
+            where it is about its track.
     """
 
     means: float = Field(2.4e-3, ge=0)

@@ -37,6 +37,8 @@ PARTS = (
      "a field of rigid motions as in Nerfies, with HyperNeRF's slices if asked for"),
     ("deformation:chs", f"{DEFORMATION}.chs", "CubicHermite", "CubicHermiteConfig",
      "a cubic Hermite spline per Gaussian, tangents learned or finite differences"),
+    ("deformation:tracked-chs", f"{DEFORMATION}.tracked_chs", "TrackedHermite",
+     "TrackedHermiteConfig", "chs in the object's frame, about the tracked pose of every frame"),
     ("deformation:rigid-spline", f"{DEFORMATION}.rigid_spline", "RigidSpline", "RigidSplineConfig",
      "one SE(3) spline moves a whole object, knots uniform or adaptive"),
     ("deformation:rigid-residual", f"{DEFORMATION}.rigid_residual", "RigidResidual",

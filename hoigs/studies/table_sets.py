@@ -57,6 +57,7 @@ TABLE_SETS = {
             (
                 _method("hoigs", "runtime/hoigs", "hosnerf/hoigs", "behave/hoigs", "arctic/hoigs",
                         "arctic-geometry/hoigs"),
+                _method("hoigs-paper"),
                 _method("4dgs", "runtime/4dgs", "hosnerf/4dgs", "behave/4dgs", "arctic/4dgs"),
                 _method("d3dgs", "runtime/d3dgs", "hosnerf/d3dgs"),
                 _method("e-d3dgs", "runtime/e-d3dgs", "hosnerf/e-d3dgs", "behave/e-d3dgs",
@@ -82,9 +83,12 @@ TABLE_SETS = {
                 Row("MLP", "hoigs-object-mlp", ("model.object.deformation.track=false",),
                     paper=("object-motion/mlp",)),
                 Row("MLP about the track's poses", "hoigs-object-mlp"),
-                Row("CHS, tangents by finite differences", "hoigs-chs-fd",
+                Row("CHS that starts near the track", "hoigs",
+                    ("model.object.deformation.use=deformation:chs",),
+                    paper=("object-motion/hoigs",)),
+                Row("CHS about the track, tangents by finite differences", "hoigs-chs-fd",
                     paper=("object-motion/baseline-deformation",)),
-                Row("CHS, learned tangents (hoigs)", "hoigs", paper=("object-motion/hoigs",)),
+                Row("CHS about the track (hoigs)", "hoigs"),
             ),
         ),
         TableSet(

@@ -37,8 +37,8 @@ class RigidFrames(DeformationModel):
     """
 
     rates: ClassVar[Mapping[str, str]] = {
-        "corrections.turns": "keyframe_rotation",
-        "corrections.shifts": "keyframes",
+        "corrections.turns": "pose",
+        "corrections.shifts": "pose",
     }
 
     def __init__(self, track: ObjectTrack, trained_frames: Sequence[int] | None = None) -> None:

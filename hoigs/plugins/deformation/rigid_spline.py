@@ -32,6 +32,7 @@ from hoigs.plugins.deformation.quaternion_spline import (
 )
 from hoigs.plugins.deformation.resizing import Resizing
 from hoigs.plugins.deformation.rigid_track import RigidTrack
+from hoigs.plugins.deformation.track_guide import TrackGuide
 
 Tangents = Literal["learned", "finite-difference"]
 RotationCurve = Literal["cubic", "slerp"]
@@ -87,8 +88,8 @@ class RigidSpline(Resizing, DeformationModel):
         "angular_tangents": "keyframe_rotation",
     }
     resizes: ClassVar[Mapping[str, int]] = dict.fromkeys(rates, 0)
-    # a hundredth of chs's: here all Gaussians together speak for each tangent
-    regularizer_weights: ClassVar[Mapping[str, float]] = {"tangent": 1e-4}
+    # "tangent" a hundredth of chs's: here all Gaussians together speak for each
+    regularizer_weights: ClassVar[Mapping[str, float]] = {"tangent": 1e-4, "track": 30.0}
 
     center: Tensor
     keyframe_translations: nn.Parameter
@@ -127,6 +128,7 @@ class RigidSpline(Resizing, DeformationModel):
         names += ["angular_tangents"] if self.learned and self.smooth else []
         self.knot_axes: Mapping[str, int] = dict.fromkeys(names, 0)
         self.rest_space = "canonical" if track is not None else "world"
+        self.guide = TrackGuide(track) if track is not None else None
         self._track = track
 
     @classmethod
@@ -283,7 +285,8 @@ class RigidSpline(Resizing, DeformationModel):
         """Squared, per knot.
 
         "acceleration": second difference of the translations, metres per interval. "tangent":
-        learned tangents against finite differences, metres and radians per interval.
+        learned tangents against finite differences, metres and radians per interval. "track": how
+        far its points are from where the track has them, metres.
         """
         penalties: dict[str, Tensor] = {}
         places = self.keyframe_translations[None]
@@ -295,4 +298,7 @@ class RigidSpline(Resizing, DeformationModel):
             if self.smooth:
                 slack = self.angular_tangents - self._angular_differences()
                 penalties["tangent"] = penalties["tangent"] + slack.square().sum(-1).mean()
+        if self.guide is not None:
+            quats, places, _, _ = self.poses(self.guide.times)
+            penalties["track"] = self.guide.deviation(quats, places)
         return penalties

@@ -8,8 +8,10 @@ from torch import Tensor, nn
 
 from hoigs.core import spline
 from hoigs.core.clip import ObjectTrack
+from hoigs.core.clock import Time
 from hoigs.core.rotation import matrices_to_quats, multiply_quats, quats_to_matrices, slerp
-from hoigs.core.spline import catmull_rom, keyframe_position
+from hoigs.core.spline import catmull_rom, keyframe_position, knot_pair
+from hoigs.plugins.deformation.quaternion_spline import turn_between
 
 
 class RigidTrack(nn.Module):
@@ -32,23 +34,40 @@ class RigidTrack(nn.Module):
             frames = value if len(value) > 1 else value.repeat(2, *[1] * (value.dim() - 1))
             self.register_buffer(name, frames.detach().clone())
 
-    def at(self, time: float) -> tuple[Float[Tensor, " 4"], Float[Tensor, " 3"]]:
+    def at(self, time: Time) -> tuple[Float[Tensor, " 4"], Float[Tensor, " 3"]]:
         """Rotation (wxyz) and translation, object to world, at `time` in [0, 1]."""
         k, r = keyframe_position(time, len(self.quats))
-        return slerp(self.quats[k], self.quats[k + 1], r), catmull_rom(
-            self.translations[None], time
-        )[0]
+        before, after = knot_pair(self.quats[None], k)
+        return slerp(before, after, r)[0], catmull_rom(self.translations[None], time)[0]
+
+    def carry(self, means: Float[Tensor, "N 3"], time: Time) -> Float[Tensor, "N 3"]:
+        """Points of the object's frame in the world at `time`."""
+        rotation, translation = self.at(time)
+        return means @ quats_to_matrices(rotation).mT + translation
 
     def place(
-        self,
-        means: Float[Tensor, "N 3"],
-        quats: Float[Tensor, "N 4"],
-        time: float,
+        self, means: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"], time: Time
     ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
         """Canonical centres and rotations in the world at `time`."""
         rotation, translation = self.at(time)
         turned = multiply_quats(rotation.expand_as(quats), quats)
         return means @ quats_to_matrices(rotation).mT + translation, turned
+
+    def velocity(
+        self, means: Float[Tensor, "N 3"], time: Time, own: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """World velocities of points that the track carries, metres per length of the clip.
+
+        Args:
+            means, own: places and velocities in the object's frame.
+        """
+        frames = len(self.quats) - 1
+        k, _ = keyframe_position(time, frames + 1)
+        before, after = knot_pair(self.quats[None], k)
+        turning = turn_between(before, after) * frames  # slerp turns evenly
+        moving = catmull_rom(self.translations[None], time, derivative=True) * frames
+        within = own + torch.linalg.cross(turning.expand_as(means), means)
+        return within @ quats_to_matrices(self.at(time)[0]).mT + moving
 
     def knots(
         self, means: Float[Tensor, "N 3"], keyframes: int, *, free_tangents: bool

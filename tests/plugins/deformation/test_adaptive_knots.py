@@ -206,6 +206,15 @@ def test_rounds_and_their_bounds():
         KnotSchedule([])
 
 
+def test_knots_that_are_not_quite_every_four_frames_may_be_halved():
+    for spacing, expected in ((2, 19), (3, 10)):
+        entity = adaptive("rigid", 10, share=1.0, spacing=spacing)  # 32 / 9 = 3.56 frames apart
+        for frame in range(FRAMES):
+            entity.deformation.schedule.observe(seen(frame / 32, 1.0, 1))
+        entity.deformation.schedule.insert(entity.deformation, entity.rest.detach())
+        assert len(entity.deformation.knots) == expected
+
+
 @pytest.mark.parametrize("kind", MAKERS)
 def test_moments_follow_and_checkpoints_of_other_sizes_restore(kind):
     entity = adaptive(kind, shake=0.1, begin=0.0, every=10)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -23,6 +24,7 @@ from hoigs.core.rotation import (
 from hoigs.core.topology import TopologyChange
 from hoigs.plugins.deformation.quaternion_spline import hermite_quats, turn_between
 from hoigs.plugins.deformation.rigid_spline import RigidSpline, RigidSplineConfig
+from hoigs.plugins.deformation.track_guide import TrackGuide
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 
 KINDS = [
@@ -249,6 +251,30 @@ def test_tangents_are_penalised_against_finite_differences():
     penalties = model.regularizers()
     assert penalties["acceleration"].item() == pytest.approx(4.0)
     assert penalties["tangent"].item() == pytest.approx(3.0)
+
+
+def test_the_track_is_a_penalty_in_square_metres():
+    track = steady_track()
+    model = on_track(track).deformation
+    assert model.regularizers()["track"].item() < 1e-6  # a steady motion is a spline
+    with torch.no_grad():
+        model.keyframe_translations += torch.tensor([0.0, 0.3, 0.4])
+    assert model.regularizers()["track"].item() == pytest.approx(0.25, rel=1e-3)
+    assert "track" in model.regularizer_weights
+    free = RigidSpline(3)
+    free.bind(cloud())
+    assert "track" not in free.regularizers()
+
+
+@pytest.mark.parametrize(("seen", "penalty"), [(True, 1 / 17), (False, 0.1 / 16.1)])
+def test_frames_that_nobody_saw_hold_the_splines_less(seen, penalty):
+    track = steady_track()
+    model = on_track(track).deformation
+    wrong = replace(track, translations=track.translations.clone(), observed=track.observed.clone())
+    wrong.translations[8, 2] += 1
+    wrong.observed[8] = seen
+    model.guide = TrackGuide(wrong)
+    assert model.regularizers()["track"].item() == pytest.approx(penalty, rel=1e-3)
 
 
 def test_refuses_what_it_cannot_derive():
