@@ -19,8 +19,8 @@ from hoigs.core.moment import BodyPose, Moment
 from hoigs.core.rasterizer import Rasterizer
 from hoigs.core.scene import SceneModel
 from hoigs.evaluation.playback import Playback
-from hoigs.plugins.deformation.chs import CubicHermite
 from hoigs.plugins.deformation.static import Static
+from hoigs.plugins.deformation.tracked_chs import TrackedHermite
 from hoigs.plugins.features.body_parts import BodyPartFeatures
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.plugins.interaction.cross_attention import CrossAttention
@@ -38,7 +38,7 @@ def scene(rasterizer: Rasterizer, **human: object) -> SceneModel:
         {
             "scene": Entity(wall, Static(), kind="scene"),
             "human": Entity(body.rest(80), person, BodyPartFeatures()),
-            "object": Entity(box, CubicHermite(4, track=track), SplineMotionFeatures(hidden=8)),
+            "object": Entity(box, TrackedHermite(4, track=track), SplineMotionFeatures(hidden=8)),
         },
         interaction=CrossAttention(hidden=16, reach=3.0),
         rasterizer=rasterizer,

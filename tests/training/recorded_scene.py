@@ -13,6 +13,7 @@ from hoigs.core.moment import BodyPose, Moment
 from hoigs.core.scene import SceneModel
 from hoigs.plugins.deformation.chs import CubicHermite
 from hoigs.plugins.deformation.static import Static
+from hoigs.plugins.deformation.tracked_chs import TrackedHermite
 from hoigs.plugins.features.body_parts import BodyPartFeatures
 from hoigs.plugins.features.embedding import EmbeddingFeatures
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
@@ -29,11 +30,12 @@ def scene(
     attention: dict[str, Any] | None = None,
     *,
     plain_tokens: bool = False,
+    motion: type[CubicHermite] = TrackedHermite,
 ) -> SceneModel:
     """All parts of the hoigs spec, small, every head and correction away from its start."""
     body, wall, box, track = things(FRAMES)
     person = person_of(body, FRAMES, (0, 1, 3, 4), **(human or {}))
-    motion = CubicHermite(4, track=track, **(thing or {}))
+    curve = motion(4, track=track, **(thing or {}))
     model = SceneModel(
         {
             "scene": Entity(wall, Static(), kind="scene"),
@@ -42,7 +44,7 @@ def scene(
             ),
             "object": Entity(
                 box,
-                motion,
+                curve,
                 EmbeddingFeatures(keyframes=3) if plain_tokens else SplineMotionFeatures(hidden=8),
                 kind="object",
             ),
@@ -135,6 +137,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "canonical field, exavatar head": {"human": {"field_at": "canonical", "head": "exavatar"}},
     "mesh laplacian": {"human": {"laplacian": "mesh", "residual_rule": "compose"}},
     "finite differences": {"thing": {"tangents": "finite-difference", "opacity": "constant"}},
+    "chs": {"motion": CubicHermite},
     "heads": {"attention": {"pose_head": "per-part", "object_residual": "both", "gate": "hard"}},
     "plain tokens": {"plain_tokens": True},
 }

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.clock import constant
 from hoigs.core.rotation import (
     axis_angle_to_quats,
     multiply_quats,
@@ -17,7 +18,7 @@ from hoigs.core.rotation import (
 
 def conjugate(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
     """Inverse of unit quaternions."""
-    return quats * quats.new_tensor((1.0, -1.0, -1.0, -1.0))
+    return quats * constant((1.0, -1.0, -1.0, -1.0), quats)
 
 
 def turn_between(

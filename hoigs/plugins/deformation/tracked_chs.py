@@ -49,6 +49,7 @@ class TrackedHermite(CubicHermite):
             CubicHermite.
     """
 
+    recordable = True
     # corrections, like those of a body's poses: at the rate of keyframes each would learn the noise
     # of the four frames about it
     rates: ClassVar[Mapping[str, str]] = {
