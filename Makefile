@@ -25,7 +25,7 @@ docs: $(INSTALLED)
 
 # accuracy against cost, into docs/results/chart; a kill loses nothing, the same command goes on
 CHART_CLIPS ?= builtin:lift-and-swing builtin:carry builtin:throw-and-catch
-CHART_SPECS ?= hoigs,hoigs-no-interaction,hoigs-object-mlp,4dgs@matched,d3dgs@matched,e-d3dgs@matched,ex4dgs@matched,exavatar@matched,hugs@matched,hold-gs@matched,hosnerf-gs@matched,static-3dgs@matched
+CHART_SPECS ?= hoigs,hoigs-paper@matched,hoigs-no-interaction,hoigs-object-mlp,4dgs@matched,d3dgs@matched,e-d3dgs@matched,ex4dgs@matched,exavatar@matched,hugs@matched,hold-gs@matched,hosnerf-gs@matched,static-3dgs@matched
 CHART_BUDGETS ?= 1200
 CHART_SEEDS ?= 3
 CHART_OUT ?= runs/results-chart

@@ -57,6 +57,7 @@ _PUBLIC = {
     "SplineMotionFeatures": "hoigs.plugins.features.spline_motion",
     "Static": "hoigs.plugins.deformation.static",
     "TorchRasterizer": "hoigs.rasterizers.torch_tiles",
+    "TrackedHermite": "hoigs.plugins.deformation.tracked_chs",
     "WarpRasterizer": "hoigs.rasterizers.warp",
     # work
     "Session": "hoigs.training.session",
