@@ -354,7 +354,7 @@ def test_recorded_runs_resume() -> None:
     assert resumed.objective.recorded.recordings == 2  # the shapes of steps 12 and 16
     for name, value in whole.checkpoint().tensors.items():
         if value.is_floating_point() and not name.startswith("density"):
-            # Adam makes steps of rounding where gradients are tiny; a lost moment is off by far more
+            # Adam makes steps of rounding where gradients are tiny; a lost moment is far worse
             assert apart(resumed.checkpoint().tensors[name], value) < 1e-2, name
     copy.deepcopy(whole.model)  # nothing of a recording hangs on the model
 
