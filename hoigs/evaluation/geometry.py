@@ -62,7 +62,7 @@ def chamfer_squared(a: Float[Array, "A 3"], b: Float[Array, "B 3"]) -> float:
     return 0.5 * float((there**2).mean() + (back**2).mean())
 
 
-def best_hand(thing: Float[Array, "O 3"], hands: Sequence[Float[Array, "H 3"]]) -> float:
+def best_hand(thing: Float[Array, "O 3"], hands: Sequence[Float[Array, "_ 3"]]) -> float:
     """CD_best: of the hand that is nearer, units squared."""
     return min(chamfer_squared(thing, hand) for hand in hands)
 

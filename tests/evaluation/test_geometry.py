@@ -45,7 +45,8 @@ def test_chamfer_is_half_the_sum_of_both_mean_squares() -> None:
     assert chamfer_squared(thing, hand) == pytest.approx(0.5 * (5.5 + 1))
     assert chamfer_squared(hand, thing) == pytest.approx(0.5 * (5.5 + 1))
     assert chamfer_squared(thing, thing) == 0
-    assert best_hand(thing, [hand + 9, hand, hand - 9]) == pytest.approx(3.25)
+    others = [np.concatenate((hand, hand)) + 9, hand, hand - 9]  # left and right differ in points
+    assert best_hand(thing, others) == pytest.approx(3.25)
 
 
 def test_distances_to_a_surface_are_to_its_triangles() -> None:

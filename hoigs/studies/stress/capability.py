@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 Capability = Literal[
     "scene", "body", "object", "whole picture", "moves", "interaction", "density", "depth loss",
     "masks", "knots", "turning knots", "rigid knots", "free knots", "time planes", "planes",
-    "networks", "embedding", "keyed opacity", "refined poses",
+    "networks", "embedding", "keyed opacity", "refined poses", "keyframe rate",
 ]  # fmt: skip
 
 MEANING: Mapping[Capability, str] = {
@@ -37,6 +37,7 @@ MEANING: Mapping[Capability, str] = {
     "embedding": "a code for each Gaussian",
     "keyed opacity": "opacity that depends on time",
     "refined poses": "body poses that training corrects",
+    "keyframe rate": "keyframes that learn at a rate of their own",
 }
 assert set(MEANING) == set(get_args(Capability))
 
@@ -80,14 +81,18 @@ def _of_entity(entity: Entity) -> Iterator[Capability]:
     parameters = dict(deformation.named_parameters())
     if parameters or entity.kind != "scene":
         yield "moves"
+    keyed = getattr(deformation, "knot_axes", {})
     for name, parameter in parameters.items():
         rate = rate_of(name, deformation.rates)
         if rate == "keyframes":
+            yield "keyframe rate"
+        turns = rate == "keyframe_rotation" or (name in keyed and name.endswith("quats"))
+        if turns:
+            yield "turning knots"
+        elif rate == "keyframes" or (name in keyed and rate == "pose"):
             yield "knots"
             free = parameter.dim() > 2 or name in deformation.per_gaussian
             yield "free knots" if free else "rigid knots"
-        elif rate == "keyframe_rotation":
-            yield "turning knots"
         elif rate == "planes":
             yield "planes"
             if "time" in name:
@@ -96,7 +101,7 @@ def _of_entity(entity: Entity) -> Iterator[Capability]:
             yield "networks"
         elif rate == "embedding":
             yield "embedding"
-        elif rate == "pose":
+        elif rate == "pose" and entity.kind == "human":
             yield "refined poses"
         if name.endswith(("opacity_logits", "centers")) and parameter.dim() > 1:
             yield "keyed opacity"
