@@ -42,7 +42,7 @@ class TrackedHermite(CubicHermite):
     Parameters are CubicHermite's, all zero at the start (rotations: no turn): `keyframe_means` and
     `tangents` are d and its tangents, in the object's frame; `keyframe_quats` turn, and
     `opacity_logits` add to, those of rest. `velocity` is that of the world. Without a track the
-    object's frame is the world.
+    object's frame is the world, and knots learn at CubicHermite's rates.
 
     Args:
         track: poses that carry the splines; rest is then the canonical object. Others: as
@@ -73,6 +73,8 @@ class TrackedHermite(CubicHermite):
         self.carrier = RigidTrack(track) if track is not None else None
         self.rest_space = "canonical" if track is not None else "world"
         self.owns = frozenset()
+        if track is None:  # all of the motion is then the splines' own
+            self.rates = CubicHermite.rates  # type: ignore[misc]
 
     def bind(self, rest: Gaussians) -> None:
         still = rest.means.new_zeros(len(rest), self.keyframes, 3)
