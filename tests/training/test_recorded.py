@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -343,6 +342,7 @@ def test_a_training_run_by_captured_steps(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_recorded_runs_resume() -> None:
+    by_launches(trainer()).train(until=20)  # a process's first run rounds unlike its later ones
     whole = by_launches(trainer())
     whole.train(until=12)
     stored = whole.checkpoint()
@@ -354,8 +354,7 @@ def test_recorded_runs_resume() -> None:
     assert resumed.objective.recorded.recordings == 2  # the shapes of steps 12 and 16
     for name, value in whole.checkpoint().tensors.items():
         if value.is_floating_point() and not name.startswith("density"):
-            # Adam makes steps of rounding where gradients are tiny; a lost moment is far worse
-            assert apart(resumed.checkpoint().tensors[name], value) < 1e-2, name
+            assert apart(resumed.checkpoint().tensors[name], value) < 1e-4, name
     copy.deepcopy(whole.model)  # nothing of a recording hangs on the model
 
 

@@ -23,6 +23,7 @@ class RigidTrack(nn.Module):
     quats: Tensor
     translations: Tensor
     observed: Tensor
+    turns: Tensor
 
     def __init__(self, track: ObjectTrack) -> None:
         super().__init__()
@@ -33,12 +34,17 @@ class RigidTrack(nn.Module):
         }.items():
             frames = value if len(value) > 1 else value.repeat(2, *[1] * (value.dim() - 1))
             self.register_buffer(name, frames.detach().clone())
+        turns = turn_between(self.quats[:-1], self.quats[1:])
+        self.register_buffer("turns", turns, persistent=False)  # read off the quaternions
 
     def at(self, time: Time) -> tuple[Float[Tensor, " 4"], Float[Tensor, " 3"]]:
         """Rotation (wxyz) and translation, object to world, at `time` in [0, 1]."""
+        return self._rotation(time), catmull_rom(self.translations[None], time)[0]
+
+    def _rotation(self, time: Time) -> Float[Tensor, " 4"]:
         k, r = keyframe_position(time, len(self.quats))
         before, after = knot_pair(self.quats[None], k)
-        return slerp(before, after, r)[0], catmull_rom(self.translations[None], time)[0]
+        return slerp(before, after, r)[0]
 
     def carry(self, means: Float[Tensor, "N 3"], time: Time) -> Float[Tensor, "N 3"]:
         """Points of the object's frame in the world at `time`."""
@@ -54,20 +60,21 @@ class RigidTrack(nn.Module):
         return means @ quats_to_matrices(rotation).mT + translation, turned
 
     def velocity(
-        self, means: Float[Tensor, "N 3"], time: Time, own: Float[Tensor, "N 3"]
+        self, means: Float[Tensor, "N 3"], time: Time, own: Float[Tensor, "N 3"], unit: float
     ) -> Float[Tensor, "N 3"]:
-        """World velocities of points that the track carries, metres per length of the clip.
+        """World velocities of points that the track carries, metres per unit of time.
 
         Args:
             means, own: places and velocities in the object's frame.
+            unit: of time, as a share of the clip.
         """
-        frames = len(self.quats) - 1
-        k, _ = keyframe_position(time, frames + 1)
-        before, after = knot_pair(self.quats[None], k)
-        turning = turn_between(before, after) * frames  # slerp turns evenly
-        moving = catmull_rom(self.translations[None], time, derivative=True) * frames
-        within = own + torch.linalg.cross(turning.expand_as(means), means)
-        return within @ quats_to_matrices(self.at(time)[0]).mT + moving
+        k, _ = keyframe_position(time, len(self.quats))
+        turn = self.turns.index_select(0, k)[0] if isinstance(k, Tensor) else self.turns[k]
+        frames = len(self.turns) * unit
+        moving = frames * catmull_rom(self.translations[None], time, derivative=True)
+        # slerp turns evenly, and its axis is the same in the frames of both ends
+        within = own + torch.linalg.cross((frames * turn).expand_as(means), means)
+        return within @ quats_to_matrices(self._rotation(time)).mT + moving
 
     def knots(
         self, means: Float[Tensor, "N 3"], keyframes: int, *, free_tangents: bool

@@ -14,7 +14,7 @@ from hoigs.core.clock import Time
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.interaction import Residual
 from hoigs.core.moment import Moment
-from hoigs.core.rotation import multiply_quats, normalize_quats
+from hoigs.core.rotation import multiply_quats
 from hoigs.core.topology import TopologyChange, reindex
 from hoigs.plugins.deformation.chs import CubicHermite, CubicHermiteConfig
 from hoigs.plugins.deformation.knot_schedule import probe_rows
@@ -92,7 +92,7 @@ class TrackedHermite(CubicHermite):
         time = moment.time
         means = rest.means + self._means(time)
         turns = self.knots.slerp(self.keyframe_quats, time)
-        quats = multiply_quats(turns, normalize_quats(rest.quats))
+        quats = multiply_quats(turns, rest.quats)  # raw, as those of rest
         if self.carrier is not None:
             means, quats = self.carrier.place(means, quats, time)
         if residual is not None and residual.means is not None:
@@ -114,8 +114,8 @@ class TrackedHermite(CubicHermite):
         own = self._means(moment.time, derivative=True)
         if self.carrier is None:
             return own
-        means, interval = rest.means + self._means(moment.time), self.knots.reference
-        return self.carrier.velocity(means, moment.time, own / interval) * interval
+        means = rest.means + self._means(moment.time)
+        return self.carrier.velocity(means, moment.time, own, self.knots.reference)
 
     @torch.no_grad()
     def traced(self, rest: Gaussians, times: Sequence[float]) -> Float[Tensor, "T P 3"]:
