@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from whole_scene import away_from_start, person_of, things
 
+from hoigs.core.body import BodyModel
+from hoigs.core.camera import Camera
+from hoigs.core.deformation import DeformationModel
 from hoigs.core.entity import Entity
+from hoigs.core.features import FeatureExtractor
 from hoigs.core.moment import BodyPose, Moment
 from hoigs.core.scene import SceneModel
+from hoigs.plugins.deformation.articulated import Articulated
 from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.plugins.deformation.knot_schedule import KnotSchedule
+from hoigs.plugins.deformation.lbs import Lbs
+from hoigs.plugins.deformation.rigid_residual import RigidResidual
+from hoigs.plugins.deformation.rigid_spline import RigidSpline
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.deformation.tracked_chs import TrackedHermite
 from hoigs.plugins.features.body_parts import BodyPartFeatures
 from hoigs.plugins.features.embedding import EmbeddingFeatures
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.plugins.interaction.cross_attention import CrossAttention
+from hoigs.plugins.interaction.none import NoInteraction
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.training.recorded import RecordedScene
 
@@ -30,29 +42,51 @@ def scene(
     attention: dict[str, Any] | None = None,
     *,
     plain_tokens: bool = False,
-    motion: type[CubicHermite] = TrackedHermite,
+    alone: bool = False,
+    person: Callable[..., DeformationModel] = person_of,
+    motion: Callable[..., DeformationModel] = TrackedHermite,
 ) -> SceneModel:
     """All parts of the hoigs spec, small, every head and correction away from its start."""
     body, wall, box, track = things(FRAMES)
-    person = person_of(body, FRAMES, (0, 1, 3, 4), **(human or {}))
+    walker = person(body, FRAMES, (0, 1, 3, 4), **(human or {}))
     curve = motion(4, track=track, **(thing or {}))
+    features: list[FeatureExtractor | None] = [BodyPartFeatures(), SplineMotionFeatures(hidden=8)]
+    if plain_tokens:
+        features = [EmbeddingFeatures(), EmbeddingFeatures(keyframes=3)]
+    if alone:
+        features = [None, None]
+    attends = CrossAttention(hidden=16, reach=3.0, **(attention or {}))
     model = SceneModel(
         {
             "scene": Entity(wall, Static(), kind="scene"),
-            "human": Entity(
-                body.rest(80), person, EmbeddingFeatures() if plain_tokens else BodyPartFeatures()
-            ),
-            "object": Entity(
-                box,
-                curve,
-                EmbeddingFeatures(keyframes=3) if plain_tokens else SplineMotionFeatures(hidden=8),
-                kind="object",
-            ),
+            "human": Entity(body.rest(80), walker, features[0]),
+            "object": Entity(box, curve, features[1], kind="object"),
         },
-        interaction=CrossAttention(hidden=16, reach=3.0, **(attention or {})),
+        interaction=NoInteraction() if alone else attends,
         rasterizer=TorchRasterizer(),
     )
     return away_from_start(model).train()
+
+
+def skinned(body: BodyModel, frames: int, trained: tuple[int, ...], refine_poses: bool) -> Lbs:
+    return Lbs(body, num_frames=frames, trained_frames=trained, refine_poses=refine_poses)
+
+
+def adaptive(motion: type[RigidSpline], **settings: Any) -> Callable[..., RigidSpline]:
+    """A motion whose knots stand where a schedule may put them, here a little off uniform."""
+
+    def make(keyframes: int, **others: Any) -> RigidSpline:
+        schedule = KnotSchedule(cameras())
+        made = motion(keyframes, schedule=schedule, **settings, **others)
+        made.knots.place([0.0, 0.3, 0.8, 1.0])
+        return made
+
+    return make
+
+
+def cameras() -> list[Camera]:
+    intrinsics = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]])
+    return [Camera(intrinsics, torch.eye(4), 64, 64)] * FRAMES
 
 
 def at(frame: float) -> Moment:
@@ -140,4 +174,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "chs": {"motion": CubicHermite},
     "heads": {"attention": {"pose_head": "per-part", "object_residual": "both", "gate": "hard"}},
     "plain tokens": {"plain_tokens": True},
+    "skinned": {"person": partial(skinned, refine_poses=False), "alone": True},
+    "skinned, refined": {"person": partial(skinned, refine_poses=True), "alone": True},
+    "rigid": {"motion": RigidSpline},
+    "rigid, adaptive": {"motion": adaptive(RigidSpline)},
+    "rigid, slerp": {"motion": partial(RigidSpline, rotation="slerp")},
+    "rigid, differences": {"motion": partial(RigidSpline, tangents="finite-difference")},
+    "rigid, residual": {"motion": adaptive(RigidResidual, residual_step=2)},
+    "articulated": {"motion": adaptive(Articulated)},
 }

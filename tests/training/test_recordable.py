@@ -16,7 +16,7 @@ from hoigs.core.spec import Spec
 
 TENSOR = torch.Tensor
 FROM_THE_HOST = {torch.tensor, torch.as_tensor, TENSOR.new_tensor}
-TO_THE_HOST = {TENSOR.item, TENSOR.tolist, TENSOR.__bool__, TENSOR.__float__}
+TO_THE_HOST = {TENSOR.item, TENSOR.tolist, TENSOR.__bool__, TENSOR.__float__, torch.equal}
 
 
 class NoHost(TorchFunctionMode):

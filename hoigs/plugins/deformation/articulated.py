@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from hoigs.core.clock import Time
 from hoigs.core.context import BuildContext
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.rotation import (
@@ -18,7 +19,7 @@ from hoigs.core.rotation import (
     quats_to_matrices,
 )
 from hoigs.plugins.deformation.knot_schedule import probe_rows
-from hoigs.plugins.deformation.knots import Knots
+from hoigs.plugins.deformation.knots import Knots, one_time
 from hoigs.plugins.deformation.rigid_spline import RigidSpline, RigidSplineConfig
 
 Joint = Literal["revolute", "prismatic"]
@@ -65,6 +66,7 @@ class Articulated(RigidSpline):
         ValueError: `moving` without a track, or of another length than its points; a zero axis.
     """
 
+    recordable = True
     per_gaussian = ("part_logits",)
     rates: ClassVar[Mapping[str, str]] = {
         **RigidSpline.rates,
@@ -150,16 +152,16 @@ class Articulated(RigidSpline):
         self.pivot = nn.Parameter(middle.clone() if pivot is None else means.new_tensor(pivot))
         self._given = (axis, pivot, None, None)
 
-    def joint_at(self, time: float) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    def joint_at(self, time: Time) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """theta and its derivative per keyframe interval: radians, or metres."""
         values = self.joint_values
         tangents = self.joint_tangents if self.learned else self.knots.differences(values[None])[0]
-        theta = self.knots.hermite_at(values, tangents, [time])
-        speed = self.knots.hermite_at(values, tangents, [time], derivative=True)
+        theta = self.knots.hermite_at(values, tangents, one_time(time))
+        speed = self.knots.hermite_at(values, tangents, one_time(time), derivative=True)
         return theta[0, 0], speed[0, 0]
 
     def shape(
-        self, rest: Gaussians, time: float
+        self, rest: Gaussians, time: Time
     ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
         theta, _ = self.joint_at(time)
         amount = torch.sigmoid(self.part_logits)[:, None] * theta
@@ -170,7 +172,7 @@ class Articulated(RigidSpline):
         arms = (quats_to_matrices(turns) @ (rest.means - self.pivot)[..., None]).squeeze(-1)
         return self.pivot + arms, multiply_quats(turns, normalize_quats(rest.quats))
 
-    def shape_velocity(self, rest: Gaussians, time: float) -> Float[Tensor, "N 3"]:
+    def shape_velocity(self, rest: Gaussians, time: Time) -> Float[Tensor, "N 3"]:
         _, speed = self.joint_at(time)
         axis = torch.nn.functional.normalize(self.axis, dim=0)
         rate = torch.sigmoid(self.part_logits)[:, None] * speed * axis

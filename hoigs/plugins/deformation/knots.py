@@ -7,13 +7,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from hoigs.core import spline
 from hoigs.core.clock import Time
 from hoigs.core.rotation import slerp
 from hoigs.plugins.deformation.resizing import Resizing
+
+Times = Sequence[float] | Float[Tensor, " T"]
+
+
+def one_time(time: Time) -> Times:
+    """A time as one of many."""
+    return time[None] if isinstance(time, Tensor) else [time]
 
 
 class Knots(Resizing):
@@ -131,7 +138,7 @@ class Knots(Resizing):
         self,
         values: Float[Tensor, "K D"],
         tangents: Float[Tensor, "K D"],
-        times: Sequence[float],
+        times: Times,
         *,
         derivative: bool = False,
     ) -> Float[Tensor, "T D"]:
@@ -148,15 +155,22 @@ class Knots(Resizing):
             + (w[3] * h * tangents[k + 1])
         )
 
-    def spans(self, times: Sequence[float], like: Tensor) -> tuple[Tensor, Any, Any]:
-        """`at` of many times: first knots [T], positions and lengths [T, 1] in the kind of `like`.
-
-        Positions and lengths are typed loosely because the bases take numbers and tensors alike.
-        """
-        found = [self.at(time) for time in times]
-        k = torch.tensor([f[0] for f in found], device=like.device)
-        r, h = (like.new_tensor([f[i] for f in found])[:, None] for i in (1, 2))
-        return k, r, h
+    def spans(
+        self, times: Times, like: Tensor
+    ) -> tuple[Int[Tensor, " T"], Float[Tensor, "T 1"], Float[Tensor, "T 1"]]:
+        """`at` of many times: first knots, positions and lengths, these in the kind of `like`."""
+        if not isinstance(times, Tensor):
+            times = self.times.new_tensor(list(times))
+        times = times.to(self.times).clamp(0.0, 1.0)
+        if self.movable:
+            first = torch.searchsorted(self.times, times, right=True) - 1
+        else:
+            first = (times * (len(self) - 1)).floor().long()
+        first = first.clamp(0, len(self) - 2)
+        low = self.times[first]
+        length = self.times[first + 1] - low
+        r, h = (times - low) / length, length / self.reference
+        return first, r.to(like)[:, None], h.to(like)[:, None]
 
     def refit(
         self,

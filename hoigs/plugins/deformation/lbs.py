@@ -26,6 +26,8 @@ class LbsConfig(ComponentConfig):
 class Lbs(SurfaceBody):
     """G(t) = LBS(P_c, theta(t), W) with the template's W; every rest field is trained."""
 
+    recordable = True
+
     @classmethod
     def from_config(cls, config: LbsConfig, context: BuildContext) -> Self:
         settings = context_settings(context, "deformation:lbs")
@@ -37,6 +39,6 @@ class Lbs(SurfaceBody):
         self, rest: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
         pose = self.moved_pose(moment, residual)
-        change = self.shape_change(pose)
+        change = self.shape_change(pose, moment)
         canonical = rest if change is None else rest.replace(means=rest.means + change)
         return self.posed(canonical, self.template_weights, pose, moment, residual)

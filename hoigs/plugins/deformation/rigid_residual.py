@@ -11,6 +11,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from hoigs.core import spline
+from hoigs.core.clock import Time
 from hoigs.core.context import BuildContext
 from hoigs.core.gaussians import Gaussians
 from hoigs.plugins.deformation.knots import Knots
@@ -40,6 +41,7 @@ class RigidResidual(RigidSpline):
             `residual_step` frames. Others: as RigidSpline.
     """
 
+    recordable = True
     per_gaussian = ("offsets",)
     rates: ClassVar[Mapping[str, str]] = {**RigidSpline.rates, "offsets": "keyframes"}
     regularizer_weights: ClassVar[Mapping[str, float]] = {
@@ -75,11 +77,11 @@ class RigidResidual(RigidSpline):
         self.offsets = nn.Parameter(rest.means.new_zeros(len(rest), len(self.residual_knots), 3))
 
     def shape(
-        self, rest: Gaussians, time: float
+        self, rest: Gaussians, time: Time
     ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
         return rest.means + self.residual_knots.catmull_rom(self.offsets, time), rest.quats
 
-    def shape_velocity(self, rest: Gaussians, time: float) -> Float[Tensor, "N 3"]:
+    def shape_velocity(self, rest: Gaussians, time: Time) -> Float[Tensor, "N 3"]:
         del rest
         own = self.residual_knots.catmull_rom(self.offsets, time, derivative=True)
         return own * (self.knots.reference / self.residual_knots.reference)

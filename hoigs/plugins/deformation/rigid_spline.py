@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from hoigs.core import spline
 from hoigs.core.clip import ObjectTrack
+from hoigs.core.clock import Time
 from hoigs.core.config import ComponentConfig
 from hoigs.core.context import BuildContext
 from hoigs.core.deformation import DeformationModel, StepEvidence
@@ -24,7 +25,7 @@ from hoigs.core.moment import Moment
 from hoigs.core.rotation import multiply_quats, normalize_quats, quats_to_matrices, slerp
 from hoigs.core.topology import AxisChange
 from hoigs.plugins.deformation.knot_schedule import AdaptiveKnotsConfig, KnotSchedule, probe_rows
-from hoigs.plugins.deformation.knots import Knots
+from hoigs.plugins.deformation.knots import Knots, Times, one_time
 from hoigs.plugins.deformation.quaternion_spline import (
     angular_differences,
     hermite_quats,
@@ -81,6 +82,7 @@ class RigidSpline(Resizing, DeformationModel):
     """
 
     provides = frozenset({"velocity"})
+    recordable = True
     rates: ClassVar[Mapping[str, str]] = {
         "keyframe_translations": "keyframes",
         "translation_tangents": "keyframes",
@@ -189,7 +191,7 @@ class RigidSpline(Resizing, DeformationModel):
         }
 
     def poses(
-        self, times: Sequence[float]
+        self, times: Times
     ) -> tuple[
         Float[Tensor, "T 4"], Float[Tensor, "T 3"], Float[Tensor, "T 3"], Float[Tensor, "T 3"]
     ]:
@@ -210,10 +212,10 @@ class RigidSpline(Resizing, DeformationModel):
         return quats, places, turning, speeds
 
     def pose(
-        self, time: float
+        self, time: Time
     ) -> tuple[Float[Tensor, " 4"], Float[Tensor, " 3"], Float[Tensor, " 3"], Float[Tensor, " 3"]]:
         """`poses` at one time."""
-        quats, places, turning, speeds = self.poses([time])
+        quats, places, turning, speeds = self.poses(one_time(time))
         return quats[0], places[0], turning[0], speeds[0]
 
     def _angular_differences(self) -> Float[Tensor, "K 3"]:
@@ -221,13 +223,13 @@ class RigidSpline(Resizing, DeformationModel):
         return angular_differences(self.keyframe_quats, lengths)
 
     def shape(
-        self, rest: Gaussians, time: float
+        self, rest: Gaussians, time: Time
     ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
         """Centres and rotations in the object's frame; here they stay."""
         del time
         return rest.means, rest.quats
 
-    def shape_velocity(self, rest: Gaussians, time: float) -> Float[Tensor, "N 3"] | None:
+    def shape_velocity(self, rest: Gaussians, time: Time) -> Float[Tensor, "N 3"] | None:
         """Derivative of `shape`'s centres per keyframe interval; None while they stay."""
         del rest, time
         return None

@@ -149,11 +149,15 @@ class SkinnedBody(DeformationModel):
         pose = moment.poses[self.entity]
         return pose if self.refinement is None else self.refinement(pose, moment.time)
 
-    def shaped(self, betas: Float[Tensor, " B"]) -> tuple[Tensor, Tensor]:
-        """Vertices and joints of the zero pose; the last shape without gradient is kept."""
+    def shaped(self, betas: Float[Tensor, " B"], *, anew: bool = False) -> tuple[Tensor, Tensor]:
+        """Vertices and joints of the zero pose; the last shape without gradient is kept.
+
+        Args:
+            anew: make them whatever is kept, which to compare would wait for the device.
+        """
         if self.held and self._shape is not None:
             return self._shape[1], self._shape[2]
-        if self.training and self.refinement is not None:  # another one at every step
+        if anew or (self.training and self.refinement is not None):  # another one at every step
             return self.body.shaped(betas)
         if betas.requires_grad and torch.is_grad_enabled():
             return self.body.shaped(betas)
@@ -161,11 +165,16 @@ class SkinnedBody(DeformationModel):
             self._shape = (betas.detach().clone(), *self.body.shaped(betas.detach()))
         return self._shape[1], self._shape[2]
 
+    def told_on_device(self, moment: Moment) -> bool:
+        """Whether the host knows nothing of this moment: training is being recorded."""
+        return self.training and isinstance(moment.time, Tensor)
+
     @torch.no_grad()
     def stance(self, moment: Moment) -> Stance:
         """The body at `moment`; kept for `anchors`, which the same forward pass asks for next."""
         pose = self.pose(moment)
-        found = Stance(pose, self.body.skinning_transforms(pose), *self.shaped(pose.betas))
+        shape = self.shaped(pose.betas, anew=self.told_on_device(moment))
+        found = Stance(pose, self.body.skinning_transforms(pose), *shape)
         self._asked = (moment, self._state(), found)
         return found
 
@@ -205,17 +214,20 @@ class SkinnedBody(DeformationModel):
         return self.scaled(joints, joints[0], moment)
 
     def arm_length(self) -> Float[Tensor, ""]:
-        if self.held and self._arm is not None:
-            return self._arm[1] * self.log_alpha.exp()
+        return self._arm_at_rest() * self.log_alpha.exp()
+
+    def _arm_at_rest(self) -> Float[Tensor, ""]:
+        if self._arm is not None and (self.held or self.refinement is None):
+            return self._arm[1]
         betas = self.betas
         if self.refinement is not None:
             betas = betas + self.refinement.betas.detach()
-        # in training the shape changes at every step, and comparing would wait for the device
-        if self.training and self.refinement is not None:
-            return self.body.arm_length(betas) * self.log_alpha.exp()
+            # in training the shape changes at every step, and comparing would wait for the device
+            if self.training:
+                return self.body.arm_length(betas)
         if self._arm is None or not torch.equal(self._arm[0], betas):
             self._arm = (betas.clone(), self.body.arm_length(betas))
-        return self._arm[1] * self.log_alpha.exp()
+        return self._arm[1]
 
 
 def context_settings(context: BuildContext, what: str) -> dict[str, Any]:

@@ -86,12 +86,13 @@ class SurfaceBody(SkinnedBody):
             pose = pose.with_residual(residual.pose)
         return pose
 
-    def shape_change(self, pose: BodyPose) -> Float[Tensor, "N 3"] | None:
+    def shape_change(self, pose: BodyPose, moment: Moment) -> Float[Tensor, "N 3"] | None:
         """How far each point moves at rest because the pose has other betas; None for not."""
-        held = self.held and self._shape is not None
-        if not (held or pose.betas.requires_grad) and torch.equal(pose.betas, self.betas):
+        anew = self.told_on_device(moment)
+        known = anew or pose.betas.requires_grad or (self.held and self._shape is not None)
+        if not known and torch.equal(pose.betas, self.betas):
             return None
-        change = self.shaped(pose.betas)[0] - self.rest_vertices
+        change = self.shaped(pose.betas, anew=anew)[0] - self.rest_vertices
         return (change[self.body.faces[self.faces]] * self.barycentric[..., None]).sum(1)
 
     def posed(
@@ -105,7 +106,7 @@ class SurfaceBody(SkinnedBody):
         """Gaussians of the zero pose, in the world."""
         transforms = self.body.skinning_transforms(pose)
         means = skin_points(canonical.means, weights, transforms)
-        joints = self.shaped(pose.betas)[1]
+        joints = self.shaped(pose.betas, anew=self.told_on_device(moment))[1]
         means = self.scaled(means, self.posed_joints(joints, transforms, (PELVIS,))[0], moment)
         if residual is not None and residual.means is not None:
             means = means + residual.means

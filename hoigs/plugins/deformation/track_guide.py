@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -19,6 +20,7 @@ class TrackGuide(nn.Module):
     on; splines that follow pictures alone leave the track there.
     """
 
+    times: Tensor
     weights: Tensor
     points: Tensor
     told: Tensor
@@ -26,13 +28,14 @@ class TrackGuide(nn.Module):
     def __init__(self, track: ObjectTrack) -> None:
         super().__init__()
         frames = len(track.rotations)
-        self.times = [frame / max(frames - 1, 1) for frame in range(frames)]
+        times = [frame / max(frames - 1, 1) for frame in range(frames)]
         points = track.points[probe_rows(len(track.points))]
         weights = UNSEEN + (1 - UNSEEN) * track.observed.to(points)
         # by way of quaternions, as poses are: a matrix that is a little skewed is not an error
         turns = quats_to_matrices(matrices_to_quats(track.rotations))
         told = points @ turns.mT + track.translations[:, None]
         for name, value in {
+            "times": torch.tensor(times, dtype=torch.float64),
             "points": points,
             "weights": weights / weights.sum(),
             "told": told,

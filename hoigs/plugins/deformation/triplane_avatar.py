@@ -184,7 +184,7 @@ class TriplaneAvatar(SurfaceBody):
             offset, scale = self.posing.shape(features, theta)
             offsets.append(offset * (~self._hands())[:, None])
             scales.append(scale.expand(-1, 3))
-        change = self.shape_change(pose)
+        change = self.shape_change(pose, moment)
         means = rest.means + torch.stack(offsets).sum(0)
         weights = self.weights(means, base)
         log_scales = rest.log_scales + torch.stack(scales).sum(0)
