@@ -23,7 +23,7 @@ from typing import Any
 from many_cells import read_cell, run_cells, write_cell
 
 RIGID_FEW = ("rigid, 2 knots", "rigid, 3 knots")
-RIGID_MANY = ("rigid, many knots", "rigid, adaptive knots")
+RIGID_MANY = ("rigid, adaptive knots",)
 BEYOND = ("articulated", "rigid and residual", "per Gaussian")
 
 
