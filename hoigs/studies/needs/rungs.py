@@ -29,6 +29,8 @@ class Rung(ComponentConfig):
             for the model blocks of that kind.
         times: dotted keys of numbers, and what their value so far is multiplied with: a rung that
             is smaller than the spec, whatever the spec has. Keys that the spec has not are left.
+        afterwards: laid over the answer where this rung is chosen, and over no trial: what takes a
+            longer training than a trial to be worth it.
         cost: of one step of a trial, where a step of the full spec costs 1
             (`benchmarks/rung_costs.py` measures it).
     """
@@ -36,6 +38,7 @@ class Rung(ComponentConfig):
     name: str
     overrides: Overrides = Field(default_factory=dict)
     times: dict[str, float] = Field(default_factory=dict)
+    afterwards: Overrides = Field(default_factory=dict)
     cost: float = Field(1.0, gt=0)
     why: str
 

@@ -73,8 +73,8 @@ class Answer:
 
     Attributes:
         block: key below `model`, or "" of a pair. chosen: its rung, None where nothing changes.
-        skipped: why the ladder was not climbed. overrides: of the chosen rung. refitted: rung that
-            scored best, whose motion the chosen one holds (`refit`).
+        skipped: why the ladder was not climbed. overrides, afterwards: of the chosen rung.
+        refitted: rung that scored best, whose motion the chosen one holds (`refit`).
     """
 
     ladder: Ladder
@@ -84,6 +84,7 @@ class Answer:
     skipped: str = ""
     overrides: Overrides = field(default_factory=dict)
     refitted: str = ""
+    afterwards: Overrides = field(default_factory=dict)
 
     def step(self, rung: Rung) -> Step:
         return next(s for s in self.steps if s.rung is rung)
@@ -168,6 +169,8 @@ class Search:
                 self.chosen.setdefault(ladder.name, set()).add(answer.chosen.name)
             self.report(told(answer))
             answers.append(answer)
+        for answer in answers:
+            self.found = laid(self.found, answer.afterwards)
         return Needs(
             clip=self.clip.name,
             base=self.base,
@@ -220,7 +223,8 @@ class Search:
                 if not ladder.else_cheapest:
                     return Answer(ladder, block, None, skipped=why)
                 first = ladder.rungs[0]
-                return Answer(ladder, block, first, (), why, self._overrides(first, blocks))
+                own, later = self._overrides(first, blocks), expanded(first.afterwards, blocks)
+                return Answer(ladder, block, first, (), why, own, afterwards=later)
         if all(rung.times for rung in ladder.rungs) and not any(
             self._overrides(rung, blocks) for rung in ladder.rungs
         ):
@@ -254,7 +258,8 @@ class Search:
         chosen = tried[place]
         rows = tuple(steps.get(rung.name, Step(rung)) for rung in ladder.rungs)
         why = "" if len(tried) > 1 else "no other of its rungs can be built here"
-        return Answer(ladder, block, chosen, rows, why, self._overrides(chosen, blocks), refitted)
+        own, later = self._overrides(chosen, blocks), expanded(chosen.afterwards, blocks)
+        return Answer(ladder, block, chosen, rows, why, own, refitted, later)
 
     def _overrides(self, rung: Rung, blocks: Mapping[str, Sequence[str]]) -> Overrides:
         """What a rung sets, over what has been found so far."""

@@ -74,7 +74,7 @@ def _comments(needs: Needs, given: Sequence[str]) -> dict[str, str]:
     """Why each key is what it is; the last ladder that has set it speaks."""
     comments = {setting.partition("=")[0].strip(): BY_HAND for setting in given}
     for answer in needs.answers:
-        for key in answer.overrides:
+        for key in (*answer.overrides, *answer.afterwards):
             comments[key] = told(answer)
     return comments
 

@@ -11,10 +11,11 @@ import torch
 from hoigs.core.clip import Clip, FrameStore
 from hoigs.core.errors import HoigsError, SpecError
 from hoigs.core.spec import Spec
+from hoigs.studies.needs.criterion import Score
 from hoigs.studies.needs.rungs import Ladder, Rung
 from hoigs.studies.needs.search import Needs, Search, told
 from hoigs.studies.needs.selection import SealedFrameError, selection_view
-from hoigs.studies.needs.trial import region_of
+from hoigs.studies.needs.trial import Trial, region_of
 from hoigs.studies.needs.write_needs import FILES, as_data, page, require_new, row, write_needs
 from hoigs.training.session import read_clip
 
@@ -115,6 +116,26 @@ def test_test_frames_cannot_be_read(clip):
     assert not set(view.split["train"]) & set(view.split["selection"])
     assert "test" not in view.split and view.held_out is None
     view[view.split["selection"][0]]  # these can
+
+
+def test_what_comes_afterwards_is_in_no_trial(clip, monkeypatch):
+    """A rung is tried as `overrides` has it; the answer has `afterwards` on top."""
+    later = {"model.{object}.deformation.keyframes": 5}
+    rungs = (STATIC, SPLINE.model_copy(update={"afterwards": later}))
+    search = Search(clip, "hoigs", (OBJECT.model_copy(update={"rungs": rungs}),), GIVEN)
+    tried: dict[str, Trial] = {}
+
+    def advance(trial: Trial, until: int) -> Score:
+        tried.setdefault(trial.model.entity("object").deformation.__class__.__name__, trial)
+        return scored(trial, until)
+
+    scored = Trial.advance
+    monkeypatch.setattr(Trial, "advance", advance)
+    found = search.run()
+    assert found.answers[0].chosen is rungs[1]
+    assert len(tried["RigidSpline"].model.entity("object").deformation.knots) == 4  # 14 frames
+    assert found.spec.model["object"].deformation.settings["keyframes"] == 5
+    assert found.overrides["model.object.deformation"]["keyframes"] == 5
 
 
 @pytest.mark.slow
