@@ -27,6 +27,8 @@ from hoigs.training.trainer import Trainer
 
 VISIBLE = 0.05  # dB that one cut may cost in any region, before the model is tuned to it
 PIXELS = (1.0, 0.5, 0.25)  # that nothing may move by when knots go, until nobody sees it
+# rates that are the same from a training's first step to its last; in tuning they are a tenth
+SETTLING = ("sh", "opacity", "scale", "rotation", "keyframe_rotation", "embedding", "shape")
 VIEWS = 16  # training frames whose pictures tell which Gaussians matter
 
 NO_INTERACTION = "interaction:none"
@@ -246,7 +248,11 @@ class Pruning:
             self._tell(Cut(f"splats of {name}", "Gaussians", before, before - len(rows), cost, why))
 
     def tune(self) -> None:
-        """Train on with what is left, one look kept back; nothing grows so late."""
+        """Train on with what is left, one look kept back: nothing grows so late, and all settles.
+
+        At rates that never fall a model ends beside its optimum: on one throw, 200 steps gained 0.03
+        dB of people and things at their full size, and 0.20 at a tenth.
+        """
         steps = int(self.judge.ledger.left - self.judge.price)
         whole = self.trained.spec.train.steps
         steps = min(steps, whole // 10)
@@ -257,6 +263,8 @@ class Pruning:
         settings.preview_every = 0
         settings.loss.lpips = 0.0
         settings.rates.camera = 0.0
+        for name in SETTLING:
+            setattr(settings.rates, name, 0.1 * getattr(settings.rates, name))
         trainer = Trainer(self.trained.model, self.trained.clip, settings)
         trainer.step = whole - steps  # the schedules' last part: rates are small, nothing grows
         kept = {k: v.clone() for k, v in self.trained.model.state_dict().items()}
