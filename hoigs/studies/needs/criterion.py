@@ -90,14 +90,20 @@ def choose(scores: Sequence[Score], criterion: Criterion = "one-se", least: floa
 
 def ranked(scores: Sequence[Score], criterion: Criterion, least: float) -> list[int]:
     """Places from the likeliest choice to the least: those that may be as good as the best by
-    cost, then the others by score.
+    cost, then the others by score; the best itself is always among the first two.
 
     Early scores say who learns fast, not who is enough, so that here a rung may be `PATIENCE`
-    errors behind, where the last choice allows one.
+    errors behind, where the last choice allows one. With few frames that is decibels, and cheap
+    rungs would crowd out whom they are to be compared with: what stands still would be "as good"
+    as what none of them is.
     """
+    places = range(len(scores))
     if criterion == "bic":
-        return sorted(range(len(scores)), key=lambda k: (bic(scores[k]), k))
+        return sorted(places, key=lambda k: (bic(scores[k]), k))
     near = near_best(scores, least, PATIENCE)
-    return sorted(
-        range(len(scores)), key=lambda k: (not near[k], k if near[k] else -scores[k].mean)
-    )
+    order = sorted(places, key=lambda k: (not near[k], k if near[k] else -scores[k].mean))
+    best = max(places, key=lambda k: scores[k].mean)
+    if order.index(best) > 1:
+        order.remove(best)
+        order.insert(1, best)
+    return order

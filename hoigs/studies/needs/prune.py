@@ -250,8 +250,8 @@ class Pruning:
     def tune(self) -> None:
         """Train on with what is left, one look kept back: nothing grows so late, and all settles.
 
-        At rates that never fall a model ends beside its optimum: on one throw, 200 steps gained 0.03
-        dB of people and things at their full size, and 0.20 at a tenth.
+        At rates that never fall a model ends beside its optimum: on one throw, 200 steps gained
+        0.03 dB of people and things at their full size, and 0.20 at a tenth.
         """
         steps = int(self.judge.ledger.left - self.judge.price)
         whole = self.trained.spec.train.steps

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from hoigs.core.errors import ClipError, HoigsError
-from hoigs.studies.needs.criterion import Score, bic, choose, gain, near_best, ranked
+from hoigs.studies.needs.criterion import PATIENCE, Score, bic, choose, gain, near_best, ranked
 from hoigs.studies.needs.halving import (
     FEWEST,
     SCORING,
@@ -74,6 +74,14 @@ def test_bic_pays_for_parameters():
 def test_ranking_puts_the_cheap_before_its_equals_and_the_good_before_the_bad():
     table = [score(10, 11), score(25, 26), score(20, 21), score(25, 26.1)]
     assert ranked(table, "one-se", 0.1) == [1, 3, 2, 0]
+
+
+def test_the_best_is_not_crowded_out_by_those_that_few_frames_cannot_tell_from_it():
+    """Three frames that disagree: cheap rungs are within 1.5 standard errors, decibels below."""
+    cheap, cheaper = score(10, 10.5, 19), score(10.2, 10, 19)
+    table = [cheaper, cheap, score(10, 10.5, 19.5), score(16, 10.5, 19)]
+    assert near_best(table, 0.1, PATIENCE) == [True] * 4
+    assert ranked(table, "one-se", 0.1) == [0, 3, 1, 2]
 
 
 # -- halving ---------------------------------------------------------------------------------------
