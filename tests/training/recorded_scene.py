@@ -42,18 +42,22 @@ def scene(
     attention: dict[str, Any] | None = None,
     *,
     plain_tokens: bool = False,
-    alone: bool = False,
+    unattended: bool = False,
     person: Callable[..., DeformationModel] = person_of,
     motion: Callable[..., DeformationModel] = TrackedHermite,
 ) -> SceneModel:
-    """All parts of the hoigs spec, small, every head and correction away from its start."""
+    """All parts of the hoigs spec, small, every head and correction away from its start.
+
+    Args:
+        unattended: without features and interaction. person, motion: made with its settings.
+    """
     body, wall, box, track = things(FRAMES)
     walker = person(body, FRAMES, (0, 1, 3, 4), **(human or {}))
     curve = motion(4, track=track, **(thing or {}))
     features: list[FeatureExtractor | None] = [BodyPartFeatures(), SplineMotionFeatures(hidden=8)]
     if plain_tokens:
         features = [EmbeddingFeatures(), EmbeddingFeatures(keyframes=3)]
-    if alone:
+    if unattended:
         features = [None, None]
     attends = CrossAttention(hidden=16, reach=3.0, **(attention or {}))
     model = SceneModel(
@@ -62,7 +66,7 @@ def scene(
             "human": Entity(body.rest(80), walker, features[0]),
             "object": Entity(box, curve, features[1], kind="object"),
         },
-        interaction=NoInteraction() if alone else attends,
+        interaction=NoInteraction() if unattended else attends,
         rasterizer=TorchRasterizer(),
     )
     return away_from_start(model).train()
@@ -174,8 +178,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "chs": {"motion": CubicHermite},
     "heads": {"attention": {"pose_head": "per-part", "object_residual": "both", "gate": "hard"}},
     "plain tokens": {"plain_tokens": True},
-    "skinned": {"person": partial(skinned, refine_poses=False), "alone": True},
-    "skinned, refined": {"person": partial(skinned, refine_poses=True), "alone": True},
+    "given poses": {"human": {"refine_poses": False}},
+    "skinned": {"person": partial(skinned, refine_poses=False), "unattended": True},
+    "skinned, refined": {"person": partial(skinned, refine_poses=True), "unattended": True},
     "rigid": {"motion": RigidSpline},
     "rigid, adaptive": {"motion": adaptive(RigidSpline)},
     "rigid, slerp": {"motion": partial(RigidSpline, rotation="slerp")},

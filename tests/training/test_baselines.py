@@ -45,13 +45,7 @@ def clip() -> Clip:
     return read_clip(builtin_clip(AnnyBody(), SceneKnobs.tiny()))
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Pictures and networks this small only make threads wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @torch.no_grad()

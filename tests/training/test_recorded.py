@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -30,17 +29,11 @@ from hoigs.core.interaction import Residual
 from hoigs.core.moment import Moment
 from hoigs.core.scene import SceneModel
 from hoigs.plugins.deformation.static import Static
+from hoigs.plugins.deformation.triplane_avatar import TriplaneAvatar
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.training.recorded import RecordedScene
 
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Numbers this few are computed faster by one thread."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -193,8 +186,9 @@ def test_what_cannot_be_recorded_says_why() -> None:
     assert of(Static(), graphs="off").reason == "train.graphs is off"
     with pytest.raises(HoigsError, match=r"train.graphs is on, but CUDA graphs need a CUDA device"):
         of(Static(), graphs="on")
-    recorded = RecordedScene(scene({"refine_poses": False}), "auto", lambda *_: 0, launches=True)
-    assert "human.deformation, a HexPlaneSkinning" in recorded.reason
+    avatar = scene(person=lambda body, *_: TriplaneAvatar(body), unattended=True)
+    recorded = RecordedScene(avatar, "auto", lambda *_: 0, launches=True)
+    assert "human.deformation, a TriplaneAvatar" in recorded.reason
     wrong = of(Forgetful(cut=False), launches=True)
     wrong(at(2))
     with pytest.warns(UserWarning, match="without CUDA graphs: means of .* differs by"):

@@ -17,7 +17,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.context import BuildContext
 from hoigs.core.gaussians import SH_C0, GaussianDelta, Gaussians
 from hoigs.core.interaction import Residual
-from hoigs.core.moment import BodyPose, Moment, ResidualRule
+from hoigs.core.moment import Moment, ResidualRule
 from hoigs.core.rotation import multiply_quats
 from hoigs.core.topology import TopologyChange
 from hoigs.plugins.deformation.alpha_start import AlphaStart, depth_ratio
@@ -115,6 +115,7 @@ class HexPlaneSkinning(SkinnedBody):
     """
 
     provides = frozenset({"field", "skeleton", "face"})
+    recordable = True
     rates: ClassVar[Mapping[str, str]] = {
         "planes": "planes",
         "refinement": "pose",
@@ -198,12 +199,6 @@ class HexPlaneSkinning(SkinnedBody):
         self._last: tuple[CanonicalAttributes, Tensor] | None = None
         self._held: tuple[Gaussians, Tensor] | None = None
 
-    @property
-    def recordable(self) -> bool:  # type: ignore[override]
-        """Only while poses are refined: a shape that is not learned is compared with the one that
-        was kept, and the answer waits for the device."""
-        return self.refinement is not None
-
     @classmethod
     def from_config(cls, config: HexPlaneSkinningConfig, context: BuildContext) -> Self:
         settings = context_settings(context, "deformation:hexplane-skinning")
@@ -233,12 +228,14 @@ class HexPlaneSkinning(SkinnedBody):
         self, rest: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
         pose = self.pose(moment)
-        vertices, joints = self.shaped(pose.betas)
+        vertices, joints = self.shaped(pose.betas, moment)
         if self._held is not None and self.held:
             canonical, weights = self._held
         else:
             attributes, weights = self._attributes(rest)
-            canonical = self._canonical(rest, attributes, pose, vertices)
+            canonical = self._canonical(
+                rest, attributes, vertices, self.reshaped(pose.betas, moment)
+            )
         if residual is not None and residual.pose is not None:
             pose = pose.with_residual(residual.pose, self.residual_rule)
         transforms = self.body.skinning_transforms(pose)
@@ -261,7 +258,8 @@ class HexPlaneSkinning(SkinnedBody):
         super().hold(rest, moment)
         pose = self.pose(moment)
         attributes, weights = self._attributes(rest)
-        canonical = self._canonical(rest, attributes, pose, self.shaped(pose.betas)[0])
+        vertices = self.shaped(pose.betas, moment)[0]
+        canonical = self._canonical(rest, attributes, vertices, reshaped=True)
         self._held = (canonical, weights)
 
     def _attributes(self, rest: Gaussians) -> tuple[CanonicalAttributes, Float[Tensor, "N J"]]:
@@ -306,12 +304,12 @@ class HexPlaneSkinning(SkinnedBody):
         self,
         rest: Gaussians,
         attributes: CanonicalAttributes,
-        pose: BodyPose,
         vertices: Float[Tensor, "V 3"],
+        reshaped: bool,
     ) -> Gaussians:
-        """Gaussians of the zero pose, in the pose's shape, which gives the vertices."""
+        """Gaussians of the zero pose; of a body with these vertices, where it is reshaped."""
         offsets = attributes.offsets
-        if pose.betas.requires_grad or not torch.equal(pose.betas, self.betas):
+        if reshaped:
             change = vertices - self.rest_vertices
             corners = change[self.body.faces[self.faces]]
             offsets = offsets + (corners * self.barycentric[..., None]).sum(1)

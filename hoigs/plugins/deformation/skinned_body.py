@@ -149,31 +149,31 @@ class SkinnedBody(DeformationModel):
         pose = moment.poses[self.entity]
         return pose if self.refinement is None else self.refinement(pose, moment.time)
 
-    def shaped(self, betas: Float[Tensor, " B"], *, anew: bool = False) -> tuple[Tensor, Tensor]:
-        """Vertices and joints of the zero pose; the last shape without gradient is kept.
-
-        Args:
-            anew: make them whatever is kept, which to compare would wait for the device.
-        """
+    def shaped(self, betas: Float[Tensor, " B"], moment: Moment) -> tuple[Tensor, Tensor]:
+        """Vertices [V, 3] and joints [J, 3] of the zero pose, metres; the last shape without
+        gradient is kept, where to compare it does not wait for the device."""
         if self.held and self._shape is not None:
             return self._shape[1], self._shape[2]
-        if anew or (self.training and self.refinement is not None):  # another one at every step
-            return self.body.shaped(betas)
+        if self.training and (self.refinement is not None or _recorded(moment)):
+            return self.body.shaped(betas)  # another one at every step
         if betas.requires_grad and torch.is_grad_enabled():
             return self.body.shaped(betas)
         if self._shape is None or not torch.equal(self._shape[0], betas):
             self._shape = (betas.detach().clone(), *self.body.shaped(betas.detach()))
         return self._shape[1], self._shape[2]
 
-    def told_on_device(self, moment: Moment) -> bool:
-        """Whether the host knows nothing of this moment: training is being recorded."""
-        return self.training and isinstance(moment.time, Tensor)
+    def reshaped(self, betas: Float[Tensor, " B"], moment: Moment) -> bool:
+        """Whether these are other betas than those that rest was made for; so, too, where to
+        compare them would wait for the device."""
+        if betas.requires_grad or self.held or (self.training and _recorded(moment)):
+            return True
+        return not torch.equal(betas, self.betas)
 
     @torch.no_grad()
     def stance(self, moment: Moment) -> Stance:
         """The body at `moment`; kept for `anchors`, which the same forward pass asks for next."""
         pose = self.pose(moment)
-        shape = self.shaped(pose.betas, anew=self.told_on_device(moment))
+        shape = self.shaped(pose.betas, moment)
         found = Stance(pose, self.body.skinning_transforms(pose), *shape)
         self._asked = (moment, self._state(), found)
         return found
@@ -228,6 +228,11 @@ class SkinnedBody(DeformationModel):
         if self._arm is None or not torch.equal(self._arm[0], betas):
             self._arm = (betas.clone(), self.body.arm_length(betas))
         return self._arm[1]
+
+
+def _recorded(moment: Moment) -> bool:
+    """Whether the host is told no time: it would be that of the recording (hoigs.core.clock)."""
+    return isinstance(moment.time, Tensor)
 
 
 def context_settings(context: BuildContext, what: str) -> dict[str, Any]:

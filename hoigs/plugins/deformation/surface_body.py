@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -87,12 +86,11 @@ class SurfaceBody(SkinnedBody):
         return pose
 
     def shape_change(self, pose: BodyPose, moment: Moment) -> Float[Tensor, "N 3"] | None:
-        """How far each point moves at rest because the pose has other betas; None for not."""
-        anew = self.told_on_device(moment)
-        known = anew or pose.betas.requires_grad or (self.held and self._shape is not None)
-        if not known and torch.equal(pose.betas, self.betas):
+        """How far each point moves at rest because the pose has other betas, metres; None for
+        not."""
+        if not self.reshaped(pose.betas, moment):
             return None
-        change = self.shaped(pose.betas, anew=anew)[0] - self.rest_vertices
+        change = self.shaped(pose.betas, moment)[0] - self.rest_vertices
         return (change[self.body.faces[self.faces]] * self.barycentric[..., None]).sum(1)
 
     def posed(
@@ -106,7 +104,7 @@ class SurfaceBody(SkinnedBody):
         """Gaussians of the zero pose, in the world."""
         transforms = self.body.skinning_transforms(pose)
         means = skin_points(canonical.means, weights, transforms)
-        joints = self.shaped(pose.betas, anew=self.told_on_device(moment))[1]
+        joints = self.shaped(pose.betas, moment)[1]
         means = self.scaled(means, self.posed_joints(joints, transforms, (PELVIS,))[0], moment)
         if residual is not None and residual.means is not None:
             means = means + residual.means

@@ -222,9 +222,7 @@ class Search:
                 why = f"{other} is {' and '.join(sorted(taken))}"
                 if not ladder.else_cheapest:
                     return Answer(ladder, block, None, skipped=why)
-                first = ladder.rungs[0]
-                own, later = self._overrides(first, blocks), expanded(first.afterwards, blocks)
-                return Answer(ladder, block, first, (), why, own, afterwards=later)
+                return self._chosen(ladder, block, ladder.rungs[0], blocks, skipped=why)
         if all(rung.times for rung in ladder.rungs) and not any(
             self._overrides(rung, blocks) for rung in ladder.rungs
         ):
@@ -258,8 +256,23 @@ class Search:
         chosen = tried[place]
         rows = tuple(steps.get(rung.name, Step(rung)) for rung in ladder.rungs)
         why = "" if len(tried) > 1 else "no other of its rungs can be built here"
-        own, later = self._overrides(chosen, blocks), expanded(chosen.afterwards, blocks)
-        return Answer(ladder, block, chosen, rows, why, own, refitted, later)
+        return self._chosen(
+            ladder, block, chosen, blocks, steps=rows, skipped=why, refitted=refitted
+        )
+
+    def _chosen(
+        self,
+        ladder: Ladder,
+        block: str,
+        rung: Rung,
+        blocks: Mapping[str, Sequence[str]],
+        *,
+        skipped: str,
+        steps: tuple[Step, ...] = (),
+        refitted: str = "",
+    ) -> Answer:
+        own, later = self._overrides(rung, blocks), expanded(rung.afterwards, blocks)
+        return Answer(ladder, block, rung, steps, skipped, own, refitted, later)
 
     def _overrides(self, rung: Rung, blocks: Mapping[str, Sequence[str]]) -> Overrides:
         """What a rung sets, over what has been found so far."""

@@ -142,6 +142,7 @@ def _answer(answer: Answer) -> dict[str, Any]:
         {
             "name": step.rung.name,
             "overrides": step.rung.overrides,
+            "afterwards": step.rung.afterwards,
             "steps": step.steps,
             "seconds": step.seconds,
             "score": None if step.score is None else asdict(step.score),

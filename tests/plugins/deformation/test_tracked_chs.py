@@ -70,9 +70,8 @@ def test_without_a_track_it_is_chs_about_rest():
     about, chs = (Entity(rest, kind(keyframes=4)) for kind in (TrackedHermite, CubicHermite))
     assert about.deformation.rest_space == chs.deformation.rest_space == "world"
     assert about.means.requires_grad and not chs.means.requires_grad
-    assert (
-        about.deformation.rates == chs.deformation.rates
-    )  # a whole motion, not what is left of it
+    # a whole motion, not what is left of it
+    assert about.deformation.rates == chs.deformation.rates
     assert TrackedHermite(track=jittering_track()).rates["keyframe_means"] == "pose"
     with torch.no_grad():
         departs = 0.3 * torch.randn(6, 4, 3)

@@ -59,13 +59,7 @@ def depth_model(folder: Path, **settings) -> Path:
     return saved(model, processor, folder, 0.3, conv3=1.0)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Models as small as these are twenty times slower on two threads when the machine is busy."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

@@ -16,18 +16,21 @@ from hoigs.core.gaussians import Gaussians
 from hoigs.core.rasterizer import RenderRequest
 from hoigs.core.scene import SceneModel
 from hoigs.core.topology import TopologyChange
+from hoigs.core.train_spec import RatesSpec
 from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.oracle import OracleRasterizer
+from hoigs.studies.needs import prune
 from hoigs.studies.needs.after import add_to_answer, finish, table
 from hoigs.studies.needs.compact_run import compact_run
 from hoigs.studies.needs.halving import Ledger
 from hoigs.studies.needs.judge import Judge
-from hoigs.studies.needs.prune import Pruning
+from hoigs.studies.needs.prune import Cut, Pruning
 from hoigs.studies.needs.prune_planes import as_one, from_one, time_planes
 from hoigs.studies.needs.prune_splats import rows_to_lose, sensitivities, take_out
 from hoigs.studies.needs.selection import SealedFrameError, sealed_view
 from hoigs.training.checkpoint import latest_checkpoint, load_checkpoint
 from hoigs.training.session import LoadedRun, Session, read_clip
+from hoigs.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +162,34 @@ def test_interaction_that_does_nothing_goes_and_one_that_does_stays(clip, strong
     assert gone is not strong
     assert (pruning.trained.spec.model["object"].features is None) is not strong
     assert (pruning.cuts[0].drop > 0.05) is strong
+
+
+def test_tuning_settles_and_leaves_the_spec_as_it_was(clip, monkeypatch):
+    """What a schedule brings down is near its end; rates without one are a tenth of the spec's."""
+    trained = as_composed(clip)
+    rates = trained.spec.train.rates.model_copy()
+    seen: list[RatesSpec] = []
+
+    class Watched(Trainer):
+        def train(self, *args, **kwargs):
+            seen.append(self.spec.rates)
+            super().train(*args, **kwargs)
+
+    monkeypatch.setattr(prune, "Trainer", Watched)
+    pruning = Pruning(trained, judge_of(clip))
+    pruning.tune()
+    assert not seen  # nothing was pruned
+    pruning.cuts = [Cut("splats", "Gaussians", 2, 1, 0.0, "")]
+    pruning.tune()
+    fields = RatesSpec.model_fields
+    steady = {n for n, f in fields.items() if f.annotation is float and not n.endswith("_final")}
+    steady -= {n for n in steady if f"{n}_final" in fields} | {"sh_rest", "camera"}
+    assert steady == set(prune.SETTLING)
+    for name in fields:
+        wanted = getattr(rates, name)
+        wanted = pytest.approx(0.1 * wanted) if name in steady else wanted
+        assert getattr(seen[0], name) == wanted, name
+    assert trained.spec.train.rates == rates
 
 
 def test_no_test_frame_is_looked_at(clip):
