@@ -104,7 +104,8 @@ class RatesSpec(_Strict):
         camera: of each frame's correction of its camera, radians and scene extents a step; 0 takes
             cameras as they are (docs/reference/refinement.md). pose: of corrections of given poses,
             radians and metres: a body's where the human's deformation refines them, an object's
-            where it is about its track.
+            where it is about its track. settle: share of the rates without a `*_final` that is left
+            at the last step, reached log-linearly over the last fifth of the run.
     """
 
     means: float = Field(2.4e-3, ge=0)
@@ -126,6 +127,7 @@ class RatesSpec(_Strict):
     pose_final: float = Field(1e-4, ge=0)
     shape: float = Field(1e-4, ge=0)
     camera: float = Field(0.0, ge=0)
+    settle: float = Field(1.0, gt=0, le=1)
     by_extent: tuple[str, ...] = ("means",)
 
     @field_validator("by_extent")

@@ -32,19 +32,25 @@ WAITING = {
 }
 
 
+SETTLING = 0.8  # of a run, where rates begin to fall by `RatesSpec.settle`
+
+
 @dataclass(frozen=True)
 class Schedule:
-    """Learning rate of one group: zero before `begin`, then log-linear from `start` to `final`."""
+    """Learning rate of one group: zero before `begin`, then `start` until `fall`, then log-linear
+    to `final` at the end; `begin` moves no fall."""
 
     start: float
     final: float
     begin: float = 0.0
+    fall: float = 0.0
 
     def at(self, progress: float) -> float:
         """Rate at `progress` in [0, 1] of the run."""
         if progress < self.begin or self.start == 0:
             return 0.0
-        return float(self.start * (max(self.final, 1e-12) / self.start) ** progress)
+        fallen = max(progress - self.fall, 0.0) / (1 - self.fall)
+        return float(self.start * (max(self.final, 1e-12) / self.start) ** fallen)
 
 
 def entity_extent(entity: Entity, scene_extent: float) -> float:
@@ -102,7 +108,10 @@ class GroupedAdam:
             if start is None:
                 known = sorted(RatesSpec.model_fields)
                 raise ValueError(f"{name} asks for the rate {rate!r}; train.rates has {known}")
-            final = getattr(rates, f"{rate}_final", start)
+            final = getattr(rates, f"{rate}_final", None)
+            settles = final is None and rates.settle < 1
+            if final is None:
+                final = start * rates.settle
             if rate in rates.by_extent and entity is not None:
                 extent = entity_extent(entity, scene_extent)
                 start, final = start * extent, final * extent
@@ -111,7 +120,7 @@ class GroupedAdam:
             parameter.data = parameter.data.contiguous()
             self.names[name] = parameter
             self.roles.append(rate)
-            self.schedules.append(Schedule(start, final, begin))
+            self.schedules.append(Schedule(start, final, begin, SETTLING if settles else 0.0))
         groups: dict[Schedule, list[nn.Parameter]] = {}
         for parameter, schedule in zip(self.names.values(), self.schedules, strict=True):
             groups.setdefault(schedule, []).append(parameter)

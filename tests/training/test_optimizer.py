@@ -34,6 +34,29 @@ def test_schedule_waits_then_decays_log_linearly():
     assert schedule.at(1.0) == pytest.approx(1e-4)
 
 
+def test_rates_without_an_end_of_their_own_settle_in_the_last_fifth():
+    model = make_model()
+
+    def ends(settle: float) -> dict[str, list[float]]:
+        adam = GroupedAdam(model, RatesSpec(settle=settle), WarmupSpec(motion=0), scene_extent=1.0)
+        rates: dict[str, list[float]] = {}
+        for progress in (0.0, 0.8, 0.9, 1.0):
+            adam.set_progress(progress)
+            for name, rate in adam.learning_rates().items():
+                rates.setdefault(name, []).append(rate)
+        return rates
+
+    steady, settled = ends(1.0), ends(0.1)
+    for name, _, rate, _ in named_rates(model):
+        if f"{rate}_final" in RatesSpec.model_fields:
+            assert settled[name] == steady[name] and steady[name][0] > steady[name][-1]
+        else:
+            start = steady[name][0]
+            assert steady[name] == [start] * 4
+            assert settled[name] == pytest.approx([start, start, start * 0.1**0.5, start * 0.1])
+    assert {"opacity", "means"} <= {rate for _, _, rate, _ in named_rates(model)}
+
+
 def test_every_trainable_parameter_has_a_known_rate():
     model = make_model()
     found = {name: rate for name, _, rate, _ in named_rates(model)}

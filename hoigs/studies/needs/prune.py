@@ -27,8 +27,7 @@ from hoigs.training.trainer import Trainer
 
 VISIBLE = 0.05  # dB that one cut may cost in any region, before the model is tuned to it
 PIXELS = (1.0, 0.5, 0.25)  # that nothing may move by when knots go, until nobody sees it
-# rates that are the same from a training's first step to its last; in tuning they are a tenth
-SETTLING = ("sh", "opacity", "scale", "rotation", "keyframe_rotation", "embedding", "shape")
+SETTLE = 0.1  # of the rates without an end of their own is left when a tuning ends, at most
 VIEWS = 16  # training frames whose pictures tell which Gaussians matter
 
 NO_INTERACTION = "interaction:none"
@@ -251,7 +250,7 @@ class Pruning:
         """Train on with what is left, one look kept back: nothing grows so late, and all settles.
 
         At rates that never fall a model ends beside its optimum: on one throw, 200 steps gained
-        0.03 dB of people and things at their full size, and 0.20 at a tenth.
+        0.03 dB of people and things at their full size, and 0.20 at a tenth of it.
         """
         steps = int(self.judge.ledger.left - self.judge.price)
         whole = self.trained.spec.train.steps
@@ -263,8 +262,7 @@ class Pruning:
         settings.preview_every = 0
         settings.loss.lpips = 0.0
         settings.rates.camera = 0.0
-        for name in SETTLING:
-            setattr(settings.rates, name, 0.1 * getattr(settings.rates, name))
+        settings.rates.settle = min(settings.rates.settle, SETTLE)
         trainer = Trainer(self.trained.model, self.trained.clip, settings)
         trainer.step = whole - steps  # the schedules' last part: rates are small, nothing grows
         kept = {k: v.clone() for k, v in self.trained.model.state_dict().items()}

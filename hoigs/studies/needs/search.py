@@ -29,6 +29,8 @@ from hoigs.studies.needs.trial import Trial, alone
 
 TOTAL = 2.5  # full trainings that the search and what comes after it may cost together
 FINAL, AFTER = 1.0, 0.1  # of these: the final training, and a reserve for work on its result
+SETTLES = "train.rates.settle"
+SETTLE = 0.1  # of trials and of the answer: at steady rates, where one ends is a matter of chance
 
 Report = Callable[[str], None]
 
@@ -157,7 +159,7 @@ class Search:
         self.ledger = Ledger((self.settings.budget - FINAL - AFTER) * steps)
         self.blocks, self.entities = _blocks(full, self.clip)
         pace = self._pace(full)
-        self.found: Overrides = {}
+        self.found: Overrides = {} if self._settled(full) else {SETTLES: SETTLE}
         self.chosen: dict[str, set[str]] = {}
         answers: list[Answer] = []
         waiting = [(ladder, block) for ladder in self.ladders for block in self._places(ladder)]
@@ -185,6 +187,11 @@ class Search:
             seconds=time.perf_counter() - began,
             full_seconds=pace * steps,
         )
+
+    def _settled(self, full: Spec) -> bool:
+        """Whether the base spec or the user has said how rates end."""
+        said = {setting.partition("=")[0].strip() for setting in self.given}
+        return SETTLES in said or full.train.rates.settle < 1
 
     def _spec(self, overrides: Mapping[str, object]) -> Spec:
         settings = as_settings(overrides)

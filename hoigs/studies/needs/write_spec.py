@@ -12,9 +12,10 @@ from hoigs.core.registry import Registry
 from hoigs.core.spec import Spec
 from hoigs.core.spec_files import SUFFIXES
 from hoigs.core.spec_loader import load_overrides
-from hoigs.studies.needs.search import Needs, told
+from hoigs.studies.needs.search import SETTLES, Needs, told
 
 BY_HAND = "as asked for by --set"
+SETTLED = "at rates that never fall a short training ends beside its optimum"
 
 
 def spec_text(needs: Needs, given: Sequence[str], folder: Path) -> str:
@@ -72,7 +73,8 @@ def checked_spec(path: Path, needs: Needs, registry: Registry | None) -> Spec:
 
 def _comments(needs: Needs, given: Sequence[str]) -> dict[str, str]:
     """Why each key is what it is; the last ladder that has set it speaks."""
-    comments = {setting.partition("=")[0].strip(): BY_HAND for setting in given}
+    comments = {SETTLES: SETTLED}
+    comments |= {setting.partition("=")[0].strip(): BY_HAND for setting in given}
     for answer in needs.answers:
         for key in (*answer.overrides, *answer.afterwards):
             comments[key] = told(answer)

@@ -11,9 +11,10 @@ import torch
 from hoigs.core.clip import Clip, FrameStore
 from hoigs.core.errors import HoigsError, SpecError
 from hoigs.core.spec import Spec
+from hoigs.studies.needs import search as search_module
 from hoigs.studies.needs.criterion import Score
 from hoigs.studies.needs.rungs import Ladder, Rung
-from hoigs.studies.needs.search import Needs, Search, told
+from hoigs.studies.needs.search import SETTLE, SETTLES, Needs, Search, told
 from hoigs.studies.needs.selection import SealedFrameError, selection_view
 from hoigs.studies.needs.trial import Trial, region_of
 from hoigs.studies.needs.write_needs import FILES, as_data, page, require_new, row, write_needs
@@ -225,9 +226,27 @@ def test_a_still_object_needs_no_interaction(clip):
     assert told(answers[1]) == "interaction: off, because object is static"
 
 
+def test_rates_settle_in_trials_and_the_answer_unless_somebody_said_otherwise(clip, monkeypatch):
+    tried: list[Spec] = []
+
+    class Seen(Trial):
+        def __init__(self, spec: Spec, *rest) -> None:
+            tried.append(spec)
+            super().__init__(spec, *rest)
+
+    monkeypatch.setattr(search_module, "Trial", Seen)
+    for given, settle in {"": SETTLE, "train.rates.settle=0.5": 0.5, f"{SETTLES}=1": 1}.items():
+        tried.clear()
+        needs = Search(clip, "hoigs", (OBJECT,), (*GIVEN, *filter(None, [given]))).run()
+        assert needs.spec.train.rates.settle == settle
+        first, *trials = tried  # the first measures the pace of the spec as it is
+        assert first.train.rates.settle == (1 if not given else settle)
+        assert trials and {spec.train.rates.settle for spec in trials} == {settle}
+
+
 def test_what_cannot_be_paid_is_left_as_it_was_and_told(clip):
     found = Search(clip, "hoigs", (OBJECT,), (*GIVEN, "train.steps=11")).run()
-    assert found.answers[0].chosen is None and found.overrides == {}
+    assert found.answers[0].chosen is None and found.overrides == {SETTLES: SETTLE}
     assert "unchanged, because 2 rungs need 9 steps at least, but get" in told(found.answers[0])
 
 
