@@ -6,7 +6,9 @@
 On each clip the whole spec is trained, and what `--auto` makes of it. Auto passes where its PSNR of
 people and things on test frames is within 0.15 dB of the whole spec's, with at most 10 % of its
 trained numbers and 50 % of its render time. A run that was stopped goes on with the same command;
-render times are measured at the end, when nothing else of this script runs, both models in turn.
+render times are measured at the end, when nothing else of this script runs, both models in turn: of
+films, which `Playback` draws (on CUDA by captured graphs), and for comparison of
+`SceneModel.render`, frame by frame, where a GPU mostly waits for launches.
 """
 
 from __future__ import annotations
@@ -77,23 +79,51 @@ def train(name: str, kind: str, options: argparse.Namespace) -> dict[str, Any]:
     return found
 
 
-def render_times(name: str, options: argparse.Namespace) -> dict[str, float]:
-    """Milliseconds a frame of both, measured in turn: medians of the rounds."""
+def render_times(name: str, options: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """Milliseconds a frame of both, two ways, measured in turn: medians of the rounds."""
     from hoigs.evaluation.measure import render_time
+    from hoigs.evaluation.playback import Playback
     from hoigs.training.session import LoadedRun
 
     loaded = {
         kind: LoadedRun.open(run_folder(name, kind, options), device=options.device)
         for kind in KINDS
     }
-    times: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    views = {
+        kind: [(run.clip.moments[p], run.clip.cameras[p]) for p in run.clip.split["test"]]
+        for kind, run in loaded.items()
+    }
+    films = {kind: Playback(run.model, views[kind]) for kind, run in loaded.items()}
+    times: dict[str, dict[str, list[float]]] = {
+        way: {kind: [] for kind in KINDS} for way in ("played", "plain")
+    }
     for _ in range(ROUNDS):
         for kind, run in loaded.items():
+            times["played"][kind].append(film_ms(films[kind], views[kind], options.device))
             positions = list(run.clip.split["test"])
-            times[kind].append(
-                render_time(run.model, run.clip, positions, frames=20, warmup=3).total_ms
-            )
-    return {kind: round(statistics.median(values), 3) for kind, values in times.items()}
+            plain = render_time(run.model, run.clip, positions, frames=20, warmup=3)
+            times["plain"][kind].append(plain.total_ms)
+    found = {
+        way: {kind: round(statistics.median(values), 3) for kind, values in of.items()}
+        for way, of in times.items()
+    }
+    return found | {"modes": {kind: film.mode for kind, film in films.items()}}
+
+
+def film_ms(film: Any, views: list[Any], device: str, sweeps: int = 3) -> float:
+    """Milliseconds a frame, without any waiting in between."""
+    import torch
+
+    def drawn(times: int) -> None:
+        for moment, camera in views * times:
+            film(moment, camera)
+        if device == "cuda":
+            torch.cuda.synchronize()
+
+    drawn(1)
+    began = time.perf_counter()
+    drawn(sweeps)
+    return 1000 * (time.perf_counter() - began) / (sweeps * len(views))
 
 
 def settings_of(options: argparse.Namespace) -> dict[str, Any]:
@@ -106,21 +136,21 @@ def summary(options: argparse.Namespace) -> bool:
     """Print and write the table of the clips that are done; whether all three rules hold on all."""
     rows, good = [], True
     print("| clip | people and things, dB: full | auto | difference | parameters | render time | "
-          "after compressing, dB | cost in full trainings | |")  # fmt: skip
-    print("|---|---:|---:|---:|---:|---:|---:|---:|---|")
+          "frame by frame | after compressing, dB | cost in full trainings | |")  # fmt: skip
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|---|")
     for name in options.clips:
         cells = {kind: read_cell(options.out, f"{name}-{kind}", settings_of(options))
                  for kind in KINDS}  # fmt: skip
         full, auto = cells["full"], cells["auto"]
         if full is None or auto is None:
             missing = [kind for kind in KINDS if cells[kind] is None]
-            print(f"| {name} | not done: {', '.join(missing)} | | | | | | | |")
+            print(f"| {name} | not done: {', '.join(missing)} | | | | | | | | |")
             good = False
             continue
         difference = auto["psnr"]["human_object"] - full["psnr"]["human_object"]
         share = auto["parameters"] / full["parameters"]
         times = render_times(name, options)
-        render = times["auto"] / times["full"]
+        render, plain = (times[way]["auto"] / times[way]["full"] for way in ("played", "plain"))
         passed = difference >= -WITHIN_DB and share <= PARAMETERS and render <= RENDER
         good &= passed
         cost = auto["after"]["full_trainings"]
@@ -129,6 +159,7 @@ def summary(options: argparse.Namespace) -> bool:
         print(
             f"| {name} | {full['psnr']['human_object']:.2f} | {auto['psnr']['human_object']:.2f} | "
             f"{difference:+.2f} | {100 * share:.1f} % | {100 * render:.0f} % | "
+            f"{100 * plain:.0f} % | "
             f"{auto['compact_psnr']['human_object']:.2f} | "
             f"{'–' if cost is None else f'{cost:.2f}'} | {'pass' if passed else 'FAIL'} |"
         )

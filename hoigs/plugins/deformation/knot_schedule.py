@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Literal, Protocol
 
@@ -18,6 +18,7 @@ from hoigs.core.deformation import StepEvidence
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.topology import AxisChange
 from hoigs.plugins.deformation.knots import Knots
+from hoigs.plugins.deformation.on_host import on_host
 
 PROBES = 64  # Gaussians whose paths stand for all
 NEAR = 0.05  # metres; what is nearer to the camera, or behind it, is not measured
@@ -57,6 +58,8 @@ class MovingCurve(Protocol):
     knot_axes: Mapping[str, int]  # parameter name to the axis along which its knots lie
 
     def get_parameter(self, target: str) -> nn.Parameter: ...
+
+    def modules(self) -> Iterator[nn.Module]: ...
 
     def resampled(self, times: Sequence[float], fit: Sequence[float]) -> dict[str, Tensor]:
         """Parameters of this same motion with knots at `times`; fitted to the present motion at
@@ -140,9 +143,11 @@ class KnotSchedule(nn.Module):
         if not due:
             return {}
         before = curve.knots.tolist()
-        self.remove(curve, rest)
-        if due == "both":
-            self.insert(curve, rest)
+        with on_host(curve), on_host(self):
+            near = rest.to("cpu")
+            self.remove(curve, near)
+            if due == "both":
+                self.insert(curve, near)
         self.error_sum.zero_()
         self.error_count.zero_()
         after = curve.knots.tolist()

@@ -72,23 +72,35 @@ def bic(score: Score) -> float:
     return count * math.log(max(score.mse, MSE_FLOOR)) + score.parameters * math.log(count)
 
 
-def near_best(scores: Sequence[Score], least: float = 0.0, errors: float = 1.0) -> list[bool]:
+def near_best(
+    scores: Sequence[Score], least: float = 0.0, price: float = 0.0, errors: float = 1.0
+) -> list[bool]:
     """Whether each is as good as the best: within so many standard errors of the paired
-    difference, or within `least` dB, which nobody would see and another seed might turn."""
+    difference, within `least` dB, which nobody would see and another seed might turn, or within
+    `price` dB for every doubling of trained numbers up to those of the best."""
     best = max(scores, key=lambda score: score.mean)
+
+    def asked(score: Score) -> float:
+        larger = max(best.parameters, 1) / max(score.parameters, 1)
+        return max(least, price * math.log2(max(larger, 1.0)))
+
     gains = [gain(best, score) for score in scores]
-    return [g.mean <= max(errors * g.error, least) for g in gains]
+    return [g.mean <= max(errors * g.error, asked(s)) for g, s in zip(gains, scores, strict=True)]
 
 
-def choose(scores: Sequence[Score], criterion: Criterion = "one-se", least: float = 0.0) -> int:
+def choose(
+    scores: Sequence[Score], criterion: Criterion = "one-se", least: float = 0.0, price: float = 0.0
+) -> int:
     """Place of the rung to keep, of scores in order of cost."""
     if criterion == "bic":
         values = [bic(score) for score in scores]
         return values.index(min(values))
-    return near_best(scores, least).index(True)
+    return near_best(scores, least, price).index(True)
 
 
-def ranked(scores: Sequence[Score], criterion: Criterion, least: float) -> list[int]:
+def ranked(
+    scores: Sequence[Score], criterion: Criterion, least: float, price: float = 0.0
+) -> list[int]:
     """Places from the likeliest choice to the least: those that may be as good as the best by
     cost, then the others by score; the best itself is always among the first two.
 
@@ -100,7 +112,7 @@ def ranked(scores: Sequence[Score], criterion: Criterion, least: float) -> list[
     places = range(len(scores))
     if criterion == "bic":
         return sorted(places, key=lambda k: (bic(scores[k]), k))
-    near = near_best(scores, least, PATIENCE)
+    near = near_best(scores, least, price, PATIENCE)
     order = sorted(places, key=lambda k: (not near[k], k if near[k] else -scores[k].mean))
     best = max(places, key=lambda k: scores[k].mean)
     if order.index(best) > 1:

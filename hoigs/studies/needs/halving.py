@@ -125,6 +125,7 @@ def climb(
     what: str = "",
     criterion: Criterion = "one-se",
     least: float = 0.0,
+    price: float = 0.0,
 ) -> Climbed:
     """Halve until two rungs are left, and choose between them.
 
@@ -139,11 +140,11 @@ def climb(
     alive, before = list(range(len(costs))), 0
     for count, until in zip(plan.alive, plan.until, strict=True):
         if len(alive) > count:
-            order = ranked([looks[k][before] for k in alive], criterion, least)
+            order = ranked([looks[k][before] for k in alive], criterion, least, price)
             alive = sorted(alive[place] for place in order[:count])
         for k in alive:
             ledger.spend(f"{what}[{k}]", costs[k] * (until - before + SCORING * frames))
             looks[k][until] = advance(k, until)
         before = until
-    chosen = alive[choose([looks[k][before] for k in alive], criterion, least)]
+    chosen = alive[choose([looks[k][before] for k in alive], criterion, least, price)]
     return Climbed(chosen, tuple(looks))

@@ -156,7 +156,7 @@ class Pruning:
                 self._uniform(key, names[0])
 
     def _schedule(self, pixels: float) -> KnotSchedule:
-        return measure(self.trained.clip, pixels).to(self.trained.model.device)
+        return measure(self.trained.clip, pixels)
 
     def _movable(self, name: str, curve: Knotted) -> None:
         """Knots of one adaptive spline."""

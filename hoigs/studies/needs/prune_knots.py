@@ -23,6 +23,7 @@ from hoigs.plugins.deformation.knot_schedule import (
     MovingCurve,
 )
 from hoigs.plugins.deformation.knots import Knots
+from hoigs.plugins.deformation.on_host import on_host
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 
 FEWEST = 2
@@ -43,7 +44,7 @@ def is_knotted(deformation: object) -> TypeGuard[Knotted]:
 
 
 def measure(clip: Clip, pixels: float) -> KnotSchedule:
-    """The test of one pixel against the cameras of a clip, one a frame."""
+    """The test of one pixel against the cameras of a clip, one a frame; it is done on the CPU."""
     config = AdaptiveKnotsConfig(pixels=pixels)
     return KnotSchedule.from_context(config, BuildContext(clip=clip))
 
@@ -65,7 +66,8 @@ def as_movable(curve: Knotted, rest: Gaussians) -> Iterator[None]:
 def remove_movable(curve: Knotted, rest: Gaussians, schedule: KnotSchedule) -> int:
     """Take out knots of an adaptive spline; how many went."""
     before = len(curve.knots)
-    schedule.remove(curve, rest)
+    with on_host(curve):
+        schedule.remove(curve, rest.to("cpu"))
     return before - len(curve.knots)
 
 
@@ -74,13 +76,14 @@ def fewer_uniform(
     curve: Knotted, rest: Gaussians, schedule: KnotSchedule
 ) -> tuple[int, dict[str, Tensor]]:
     """The fewest uniform knots whose refitted motion stays within `pixels` of the present one, and
-    the parameters at them; tangents are per interval of the new knots.
+    the parameters at them, on the CPU; tangents are per interval of the new knots.
 
     Each count is refitted to the motion as it is now, one fewer at a time, until one fails.
     """
     count = len(curve.knots)
-    best, values = count, _values(curve)
-    with as_movable(curve, rest):
+    rest = rest.to("cpu")
+    with on_host(curve), as_movable(curve, rest):
+        best, values = count, _values(curve)
         still, fit = schedule.screen(curve, rest), schedule.sample_times()
         for fewer in range(count - 1, FEWEST - 1, -1):
             with KnotTrial(curve) as trial:

@@ -13,6 +13,7 @@ import torch
 from hoigs.core.clip import Clip
 from hoigs.core.gaussians import Gaussians
 from hoigs.plugins.deformation.knot_schedule import KnotSchedule, KnotTrial
+from hoigs.plugins.deformation.on_host import on_host
 from hoigs.plugins.deformation.rigid_spline import RigidSpline
 from hoigs.plugins.deformation.static import Static
 from hoigs.studies.needs.prune_knots import Knotted, as_movable, measure
@@ -38,7 +39,7 @@ def cheapest_refit(
     curves = [e.deformation for e in entities if type(e.deformation) is RigidSpline]
     if len(curves) < len(entities):
         return place
-    schedule = measure(clip, UNSEEN).to(chosen.model.device)
+    schedule = measure(clip, UNSEEN)
     for cheaper in range(place):
         trial = trials[rungs[cheaper].name]
         counts = [_uniform_knots(trial.model.entity(name).deformation) for name in chosen.names]
@@ -60,12 +61,14 @@ def _uniform_knots(deformation: object) -> int | None:
 @torch.no_grad()
 def _held(curve: Knotted, rest: Gaussians, count: int, schedule: KnotSchedule) -> bool:
     """Whether nothing moves by `UNSEEN` pixels when `count` uniform knots have to do."""
-    still = schedule.screen(curve, rest)
-    if count == 1:
-        middle = curve.traced(rest, [0.5] * len(schedule.frame_times))
-        return schedule.deviation(still, schedule.on_screen(middle)) <= UNSEEN
-    if count >= len(curve.knots):
-        return False
-    with as_movable(curve, rest), KnotTrial(curve) as trial:
-        trial.place([k / (count - 1) for k in range(count)], schedule.sample_times())
-        return schedule.deviation(still, schedule.screen(curve, rest)) <= UNSEEN
+    rest = rest.to("cpu")
+    with on_host(curve):
+        still = schedule.screen(curve, rest)
+        if count == 1:
+            middle = curve.traced(rest, [0.5] * len(schedule.frame_times))
+            return schedule.deviation(still, schedule.on_screen(middle)) <= UNSEEN
+        if count >= len(curve.knots):
+            return False
+        with as_movable(curve, rest), KnotTrial(curve) as trial:
+            trial.place([k / (count - 1) for k in range(count)], schedule.sample_times())
+            return schedule.deviation(still, schedule.screen(curve, rest)) <= UNSEEN

@@ -55,6 +55,7 @@ class Ladder(ComponentConfig):
         rungs: cheapest first.
         share: of the search's budget, against the other ladders.
         least: dB within which a cheaper rung is taken; None goes by the search's settings.
+        price: dB that a rung must bring for every doubling of the trial's trained numbers.
         during: laid under each rung while it is tried, and no longer.
         unless: ladder to rungs; a ladder is left out where one of these has been chosen.
         else_cheapest: a ladder that is left out takes its first rung, else it changes nothing.
@@ -66,6 +67,7 @@ class Ladder(ComponentConfig):
     rungs: tuple[Rung, ...] = Field(min_length=2)
     share: float = Field(1.0, gt=0)
     least: float | None = Field(None, ge=0)
+    price: float = Field(0.0, ge=0)
     during: Overrides = Field(default_factory=dict)
     unless: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     else_cheapest: bool = False

@@ -253,6 +253,7 @@ class Search:
                 what=f"{ladder.name} {block}".strip(),
                 criterion=self.settings.criterion,
                 least=self.settings.least if ladder.least is None else ladder.least,
+                price=ladder.price,
             )
             place = cheapest_refit(tried, climbed.chosen, trials, self.clip)
             if place != climbed.chosen:

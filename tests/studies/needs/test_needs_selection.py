@@ -55,6 +55,20 @@ def test_equal_rungs_give_the_cheapest():
     assert choose([score(20, 21), score(20, 21), score(20, 21)]) == 0
 
 
+def test_a_doubling_of_numbers_has_its_price():
+    """What is four times as large must bring twice the price, and more than its error."""
+    small = score(20, 22, 24, parameters=1000)
+    large = score(21.4, 23.5, 25.6, parameters=4000)  # 1.5 dB better
+    assert choose([small, large], price=0.74) == 1
+    assert choose([small, large], price=0.76) == 0
+    few = score(21.4, 23.5, 25.6, parameters=10)
+    assert choose([small, few], price=9) == 1  # nothing to pay for
+    table = [small, score(20, 22, 24, parameters=2000), large]
+    assert ranked(table, "one-se", 0.1, 0.76) == [0, 2, 1]  # 1.5 dB over half of it is worth it
+    assert ranked(table, "one-se", 0.1, 2.0) == [0, 2, 1]  # the best stays all the same
+    assert ranked(table, "one-se", 0.1) == [2, 0, 1]
+
+
 def test_least_gain_counts_for_nothing():
     table = [score(25, 26, 27), score(25.05, 26.06, 27.05)]
     assert choose(table) == 1
@@ -80,7 +94,7 @@ def test_the_best_is_not_crowded_out_by_those_that_few_frames_cannot_tell_from_i
     """Three frames that disagree: cheap rungs are within 1.5 standard errors, decibels below."""
     cheap, cheaper = score(10, 10.5, 19), score(10.2, 10, 19)
     table = [cheaper, cheap, score(10, 10.5, 19.5), score(16, 10.5, 19)]
-    assert near_best(table, 0.1, PATIENCE) == [True] * 4
+    assert near_best(table, 0.1, errors=PATIENCE) == [True] * 4
     assert ranked(table, "one-se", 0.1) == [0, 3, 1, 2]
 
 
