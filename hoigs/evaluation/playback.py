@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from hoigs.core.camera import Camera
+from hoigs.core.capture import capturing
 from hoigs.core.errors import RenderError
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.moment import Moment
@@ -278,9 +279,9 @@ class Playback:
                 self._packed.copy_(self._pack(moment, camera))
                 self._deform()
                 self._draw()
-            with torch.cuda.graph(graphs[0], stream=side, capture_error_mode="thread_local"):
+            with capturing(graphs[0], side):
                 self._deform()
-            with torch.cuda.graph(graphs[1], stream=side, capture_error_mode="thread_local"):
+            with capturing(graphs[1], side):
                 self._output = self._draw()
         torch.cuda.current_stream(device).wait_stream(side)
         self._graphs = graphs

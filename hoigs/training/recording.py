@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from hoigs.core.capture import capturing
+
 Key = tuple[str, ...]
 Compute = Callable[[Mapping[str, Tensor]], dict[Key, Tensor]]
 
@@ -137,13 +139,12 @@ class Recording:
         current = torch.cuda.current_stream(stream.device)
         stream.wait_stream(current)
         graphs = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
-        settings: dict[str, Any] = {"stream": stream, "capture_error_mode": "thread_local"}
         # the stream outside too: a capture that fails does not restore the one before
         with torch.cuda.device(stream.device), torch.cuda.stream(stream):
             self._rehearse()
-            with torch.cuda.graph(graphs[0], **settings):
+            with capturing(graphs[0], stream):
                 self._run()
-            with torch.cuda.graph(graphs[1], pool=graphs[0].pool(), **settings):
+            with capturing(graphs[1], stream, pool=graphs[0].pool()):
                 self._run_backward()
         current.wait_stream(stream)
         self.live = {key: value.detach() for key, value in self.live.items()}

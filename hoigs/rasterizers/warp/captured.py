@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from hoigs.core.camera import Camera
+from hoigs.core.capture import capturing
 from hoigs.core.errors import RenderError
 from hoigs.core.gaussians import Gaussians
 from hoigs.core.rasterizer import RenderOutput, RenderRequest
@@ -101,7 +102,7 @@ class CapturedRender:
         with torch.no_grad(), torch.cuda.device(device):
             with torch.cuda.stream(side):  # kernels are compiled, and pairs counted
                 self._draw()
-            with torch.cuda.graph(self._graph, stream=side, capture_error_mode="thread_local"):
+            with capturing(self._graph, side):
                 self._output, self._room = self._draw()
         torch.cuda.current_stream(device).wait_stream(side)
         self.captures += 1
