@@ -52,9 +52,11 @@ class InteractionModule(nn.Module, ABC):
 
     Attributes:
         recordable: as DeformationModel.recordable.
+        reads: whether it reads tokens and roles; where it does not, they are not computed.
     """
 
     recordable: bool = False
+    reads: bool = True
 
     @classmethod
     def from_config(cls, config: Any, context: BuildContext) -> Self:

@@ -98,13 +98,14 @@ class SceneModel(nn.Module):
         names = list(self.entities if only is None else only)
         tokens: dict[str, Tokens] = {}
         residuals: Mapping[str, Residual] = {}
-        if self.interaction is not None and self.interaction_enabled:
+        module = self.interaction
+        if module is not None and module.reads and self.interaction_enabled:
             for name in self.entities:
                 described = self.entity(name).tokens(moment)
                 if described is not None:
                     tokens[name] = described
             roles = {name: self.entity(name).role(moment) for name in self.entities}
-            residuals = self.interaction(tokens, roles)
+            residuals = module(tokens, roles)
         gaussians = {n: self.entity(n)(moment, residuals.get(n)) for n in names}
         return SceneState(gaussians, residuals, tokens)
 

@@ -59,6 +59,15 @@ def knot_pair(values: Float[Tensor, "N K ..."], k: Any) -> tuple[Tensor, Tensor]
     return values[:, k], values[:, k + 1]
 
 
+# `hermite_basis` and its derivative in powers 1, r, r^2, r^3: a column for each of the four weights
+HERMITE = (
+    (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (-3.0, -2.0, 3.0, -1.0), (2.0, 1.0, -2.0, 1.0)
+)  # fmt: skip
+HERMITE_RATES = (
+    (0.0, 1.0, 0.0, 0.0), (-6.0, -4.0, 6.0, -2.0), (6.0, 3.0, -6.0, 3.0), (0.0, 0.0, 0.0, 0.0)
+)  # fmt: skip
+
+
 def hermite_basis(r: Any) -> tuple[Any, Any, Any, Any]:
     """Weights of m_k, tau_k, m_{k+1}, tau_{k+1} at r in [0, 1] (HOIGS, equation of CHS)."""
     return (

@@ -183,7 +183,7 @@ class Articulated(RigidSpline):
     @torch.no_grad()
     def traced(self, rest: Gaussians, times: Sequence[float]) -> Float[Tensor, "T P 3"]:
         rows = probe_rows(len(rest)).to(rest.means.device)
-        quats, places, _, _ = self.poses(times)
+        quats, places = self.placed(times)
         shapes = torch.stack([self.shape(rest, time)[0][rows] for time in times])
         turned = (shapes - self.center) @ quats_to_matrices(quats).mT
         return turned + (places + self.center)[:, None]

@@ -11,11 +11,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from hoigs.core import spline
-from hoigs.core.clock import Time
+from hoigs.core.clock import Time, constant
 from hoigs.core.rotation import slerp
 from hoigs.plugins.deformation.resizing import Resizing
 
 Times = Sequence[float] | Float[Tensor, " T"]
+Spans = tuple[Int[Tensor, " T"], Float[Tensor, "T 1"], Float[Tensor, "T 1"]]
 
 
 def one_time(time: Time) -> Times:
@@ -143,21 +144,26 @@ class Knots(Resizing):
         derivative: bool = False,
     ) -> Float[Tensor, "T D"]:
         """`hermite` of one curve at many times."""
-        k, r, h = self.spans(times, values)
-        if derivative:
-            w = [x / h for x in spline.hermite_basis_derivative(r)]
-        else:
-            w = list(spline.hermite_basis(r))
-        return (
-            w[0] * values[k]
-            + w[1] * h * tangents[k]
-            + w[2] * values[k + 1]
-            + (w[3] * h * tangents[k + 1])
-        )
+        return self.hermite_in(self.spans(times, values), values, tangents, derivative=derivative)
 
-    def spans(
-        self, times: Times, like: Tensor
-    ) -> tuple[Int[Tensor, " T"], Float[Tensor, "T 1"], Float[Tensor, "T 1"]]:
+    @staticmethod
+    def hermite_in(
+        spans: Spans,
+        values: Float[Tensor, "K D"],
+        tangents: Float[Tensor, "K D"],
+        *,
+        derivative: bool = False,
+    ) -> Float[Tensor, "T D"]:
+        """`hermite_at` of times whose `spans` are known."""
+        k, r, h = spans
+        after = k + 1
+        controls = (values[k], h * tangents[k], values[after], h * tangents[after])
+        powers = r ** constant((0, 1, 2, 3), r)
+        weights = powers @ constant(spline.HERMITE_RATES if derivative else spline.HERMITE, r)
+        found = (weights[:, None] @ torch.stack(controls, 1)).squeeze(1)
+        return found / h if derivative else found
+
+    def spans(self, times: Times, like: Tensor) -> Spans:
         """`at` of many times: first knots, positions and lengths, these in the kind of `like`."""
         if not isinstance(times, Tensor):
             times = self.times.new_tensor(list(times))

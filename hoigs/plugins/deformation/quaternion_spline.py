@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -47,6 +49,11 @@ def angular_differences(
     return torch.cat((turns[:1], inner, turns[-1:]))
 
 
+# what each factor of the curve has turned at r of the interval, in powers r, r^2, r^3, and its rate
+CUMULATIVE = ((3.0, 0.0, 0.0), (-3.0, 3.0, 0.0), (1.0, -2.0, 1.0))
+RATES = ((3.0, 0.0, 0.0), (-6.0, 6.0, 0.0), (3.0, -6.0, 3.0))
+
+
 def hermite_quats(
     a: Float[Tensor, "*batch 4"],
     b: Float[Tensor, "*batch 4"],
@@ -66,20 +73,48 @@ def hermite_quats(
         velocity_a, velocity_b: in the frames of a and b, radians per unit.
         length: of the interval, in the same unit.
     """
-    a, b = normalize_quats(a), normalize_quats(b)
-    w1, w3 = velocity_a * (length / 3), velocity_b * (length / 3)
-    start = multiply_quats(a, axis_angle_to_quats(w1))
-    end = multiply_quats(b, axis_angle_to_quats(-w3))
-    w2 = turn_between(start, end)
-    q1 = axis_angle_to_quats(w1 * (1 - (1 - r) ** 3))
-    q2 = axis_angle_to_quats(w2 * (3 * r**2 - 2 * r**3))
-    q3 = axis_angle_to_quats(w3 * r**3)
-    quat = multiply_quats(multiply_quats(a, q1), multiply_quats(q2, q3))
+    quat, turns, factors = _factors(a, b, velocity_a, velocity_b, r, length)
+    first, second, third = (turns * _polynomials(RATES, r, turns, 0)).unbind(-2)
     # each factor's velocity, carried through the factors on its right into the final frame
-    speed = w1 * (3 * (1 - r) ** 2)
-    speed = _into(q2, speed) + w2 * (6 * r - 6 * r**2)
-    speed = _into(q3, speed) + w3 * (3 * r**2)
-    return normalize_quats(quat), speed / length
+    speed = _into(factors[..., 1, :], first) + second
+    speed = _into(factors[..., 2, :], speed) + third
+    return quat, speed / length
+
+
+def hermite_turns(
+    a: Float[Tensor, "*batch 4"],
+    b: Float[Tensor, "*batch 4"],
+    velocity_a: Float[Tensor, "*batch 3"],
+    velocity_b: Float[Tensor, "*batch 3"],
+    r: Float[Tensor, "*batch 1"] | float,
+    length: Float[Tensor, "*batch 1"] | float = 1.0,
+) -> Float[Tensor, "*batch 4"]:
+    """The rotation of `hermite_quats` alone."""
+    return _factors(a, b, velocity_a, velocity_b, r, length)[0]
+
+
+def _factors(
+    a: Tensor, b: Tensor, velocity_a: Tensor, velocity_b: Tensor, r: Any, length: Any
+) -> tuple[Tensor, Tensor, Tensor]:
+    """q(r), and along the axis before the last w1, w2, w3 and the three factors. What is alike is
+    computed together: on a GPU each of these small steps costs its launch."""
+    ends = normalize_quats(torch.stack((a, b), -2))
+    w1, w3 = velocity_a * (length / 3), velocity_b * (length / 3)
+    inner = multiply_quats(ends, axis_angle_to_quats(torch.stack((w1, -w3), -2)))
+    start, end = inner.unbind(-2)
+    w2 = quats_to_axis_angle(multiply_quats(conjugate(start), end))
+    turns = torch.stack((w1, w2, w3), -2)
+    factors = axis_angle_to_quats(turns * _polynomials(CUMULATIVE, r, turns, 1))
+    q1, q2, q3 = factors.unbind(-2)
+    quat = multiply_quats(multiply_quats(ends[..., 0, :], q1), multiply_quats(q2, q3))
+    return normalize_quats(quat), turns, factors
+
+
+def _polynomials(table: Any, r: Any, like: Tensor, lowest: int) -> Tensor:
+    """Three polynomials in r, a column of `table` each, as [*batch, 3, 1]; powers from `lowest`."""
+    r = r if isinstance(r, Tensor) else like.new_full((1,), r)
+    powers = constant(tuple(range(lowest, lowest + 3)), like)
+    return (r.to(like) ** powers @ constant(table, like))[..., None]
 
 
 def _into(quat: Tensor, vector: Tensor) -> Tensor:

@@ -25,10 +25,11 @@ from hoigs.core.moment import Moment
 from hoigs.core.rotation import multiply_quats, normalize_quats, quats_to_matrices, slerp
 from hoigs.core.topology import AxisChange
 from hoigs.plugins.deformation.knot_schedule import AdaptiveKnotsConfig, KnotSchedule, probe_rows
-from hoigs.plugins.deformation.knots import Knots, Times, one_time
+from hoigs.plugins.deformation.knots import Knots, Spans, Times, one_time
 from hoigs.plugins.deformation.quaternion_spline import (
     angular_differences,
     hermite_quats,
+    hermite_turns,
     turn_between,
 )
 from hoigs.plugins.deformation.resizing import Resizing
@@ -197,19 +198,38 @@ class RigidSpline(Resizing, DeformationModel):
     ]:
         """Rotations (wxyz), translations, and their velocities per keyframe interval: the angular
         ones in the object's frame, radians, the linear ones in the world, metres."""
-        values = self.keyframe_translations
-        tangents = (
-            self.translation_tangents if self.learned else self.knots.differences(values[None])[0]
-        )
-        places = self.knots.hermite_at(values, tangents, times)
-        speeds = self.knots.hermite_at(values, tangents, times, derivative=True)
-        k, r, h = self.knots.spans(times, values)
+        spans, tangents = self._spans(times), self._tangents()
+        places = self.knots.hermite_in(spans, self.keyframe_translations, tangents)
+        speeds = self.knots.hermite_in(spans, self.keyframe_translations, tangents, derivative=True)
+        k, r, h = spans
         a, b = self.keyframe_quats[k], self.keyframe_quats[k + 1]
         if not self.smooth:
             return slerp(a, b, r), places, turn_between(a, b) / h, speeds
-        velocities = self.angular_tangents if self.learned else self._angular_differences()
+        velocities = self._velocities()
         quats, turning = hermite_quats(a, b, velocities[k], velocities[k + 1], r, h)
         return quats, places, turning, speeds
+
+    def placed(self, times: Times) -> tuple[Float[Tensor, "T 4"], Float[Tensor, "T 3"]]:
+        """Rotations and translations of `poses`, without what they cost to differentiate."""
+        spans = self._spans(times)
+        places = self.knots.hermite_in(spans, self.keyframe_translations, self._tangents())
+        k, r, h = spans
+        a, b = self.keyframe_quats[k], self.keyframe_quats[k + 1]
+        if not self.smooth:
+            return slerp(a, b, r), places
+        velocities = self._velocities()
+        return hermite_turns(a, b, velocities[k], velocities[k + 1], r, h), places
+
+    def _spans(self, times: Times) -> Spans:
+        return self.knots.spans(times, self.keyframe_translations)
+
+    def _tangents(self) -> Float[Tensor, "K 3"]:
+        if self.learned:
+            return self.translation_tangents
+        return self.knots.differences(self.keyframe_translations[None])[0]
+
+    def _velocities(self) -> Float[Tensor, "K 3"]:
+        return self.angular_tangents if self.learned else self._angular_differences()
 
     def pose(
         self, time: Time
@@ -238,7 +258,7 @@ class RigidSpline(Resizing, DeformationModel):
         self, rest: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
         means, quats = self.shape(rest, moment.time)
-        quat, place, _, _ = self.pose(moment.time)
+        (quat,), (place,) = self.placed(one_time(moment.time))
         means = (means - self.center) @ quats_to_matrices(quat).mT + (self.center + place)
         if residual is not None and residual.means is not None:
             means = means + residual.means
@@ -262,7 +282,7 @@ class RigidSpline(Resizing, DeformationModel):
     def traced(self, rest: Gaussians, times: Sequence[float]) -> Float[Tensor, "T P 3"]:
         """World positions of some Gaussians at some times, metres."""
         rows = probe_rows(len(rest)).to(rest.means.device)
-        quats, places, _, _ = self.poses(times)
+        quats, places = self.placed(times)
         turned = (rest.means[rows] - self.center) @ quats_to_matrices(quats).mT
         return turned + (places + self.center)[:, None]
 
@@ -273,7 +293,7 @@ class RigidSpline(Resizing, DeformationModel):
         if fit:
             knots = Knots(self.keyframes, movable=True).to(places.device)
             knots.place(times)
-            samples = self.poses(fit)[1]
+            samples = self.placed(fit)[1]
             places, speeds = knots.refit(samples, fit, free_tangents=self.learned)
         found = {
             "keyframe_translations": places,
@@ -301,6 +321,6 @@ class RigidSpline(Resizing, DeformationModel):
                 slack = self.angular_tangents - self._angular_differences()
                 penalties["tangent"] = penalties["tangent"] + slack.square().sum(-1).mean()
         if self.guide is not None:
-            quats, places, _, _ = self.poses(self.guide.times)
+            quats, places = self.placed(self.guide.times)
             penalties["track"] = self.guide.deviation(quats, places)
         return penalties

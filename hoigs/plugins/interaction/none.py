@@ -17,6 +17,7 @@ class NoInteraction(InteractionModule):
     """No residuals."""
 
     recordable = True
+    reads = False
 
     def forward(
         self, tokens: Mapping[str, Tokens], roles: Mapping[str, Role]

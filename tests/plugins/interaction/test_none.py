@@ -1,0 +1,51 @@
+"""Without interaction, nothing is computed for it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from hoigs.core.deformation import DeformationModel
+from hoigs.core.entity import Entity
+from hoigs.core.gaussians import Gaussians
+from hoigs.core.interaction import InteractionModule
+from hoigs.core.moment import Moment
+from hoigs.core.scene import SceneModel
+from hoigs.plugins.interaction.none import NoInteraction
+from hoigs.rasterizers.torch_tiles import TorchRasterizer
+
+
+class Asked(Exception):  # noqa: N818
+    pass
+
+
+class Walker(DeformationModel):
+    """Says when somebody wants to know where it stands."""
+
+    def forward(self, rest, moment, residual=None):
+        assert residual is None
+        return rest
+
+    def anchors(self, moment):
+        raise Asked
+
+    def arm_length(self):
+        raise Asked
+
+
+class Curious(InteractionModule):
+    def forward(self, tokens, roles):
+        return {}
+
+
+def test_roles_are_asked_for_only_where_they_are_read():
+    rest = Gaussians.from_points(torch.rand(4, 3))
+
+    def scene(interaction: InteractionModule | None) -> SceneModel:
+        human = Entity(rest, Walker(), kind="human")
+        return SceneModel({"human": human}, interaction=interaction, rasterizer=TorchRasterizer())
+
+    for interaction in (None, NoInteraction()):
+        assert scene(interaction)(Moment(0.5)).residuals == {}
+    with pytest.raises(Asked):
+        scene(Curious())(Moment(0.5))
