@@ -22,15 +22,17 @@ class Asked(Exception):  # noqa: N818
 class Walker(DeformationModel):
     """Says when somebody wants to know where it stands."""
 
+    provides = frozenset({"skeleton"})
+    entity = "human"
+
     def forward(self, rest, moment, residual=None):
         assert residual is None
         return rest
 
-    def anchors(self, moment):
+    def asked(self, *args):
         raise Asked
 
-    def arm_length(self):
-        raise Asked
+    pose = anchors = arm_length = point_parts = asked
 
 
 class Curious(InteractionModule):
