@@ -170,7 +170,7 @@ class KnotSchedule(nn.Module):
             trials = []
             for k in range(1, len(times) - 1):
                 with KnotTrial(curve) as trial:
-                    trial.place(times[:k] + times[k + 1 :], ())
+                    trial.leave_out(k)
                     trials.append((self.deviation(still, self.screen(curve, rest)), k))
             for _, k in sorted(trials)[:3]:  # the refit is dear, so only the likeliest have one
                 with KnotTrial(curve) as trial:
@@ -259,6 +259,16 @@ class KnotTrial:
     def place(self, times: Sequence[float], fit: Sequence[float]) -> None:
         values = self.curve.resampled(times, fit)
         self.curve.knots.place(times)
+        self._set(values)
+
+    def leave_out(self, k: int) -> None:
+        """One knot fewer; the others as they are."""
+        self.curve.knots.place(self.times[:k] + self.times[k + 1 :])
+        values = {}
+        for name, value in self.values.items():
+            axis = self.curve.knot_axes[name]
+            after = value.narrow(axis, k + 1, value.shape[axis] - k - 1)
+            values[name] = torch.cat((value.narrow(axis, 0, k), after), axis)
         self._set(values)
 
     def keep(self) -> None:

@@ -191,17 +191,15 @@ class Knots(Resizing):
         """
         count = len(self)
         kind: dict[str, Any] = {"dtype": torch.float64, "device": samples.device}
-        rows = torch.zeros(len(sample_times), 2 * count, **kind)
-        for i, time in enumerate(sample_times):
-            k, r, h = self.at(time)
-            weights = spline.hermite_basis(r)
-            columns = (k, count + k, k + 1, count + k + 1)
-            for column, weight, unit in zip(columns, weights, (1.0, h, 1.0, h), strict=True):
-                rows[i, column] += unit * weight
+        target = samples.to(torch.float64)
+        k, r, h = self.spans(sample_times, target)
+        weights = r ** constant((0, 1, 2, 3), r) @ constant(spline.HERMITE, r)
+        weights = weights * torch.cat((torch.ones_like(h), h), 1).repeat(1, 2)
+        columns = torch.stack((k, count + k, k + 1, count + k + 1), 1)
+        rows = torch.zeros(len(target), 2 * count, **kind).scatter(1, columns, weights)
         eye = torch.eye(count, **kind)
         differences = self.differences(eye[None])[0]
         whole = torch.cat((eye, differences))  # values to values and their difference tangents
-        target = samples.to(torch.float64)
         if not free_tangents:
             solution = whole @ torch.linalg.lstsq(rows @ whole, target).solution
         else:
