@@ -55,11 +55,10 @@ CASES = {
 }
 
 
-def run(case: Case, seed: int, options: argparse.Namespace) -> dict[str, Any]:
-    """One search; what was chosen, whether that is right, and what it cost."""
+def search_of(case: Case, seed: int, options: argparse.Namespace, kind: type[Any]) -> Any:
+    """A search of `kind`, of the ladders that the case speaks of."""
     from hoigs.studies.needs.rungs import load_ladders
-    from hoigs.studies.needs.search import Search, Settings, told
-    from hoigs.studies.needs.write_needs import as_data
+    from hoigs.studies.needs.search import Settings
     from hoigs.training.session import read_clip
 
     clip = read_clip(
@@ -72,9 +71,16 @@ def run(case: Case, seed: int, options: argparse.Namespace) -> dict[str, Any]:
     ladders = [ladder for ladder in load_ladders() if options.all or ladder.name in wanted]
     given = (f"train.steps={options.steps}", f"train.seed={seed}",
              "model.human.points=2000", "model.human.deformation.resolution=32")  # fmt: skip
-    settings = Settings(options.criterion, share=options.share)
+    return kind(clip, "hoigs", ladders, given, Settings(options.criterion, share=options.share))
+
+
+def run(case: Case, seed: int, options: argparse.Namespace) -> dict[str, Any]:
+    """One search; what was chosen, whether that is right, and what it cost."""
+    from hoigs.studies.needs.search import Search, told
+    from hoigs.studies.needs.write_needs import as_data
+
     began = time.process_time()
-    needs = Search(clip, "hoigs", ladders, given, settings).run()
+    needs = search_of(case, seed, options, Search).run()
     chosen = {a.ladder.name: a.chosen.name for a in needs.answers if a.chosen is not None}
     return {
         "chosen": chosen,
