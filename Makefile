@@ -47,7 +47,8 @@ stress: $(INSTALLED)
 		--seeds $(STRESS_SEEDS) --steps $(STRESS_STEPS) --jobs $(STRESS_JOBS) --threads 1 \
 		--out $(STRESS_OUT)
 	mkdir -p docs/results/stress
-	cp $(STRESS_OUT)/stress* docs/results/stress/
+	cp $(addprefix $(STRESS_OUT)/,stress.md stress.json stress-matrix.png stress-curves.png) \
+		docs/results/stress/
 
 # fragments of changelog.d, collected into CHANGELOG.md
 changelog: $(INSTALLED)

@@ -155,7 +155,8 @@ def _verdict(
         return Verdict(case.id, label, status, found.measured)  # type: ignore[arg-type]
     mine = [p for p in progress if p.chain.case is case and p.chain.spec.label == label]
     seeds = [Seed(p.chain.seed, tuple(p.levels)) for p in mine]
-    done = [p.chain.jobs[0] for p in mine if p.chain.jobs[0].state() is JobState.done]
+    jobs = [job for p in mine for job in p.chain.jobs[: len(p.levels)]]
+    done = [job for job in jobs if job.state() is JobState.done]
     costs = [read_cost(job.folder) for job in done]
     machines = tuple(dict.fromkeys(word for cost in costs for word in cost.machines))
     protocol = protocol_of(done[0].scores(), costs[0]) if done else ()
