@@ -158,8 +158,7 @@ class Knots(Resizing):
         k, r, h = spans
         after = k + 1
         controls = (values[k], h * tangents[k], values[after], h * tangents[after])
-        powers = r ** constant((0, 1, 2, 3), r)
-        weights = powers @ constant(spline.HERMITE_RATES if derivative else spline.HERMITE, r)
+        weights = _weights(r, spline.HERMITE_RATES if derivative else spline.HERMITE)
         found = (weights[:, None] @ torch.stack(controls, 1)).squeeze(1)
         return found / h if derivative else found
 
@@ -193,8 +192,7 @@ class Knots(Resizing):
         kind: dict[str, Any] = {"dtype": torch.float64, "device": samples.device}
         target = samples.to(torch.float64)
         k, r, h = self.spans(sample_times, target)
-        weights = r ** constant((0, 1, 2, 3), r) @ constant(spline.HERMITE, r)
-        weights = weights * torch.cat((torch.ones_like(h), h), 1).repeat(1, 2)
+        weights = _weights(r, spline.HERMITE) * torch.cat((torch.ones_like(h), h), 1).repeat(1, 2)
         columns = torch.stack((k, count + k, k + 1, count + k + 1), 1)
         rows = torch.zeros(len(target), 2 * count, **kind).scatter(1, columns, weights)
         eye = torch.eye(count, **kind)
@@ -208,6 +206,12 @@ class Knots(Resizing):
             solution = torch.linalg.lstsq(torch.cat((rows, ties)), target).solution
         values, tangents = solution.to(samples.dtype).split(count)
         return values, tangents
+
+
+def _weights(r: Float[Tensor, "T 1"], table: Any) -> Float[Tensor, "T 4"]:
+    """Of values and tangents at both ends of an interval, at r in it; `table` is spline.HERMITE or
+    spline.HERMITE_RATES."""
+    return r ** constant((0, 1, 2, 3), r) @ constant(table, r)
 
 
 def _hermite(

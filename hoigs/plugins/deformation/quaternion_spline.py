@@ -73,7 +73,7 @@ def hermite_quats(
         velocity_a, velocity_b: in the frames of a and b, radians per unit.
         length: of the interval, in the same unit.
     """
-    quat, turns, factors = _factors(a, b, velocity_a, velocity_b, r, length)
+    quat, turns, factors = hermite_factors(a, b, velocity_a, velocity_b, r, length)
     first, second, third = (turns * _polynomials(RATES, r, turns, 0)).unbind(-2)
     # each factor's velocity, carried through the factors on its right into the final frame
     speed = _into(factors[..., 1, :], first) + second
@@ -81,23 +81,12 @@ def hermite_quats(
     return quat, speed / length
 
 
-def hermite_turns(
-    a: Float[Tensor, "*batch 4"],
-    b: Float[Tensor, "*batch 4"],
-    velocity_a: Float[Tensor, "*batch 3"],
-    velocity_b: Float[Tensor, "*batch 3"],
-    r: Float[Tensor, "*batch 1"] | float,
-    length: Float[Tensor, "*batch 1"] | float = 1.0,
-) -> Float[Tensor, "*batch 4"]:
-    """The rotation of `hermite_quats` alone."""
-    return _factors(a, b, velocity_a, velocity_b, r, length)[0]
-
-
-def _factors(
-    a: Tensor, b: Tensor, velocity_a: Tensor, velocity_b: Tensor, r: Any, length: Any
-) -> tuple[Tensor, Tensor, Tensor]:
-    """q(r), and along the axis before the last w1, w2, w3 and the three factors. What is alike is
-    computed together: on a GPU each of these small steps costs its launch."""
+def hermite_factors(
+    a: Tensor, b: Tensor, velocity_a: Tensor, velocity_b: Tensor, r: Any, length: Any = 1.0
+) -> tuple[Float[Tensor, "*batch 4"], Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3 4"]]:
+    """Of `hermite_quats`, whose arguments these are: q(r) alone, then w1, w2, w3 in radians and
+    their three factors. What is alike is computed together: on a GPU each of these small steps
+    costs its launch."""
     ends = normalize_quats(torch.stack((a, b), -2))
     w1, w3 = velocity_a * (length / 3), velocity_b * (length / 3)
     inner = multiply_quats(ends, axis_angle_to_quats(torch.stack((w1, -w3), -2)))

@@ -28,8 +28,8 @@ from hoigs.plugins.deformation.knot_schedule import AdaptiveKnotsConfig, KnotSch
 from hoigs.plugins.deformation.knots import Knots, Spans, Times, one_time
 from hoigs.plugins.deformation.quaternion_spline import (
     angular_differences,
+    hermite_factors,
     hermite_quats,
-    hermite_turns,
     turn_between,
 )
 from hoigs.plugins.deformation.resizing import Resizing
@@ -218,7 +218,7 @@ class RigidSpline(Resizing, DeformationModel):
         if not self.smooth:
             return slerp(a, b, r), places
         velocities = self._velocities()
-        return hermite_turns(a, b, velocities[k], velocities[k + 1], r, h), places
+        return hermite_factors(a, b, velocities[k], velocities[k + 1], r, h)[0], places
 
     def _spans(self, times: Times) -> Spans:
         return self.knots.spans(times, self.keyframe_translations)

@@ -22,12 +22,12 @@ from hoigs.studies.needs.prune_knots import (
 )
 from hoigs.studies.needs.prune_planes import ONE, as_one, from_one, time_planes
 from hoigs.studies.needs.prune_splats import rows_to_lose, sensitivities, take_out
+from hoigs.studies.needs.search import SETTLE
 from hoigs.studies.needs.trained import Trained, state_prefix
 from hoigs.training.trainer import Trainer
 
 VISIBLE = 0.05  # dB that one cut may cost in any region, before the model is tuned to it
 PIXELS = (1.0, 0.5, 0.25)  # that nothing may move by when knots go, until nobody sees it
-SETTLE = 0.1  # of the rates without an end of their own is left when a tuning ends, at most
 VIEWS = 16  # training frames whose pictures tell which Gaussians matter
 
 NO_INTERACTION = "interaction:none"

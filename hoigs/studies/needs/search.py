@@ -30,7 +30,7 @@ from hoigs.studies.needs.trial import Trial, alone
 TOTAL = 2.5  # full trainings that the search and what comes after it may cost together
 FINAL, AFTER = 1.0, 0.1  # of these: the final training, and a reserve for work on its result
 SETTLES = "train.rates.settle"
-SETTLE = 0.1  # of trials and of the answer: at steady rates, where one ends is a matter of chance
+SETTLE = 0.1  # of trials, answer and tuning: at steady rates, where one ends is a matter of chance
 
 Report = Callable[[str], None]
 
