@@ -132,9 +132,11 @@ class JointObjective:
             weights["regularizer/camera"] = self.spec.regularizers.get("camera", CAMERA_WEIGHT)
         for name, residual in state.residuals.items():
             self._restrain(name, residual, terms, weights)
-        total = 0 * composite.color.sum()  # of a frame that tells nothing
+        total = composite.color.new_zeros(())
         for name, term in terms.items():
             total = total + weights[name] * term
+        if not total.requires_grad:  # a frame that tells nothing
+            total = total + 0 * composite.color.sum()
         return ObjectiveResult(terms, total, state, composite, offsets, weights, absolutes)
 
     def _deform(self, moment: Moment) -> Deformed:
@@ -158,7 +160,9 @@ class JointObjective:
         offsets: Tensor,
         absolutes: Tensor | None,
     ) -> dict[str, Tensor]:
-        terms = {}
+        terms: dict[str, Tensor] = {}
+        if self.weights["scene"] == 0:
+            return terms
         blank = frame.ignored
         dssim = (self.spec.lambda_dssim, self.spec.ssim)
         if self.spec.scene_loss in ("full", "both"):
@@ -171,19 +175,33 @@ class JointObjective:
         left_out = frame.masks if kind == "background" else modelled
         told = not frame.unknown & {*left_out, *self.model.entities}  # what to leave out is known
         if kind in ("masked", "both", "background") and scenes and told:
-            request = RenderRequest()
-            if kind != "both":  # where the composite is not compared, density control looks here
-                request = RenderRequest(
-                    screen_offsets=_of(scenes, state, offsets),
-                    absolute_gradients=None if absolutes is None else _of(scenes, state, absolutes),
-                )
-            alone = self.model.rasterizer.render(state.joined(scenes), camera, request)
+            alone = self._scene_alone(camera, state, composite, offsets, absolutes)
             dynamic = union(left_out.values())
             if dynamic is not None:
                 dynamic = dilate(dynamic, self.spec.dilate)
             hidden = union(m for m in (dynamic, blank) if m is not None)
             terms["scene/masked"] = scene_only_loss(alone.color, image, hidden, *dssim)
         return terms
+
+    def _scene_alone(
+        self,
+        camera: Camera,
+        state: SceneState,
+        composite: RenderOutput,
+        offsets: Tensor,
+        absolutes: Tensor | None,
+    ) -> RenderOutput:
+        """Without people and things. Where the composite is not compared, density control looks
+        here."""
+        scenes, request = self.model.names("scene"), RenderRequest()
+        if self.spec.scene_loss != "both":
+            if len(scenes) == len(self.model.entities):
+                return composite
+            request = RenderRequest(
+                screen_offsets=_of(scenes, state, offsets),
+                absolute_gradients=None if absolutes is None else _of(scenes, state, absolutes),
+            )
+        return self.model.rasterizer.render(state.joined(scenes), camera, request)
 
     def _alone(
         self, name: str, kind: str, crop: Crop, state: SceneState, generator: torch.Generator

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
+from typing import Any
 
 import torch
 from small_clip import small_clip
@@ -10,6 +12,7 @@ from small_clip import small_clip
 from hoigs.core.clip import Clip, Frame
 from hoigs.core.entity import Entity
 from hoigs.core.gaussians import Gaussians
+from hoigs.core.rasterizer import RenderOutput
 from hoigs.core.scene import SceneModel
 from hoigs.core.train_spec import LossSpec, TrainSpec
 from hoigs.evaluation.evaluate import evaluate
@@ -19,9 +22,24 @@ from hoigs.training.objective import JointObjective
 from hoigs.training.trainer import Trainer
 
 
-def model(clip: Clip) -> SceneModel:
+class Counting(TorchRasterizer):
+    """How often it was asked."""
+
+    asked = 0
+
+    def render(self, *arguments: Any, **named: Any) -> RenderOutput:
+        self.asked += 1
+        return super().render(*arguments, **named)
+
+
+def model(clip: Clip, *, beside: bool = False) -> SceneModel:
+    """A scene; `beside`: and a thing far behind all cameras."""
     points = Gaussians.from_points(clip.points, clip.point_colors, scales=0.12, opacity=0.6)
-    return SceneModel({"scene": Entity(points, Static())}, rasterizer=TorchRasterizer())
+    entities = {"scene": Entity(points, Static())}
+    if beside:
+        behind = points.replace(means=points.means - 1000)
+        entities["object"] = Entity(behind, Static(), kind="object")
+    return SceneModel(entities, rasterizer=Counting())
 
 
 def gradient(scene: SceneModel, frame: Frame, loss: str) -> torch.Tensor:
@@ -51,16 +69,31 @@ def test_what_is_painted_there_changes_no_gradient() -> None:
 def test_a_scene_drawn_alone_tells_density_control_where_to_grow() -> None:
     """`screen_offsets` take part in the picture that is compared, whichever that is."""
     clip = small_clip()
-    scene, frame = model(clip), clip[2]
-    found = {}
-    for loss in ("full", "masked", "background"):
+    frame, found = clip[2], {}
+    for loss, others in product(("full", "masked", "background"), (False, True)):
+        scene = model(clip, beside=others)
         spec = LossSpec(scene_loss=loss, ssim="torch")  # type: ignore[arg-type]
         result = JointObjective(scene, spec, "none")(frame, frame.camera, torch.Generator())
         result.total.backward()
-        found[loss] = result.screen_offsets.grad
-    assert found["full"] is not None and found["full"].norm() > 0
-    for loss in ("masked", "background"):  # nothing is masked here: the same picture
-        torch.testing.assert_close(found[loss], found["full"], rtol=1e-3, atol=1e-7)
+        gradient = result.screen_offsets.grad
+        assert gradient is not None
+        found[loss, others] = gradient[: len(scene.entity("scene"))]
+        # a scene that is all there is was drawn already
+        assert scene.rasterizer.asked == (2 if others and loss != "full" else 1)  # type: ignore[union-attr]
+    assert found["full", False].norm() > 0
+    for gradient in found.values():  # nothing is masked here: the same picture
+        torch.testing.assert_close(gradient, found["full", False], rtol=1e-3, atol=1e-7)
+
+
+def test_what_has_no_weight_is_not_computed() -> None:
+    clip = small_clip()
+    scene, frame = model(clip), clip[2]
+    for loss in ("full", "masked", "both"):
+        spec = LossSpec(scene_loss=loss, ssim="torch", scene=0.0)  # type: ignore[arg-type]
+        result = JointObjective(scene, spec, "none")(frame, frame.camera, torch.Generator())
+        result.total.backward()  # of a frame that tells nothing, too
+        assert not result.terms and result.total.item() == 0
+    assert scene.rasterizer.asked == 3  # type: ignore[union-attr]
 
 
 def test_a_background_learns_nothing_from_people_that_the_model_has_not() -> None:

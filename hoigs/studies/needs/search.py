@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import median
 
 from hoigs.core.clip import Clip
 from hoigs.core.errors import SpecError
@@ -211,10 +212,12 @@ class Search:
         self.ledger.spend("pace of a full training", steps + SCORING * len(self.held))
         spec, registry = self._spec(trial), self._registry()
         model = Trial(spec, self.view, "background", names, registry, self.device)
-        model.trainer.train(until=2)
-        began = time.perf_counter()
-        model.trainer.train(until=steps)
-        return (time.perf_counter() - began) / (steps - 2)
+        paces = []
+        for step in range(1, steps + 1):
+            began = time.perf_counter()
+            model.trainer.train(until=step)
+            paces.append(time.perf_counter() - began)
+        return median(paces[2:])  # one of them may capture CUDA graphs
 
     def _registry(self) -> Registry:
         assert self.registry is not None
