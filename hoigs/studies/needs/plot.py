@@ -5,61 +5,126 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+from hoigs.studies.chart_labels import Box, place
+from hoigs.studies.chart_style import PALETTE, QUIET, STYLE, ink_of, is_log, short_number
 from hoigs.studies.needs.search import Answer, Needs, Step
 
-WIDTH, HEIGHT = 3.6, 3.0  # inches of a panel
-COLUMNS = 3
-SPAN = 4.0
+WIDTH, HEIGHT = 4.3, 3.5  # inches of a panel
+COLUMNS, DPI = 3, 130
+TRIED, TAKEN = PALETTE[0], PALETTE[1]
 
 
 def draw(needs: Needs, *paths: Path) -> None:
     """Write the plot to every path, in the format of its suffix."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    with matplotlib.rc_context(STYLE):
+        figure = _figure(needs)
+        for path in paths:
+            figure.savefig(path, format=path.suffix.removeprefix("."), dpi=DPI)
 
+
+def _figure(needs: Needs) -> Figure:
     answers = [a for a in needs.answers if any(s.score for s in a.steps)]
     columns = max(1, min(COLUMNS, len(answers)))
     rows = max(1, math.ceil(len(answers) / columns))
-    figure = Figure(figsize=(columns * WIDTH, rows * HEIGHT), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(f"{needs.clip}: error on training frames held back")
-    for place, answer in enumerate(answers, 1):
-        _panel(figure.add_subplot(rows, columns, place), answer)
-    for path in paths:
-        figure.savefig(path, format=path.suffix.removeprefix("."), dpi=130)
+    figure = Figure(figsize=(columns * WIDTH, rows * HEIGHT), layout="constrained", dpi=DPI)
+    canvas = FigureCanvasAgg(figure)
+    figure.suptitle(
+        f"What {needs.clip} needs: error on training frames held back, by trained parameters",
+        weight="bold",
+    )
+    panels = []
+    for number, answer in enumerate(answers, 1):
+        axes = figure.add_subplot(rows, columns, number)
+        _panel(axes, answer)
+        panels.append((axes, answer))
+    figure.supxlabel(
+        "trained parameters of the trial (a star: what was taken; pale: given up on the way, after "
+        "fewer steps)",
+        size=8.5, color=QUIET,
+    )  # fmt: skip
+    canvas.draw()
+    figure.set_layout_engine("none")  # labels are placed where everything stands now
+    for axes, answer in panels:
+        _name(axes, answer)
+    return figure
 
 
-def _panel(axes: object, answer: Answer) -> None:
-    from matplotlib.axes import Axes
-
-    assert isinstance(axes, Axes)
-    shown = [s for s in answer.steps if s.score is not None]
+def _panel(axes: Axes, answer: Answer) -> None:
+    """One ladder's points and axes."""
+    shown = _shown(answer)
     longest = max(s.steps for s in shown)
     for step in shown:
         parameters, error, spread = _point(step)
         taken = step.rung is answer.chosen
         axes.errorbar(
-            [parameters], [error], yerr=[spread], capsize=2, color="C3" if taken else "C0",
-            marker="*" if taken else "o", markersize=11 if taken else 5,
-            alpha=1.0 if step.steps == longest else 0.45,
+            [parameters], [error], yerr=[spread], capsize=2, color=TAKEN if taken else TRIED,
+            marker="*" if taken else "o", markersize=13 if taken else 6,
+            alpha=1.0 if step.steps == longest else 0.45, zorder=3,
         )  # fmt: skip
-        axes.annotate(
-            step.rung.name, (parameters, error), textcoords="offset points", xytext=(5, 4),
-            fontsize=6.5,
-        )  # fmt: skip
-    block = answer.block
-    name = answer.ladder.name
-    axes.set_title(name if block in ("", name) else f"{name} of {block}", fontsize=9)
-    counts = [s.score.parameters for s in shown if s.score]
-    if max(counts) > SPAN * min(counts):  # over less, logarithmic ticks cannot be read
-        axes.set_xscale("log")
-    else:
-        axes.ticklabel_format(axis="x", style="sci", scilimits=(0, 4))
-        axes.locator_params(axis="x", nbins=4)
-    axes.margins(x=0.3, y=0.15)
-    axes.set_xlabel("trained parameters (of the trial)", fontsize=7)
-    axes.set_ylabel("RMSE, grey levels of 255", fontsize=7)
-    axes.tick_params(labelsize=6, which="both")
+    block, name = answer.block, answer.ladder.name
+    axes.set_title(name if block in ("", name) else f"{name} of {block}", size=10, loc="left")
+    axes.set_ylabel("RMSE, grey levels of 255", size=8)
+    axes.tick_params(labelsize=8, which="both")
+    axes.margins(x=0.3, y=0.25)
+    _scale(axes, [_point(s)[0] for s in shown], [_point(s)[1] for s in shown])
+
+
+def _scale(axes: Axes, parameters: list[int], errors: list[float]) -> None:
+    """Logarithmic where that is easier to read; numbers as people say them."""
+    for axis, scale, values in (
+        (axes.xaxis, axes.set_xscale, parameters),
+        (axes.yaxis, axes.set_yscale, errors),
+    ):
+        if is_log(values):
+            scale("log")
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
+            axis.set_minor_locator(NullLocator())
+        else:
+            axis.set_major_locator(MaxNLocator(5))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: short_number(value)))
+
+
+def _name(axes: Axes, answer: Answer) -> None:
+    """The rungs' names, where nothing else is."""
+    shown = _shown(answer)
+    spots = [
+        (float(x), float(y)) for x, y in axes.transData.transform([_point(s)[:2] for s in shown])
+    ]
+    renderer = axes.figure.canvas.get_renderer()  # type: ignore[attr-defined]
+    artists = [
+        axes.text(
+            *_point(s)[:2], s.rung.name, size=8, verticalalignment="bottom", zorder=4,
+            color=ink_of(TAKEN if s.rung is answer.chosen else TRIED),
+            weight="bold" if s.rung is answer.chosen else "normal",
+        )
+        for s in shown
+    ]  # fmt: skip
+    sizes = [(e.width + 2, e.height + 2) for e in (a.get_window_extent(renderer) for a in artists)]
+    window = axes.get_window_extent(renderer)
+    bounds = Box(window.x0 + 2, window.y0 + 2, window.x1 - 2, window.y1 - 2)
+    r = 7 * DPI / 72  # of a star
+    points = [Box(x - r, y - r, x + r, y + r) for x, y in spots]
+    back = axes.transData.inverted()
+    for artist, spot, (x, y) in zip(
+        artists, place(spots, sizes, points, bounds), spots, strict=True
+    ):
+        box = spot.box
+        artist.set_position(tuple(back.transform((box.x0 + 1, box.y0 + 1))))
+        if spot.leader:
+            near = (min(max(x, box.x0), box.x1), min(max(y, box.y0), box.y1))
+            ends = back.transform([(x, y), near])
+            axes.plot(ends[:, 0], ends[:, 1], color=QUIET, linewidth=0.6, zorder=2, scalex=False,
+                      scaley=False)  # fmt: skip
+
+
+def _shown(answer: Answer) -> list[Step]:
+    return [s for s in answer.steps if s.score is not None]
 
 
 def _point(step: Step) -> tuple[int, float, float]:
