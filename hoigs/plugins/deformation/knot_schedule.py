@@ -29,7 +29,8 @@ class AdaptiveKnotsConfig(ComponentConfig):
 
     Attributes:
         begin, end: fractions of the run between which rounds take place. every: steps between
-            rounds. The last round only removes.
+            rounds. The last round only removes; with `begin` at `end` there is no other, which
+            suits motions that begin with knots to spare (`keyframe_step`).
         insert_by: intervals get a knot by their mean image loss ("residual") or by how much the
             motion bends within them on the screen ("acceleration").
         share: of the intervals that get a knot in a round, the worst first; at least one.
