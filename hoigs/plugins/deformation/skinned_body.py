@@ -119,6 +119,7 @@ class SkinnedBody(DeformationModel):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         self.body._apply(fn, recurse)
         self._shape = self._arm = self._asked = None
+        self.held = False
         return super()._apply(fn, recurse)
 
     @torch.no_grad()

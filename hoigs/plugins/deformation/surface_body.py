@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -64,6 +65,13 @@ class SurfaceBody(SkinnedBody):
         )
         self.log_alpha.requires_grad_(False)
         self._surface, self.seed = surface, seed
+        self._change: Tensor | None = None
+
+    @torch.no_grad()
+    def hold(self, rest: Gaussians, moment: Moment) -> None:
+        """Where each point is at rest, too, in this moment's shape."""
+        super().hold(rest, moment)
+        self._change = self._changed(self.pose(moment), moment)
 
     def bind(self, rest: Gaussians) -> None:
         made = self._surface or self.body.surface(len(rest), self.betas, self.seed)
@@ -88,8 +96,11 @@ class SurfaceBody(SkinnedBody):
     def shape_change(self, pose: BodyPose, moment: Moment) -> Float[Tensor, "N 3"] | None:
         """How far each point moves at rest because the pose has other betas, metres; None for
         not."""
-        if not self.reshaped(pose.betas, moment):
-            return None
+        if self.held:
+            return self._change
+        return self._changed(pose, moment) if self.reshaped(pose.betas, moment) else None
+
+    def _changed(self, pose: BodyPose, moment: Moment) -> Float[Tensor, "N 3"]:
         change = self.shaped(pose.betas, moment)[0] - self.rest_vertices
         return (change[self.body.faces[self.faces]] * self.barycentric[..., None]).sum(1)
 
