@@ -95,6 +95,7 @@ def method(needs: Needs) -> list[str]:
     chosen = needs.settings
     rule = (
         f"the cheapest rung within one standard error of the best, or within {chosen.least:g} dB"
+        f"{_tolerances(needs)}"
         if chosen.criterion == "one-se"
         else "the rung of the least BIC"
     )
@@ -115,6 +116,18 @@ def method(needs: Needs) -> list[str]:
         f"where a full training would take about {needs.full_seconds:.0f} s "
         f"({needs.seconds / needs.full_seconds:.2f} of it).",
     ]
+
+
+def _tolerances(needs: Needs) -> str:
+    """What ladders ask for themselves: "; interaction 0.5 dB; object 0.6 dB a doubling …"."""
+    ladders = {a.ladder.name: a.ladder for a in needs.answers if a.steps}.values()
+    own = [f"; {ladder.name} {ladder.least:g} dB" for ladder in ladders if ladder.least is not None]
+    own += [
+        f"; {ladder.name} {ladder.price:g} dB for every doubling of parameters"
+        for ladder in ladders
+        if ladder.price > 0
+    ]
+    return "".join(own)
 
 
 def as_data(needs: Needs) -> dict[str, Any]:

@@ -195,6 +195,11 @@ def test_the_answer_on_disk(needs, tmp_path):
         json.dumps(as_data(needs))
     )
     assert "| rigid |" in page(needs) and "taken" in page(needs)
+    assert "or within 0.1 dB. ±" in page(needs)
+    asking = OBJECT.model_copy(update={"least": 0.5, "price": 0.6})
+    answers = tuple(replace(a, ladder=asking) for a in needs.answers if a.ladder == OBJECT)
+    told_of = "0.1 dB; object 0.5 dB; object 0.6 dB for every doubling of parameters. ±"
+    assert told_of in page(replace(needs, answers=answers))
     assert (tmp_path / "out" / "needs.svg").read_text().lstrip().startswith("<?xml")
     with pytest.raises(HoigsError, match=r"has spec\.yaml"):
         require_new(tmp_path / "out", overwrite=False)
