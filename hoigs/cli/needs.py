@@ -105,7 +105,7 @@ def find_needs(
     from hoigs.studies.needs.criterion import CRITERIA
     from hoigs.studies.needs.rungs import load_ladders
     from hoigs.studies.needs.search import Search, Settings
-    from hoigs.studies.needs.write_needs import method, require_new, row, title, write_needs
+    from hoigs.studies.needs.write_needs import method, require_new, row, write_needs
     from hoigs.training.session import read_clip
 
     rule = next((c for c in CRITERIA if c == criterion), None)
@@ -132,7 +132,7 @@ def find_needs(
     columns = ("rung", "held-back dB", "over chosen dB", "parameters", "steps", "verdict")
     for answer in found.answers:
         if answer.steps:
-            print_table(title(answer), columns, [row(answer, step) for step in answer.steps])
+            print_table(answer.title, columns, [row(answer, step) for step in answer.steps])
     for sentence in method(found):
         typer.echo(sentence)
     for path in write_needs(found, folder, given=given, registry=registry):

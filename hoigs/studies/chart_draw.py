@@ -17,7 +17,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from hoigs.studies.chart_data import ACCURACY, COST, Axis, Point
 from hoigs.studies.chart_front import comparable, front, machines, usable_axes
-from hoigs.studies.chart_labels import Box, place
+from hoigs.studies.chart_labels import Box
+from hoigs.studies.chart_names import settle
 from hoigs.studies.chart_style import (
     INK,
     QUIET,
@@ -228,33 +229,19 @@ def _label(axes: Axes, points: Sequence[Point], cost: Axis, accuracy: Axis) -> l
         return float(x), float(y)
 
     pixel = DPI / 72
-    renderer = axes.figure.canvas.get_renderer()  # type: ignore[attr-defined]
     paper = {"facecolor": "white", "alpha": 0.7, "linewidth": 0, "pad": 0.6}
-    artists = [
+    texts = [
         axes.text(_at(p, cost), _at(p, accuracy), p.spec, size=8.5, weight="bold", zorder=2.5,
                   color=ink_of(colors[p.spec]), bbox=paper)
         for p in named
     ]  # fmt: skip
-    sizes = [(e.width + 2, e.height + 2) for e in (a.get_window_extent(renderer) for a in artists)]
     r = (MARKER_RADIUS + 1) * pixel
     markers = [Box(x - r, y - r, x + r, y + r) for x, y in map(pixels, shown)]
     strokes = [(pixels(a), pixels(b)) for line in lines for a, b in pairwise(line)]
     strokes += list(_bars(axes, shown, cost, accuracy))
     strokes += list(_stairs([pixels(p) for p in front(shown, (cost, accuracy))]))
-    window = axes.get_window_extent(renderer)
-    bounds = Box(window.x0 + 2, window.y0 + 2, window.x1 - 2, window.y1 - 2)
-    placed = place(list(map(pixels, named)), sizes, markers, bounds, strokes)
-    invert = axes.transData.inverted()
-    for artist, spot, point in zip(artists, placed, named, strict=True):
-        artist.set_position(tuple(invert.transform((spot.box.x0 + 1, spot.box.y0 + 1))))
-        artist.set_verticalalignment("bottom")
-        if spot.leader:
-            x, y = pixels(point)
-            near = (min(max(x, spot.box.x0), spot.box.x1), min(max(y, spot.box.y0), spot.box.y1))
-            ends = invert.transform([(x, y), near])
-            axes.plot(ends[:, 0], ends[:, 1], color=colors[point.spec], linewidth=0.7, alpha=0.8,
-                      zorder=2, scalex=False, scaley=False)  # fmt: skip
-    return [spot.box for spot in placed]
+    leaders = [colors[p.spec] for p in named]
+    return settle(axes, texts, list(map(pixels, named)), markers, strokes, leaders=leaders)
 
 
 def _stairs(

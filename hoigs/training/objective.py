@@ -62,6 +62,7 @@ class JointObjective:
     L_human and L_object draw the entity alone over a random background, on the crop of its mask
     (L_human may compare the composite there instead or too, and adds L_face where asked: LossSpec);
     L_scene compares the composite (or the scene alone); L_depth compares the composite's depth.
+    Neither is computed where it has no weight.
     """
 
     def __init__(

@@ -101,6 +101,7 @@ class SurfaceBody(SkinnedBody):
         return self._changed(pose, moment) if self.reshaped(pose.betas, moment) else None
 
     def _changed(self, pose: BodyPose, moment: Moment) -> Float[Tensor, "N 3"]:
+        """`shape_change`, whatever the betas."""
         change = self.shaped(pose.betas, moment)[0] - self.rest_vertices
         return (change[self.body.faces[self.faces]] * self.barycentric[..., None]).sum(1)
 

@@ -11,7 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from hoigs.studies.chart_labels import Box, place
+from hoigs.studies.chart_labels import Box
+from hoigs.studies.chart_names import settle
 from hoigs.studies.chart_style import PALETTE, QUIET, STYLE, ink_of, is_log, short_number
 from hoigs.studies.needs.search import Answer, Needs, Step
 
@@ -67,8 +68,7 @@ def _panel(axes: Axes, answer: Answer) -> None:
             marker="*" if taken else "o", markersize=13 if taken else 6,
             alpha=1.0 if step.steps == longest else 0.45, zorder=3,
         )  # fmt: skip
-    block, name = answer.block, answer.ladder.name
-    axes.set_title(name if block in ("", name) else f"{name} of {block}", size=10, loc="left")
+    axes.set_title(answer.title, size=10, loc="left")
     axes.set_ylabel("RMSE, grey levels of 255", size=8)
     axes.tick_params(labelsize=8, which="both")
     axes.margins(x=0.3, y=0.25)
@@ -96,31 +96,17 @@ def _name(axes: Axes, answer: Answer) -> None:
     spots = [
         (float(x), float(y)) for x, y in axes.transData.transform([_point(s)[:2] for s in shown])
     ]
-    renderer = axes.figure.canvas.get_renderer()  # type: ignore[attr-defined]
-    artists = [
+    texts = [
         axes.text(
-            *_point(s)[:2], s.rung.name, size=8, verticalalignment="bottom", zorder=4,
+            *_point(s)[:2], s.rung.name, size=8, zorder=4,
             color=ink_of(TAKEN if s.rung is answer.chosen else TRIED),
             weight="bold" if s.rung is answer.chosen else "normal",
         )
         for s in shown
     ]  # fmt: skip
-    sizes = [(e.width + 2, e.height + 2) for e in (a.get_window_extent(renderer) for a in artists)]
-    window = axes.get_window_extent(renderer)
-    bounds = Box(window.x0 + 2, window.y0 + 2, window.x1 - 2, window.y1 - 2)
     r = 7 * DPI / 72  # of a star
     points = [Box(x - r, y - r, x + r, y + r) for x, y in spots]
-    back = axes.transData.inverted()
-    for artist, spot, (x, y) in zip(
-        artists, place(spots, sizes, points, bounds), spots, strict=True
-    ):
-        box = spot.box
-        artist.set_position(tuple(back.transform((box.x0 + 1, box.y0 + 1))))
-        if spot.leader:
-            near = (min(max(x, box.x0), box.x1), min(max(y, box.y0), box.y1))
-            ends = back.transform([(x, y), near])
-            axes.plot(ends[:, 0], ends[:, 1], color=QUIET, linewidth=0.6, zorder=2, scalex=False,
-                      scaley=False)  # fmt: skip
+    settle(axes, texts, spots, points, leaders=[QUIET] * len(texts))
 
 
 def _shown(answer: Answer) -> list[Step]:

@@ -89,6 +89,12 @@ class Answer:
     refitted: str = ""
     afterwards: Overrides = field(default_factory=dict)
 
+    @property
+    def title(self) -> str:
+        """The ladder, and the block where it has another name: "human planes of dancer"."""
+        name = self.ladder.name
+        return name if self.block in ("", name) else f"{name} of {self.block}"
+
     def step(self, rung: Rung) -> Step:
         return next(s for s in self.steps if s.rung is rung)
 
@@ -350,9 +356,7 @@ def _blocks(spec: Spec, clip: Clip) -> tuple[dict[str, list[str]], dict[str, lis
 
 def told(answer: Answer) -> str:
     """An answer in one line: "object: rigid, 3 knots, because …"."""
-    name = answer.ladder.name
-    if answer.block and answer.block != name:
-        name = f"{name} of {answer.block}"
+    name = answer.title
     if answer.chosen is None:
         return f"{name}: unchanged, because {answer.skipped}"
     if answer.skipped:

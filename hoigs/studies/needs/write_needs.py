@@ -62,13 +62,8 @@ def page(needs: Needs) -> str:
     lines += [f"- {told(answer)}" for answer in needs.answers]
     for answer in needs.answers:
         if answer.steps:
-            lines += ["", f"## {title(answer)}", "", *_table(answer)]
+            lines += ["", f"## {answer.title}", "", *_table(answer)]
     return "\n".join([*lines, "", "## How it was chosen", "", *method(needs)]) + "\n"
-
-
-def title(answer: Answer) -> str:
-    block, name = answer.block, answer.ladder.name
-    return name if block in ("", name) else f"{name} of {block}"
 
 
 def _table(answer: Answer) -> list[str]:
