@@ -18,12 +18,13 @@ lint: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python scripts/check_types_for_users.py
 
-# the site, into build/site; strict: a dead link or a page that nothing leads to is an error
+# the site, into build/site; strict: a dead link or a page without a link to it is an error
 docs: $(INSTALLED)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
-# accuracy against cost, into docs/results/chart; a kill loses nothing, the same command goes on
+# accuracy against cost, into docs/results/chart; the same command continues after a kill
 CHART_CLIPS ?= builtin:lift-and-swing builtin:carry builtin:throw-and-catch
 CHART_SPECS ?= hoigs,hoigs-paper@matched,hoigs-no-interaction,hoigs-object-mlp,4dgs@matched,d3dgs@matched,e-d3dgs@matched,ex4dgs@matched,exavatar@matched,hugs@matched,hold-gs@matched,hosnerf-gs@matched,static-3dgs@matched
 CHART_BUDGETS ?= 1200
@@ -33,7 +34,7 @@ charts: $(INSTALLED)
 	$(BIN)/hoigs chart $(CHART_CLIPS) --specs "$(CHART_SPECS)" --budgets $(CHART_BUDGETS) \
 		--seeds $(CHART_SEEDS) --out $(CHART_OUT)
 	mkdir -p docs/results/chart
-	cp $(CHART_OUT)/chart* docs/results/chart/
+	cp $(addprefix $(CHART_OUT)/,chart.md chart.json chart-*.png) docs/results/chart/
 
 # where methods break, into docs/results/stress; likewise
 STRESS_CASES ?= all

@@ -3,7 +3,7 @@
 Splats are split as in trained runs of the built-in clip and of juggle: four fifths are the scene,
 which density control has filled up, one sixth the person (a fixed number on the skin), the rest the
 object. `--run` measures a trained model in their place. A model that has not been trained is given
-opacities of 0.7 rather than 3DGS's 0.1, with which every ray would pass through everything.
+opacities of 0.7 rather than 3DGS's 0.1, with which every ray would reach the background.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def spec_overrides(splats: tuple[int, int, int], more: list[str]) -> list[str]:
 
 
 def clock(device: torch.device) -> float:
-    """Milliseconds, once all that was asked of the device is done."""
+    """Time in milliseconds, after the device has finished its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return 1e3 * time.perf_counter()

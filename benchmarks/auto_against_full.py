@@ -3,9 +3,9 @@
     python benchmarks/auto_against_full.py --jobs 6 --threads 8 --minutes 60
     python benchmarks/auto_against_full.py --clips lift-and-swing --steps 300 --width 64
 
-On each clip the whole spec is trained, and what `--auto` makes of it. Auto passes where its PSNR of
-people and things on test frames is within 0.15 dB of the whole spec's, with at most 10 % of its
-trained numbers and 50 % of its render time. A run that was stopped goes on with the same command;
+On each clip the whole spec is trained, and the spec that `--auto` finds. Auto passes where its PSNR
+of people and objects on test frames is within 0.15 dB of the whole spec's, with at most 10 % of its
+trained numbers and 50 % of its render time. The same command continues a run that was stopped;
 render times are measured at the end, when nothing else of this script runs, both models in turn: of
 films, which `Playback` draws (on CUDA by captured graphs), and for comparison of
 `SceneModel.render`, frame by frame, where a GPU mostly waits for launches.
@@ -30,8 +30,8 @@ ROUNDS = 15  # short ones, both models in each: machines have slow minutes
 
 
 def clip_of(name: str, options: argparse.Namespace) -> str:
-    knobs = f"?width={options.width}" if options.width else ""
-    return f"builtin:{name}{knobs}"
+    settings = f"?width={options.width}" if options.width else ""
+    return f"builtin:{name}{settings}"
 
 
 def run_folder(name: str, kind: str, options: argparse.Namespace) -> Path:
@@ -40,12 +40,12 @@ def run_folder(name: str, kind: str, options: argparse.Namespace) -> Path:
 
 def train(name: str, kind: str, options: argparse.Namespace) -> dict[str, Any]:
     """One training, gone on with where it had begun, and its scores on test frames."""
-    from hoigs.cli.train import compact_of
-    from hoigs.cli.train import train as train_verb
+    import hoigs
     from hoigs.evaluation.evaluate import evaluate
-    from hoigs.training.checkpoint import has_checkpoint
-    from hoigs.training.run_folder import RunFolder
-    from hoigs.training.session import LoadedRun
+    from hoigs.runs.checkpoint import has_checkpoint
+    from hoigs.runs.loaded_run import LoadedRun
+    from hoigs.runs.run_folder import RunFolder
+    from hoigs.studies.needs.pruning.compact_run import compact_of
 
     run = run_folder(name, kind, options)
     folder, began = RunFolder(run), time.perf_counter()
@@ -56,10 +56,12 @@ def train(name: str, kind: str, options: argparse.Namespace) -> dict[str, Any]:
     answered = run.with_name(f"{run.name}-needs") / "spec.yaml"
     if not finished:
         resume = begun and (kind == "full" or answered.is_file())
-        train_verb(
-            Path(clip_of(name, options)), spec=options.spec, out=run, auto=kind == "auto",
-            settings=[] if resume and kind == "auto" else settings, device=options.device,
+        train_it = hoigs.auto if kind == "auto" else hoigs.train
+        train_it(
+            clip_of(name, options), options.spec, out=run,
+            overrides=[] if resume and kind == "auto" else settings, device=options.device,
             resume=resume, overwrite=not resume, evaluate=False,
+            report=lambda line: print(line, flush=True),
         )  # fmt: skip
     found: dict[str, Any] = {"seconds": round(time.perf_counter() - began, 1), "resumed": begun}
     for label, path in {"": run, "compact_": compact_of(run)}.items():
@@ -83,8 +85,8 @@ def render_times(name: str, options: argparse.Namespace) -> dict[str, dict[str, 
     """Milliseconds a frame of both, two ways, measured in turn, and the shares of auto's in the
     whole spec's: medians of the rounds."""
     from hoigs.evaluation.measure import render_time
-    from hoigs.evaluation.playback import Playback
-    from hoigs.training.session import LoadedRun
+    from hoigs.runs.loaded_run import LoadedRun
+    from hoigs.viewing.playback import Playback
 
     loaded = {
         kind: LoadedRun.open(run_folder(name, kind, options), device=options.device)
@@ -139,10 +141,10 @@ def settings_of(options: argparse.Namespace) -> dict[str, Any]:
 
 def summary(options: argparse.Namespace) -> bool:
     """Print and write the table of the clips that are done; whether all three rules hold on all."""
-    from hoigs.studies.machine import Machine
+    from hoigs.studies.jobs.machine import Machine
 
     rows, good = [], True
-    print("| clip | people and things, dB: full | auto | difference | parameters | render time | "
+    print("| clip | people and objects, dB: full | auto | difference | parameters | render time | "
           "frame by frame | after compressing, dB | cost in full trainings | |")  # fmt: skip
     print("|---|---:|---:|---:|---:|---:|---:|---:|---:|---|")
     for name in options.clips:

@@ -3,10 +3,12 @@
     python benchmarks/degradations.py
     python benchmarks/degradations.py --only clean depth-x0.8 --steps 200 --json drops.json
 
-Every clip is the built-in one with one knob of `SceneKnobs.noise`; training allows faults. Models
-are scored against the clean clip's frames, masks and depth, so that only what was learned differs;
-where poses or the number of frames differ, against the degraded clip's own test frames. Held-out
-cameras are exact and the same everywhere. `named` is the kinds of fault that the run reported.
+Every clip is the built-in one with one setting of `SceneConfig.noise`; training allows faults.
+Models are scored against the frames, masks and depth of the clean clip, so that only the training
+data differ; where poses or the number of frames differ, against the degraded clip's own test
+frames.
+Held-out cameras are exact and the same everywhere. `named` lists the kinds of fault that the run
+reported.
 """
 
 from __future__ import annotations
@@ -41,7 +43,9 @@ LIMIT_DB = 1.5
 def measure(fault: str, options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """One clip trained on and scored."""
     from hoigs.evaluation.evaluate import evaluate
-    from hoigs.training.session import LoadedRun, Session, read_clip
+    from hoigs.runs.clip_source import read_clip
+    from hoigs.runs.loaded_run import LoadedRun
+    from hoigs.training.session import Session
 
     base = (
         f"builtin:lift-and-swing?width={options.width}&frames={options.frames}&edge_samples=4"

@@ -15,7 +15,7 @@ interleaved, so that whatever else the machine does falls on all alike: compare 
 `deform_ms` and `raster_ms` are medians over frames by CUDA events (on a CPU by the clock), which
 also count the time that a device waits for launches; `frame_ms` is the wall time of a sweep without
 any waiting in between over its frames, the median over rounds, and `fps` is from that.
-`first_frame_ms` is from asking to the finished picture, one frame at a time.
+`first_frame_ms` is from the call to the finished image, one frame at a time.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ from benchmarks.at_size import (
     spec_overrides,
     write,
 )
-from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip
 from hoigs.core.errors import RenderError
-from hoigs.core.moment import BodyPose, Moment
-from hoigs.core.scene import SceneModel
-from hoigs.evaluation.playback import Playback
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.moment import BodyPose, Moment
+from hoigs.viewing.playback import Playback
 
 View = tuple[Moment, Camera]
 KEPT = 8  # views from which a playback is made
@@ -181,9 +181,10 @@ def measure(model: SceneModel, views: list[View], rounds: int) -> dict[str, Any]
 
 
 def load(options: argparse.Namespace, size: Size) -> tuple[SceneModel, Clip, str]:
-    from hoigs.core.compose import compose
-    from hoigs.core.spec import Spec
-    from hoigs.training.session import LoadedRun, read_clip
+    from hoigs.core.model.compose import compose
+    from hoigs.core.spec.schema import Spec
+    from hoigs.runs.clip_source import read_clip
+    from hoigs.runs.loaded_run import LoadedRun
 
     if options.run is not None:
         run = LoadedRun.open(options.run, device=options.device)

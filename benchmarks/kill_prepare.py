@@ -1,11 +1,11 @@
-"""Kills `prepare` at random moments, again and again, and says whether every next run went on.
+"""Kill `prepare` at random moments, and check that every next run continues.
 
     python benchmarks/kill_prepare.py --times 50
 
 A tiny made-up source is prepared once, unbroken. Then processes prepare it anew and are killed
 (SIGKILL) after a random part of that time, more often early than late. After each kill the target
-must be absent or whole; a run that gets to its end must have made, byte for byte, what the unbroken
-one made (but for the seconds in its reports), and must have left nothing beside it. Each process is
+must be absent or whole; a run that completes must have written the same bytes as the unbroken one
+(but for the seconds in its reports), and must have left no other file. Each process is
 forked from one that has only imported hoigs, so that the kills fall into the work and not into
 `import torch`.
 """
@@ -28,10 +28,10 @@ from pathlib import Path
 import torch
 import torch._dynamo  # what an optimizer's first step imports, for seconds
 
-from hoigs.core.clip_folder import check_clip
+from hoigs.core.clip_folder.check import check_clip
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.preparation.plan import PLAN
 from hoigs.preparation.prepare import PrepareOptions, prepare, work_folder
+from hoigs.preparation.stages.plan import PLAN
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/preparation"))
 from tiny import FRAMES, make_source, picture
@@ -141,7 +141,7 @@ def same(clip: Path, unbroken: Path) -> None:
 
 
 def tiny_video(folder: Path) -> Path:
-    from hoigs.preparation.video_out import VideoWriter
+    from hoigs.preparation.report.video_out import VideoWriter
 
     path = folder / "tiny.mp4"
     with VideoWriter(path, fps=12, crf=8) as video:

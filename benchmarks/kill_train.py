@@ -3,11 +3,11 @@
     python benchmarks/kill_train.py
     python benchmarks/kill_train.py --kills 10 --json killed.json
 
-An unbroken run comes first. Then the same run is started again and again, resumed wherever it has
-come into being, and killed: every other time at a random moment between its start and the time
+An unbroken run comes first. Then the same run is started again and again, resumed if it
+exists, and killed: every other time at a random moment between its start and the time
 that the unbroken run took, and every other time within 5 ms of the appearance of a temporary file,
 that is while it writes. After each kill all that stands in the run folder under its final name is
-read. A run that gets to its end is compared with the unbroken one, bit for bit, and started anew
+read. A run that completes is compared with the unbroken one, bit for bit, and started anew
 until there have been enough kills. On one thread, as sums of several have no fixed order.
 
 Exit code 1 when anything could not be read, could not be resumed, or differs.
@@ -125,8 +125,8 @@ def _kind(name: str) -> str:
 def _look(run: Path, record: Kills) -> None:
     """Read all that has its final name, as a resumed run would."""
     from hoigs.core.errors import HoigsError
-    from hoigs.core.spec import Spec
-    from hoigs.training.checkpoint import has_checkpoint, latest_checkpoint, load_checkpoint
+    from hoigs.core.spec.schema import Spec
+    from hoigs.runs.checkpoint import has_checkpoint, latest_checkpoint, load_checkpoint
 
     if not run.exists():
         record.before_run += 1
@@ -145,7 +145,7 @@ def _look(run: Path, record: Kills) -> None:
 
 def differences(run: Path, whole: Path) -> list[str]:
     """In what a run that was broken differs from the unbroken one: weights, moments, metrics."""
-    from hoigs.training.checkpoint import latest_checkpoint, load_checkpoint
+    from hoigs.runs.checkpoint import latest_checkpoint, load_checkpoint
 
     ours, theirs = (load_checkpoint(latest_checkpoint(r / "checkpoints")) for r in (run, whole))
     if ours.meta["step"] != theirs.meta["step"]:
@@ -160,7 +160,7 @@ def differences(run: Path, whole: Path) -> list[str]:
 
 
 def _equal(ours: object, theirs: object, key: str) -> bool:
-    from hoigs.training.checkpoint import Checkpoint
+    from hoigs.runs.checkpoint import Checkpoint
 
     assert isinstance(ours, Checkpoint) and isinstance(theirs, Checkpoint)
     return key in ours.tensors and ours.tensors[key].equal(theirs.tensors[key])

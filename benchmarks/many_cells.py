@@ -1,4 +1,4 @@
-"""Cells of a benchmark in processes of their own: a JSON a cell, written at once; resumable.
+"""Cells of a benchmark in their own processes, with a JSON for each; resumable.
 
 A benchmark calls `run_cells` in its parent, and in a child `write_cell`; the child is the same
 script with `--cell NAME`.

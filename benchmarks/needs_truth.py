@@ -3,10 +3,10 @@
     python benchmarks/needs_truth.py --jobs 60 --threads 1 --minutes 20
     python benchmarks/needs_truth.py --only still glide --seeds 2 --jobs 2
 
-A seed is of the clip (textures, points, jolts) and of the training. Only the ladders that a case
-speaks of are climbed, so that they share the budget of a full search between them; --all climbs
-every ladder. A JSON is written for each case and seed as soon as it is done, and the same command
-goes on where it was stopped; --summary only reads what is there.
+A seed is used for the clip (textures, points, jolts) and for the training. Only the search spaces
+that a case names are searched, with the budget of a full search; --all searches all of them. A JSON
+is written for each case and seed as soon as it is done, and the same command continues after an
+interruption; --summary only reads the files.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ BEYOND = ("articulated", "rigid and residual", "per Gaussian")
 
 @dataclass(frozen=True)
 class Case:
-    """A clip, and the rungs that are right for it, by ladder.
+    """A clip, and the candidates that are right for it, by search space.
 
     Attributes:
-        knobs: of the clip, beside those that all have.
+        clip_settings: of the clip, beside those that all have.
     """
 
     clip: str
     right: dict[str, tuple[str, ...]]
-    knobs: str = ""
+    clip_settings: str = ""
 
 
 CASES = {
@@ -56,36 +56,37 @@ CASES = {
 
 
 def search_of(case: Case, seed: int, options: argparse.Namespace, kind: type[Any]) -> Any:
-    """A search of `kind`, of the ladders that the case speaks of."""
-    from hoigs.studies.needs.rungs import load_ladders
-    from hoigs.studies.needs.search import Settings
-    from hoigs.training.session import read_clip
+    """A search of class `kind`, with the search spaces that the case names."""
+    from hoigs.runs.clip_source import read_clip
+    from hoigs.studies.needs.result import Settings
+    from hoigs.studies.needs.search_space import load_search_spaces
 
     clip = read_clip(
         f"builtin:{case.clip}?frames={options.frames}&fps={options.frames / 4}"
         f"&width={options.size}&samples=4&edge_samples=4&held_out_views=0"
         f"&test_frames={options.frames // 8}&scene_points=1000&object_points=600&seed={seed}"
-        f"{case.knobs}"
+        f"{case.clip_settings}"
     )
-    wanted = {"object", *case.right}  # what the others ask about
-    ladders = [ladder for ladder in load_ladders() if options.all or ladder.name in wanted]
+    wanted = {"object", *case.right}  # which `unless` of the others names
+    spaces = [s for s in load_search_spaces() if options.all or s.name in wanted]
     given = (f"train.steps={options.steps}", f"train.seed={seed}",
              "model.human.points=2000", "model.human.deformation.resolution=32")  # fmt: skip
-    return kind(clip, "hoigs", ladders, given, Settings(options.criterion, share=options.share))
+    return kind(clip, "hoigs", spaces, given, Settings(options.criterion, share=options.share))
 
 
 def run(case: Case, seed: int, options: argparse.Namespace) -> dict[str, Any]:
     """One search; what was chosen, whether that is right, and what it cost."""
-    from hoigs.studies.needs.search import Search, told
-    from hoigs.studies.needs.write_needs import as_data
+    from hoigs.studies.needs.report.write import as_data
+    from hoigs.studies.needs.result import summary_line
+    from hoigs.studies.needs.search import Search
 
     began = time.process_time()
     needs = search_of(case, seed, options, Search).run()
-    chosen = {a.ladder.name: a.chosen.name for a in needs.answers if a.chosen is not None}
+    chosen = {a.space.name: a.chosen.name for a in needs.answers if a.chosen is not None}
     return {
         "chosen": chosen,
-        "right": all(chosen[name] in rungs for name, rungs in case.right.items()),
-        "because": [told(answer) for answer in needs.answers],
+        "right": all(chosen[name] in candidates for name, candidates in case.right.items()),
+        "because": [summary_line(answer) for answer in needs.answers],
         "cpu_seconds": round(time.process_time() - began, 1),
         "seconds": round(needs.seconds, 1),
         "full_seconds": round(needs.full_seconds, 1),
@@ -101,7 +102,7 @@ def settings_of(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def cells_of(options: argparse.Namespace) -> list[str]:
-    """Seed by seed, so that a run cut short says a little of every case."""
+    """Seed by seed, so that an interrupted run has results of every case."""
     return [f"{name}-{seed}" for seed in range(options.seeds) for name in options.only]
 
 
@@ -121,7 +122,7 @@ def summary(options: argparse.Namespace) -> bool:
                 "case": name,
                 "right": right,
                 "of": len(done),
-                "asked": options.seeds,
+                "seeds": options.seeds,
                 "chosen": [cell["chosen"] for cell in done],
                 "median_cpu_seconds": _median([cell["cpu_seconds"] for cell in done]),
                 "median_search_over_full": _median([cell["search_over_full"] for cell in done]),
@@ -131,10 +132,10 @@ def summary(options: argparse.Namespace) -> bool:
     print("|---|---|---:|---:|---:|")
     for row in rows:
         ratio = row["median_search_over_full"]
-        told = ("–", "–") if ratio is None else (f"{ratio:.2f}", f"<= {1 + ratio:.2f}")
+        shown = ("–", "–") if ratio is None else (f"{ratio:.2f}", f"<= {1 + ratio:.2f}")
         print(
             f"| {row['case']} | in {row['right']} of {row['of']} seeds | "
-            f"{row['median_cpu_seconds'] or '–'} | {told[0]} | {told[1]} |"
+            f"{row['median_cpu_seconds'] or '–'} | {shown[0]} | {shown[1]} |"
         )
     path = options.out / "summary.json"
     path.write_text(json.dumps({"settings": settings_of(options), "rows": rows}, indent=1))
@@ -155,7 +156,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--share", type=float, default=0.15, help="of training frames, held back")
     parser.add_argument("--criterion", choices=["one-se", "bic"], default="one-se")
-    parser.add_argument("--all", action="store_true", help="climb every ladder")
+    parser.add_argument("--all", action="store_true", help="search every search space")
     parser.add_argument("--jobs", type=int, default=1, help="searches at a time")
     parser.add_argument("--threads", type=int, default=1, help="of each")
     parser.add_argument("--minutes", type=float, help="stop then; the same command goes on")

@@ -1,9 +1,9 @@
-"""How many operations place the Gaussians of a frame, and which lines ask for them.
+"""Number of torch operations that compute the Gaussians of a frame, by line of code.
 
     python benchmarks/operations.py runs/mine runs/other
 
-Of `Playback`, so that what depends on no time is left out. Views of memory are no operations. On a
-GPU each is a launch or more, which small models mostly consist of.
+Measured in `Playback`, without what does not depend on time. Views are not counted. On a GPU each
+operation is at least one kernel launch, which dominate the time of small models.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import Any
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from hoigs.evaluation.playback import Playback
-from hoigs.training.session import LoadedRun
+from hoigs.runs.loaded_run import LoadedRun
+from hoigs.viewing.playback import Playback
 
 VIEWS = {
     "_reshape_alias", "_unsafe_view", "alias", "as_strided", "detach", "diagonal", "expand",

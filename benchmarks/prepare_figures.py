@@ -1,7 +1,7 @@
-"""How well a prepared clip fits what it was made from: the body's landmarks, and the ball's track.
+"""How well a prepared clip fits its inputs: the body's landmarks, and the ball's track.
 
-    hoigs prepare ../shared/data/juggle --out clips/juggle
-    python benchmarks/prepare_figures.py clips/juggle ../shared/data/juggle
+    hoigs prepare videos/juggle --out clips/juggle
+    python benchmarks/prepare_figures.py clips/juggle videos/juggle
 
 Both are recomputed from the clip alone: its body is posed and projected by its cameras and compared
 with the supplied landmarks that are visible (more than 0.5), its object's centre with the ball's.
@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hoigs.core.skinning import skin
+from hoigs.core.maths.skinning import skin
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.preparation.landmarks import points_of
+from hoigs.preparation.body.landmarks import points_of
 
 WIDTH = 1280
 
@@ -65,8 +65,8 @@ def landmark_distances(clip, path: Path, numbers: list[int], unit: float) -> np.
     carriers = torch.cat((carriers, body.skinning_weights[vertices_of]))
     poses = clip.bodies[name].poses
     vertices, joints = body.shaped(poses.betas)
-    rest = torch.cat((joints[points.joints], vertices[vertices_of]))
-    world = skin(rest, body.skinning_transforms(poses), carriers)
+    canonical = torch.cat((joints[points.joints], vertices[vertices_of]))
+    world = skin(canonical, body.skinning_transforms(poses), carriers)
     for i, camera in enumerate(clip.cameras):
         xy, _ = camera.project(world[i])
         distance = np.linalg.norm(xy.numpy() * scale - given[i, :, :2] * unit, axis=-1)

@@ -1,7 +1,7 @@
 """Cameras of a prepared clip against a COLMAP model, after the best similarity between them.
 
-    hoigs prepare ../shared/data/backpack --camera sfm --out clips/backpack
-    python benchmarks/sfm_against_supplied.py clips/backpack ../shared/data/backpack/sparse
+    hoigs prepare videos/backpack --camera sfm --out clips/backpack
+    python benchmarks/sfm_against_supplied.py clips/backpack videos/backpack/sparse
 
 Prints the distance between camera centres as a part of the path's length, and the angle between
 viewing directions. Images are matched by frame number.
@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from hoigs.preparation.source import frame_number
+from hoigs.preparation.video.source import frame_number
 
 
 def main() -> None:

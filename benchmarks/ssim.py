@@ -27,7 +27,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.evaluation.metrics import ssim
+from hoigs.metrics.ssim import ssim
 
 Score = Callable[[Tensor, Tensor], Tensor]  # images [H, W, 3] to the mean
 FIRST = "warp"

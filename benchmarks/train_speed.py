@@ -51,8 +51,8 @@ from benchmarks.at_size import (
     spec_overrides,
     write,
 )
-from hoigs.core.clip import Clip
-from hoigs.training.recorded import RecordedScene
+from hoigs.core.values.clip import Clip
+from hoigs.training.graphs.graphed_scene import GraphedScene
 from hoigs.training.session import Session
 from hoigs.training.trainer import Trainer
 
@@ -209,11 +209,11 @@ def measure(trainer: Trainer, steps: int) -> dict[str, Any]:
 def measured(trainer: Trainer, steps: int) -> dict[str, Any]:
     """All figures of the trainer as it is, and whether graphs were replayed."""
     found = measure(trainer, steps) | operations(trainer, min(4, steps))
-    recorded = trainer.objective.recorded
+    graphed = trainer.objective.graphed_scene
     found["graphs"] = {
-        "mode": recorded.mode,
-        "reason": recorded.reason,
-        "recordings": recorded.recordings,
+        "mode": graphed.mode,
+        "reason": graphed.reason,
+        "captures": graphed.captures,
     }
     return found
 
@@ -256,11 +256,11 @@ def main() -> None:
             assert frame.image.shape[1] == size.width
         objective, without = trainer.objective, {}
         if options.graphs == "both":
-            recorded = objective.recorded
-            objective.recorded = RecordedScene(trainer.model, "off", objective.weight_of)
+            graphed = objective.graphed_scene
+            objective.graphed_scene = GraphedScene(trainer.model, "off", objective.weight_of)
             run(trainer, options.warmup)
             without = {"without_graphs": measured(trainer, options.steps)}
-            objective.recorded = recorded
+            objective.graphed_scene = graphed
         run(trainer, options.warmup)
         report = {
             "machine": machine(trainer.model.device),

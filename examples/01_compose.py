@@ -1,6 +1,6 @@
-"""A scene composed by hand: three entities, what passes between them, and how they are drawn.
+"""A scene composed by hand, without registry and spec: three entities, interaction, rasterizer.
 
-No registry, no spec. Run: python examples/01_compose.py [CLIP [STEPS]]
+Run: python examples/01_compose.py [CLIP [STEPS]]
 """
 
 import sys
@@ -18,13 +18,13 @@ scene = h.SceneModel(
     {
         "scene": h.Entity(h.Gaussians.from_points(clip.points, clip.point_colors), h.Static()),
         "human": h.Entity(
-            body.rest(6000),
-            h.HexPlaneSkinning(body, num_frames=clip.num_frames),
+            body.canonical(6000),
+            h.HexPlaneSkinning(body=body, num_frames=clip.num_frames),
             features=h.BodyPartFeatures(),
         ),
         "object": h.Entity(
             h.Gaussians.from_points(track.points, track.colors),
-            h.CubicHermite(keyframes=17, track=track),
+            h.CubicHermite(h.CubicHermite.Config(keyframes=17), track=track),
             features=h.SplineMotionFeatures(),
         ),
     },

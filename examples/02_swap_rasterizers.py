@@ -13,7 +13,8 @@ gaussians = h.Gaussians.from_points(points, torch.rand(300, 3), opacity=0.7)
 K = torch.tensor([[80.0, 0, 32], [0, 80.0, 32], [0, 0, 1]])
 camera = h.Camera(K, torch.eye(4), width=64, height=64)
 
-reference = h.OracleRasterizer(cutoffs=True).render(gaussians, camera).color
+oracle = h.OracleRasterizer(h.OracleRasterizer.Config(cutoffs=True))
+reference = oracle.render(gaussians, camera).color
 for backend in (h.TorchRasterizer(), h.WarpRasterizer()):
     image = backend.render(gaussians, camera).color
     off = float((image - reference).abs().max())

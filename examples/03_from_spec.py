@@ -1,4 +1,4 @@
-"""A method by its name: load a spec, change one setting, compose it for a clip, draw it.
+"""Load a spec by name, change one setting, compose its model for a clip, and render it.
 
 Run: python examples/03_from_spec.py [CLIP]
 """

@@ -17,13 +17,15 @@ steps = int(sys.argv[1]) if sys.argv[1:] else 200
 class Swing(h.DeformationModel):
     """x(t) = x + a sin(pi t), with one a [3] for the whole entity, metres."""
 
-    rest_space = "world"
+    input_space = "world"
 
-    def bind(self, rest):
+    def bind(self, canonical):
         self.swing = nn.Parameter(torch.zeros(3))
 
-    def forward(self, rest, moment, residual=None):
-        return rest.replace(means=rest.means + self.swing * math.sin(math.pi * moment.time))
+    def forward(self, canonical, moment, residual=None):
+        return canonical.replace(
+            means=canonical.means + self.swing * math.sin(math.pi * moment.time)
+        )
 
 
 torch.manual_seed(0)
@@ -33,10 +35,10 @@ camera = h.Camera(K, torch.eye(4), width=32, height=32)
 
 # what happens: the ball goes 0.3 m to the right and comes back
 happened = h.SceneModel({"ball": h.Entity(ball, Swing())}, rasterizer=h.WarpRasterizer())
-happened.entity("ball").deformation.swing.data = torch.tensor([0.3, 0.0, 0.0])
+happened.entity("ball").deformation.get_parameter("swing").data = torch.tensor([0.3, 0.0, 0.0])
 
 learned = h.SceneModel({"ball": h.Entity(ball, Swing())}, rasterizer=h.WarpRasterizer())
-swing = learned.entity("ball").deformation.swing
+swing = learned.entity("ball").deformation.get_parameter("swing")
 optimizer = torch.optim.Adam([swing], lr=0.01)
 for step in range(steps):
     moment = h.Moment(time=(step % 9) / 8)

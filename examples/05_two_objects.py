@@ -1,4 +1,4 @@
-"""A person with two objects: attention couples the person with both, and what each is corrected by.
+"""A person with two objects: attention couples the person with both, and corrects all three.
 
 The built-in clip has one box; the second is a copy of it, half a metre to the side.
 Run: python examples/05_two_objects.py [CLIP]
@@ -17,9 +17,10 @@ copy = replace(box, translations=box.translations + torch.tensor([0.5, 0.0, 0.0]
 body = h.AnnyBody()
 
 
-def thing(track):
+def moving(track):
     points = h.Gaussians.from_points(track.points, track.colors, opacity=0.8)
-    return h.Entity(points, h.CubicHermite(9, track=track), h.SplineMotionFeatures())
+    motion = h.CubicHermite(h.CubicHermite.Config(keyframes=9), track=track)
+    return h.Entity(points, motion, h.SplineMotionFeatures())
 
 
 torch.manual_seed(0)
@@ -27,21 +28,21 @@ interaction = h.CrossAttention()
 model = h.SceneModel(
     {
         "human": h.Entity(
-            body.rest(2000),
-            h.HexPlaneSkinning(body, num_frames=clip.num_frames),
+            body.canonical(2000),
+            h.HexPlaneSkinning(body=body, num_frames=clip.num_frames),
             h.BodyPartFeatures(),
             kind="human",
         ),
-        "box": thing(box),
-        "copy": thing(copy),
+        "box": moving(box),
+        "copy": moving(copy),
     },
     interaction=interaction,
     rasterizer=h.WarpRasterizer(),
 )
 
 # corrections start at zero; with other weights both objects and the person are corrected
-torch.nn.init.normal_(interaction.means_head[-1].weight, std=0.1)
-torch.nn.init.normal_(interaction.pose_head[-1].weight, std=0.1)
+torch.nn.init.normal_(interaction.means_head[-1].get_parameter("weight"), std=0.1)
+torch.nn.init.normal_(interaction.pose_head[-1].get_parameter("weight"), std=0.1)
 frame = clip[len(clip) // 2]
 moment = frame.moment.with_pose("human", next(iter(frame.moment.poses.values())))
 with torch.no_grad():

@@ -2,8 +2,8 @@
 
     python scripts/api_surface.py > docs/api-surface.txt
 
-What stands there is a promise. A line that goes or changes breaks somebody's code: keep the old way
-working for a release, with a DeprecationWarning, and say so in changelog.d/.
+Users rely on these names. A line that is removed or changed breaks their code: keep the old name
+working for a release, with a DeprecationWarning, and describe the change in changelog.d/.
 """
 
 from __future__ import annotations
@@ -16,16 +16,20 @@ from typing import Any
 # beside the names of `hoigs` itself: what plugins import
 MODULES = (
     "hoigs.core.config",
-    "hoigs.core.context",
-    "hoigs.core.deformation",
-    "hoigs.core.density",
+    "hoigs.core.interfaces.context",
+    "hoigs.core.interfaces.deformation",
+    "hoigs.core.interfaces.density",
     "hoigs.core.errors",
-    "hoigs.core.features",
-    "hoigs.core.interaction",
-    "hoigs.core.rasterizer",
-    "hoigs.core.reader",
-    "hoigs.core.registry",
-    "hoigs.core.topology",
+    "hoigs.core.interfaces.estimator",
+    "hoigs.core.model.exporter",
+    "hoigs.core.interfaces.features",
+    "hoigs.core.interfaces.initializer",
+    "hoigs.core.interfaces.interaction",
+    "hoigs.core.interfaces.rasterizer",
+    "hoigs.core.interfaces.reader",
+    "hoigs.core.progress",
+    "hoigs.core.registry.registry",
+    "hoigs.core.values.topology",
     "hoigs.testing",
 )
 

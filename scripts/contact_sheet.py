@@ -8,8 +8,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hoigs.evaluation.contact_sheet import contact_sheet
-from hoigs.training.session import LoadedRun
+from hoigs.evaluation.report.contact_sheet import contact_sheet
+from hoigs.runs.loaded_run import LoadedRun
 
 
 def main() -> None:

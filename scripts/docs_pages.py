@@ -1,6 +1,6 @@
 """Pages of the site that are made from the code, whenever the site is built (see mkdocs.yml).
 
-python scripts/docs_pages.py FOLDER      writes them there, for looking
+python scripts/docs_pages.py FOLDER      writes them into FOLDER, to look at
 """
 
 from __future__ import annotations
@@ -100,9 +100,9 @@ def _plain(value: Any) -> str:
 
 def schema_page() -> str:
     """The blocks of a spec, every key with type, default and meaning."""
-    from hoigs.core.settings import describe_settings
-    from hoigs.core.spec import EntitySpec, Spec
-    from hoigs.core.train_spec import EvaluationSpec, TrainSpec
+    from hoigs.core.registry.settings import describe_settings
+    from hoigs.core.spec.schema import EntitySpec, Spec
+    from hoigs.core.spec.train_schema import EvaluationSpec, TrainSpec
 
     lines = [
         "# Schema of a spec",
@@ -144,9 +144,9 @@ def _cell(text: str | None) -> str:
 
 def component_pages() -> Pages:
     """The gallery: every component of hoigs with its settings; pictures where they are cheap."""
-    from hoigs.core.component import KINDS
-    from hoigs.core.registry import default_registry
-    from hoigs.core.settings import describe_settings
+    from hoigs.core.registry.component import KINDS
+    from hoigs.core.registry.registry import default_registry
+    from hoigs.core.registry.settings import describe_settings
 
     registry = default_registry()
     files: Pages = {}
@@ -231,7 +231,7 @@ def _body(name: str) -> Any:
 
     import hoigs as h
 
-    rest = getattr(h, name)().rest(4000)
+    rest = getattr(h, name)().canonical(4000)
     rest = rest.replace(opacity_logits=torch.full_like(rest.opacity_logits, 2.0))
     lit = h.Gaussians.from_points(rest.means, _shading(rest.means), opacity=0.9)
     middle = rest.means.mean(0)
@@ -250,7 +250,11 @@ def _shading(points: Any) -> Any:
 def _deformation(name: str, **settings: Any) -> Callable[[], Any]:
     import hoigs as h
 
-    return lambda: _strip(getattr(h, name)(**settings))
+    def picture() -> Any:
+        kind = getattr(h, name)
+        return _strip(kind(kind.Config(**settings)) if settings else kind())
+
+    return picture
 
 
 PREVIEWS: dict[str, Callable[[], Any]] = {
@@ -280,12 +284,12 @@ def api_page() -> str:
 
     groups: dict[str, list[str]] = {}
     for name, module in hoigs._PUBLIC.items():
-        room = ".".join(module.split(".")[:2])
-        groups.setdefault(room, []).append(f"::: {module}.{name}")
+        package = ".".join(module.split(".")[:2])
+        groups.setdefault(package, []).append(f"::: {module}.{name}")
     lines = ["# Python", "", "`import hoigs as h` has these names; they load on first use.", ""]
-    for room, entries in groups.items():
-        doc = importlib.import_module(room).__doc__ or ""
-        lines += [f"## {room}", "", doc.partition("\n")[0], "", *(f"{e}\n" for e in entries)]
+    for package, entries in groups.items():
+        doc = importlib.import_module(package).__doc__ or ""
+        lines += [f"## {package}", "", doc.partition("\n")[0], "", *(f"{e}\n" for e in entries)]
     return "\n".join(lines)
 
 

@@ -1,9 +1,11 @@
-"""Shared by all tests: shape checking at run time, two threads, the optional shared data."""
+"""Shared by all tests: run-time shape checks, threads, the optional shared data, `hoigs …`."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -20,10 +22,14 @@ CHECKED = (
     "hoigs.rasterizers.gsplat",
     "hoigs.rasterizers.oracle",
     "hoigs.rasterizers.torch_tiles",
+    "hoigs.metrics",
     "hoigs.evaluation",
     "hoigs.training",
+    "hoigs.runs",
+    "hoigs.workflows",
     "hoigs.studies",
     "hoigs.testing",
+    "hoigs.viewing",
 )
 install_import_hook(list(CHECKED), "shapecheck.check")
 
@@ -60,3 +66,31 @@ DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 def device(request: pytest.FixtureRequest) -> torch.device:
     """Every device of this machine: the CPU, and CUDA where there is one."""
     return torch.device(request.param)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Exit code, stdout and stderr of one `hoigs …`."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def hoigs(monkeypatch, capsys) -> Callable[..., Outcome]:
+    """Run `hoigs ARGS…` in this process."""
+    from hoigs.cli.main import main
+
+    def run(*args: object) -> Outcome:
+        monkeypatch.setattr(sys, "argv", ["hoigs", *map(str, args)])
+        capsys.readouterr()
+        try:
+            main()
+            code = 0
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        captured = capsys.readouterr()
+        return Outcome(code, captured.out, captured.err)
+
+    return run

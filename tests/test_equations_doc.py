@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hoigs.core.spec import Spec
+from hoigs.core.spec.schema import Spec
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "design" / "hoigs-equations.md").read_text()

@@ -14,10 +14,10 @@ README = Path(__file__).parents[1] / "README.md"
 
 @pytest.mark.slow
 def test_the_first_screen_runs(monkeypatch):
-    from hoigs.synthesis import SceneKnobs, builtin_clip
+    from hoigs.synthesis import SceneConfig, builtin_clip
 
     # the smallest clip in place of the default one: the same code, seconds instead of a minute
-    tiny = lambda body: builtin_clip(body, SceneKnobs.tiny())  # noqa: E731
+    tiny = lambda body: builtin_clip(body, SceneConfig.tiny())  # noqa: E731
     monkeypatch.setattr(hoigs, "builtin_clip", tiny, raising=False)
     code = re.search(r"```python\n(.*?)```", README.read_text(), re.S)
     assert code is not None

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.core.clip import ObjectTrack
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.scene import SceneModel
-from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.clip import ObjectTrack
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.plugins.deformation.avatars.hexplane_skinning import HexPlaneSkinning
 from hoigs.testing.material.body import TinyBody
 
 
@@ -35,11 +35,11 @@ def person_of(
     body: TinyBody, frames: int, trained: tuple[int, ...], **settings: Any
 ) -> HexPlaneSkinning:
     """HOIGS's human with few cells; its poses are refined at the trained frames."""
-    usual = {"refine_poses": True, "num_frames": frames, "trained_frames": trained}
-    return HexPlaneSkinning(
-        body, resolution=8, channels=4, time_resolution=4, field_points=64, width=16,
-        **(usual | settings),
-    )  # fmt: skip
+    sizes = {"resolution": 8, "channels": 4, "time_resolution": 4, "field_points": 64, "width": 16}
+    fields = HexPlaneSkinning.Config.model_fields
+    sizes |= {name: settings.pop(name) for name in [*settings] if name in fields}
+    given = {"num_frames": frames, "trained_frames": trained} | settings
+    return HexPlaneSkinning(HexPlaneSkinning.Config(**sizes), body=body, **given)
 
 
 def away_from_start(model: SceneModel) -> SceneModel:

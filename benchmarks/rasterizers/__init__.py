@@ -13,5 +13,5 @@ JSON and a chart to benchmarks/results. What is measured:
 - *growth*: the factor that doubling the Gaussians, or the pixels, costs.
 - *stages* (CPU): where the time goes, kernel by kernel, and what part of the machine's own limits
   each reaches, measured in the same run.
-- *memory* (CPU): most bytes held at once, as bytes a Gaussian, a pixel and a pair.
+- *memory* (CPU): most bytes held at once, as bytes a Gaussian, a pixel and a tile intersection.
 """

@@ -14,7 +14,7 @@ from benchmarks.rasterizers import chart, machine, timing
 from benchmarks.rasterizers.peers import Peer, all_peers
 from benchmarks.rasterizers.scenes import GARDEN, Case, build
 
-CPU_PEERS = ["warp", "warp-openmp", "prototype", "torch", "oracle", "gsplat-torch"]
+CPU_PEERS = ["warp", "warp-openmp", "torch", "oracle", "gsplat-torch"]
 CUDA_PEERS = ["warp", "warp-captured", "gsplat", "gswarp"]
 CPU_CASES = [
     f"{size}/{count}"
@@ -87,15 +87,15 @@ def run(options: argparse.Namespace, device: torch.device) -> dict[str, Any]:
             for what, cases in (("gaussians", MORE_GAUSSIANS), ("pixels", MORE_PIXELS))
         }
         for what, factors in report["growth"].items():
-            pairs = ", ".join(f"{x['factor']} ({x['factor_cores']})" for x in factors)
-            say(f"twice the {what}: {pairs} by the clock (by the cores' time)")
+            text = ", ".join(f"{x['factor']} ({x['factor_cores']})" for x in factors)
+            say(f"twice the {what}: {text} by the clock (by the cores' time)")
     if device.type == "cpu" and {"stages", "memory"} & set(options.only):
         report |= inside(options)
     return report
 
 
 def inside(options: argparse.Namespace) -> dict[str, Any]:
-    """Stages and memory of our CPU path."""
+    """Stages and memory of our native CPU kernels."""
     from benchmarks.rasterizers import limits, memory, stages
 
     device, report = torch.device("cpu"), {}

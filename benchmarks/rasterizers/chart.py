@@ -15,7 +15,6 @@ COLORS = {
     "warp-captured": "#5fb48c",
     "torch": "#7a7a7a",
     "oracle": "#b9b9b9",
-    "prototype": "#c98a00",
     "gsplat-torch": "#b0413e",
     "gsplat": "#b0413e",
     "gswarp": "#3f6fb5",

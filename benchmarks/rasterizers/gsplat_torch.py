@@ -21,9 +21,9 @@ from torch import Tensor
 
 from benchmarks.rasterizers.hits import hits
 from benchmarks.rasterizers.peers import NotMeasuredError, Round, differentiated, installed
-from hoigs.core.camera import Camera
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 
 NOTE = (
     "its _quat_scale_to_covar_preci, _fully_fused_projection, _spherical_harmonics and accumulate "

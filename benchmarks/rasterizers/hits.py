@@ -1,4 +1,4 @@
-"""Which splats are drawn at which pixels: a count, and the list for gsplat's reference."""
+"""Which splats are drawn at which pixels: a count, and the list for gsplat's torch reference."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from benchmarks.rasterizers.peers import NotMeasuredError
-from hoigs.core.camera import Camera
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.projection import project
-from hoigs.core.rasterizer import RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.rasterizers.compositing import project_gaussians
 
 BAND = 16  # pixels: side of the squares that are looked at one by one
 
@@ -31,7 +31,7 @@ def _square(shown: tuple[Tensor, ...], left: int, top: int, width: int, height: 
 def squares(gaussians: Gaussians, camera: Camera):  # type: ignore[no-untyped-def]
     """For each square of pixels: its left, top, width, the rows of its splats, drawn or not."""
     with torch.no_grad():
-        shown = project(gaussians, camera, RenderRequest())
+        shown = project_gaussians(gaussians, camera, RenderRequest())
         order = shown.depths.argsort(stable=True)
         means2d, extents = shown.means2d[order], shown.extents[order] + 1
         opacities, conics = shown.opacities[order], shown.conics[order]

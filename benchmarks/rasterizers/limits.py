@@ -1,19 +1,20 @@
-"""What this machine can do at most: bytes copied, vector operations done, in the very snippet."""
+"""What this machine can do at most: bytes copied, and vector operations of the CPU kernels."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from string import Template
 from typing import Any
 
 import torch
 
-from hoigs.rasterizers.warp.cpu_vectors import EXTRA, MAX_ROWS, VECTORS
-from hoigs.rasterizers.warp.runtime import CPU_FLAGS, wp
+from hoigs.rasterizers.warp.common.runtime import CPU_FLAGS, wp
+from hoigs.rasterizers.warp.cpu.vector_source import MAX_ROWS, PASS_CHANNELS, VECTORS
 
 F32 = wp.array(dtype=wp.float32)
-_HEAD = VECTORS.replace("$MAX_ROWS", str(MAX_ROWS)).replace("$EXTRA", str(EXTRA))
+_HEAD = Template(VECTORS).substitute(MAX_ROWS=MAX_ROWS, PASS_CHANNELS=PASS_CHANNELS)
 CHAINS = 12  # multiply-adds in flight, so that latency does not count
 EXPONENTIALS = 8
 

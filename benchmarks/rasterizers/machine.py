@@ -1,4 +1,4 @@
-"""What it was measured on."""
+"""The machine of a measurement."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PACKAGES = ("torch", "warp-lang", "numpy", "hoigs", "gsplat", "gswarp")
 
 
 def processor() -> str:
-    """The CPU's model, as Linux tells it, else what Python knows."""
+    """The CPU's model from /proc/cpuinfo, else from Python's `platform`."""
     table = Path("/proc/cpuinfo")
     if table.exists():
         for line in table.read_text().splitlines():

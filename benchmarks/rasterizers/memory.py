@@ -1,4 +1,4 @@
-"""Most bytes that a training step holds at once, told apart by Gaussian, pixel and pair."""
+"""Most bytes that a training step holds at once, by Gaussian, pixel and tile intersection."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.rasterizers.peers import ours
 from benchmarks.rasterizers.scenes import Case
-from benchmarks.rasterizers.stages import tile_lists
-from hoigs.core.camera import Camera
-from hoigs.core.gaussians import Gaussians
+from benchmarks.rasterizers.stages import count_intersections
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.warp import WarpRasterizer
 
 
@@ -38,35 +38,35 @@ def peak_bytes(gaussians: Gaussians, camera: Camera, rasterizer: WarpRasterizer)
 
 
 def measure(scenes: list[tuple[Case, Gaussians, Camera]]) -> dict[str, Any]:
-    """Bytes a Gaussian, a pixel and a pair (a Gaussian in a tile) that explain the peaks best.
+    """Bytes a Gaussian, a pixel and a tile intersection that explain the peaks best.
 
     Returns:
-        the three, the peaks, and `unexplained`: how far a peak is from what they say, at most, as
-        a fraction. Pairs are what grows where splats are large: see `pairs_per_gaussian`.
+        the three, the peaks, and `unexplained`: how far a peak is from their sum, at most, as a
+        fraction. Large splats have more intersections: see `intersections_per_gaussian`.
     """
-    rasterizer, rows, table = WarpRasterizer(threads=2), [], []
+    rasterizer, rows, table = WarpRasterizer(WarpRasterizer.Config(threads=2)), [], []
     for case, gaussians, camera in scenes:
-        _, pairs = tile_lists(gaussians, camera, rasterizer)
+        _, intersections = count_intersections(gaussians, camera, rasterizer)
         pixels = case.width * case.height
         peak = peak_bytes(gaussians, camera, rasterizer)
-        table.append((len(gaussians), pixels, pairs, peak))
+        table.append((len(gaussians), pixels, intersections, peak))
         rows.append(
             {
                 "case": str(case),
                 "peak_bytes": peak,
-                "pairs": pairs,
-                "pairs_per_gaussian": round(pairs / len(gaussians), 2),
+                "intersections": intersections,
+                "intersections_per_gaussian": round(intersections / len(gaussians), 2),
             }
         )
     if len(table) < 3:
-        return {"unexplained": "three cases or more are needed to tell them apart", "cases": rows}
+        return {"unexplained": "three cases or more are needed", "cases": rows}
     numbers = np.array(table, dtype=np.float64)
     found, _ = nnls(numbers[:, :3] / numbers[:, 3:], np.ones(len(numbers)))
     explained = numbers[:, :3] @ found / numbers[:, 3]
     return {
         "bytes_per_gaussian": round(float(found[0]), 1),
         "bytes_per_pixel": round(float(found[1]), 1),
-        "bytes_per_pair": round(float(found[2]), 1),
+        "bytes_per_intersection": round(float(found[2]), 1),
         "unexplained": round(float(np.abs(1 - explained).max()), 4),
         "cases": rows,
     }

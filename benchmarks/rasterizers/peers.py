@@ -1,4 +1,7 @@
-"""Who is measured. A peer draws a case and differentiates it; what it leaves out is in its note."""
+"""The implementations that are measured.
+
+A peer draws a case and differentiates it; what it leaves out is in its note.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 
 
 class NotMeasuredError(Exception):
@@ -80,7 +83,7 @@ def ours(rasterizer: Any) -> Callable[[Gaussians, Camera], Round]:
 def warp(**options: Any) -> Callable[[Gaussians, Camera], Round]:
     from hoigs.rasterizers.warp import WarpRasterizer
 
-    return ours(WarpRasterizer(**options))
+    return ours(WarpRasterizer(WarpRasterizer.Config(**options)))
 
 
 def warp_captured(gaussians: Gaussians, camera: Camera) -> Round:
@@ -105,7 +108,7 @@ def oracle(gaussians: Gaussians, camera: Camera) -> Round:
 
     if camera.width * camera.height * len(gaussians) > 64 * 64 * 2000:
         raise NotMeasuredError("dense in float64: 64x64 with 2,000 Gaussians at most")
-    rasterizer = OracleRasterizer(cutoffs=True)
+    rasterizer = OracleRasterizer(OracleRasterizer.Config(cutoffs=True))
     return ours(rasterizer)(gaussians, camera)
 
 
@@ -202,7 +205,7 @@ def _versions(*packages: str) -> dict[str, str]:
 
 def all_peers() -> dict[str, Callable[[], Peer]]:
     """Peers by name, made on request: importing one must not need another's packages."""
-    from benchmarks.rasterizers import gsplat_torch, prototype
+    from benchmarks.rasterizers import gsplat_torch
 
     return {
         "warp": lambda: Peer("warp", warp(), "the default: native kernels, Python threads"),
@@ -217,7 +220,6 @@ def all_peers() -> dict[str, Callable[[], Peer]]:
         ),
         "torch": lambda: Peer("torch", plain_torch, "our plain torch tiles"),
         "oracle": lambda: Peer("oracle", oracle, "our dense float64 reference"),
-        "prototype": lambda: Peer("prototype", prototype.prepare, prototype.NOTE),
         "gsplat-torch": lambda: Peer(
             "gsplat-torch", gsplat_torch.prepare, gsplat_torch.NOTE, _versions("gsplat")
         ),

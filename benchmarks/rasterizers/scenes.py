@@ -1,4 +1,4 @@
-"""What is drawn: gsplat's garden, or a ball of random splats where that file is absent."""
+"""The scenes: gsplat's garden, or a ball of random splats where that file is absent."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hoigs.core.camera import Camera
-from hoigs.core.gaussians import Gaussians
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 
 SHARED = Path(os.environ.get("HOIGS_SHARED", Path(__file__).parents[3] / "shared"))
 GARDEN = SHARED / "data" / "garden.npz"

@@ -11,31 +11,31 @@ import torch
 from benchmarks.rasterizers.hits import count_hits
 from benchmarks.rasterizers.peers import ours
 from benchmarks.rasterizers.timing import once
-from hoigs.core.camera import Camera
-from hoigs.core.gaussians import Gaussians
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.warp import WarpRasterizer
-from hoigs.rasterizers.warp.launchers import Cores
-from hoigs.rasterizers.warp.records import MOMENTS, RECORD
+from hoigs.rasterizers.warp.common.records import MOMENTS, RECORD
+from hoigs.rasterizers.warp.cpu.cores import Cores
 
 # stages by kernel, in the order in which they run
 STAGES = {
     "project": "project",
     "sort_by_depth": "sort",
-    "count_pairs": "bin",
-    "place_pairs": "bin",
-    "scatter_pairs": "bin",
+    "count_intersections": "intersect",
+    "place_intersections": "intersect",
+    "scatter_intersections": "intersect",
     "forward_tiles": "forward",
     "backward_tiles": "backward",
     "project_adjoint": "project backward",
 }
-# Vector arithmetic of one block in `cpu_splats` and `cpu_adjoint`, additions, multiplications and
-# multiply-adds alike: alpha and its growth, weight, next, four channels | value, four sums, S,
-# the reciprocal (3), slope (3), three moments.
+# Vector operations of one block in `splat_source` and `backward_source`; additions, multiplications
+# and multiply-adds count alike: alpha and its growth, weight, next, four channels | value, four
+# sums, S, the reciprocal (3), slope (3), three moments.
 FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 8, 24
 
 
 class TimedCores(Cores):
-    """Cores that write down how long each kernel took, all its launches together."""
+    """Cores that note how long each kernel took, all its launches together."""
 
     def __init__(self, cores: Cores) -> None:
         super().__init__(cores.workers, cores.threads)
@@ -66,8 +66,8 @@ def measure(
     """
     device = torch.device("cpu")
     rasterizer = WarpRasterizer()
-    path = rasterizer.path(device)
-    path.cores = cores = TimedCores(path.cores)
+    pipeline = rasterizer.pipeline(device)
+    pipeline.cores = cores = TimedCores(pipeline.cores)
     drawing = ours(rasterizer)(gaussians, camera)
     times: dict[str, list[float]] = {name: [] for name in [*STAGES.values(), "other"]}
     for number in range(rounds + 2):
@@ -82,7 +82,7 @@ def measure(
                 times[name].append(milliseconds)
     work = _work(gaussians, camera, rasterizer)
     return {
-        "counts": {name: work[name] for name in ("gaussians", "visible", "pairs", "hits")},
+        "counts": {name: work[name] for name in ("gaussians", "visible", "intersections", "hits")},
         "milliseconds": {name: round(statistics.median(x), 3) for name, x in times.items()},
         "of_limit": {
             name: _fraction(name, statistics.median(x) / 1e3, work, limits)
@@ -92,31 +92,33 @@ def measure(
     }
 
 
-def tile_lists(gaussians: Gaussians, camera: Camera, rasterizer: WarpRasterizer) -> tuple[int, int]:
-    """How many Gaussians are drawn, and in how many pairs with a tile."""
-    path = rasterizer.path(torch.device("cpu"))
+def count_intersections(
+    gaussians: Gaussians, camera: Camera, rasterizer: WarpRasterizer
+) -> tuple[int, int]:
+    """How many Gaussians are drawn, and how many tile intersections they have."""
+    pipeline = rasterizer.pipeline(torch.device("cpu"))
     found: list[tuple[int, int]] = []
-    make = path.bin
+    intersect = pipeline.intersect
 
     def watched(projected: Any, settings: Any) -> Any:
-        lists = make(projected, settings)
-        found.append((int((projected.drawn_depths > 0).sum()), lists.pairs.shape[0]))
-        return lists
+        intersections = intersect(projected, settings)
+        found.append((int((projected.drawn_depths > 0).sum()), intersections.count))
+        return intersections
 
-    path.bin = watched
+    pipeline.intersect = watched
     try:
         rasterizer.render(gaussians, camera)
     finally:
-        path.bin = make
+        pipeline.intersect = intersect
     return found[0]
 
 
 def _work(gaussians: Gaussians, camera: Camera, rasterizer: WarpRasterizer) -> dict[str, int]:
-    visible, pairs = tile_lists(gaussians, camera, rasterizer)
+    visible, intersections = count_intersections(gaussians, camera, rasterizer)
     return {
         "gaussians": len(gaussians),
         "visible": visible,
-        "pairs": pairs,
+        "intersections": intersections,
         "hits": count_hits(gaussians, camera),
         "raw": 4 * (3 + 4 + 3 + 1 + 3 * gaussians.sh.shape[1]),
     }
@@ -125,7 +127,8 @@ def _work(gaussians: Gaussians, camera: Camera, rasterizer: WarpRasterizer) -> d
 def _fraction(
     stage: str, seconds: float, work: dict[str, int], limits: dict[str, float]
 ) -> dict[str, Any]:
-    n, seen, pairs, raw = (work[name] for name in ("gaussians", "visible", "pairs", "raw"))
+    names = ("gaussians", "visible", "intersections", "raw")
+    n, seen, intersections, raw = (work[name] for name in names)
     record, partial = 4 * RECORD, 4 * MOMENTS
     if stage in ("forward", "backward"):
         operations = FORWARD_OPERATIONS if stage == "forward" else BACKWARD_OPERATIONS
@@ -135,8 +138,8 @@ def _fraction(
     least = {
         "project": n * raw + seen * record + n * 4 * 5,
         "sort": n * 4 + seen * (2 * 8 + 3 * 2 * 8),
-        "bin": 2 * seen * record + pairs * (8 + 2 * 12),
-        "project backward": n * 2 * raw + pairs * partial + n * 8,
+        "intersect": 2 * seen * record + intersections * (8 + 2 * 12),
+        "project backward": n * 2 * raw + intersections * partial + n * 8,
     }[stage]
     rate = least / seconds
     most = limits["copy_bytes"]

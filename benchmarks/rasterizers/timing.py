@@ -1,4 +1,4 @@
-"""Interleaved rounds, and what they come to."""
+"""Interleaved rounds, and their medians and ratios."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from torch import Tensor
 
 from benchmarks.rasterizers.peers import NotMeasuredError, Peer, Round
 from benchmarks.rasterizers.scenes import Case
-from hoigs.core.camera import Camera
-from hoigs.core.gaussians import Gaussians
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 
 
 def clock(device: torch.device) -> float:
-    """Milliseconds, once all that was asked of the device is done."""
+    """Milliseconds, once the device has finished."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return 1e3 * time.perf_counter()

@@ -1,4 +1,4 @@
-"""`hoigs chart`: accuracy against cost, of specs x rasterizers x budgets x clips x seeds."""
+"""`hoigs chart`: accuracy against cost, for specs, rasterizers, budgets, clips and seeds."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from hoigs.cli.common import (
     SeedsOption,
     SetOption,
     ThreadsOption,
-    pick_device,
     print_table,
 )
 from hoigs.cli.evaluate import LpipsOption
+from hoigs.runs.choices import pick_device
 
 
 def chart(
@@ -29,12 +29,13 @@ def chart(
         str,
         typer.Option(
             "--specs",
-            help="With commas between, each [LABEL=]SPEC[+KEY=VALUE…]: hoigs,mine.yaml,"
+            help="Specs with commas between, each [LABEL=]SPEC[+KEY=VALUE…]: hoigs,mine.yaml,"
             "hoigs+interaction.use=interaction:none.",
         ),
     ] = "hoigs,static",
     rasterizers: Annotated[
-        str, typer.Option("--rasterizers", help="warp,torch …; default each spec's own.")
+        str,
+        typer.Option("--rasterizers", help="Rasterizers: warp,torch …; default each spec's own."),
     ] = "",
     budgets: Annotated[
         str, typer.Option("--budgets", help="Steps: 200,1000; default each spec's own.")
@@ -48,42 +49,50 @@ def chart(
     minutes: MinutesOption = None,
     add: Annotated[
         list[Path] | None,
-        typer.Option("--add", help="Also draw the cells of another chart.json. Repeatable."),
+        typer.Option(
+            "--add",
+            help="Also draw the results of this chart.json; without CLIPS, only those. Repeatable.",
+        ),
     ] = None,
     mix_machines: Annotated[
-        bool, typer.Option("--mix-machines", help="Draw times of several machines together.")
+        bool,
+        typer.Option("--mix-machines", help="Draw times that were measured on different machines."),
     ] = False,
     rerun: Annotated[
         str | None,
-        typer.Option("--rerun", help="Run one cell, CLIP/RUN, again and print the difference."),
+        typer.Option("--rerun", help="Train CLIP/RUN again and print the differences."),
     ] = None,
     settings: SetOption = None,
     device: DeviceOption = "auto",
     lpips_weights: LpipsOption = None,
     plugin: PluginOption = None,
 ) -> None:
-    """Chart accuracy against cost; what is done stays done, what failed is tried again.
+    """Chart accuracy against cost. The same command continues an interrupted study.
 
-    Writes chart.html (interactive), chart.md (who dominates whom), chart.csv, chart.json, and
-    chart-CLIP.png and .svg with curves of training beside them. --rerun leaves with 1 when a PSNR
-    is more than 0.05 dB off on the same machine.
+    Writes chart.html (interactive, needs plotly: pip install 'hoigs[charts]'), chart.md,
+    chart.csv, chart.json, and chart-CLIP.png and .svg with training curves beside them. With
+    --rerun, the exit code is 1 if a PSNR differs by more than 0.05 dB on the same machine.
     """
     each = threads or max(1, (os.cpu_count() or 1) // jobs)
-    before = signal.signal(signal.SIGTERM, _stop)  # so that a plain kill ends the runs too
+    before = signal.signal(signal.SIGTERM, _stop)  # so that SIGTERM ends the runs too
     try:
         if rerun is not None:
             _rerun(out, rerun, each)
             return
         from hoigs.core.errors import HoigsError
-        from hoigs.studies.chart_data import load_cells
-        from hoigs.studies.chart_plan import ChartStudy, parse_variants
-        from hoigs.studies.chart_run import run_chart
-        from hoigs.studies.chart_write import write_chart
-        from hoigs.studies.job import Job
+        from hoigs.studies.chart.data import load_chart
+        from hoigs.studies.chart.interactive import require_plotly
+        from hoigs.studies.chart.plan import ChartStudy
+        from hoigs.studies.chart.run import run_chart
+        from hoigs.studies.chart.write import write_chart
+        from hoigs.studies.jobs.job import Job
+        from hoigs.studies.jobs.variants import parse_variants
 
         if not clips and not add:
             raise HoigsError("name a clip: `hoigs chart builtin:carry --specs hoigs,static`")
-        others = [cell for path in add or () for cell in load_cells(path)]
+        require_plotly()
+        loaded = {path: load_chart(path) for path in add or ()}
+        others = [cell for added, _ in loaded.values() for cell in added]
         study = ChartStudy(
             clips=clips or [],
             variants=parse_variants(specs),
@@ -103,10 +112,13 @@ def chart(
         limit = None if minutes is None else 60 * minutes
         cells = run_chart(study, workers=jobs, threads=each, limit_s=limit, report=report)
         about = _about(study.settings, study.device, jobs, each)
+        if not clips:  # nothing was run
+            about = {k if len(loaded) == 1 else f"{k} ({path})": v
+                     for path, (_, made) in loaded.items() for k, v in made.items()}  # fmt: skip
         for path in write_chart([*cells, *others], study.out, about, mix_machines=mix_machines):
             typer.echo(f"wrote {path}")
         if any(cell.missing for cell in cells):
-            typer.echo("some cells are not computed; chart.md says why")
+            typer.echo("some trainings are not done; chart.md gives the reason")
     finally:
         signal.signal(signal.SIGTERM, before)
 
@@ -121,14 +133,16 @@ def _steps(text: str) -> list[int]:
     words = [word.strip() for word in text.split(",") if word.strip()]
     for word in words:
         if not word.isdecimal() or int(word) < 1:
-            raise HoigsError(f'--budgets: "{word}" is no number of steps; give some: 200,1000')
+            raise HoigsError(
+                f'--budgets: "{word}" is not a number of steps; expected for example 200,1000'
+            )
     return list(dict.fromkeys(map(int, words)))
 
 
 def _about(settings: tuple[str, ...], device: str, jobs: int, threads: int) -> dict[str, object]:
     from datetime import UTC, datetime
 
-    from hoigs.training.run_folder import versions
+    from hoigs.runs.run_folder import versions
 
     return {
         "date": datetime.now(UTC).date().isoformat(),
@@ -140,9 +154,9 @@ def _about(settings: tuple[str, ...], device: str, jobs: int, threads: int) -> d
 
 def _rerun(out: Path, cell: str, threads: int) -> None:
     from hoigs.evaluation.protocol import NotComputed
-    from hoigs.studies.chart_data import AXES
-    from hoigs.studies.rerun import TOLERANCE_DB
-    from hoigs.studies.rerun import rerun as run_again
+    from hoigs.studies.chart.data import AXES
+    from hoigs.studies.chart.rerun import TOLERANCE_DB
+    from hoigs.studies.chart.rerun import rerun as run_again
 
     found = run_again(out.resolve(), cell, threads)
     rows = []
@@ -153,7 +167,7 @@ def _rerun(out: Path, cell: str, threads: int) -> None:
         rows.append((axis.title, *shown, "" if difference is None else f"{difference:+.4f}"))
     print_table(cell, ("measure", "first", "again", "difference"), rows, [f"run: {found.run}"])
     if not found.same_machine:
-        typer.echo(f"two machines, nothing is asked: {found.machines[0]} | {found.machines[1]}")
+        typer.echo(f"two machines, so not compared: {found.machines[0]} | {found.machines[1]}")
         return
     word = "reproduced" if found.reproduced else "NOT reproduced"
     typer.echo(f"{word}: PSNR to {TOLERANCE_DB} dB on the same machine")

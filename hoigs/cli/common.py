@@ -1,4 +1,4 @@
-"""What the verbs share: options, tables and progress bars. No torch."""
+"""Options, tables and progress bars that commands share; imports no torch."""
 
 from __future__ import annotations
 
@@ -11,57 +11,53 @@ import typer
 
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Override one key of the spec: train.steps=500. Repeatable."),
+    typer.Option("--set", help="Set one key of the spec: train.steps=500. Repeatable."),
 ]
 RasterizerOption = Annotated[
     str | None,
-    typer.Option("--rasterizer", help="Backend: warp, torch, oracle or any rasterizer plugin."),
+    typer.Option("--rasterizer", help="Rasterizer: warp, torch, oracle or a plugin."),
 ]
 DeviceOption = Annotated[
-    str, typer.Option("--device", help="cpu, cuda, or auto: cuda where there is one.")
+    str, typer.Option("--device", help="cpu, cuda, or auto: cuda if available.")
 ]
-SeedsOption = Annotated[int, typer.Option("--seeds", min=1, help="Runs of each, seeds 0, 1 …")]
-JobsOption = Annotated[int, typer.Option("--jobs", min=1, help="Runs at a time.")]
+SeedsOption = Annotated[int, typer.Option("--seeds", min=1, help="Number of seeds: 0, 1 …")]
+JobsOption = Annotated[int, typer.Option("--jobs", min=1, help="Trainings at a time.")]
 ThreadsOption = Annotated[
-    int | None, typer.Option("--threads", min=1, help="Of each run; default cores / jobs.")
+    int | None,
+    typer.Option("--threads", min=1, help="Threads of each training; default cores / jobs."),
 ]
 MinutesOption = Annotated[
     float | None,
-    typer.Option("--minutes", help="Stop then, write what there is; the same command goes on."),
+    typer.Option(
+        "--minutes",
+        help="Stop after this time and write the results so far; the same command continues.",
+    ),
+]
+ClipOption = Annotated[
+    Path | None,
+    typer.Option("--clip", help="The clip, if it was moved: a folder or builtin:NAME."),
+]
+AllowFaultsOption = Annotated[
+    bool,
+    typer.Option(
+        "--allow-faults",
+        help="Continue without masks, images and depth that are missing or broken.",
+    ),
 ]
 PluginOption = Annotated[
     list[Path] | None,
-    typer.Option("--plugin", help="Also load this plugin file. It is Python and will run."),
+    typer.Option(
+        "--plugin", help="Also load this Python file as a plugin; its code runs. Repeatable."
+    ),
 ]
-
-
-def pick_device(name: str) -> str:
-    """Resolve "auto", and refuse a device that is not there."""
-    import torch
-
-    from hoigs.core.errors import HoigsError
-
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise HoigsError(f"--device {name}: this machine has no CUDA device; use --device cpu")
-    return name
-
-
-def overrides(values: Sequence[str] | None, rasterizer: str | None = None) -> list[str]:
-    """`--set` values with `--rasterizer NAME` as one more."""
-    chosen = list(values or [])
-    if rasterizer is not None:
-        key = rasterizer if ":" in rasterizer else f"rasterizer:{rasterizer}"
-        chosen.append(f"rasterizer.use={key}")
-    return chosen
 
 
 def print_table(
     title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], notes: Sequence[str] = ()
 ) -> None:
-    """A table on stdout: drawn for a terminal, plain columns for a pipe."""
+    """Print a table on stdout."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     console = Console(width=None if Console().is_terminal else 160)
@@ -69,7 +65,7 @@ def print_table(
     for i, column in enumerate(columns):
         table.add_column(column, justify="left" if i == 0 else "right")
     for row in rows:
-        table.add_row(*(str(cell) for cell in row))
+        table.add_row(*(escape(str(cell)) for cell in row))  # "hoigs[gsplat]" is no markup
     console.print(table)
     for note in notes:
         console.print(f"[dim]{note}[/dim]", highlight=False)

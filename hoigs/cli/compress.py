@@ -1,4 +1,4 @@
-"""`hoigs compress`: a run in few bytes, and what that costs in the picture."""
+"""`hoigs compress`: quantise the model of a run, and print what that costs."""
 
 from __future__ import annotations
 
@@ -7,37 +7,32 @@ from typing import Annotated
 
 import typer
 
-from hoigs.cli.common import DeviceOption, PluginOption, pick_device
+from hoigs.cli.common import ClipOption, DeviceOption, PluginOption
 
 
 def compress(
     run: Annotated[Path, typer.Argument(help="Run folder, as `hoigs train` makes it.")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="Folder of the small run; default RUN-compact.")
+        Path | None,
+        typer.Option("--out", help="Folder of the compressed run; default RUN-compact."),
     ] = None,
-    clip: Annotated[
-        Path | None, typer.Option("--clip", help="The clip, if it has moved; builtin:NAME too.")
-    ] = None,
+    clip: ClipOption = None,
     device: DeviceOption = "auto",
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the run in --out.")
     ] = False,
     plugin: PluginOption = None,
 ) -> None:
-    """Quantise a trained model to 8 and 16 bits a number and squeeze it. eval, render and view take
-    the small run as any other; training cannot go on from it."""
-    from hoigs.studies.needs.compact_run import compact_run
+    """Quantise a trained model to 8 and 16 bits a number and compress it.
 
-    target = out or run.with_name(f"{run.name}-compact")
-    done = compact_run(
-        run,
-        target,
-        clip=clip,
-        device=pick_device(device),
-        plugins=plugin or (),
-        overwrite=overwrite,
+    The result is a run for eval, render and view; it cannot be trained further.
+    """
+    from hoigs.studies.needs.pruning.compact_run import compress as compress_run
+
+    done = compress_run(
+        run, out=out, clip=clip, device=device, overwrite=overwrite, plugins=plugin or ()
     )
     typer.echo(str(done))
     frames = ", ".join(map(str, done.frames))
-    typer.echo(f"looked at: training frames {frames}; people and things, and background, apart")
-    typer.echo(f"run: {target}")
+    typer.echo(f"scored on training frames {frames}: people and objects, and background")
+    typer.echo(f"run: {done.path}")

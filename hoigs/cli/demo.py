@@ -1,4 +1,4 @@
-"""`hoigs demo`: the built-in clip, reconstructed, judged and compared with a static model."""
+"""`hoigs demo`: reconstruct the built-in clip, and compare with a static model."""
 
 from __future__ import annotations
 
@@ -8,17 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hoigs.cli.common import (
-    DeviceOption,
-    RasterizerOption,
-    SetOption,
-    overrides,
-    pick_device,
-    print_table,
-)
+from hoigs.cli.common import DeviceOption, RasterizerOption, SetOption, print_table
+from hoigs.cli.display import Display, print_scores
 
 if TYPE_CHECKING:
-    from hoigs.evaluation.scores import Evaluation
+    from hoigs.workflows.train import TrainedRun
 
 
 def demo(
@@ -28,50 +22,44 @@ def demo(
     rasterizer: RasterizerOption = None,
     device: DeviceOption = "auto",
     baseline: Annotated[
-        bool, typer.Option("--baseline/--no-baseline", help="Also train a static model to compare.")
+        bool,
+        typer.Option("--baseline/--no-baseline", help="Also train a static model for comparison."),
     ] = True,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier demo.")
     ] = False,
 ) -> None:
     """Generate a clip with known truth, reconstruct it, and write report.html."""
-    from hoigs.cli.evaluate import score_run
-    from hoigs.cli.train import run_session
-    from hoigs.core.registry import default_registry
-    from hoigs.synthesis import builtin_clip
-    from hoigs.training.run_folder import RunFolder
-    from hoigs.training.session import Session
+    from hoigs.workflows.demo import demo as run_demo
 
     began = time.perf_counter()
-    where = pick_device(device)
-    runs = {"hoigs": out}
-    if baseline:
-        runs["static"] = out.with_name(f"{out.name}-static")
-    for folder in runs.values():  # before the first has trained for minutes
-        RunFolder(folder).refuse_existing(overwrite)
-    typer.echo("generating the built-in clip (once; cached afterwards)")
-    clip = builtin_clip(default_registry().get("body:anny")())
-    evaluations = {}
-    for spec, folder in runs.items():
-        session = Session.open(
-            clip,
-            spec,
-            out=folder,
-            overrides=[f"train.steps={steps}", *overrides(settings, rasterizer)],
-            device=where,
+    with Display() as show:
+        runs = run_demo(
+            out=out,
+            steps=steps,
+            overrides=settings or (),
+            rasterizer=rasterizer,
+            device=device,
+            baseline=baseline,
             overwrite=overwrite,
+            on_start=show.started,
+            on_step=show.step,
+            progress=show.fraction,
+            report=show.line,
         )
-        run_session(session)
-        evaluations[spec] = score_run(folder, device=where)
-    _compare(evaluations)
+    for run in runs.values():
+        assert run.evaluated is not None
+        print_scores(run.evaluated)
+    _compare(runs)
     typer.echo(f"demo took {time.perf_counter() - began:.0f} s; open {out / 'report.html'}")
 
 
-def _compare(evaluations: dict[str, Evaluation]) -> None:
+def _compare(runs: dict[str, TrainedRun]) -> None:
     """PSNR of the runs, region by region, on the same test frames."""
     regions = ("full", "human_object", "human", "object", "interaction", "background")
     rows = []
-    for name, evaluation in evaluations.items():
-        scores = [evaluation.score(region, "psnr") for region in regions]
+    for name, run in runs.items():
+        assert run.evaluated is not None
+        scores = [run.evaluated.evaluation.score(region, "psnr") for region in regions]
         rows.append((name, *(f"{s:.2f}" if isinstance(s, float) else str(s) for s in scores)))
     print_table("PSNR on test frames, dB", ("spec", *regions), rows)

@@ -9,7 +9,7 @@ import typer
 from hoigs.cli.common import PluginOption
 from hoigs.cli.plugins_check import check
 from hoigs.cli.plugins_new import new
-from hoigs.cli.plugins_show import show
+from hoigs.cli.plugins_show import one_line, show
 
 app = typer.Typer(invoke_without_command=True)
 app.command("check")(check)
@@ -62,9 +62,9 @@ def list_plugins(*, load: bool = False, files: Any = ()) -> tuple[list[dict[str,
         Rows with key, status, dist, version, target, summary, error, seconds (of the plugin's
         import); and notes on the settings.
     """
-    from hoigs.core.component import KINDS
-    from hoigs.core.manager import Status
-    from hoigs.core.registry import default_registry
+    from hoigs.core.registry.component import KINDS
+    from hoigs.core.registry.manager import Status
+    from hoigs.core.registry.registry import default_registry
 
     registry = default_registry(files)
     rows = []
@@ -97,8 +97,3 @@ def _row(key: str, plugin: Any, status: str, error: str, component: Any) -> dict
         "error": error,
         "seconds": round(plugin.seconds, 3),
     }
-
-
-def one_line(text: str) -> str:
-    """`text` without line breaks and control characters: a stranger wrote it."""
-    return "".join(c for c in " ".join(text.split()) if c.isprintable())

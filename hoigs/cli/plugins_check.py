@@ -8,8 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from hoigs.cli.common import DeviceOption, PluginOption, SetOption, pick_device
+from hoigs.cli.common import DeviceOption, PluginOption, SetOption
 from hoigs.core.errors import HoigsError
+from hoigs.runs.choices import pick_device
 
 
 def check(
@@ -30,8 +31,8 @@ def check(
     plugin: PluginOption = None,
 ) -> None:
     """Run the conformance kit; exit code 1 when any check fails, or none could be run."""
-    from hoigs.core.registry import default_registry
-    from hoigs.testing.door import check_plugin
+    from hoigs.core.registry.registry import default_registry
+    from hoigs.testing.runner import check_plugin
 
     try:
         reports = check_plugin(

@@ -32,6 +32,7 @@ class NewKind(StrEnum):
     density = "density"
     reader = "reader"
     rasterizer = "rasterizer"
+    exporter = "exporter"
 
 
 SUMMARIES = {
@@ -41,6 +42,13 @@ SUMMARIES = {
     NewKind.density: "removes what can hardly be seen",
     NewKind.reader: "a folder with scene.npz and images",
     NewKind.rasterizer: "plain torch, every splat at every pixel",
+    NewKind.exporter: "a text file of positions and opacities for each moment",
+}
+
+# the command that uses a component, where it is not the training of a spec that names it
+USAGES = {
+    NewKind.reader: "hoigs train FOLDER        # reads {name}'s folders",
+    NewKind.exporter: "hoigs plugins check exporter:{name}",
 }
 
 
@@ -65,8 +73,8 @@ def write_package(name: str, kind: NewKind, out: Path) -> Path:
     Raises:
         HoigsError: the name cannot be that of a package, or the folder is there already.
     """
-    from hoigs.core.component import API
     from hoigs.core.errors import HoigsError
+    from hoigs.core.registry.component import API
 
     check_name(name, kind)
     folder = out / name
@@ -80,11 +88,7 @@ def write_package(name: str, kind: NewKind, out: Path) -> Path:
         "cls": class_name(name),
         "api": str(API),
         "summary": SUMMARIES[kind],
-        "usage": (
-            f"hoigs train FOLDER        # reads {name}'s folders"
-            if kind is NewKind.reader
-            else f"hoigs train CLIP --spec {name}.yaml"
-        ),
+        "usage": USAGES.get(kind, "hoigs train CLIP --spec {name}.yaml").format(name=name),
     }
     root = resources.files("hoigs.cli") / TEMPLATES
     out.mkdir(parents=True, exist_ok=True)
@@ -102,7 +106,7 @@ def write_package(name: str, kind: NewKind, out: Path) -> Path:
 def check_name(name: str, kind: NewKind) -> None:
     """Raise HoigsError unless a distribution, a module, a class and a component can have `name`."""
     from hoigs.core.errors import HoigsError
-    from hoigs.core.registry import default_registry
+    from hoigs.core.registry.registry import default_registry
 
     if not _NAME.fullmatch(name):
         near = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")

@@ -11,8 +11,8 @@ import typer
 from hoigs.cli.common import PluginOption
 
 if TYPE_CHECKING:
-    from hoigs.core.manager import Offer, Plugin
-    from hoigs.core.registry import Registry
+    from hoigs.core.registry.manager import Offer, Plugin
+    from hoigs.core.registry.registry import Registry
 
 
 def show(
@@ -23,7 +23,7 @@ def show(
     plugin: PluginOption = None,
 ) -> None:
     """Show a component: where it is from, how it stands, its settings with defaults and meaning."""
-    from hoigs.core.registry import default_registry
+    from hoigs.core.registry.registry import default_registry
 
     pages = describe_all(name, default_registry(plugin or ()))
     if as_json:
@@ -41,7 +41,7 @@ def describe_all(name: str, registry: Registry) -> list[dict[str, Any]]:
         PluginError: it means none; with the nearest name.
     """
     from hoigs.core.errors import PluginError, did_you_mean
-    from hoigs.core.manager import normal_name
+    from hoigs.core.registry.manager import normal_name
 
     manager = registry.manager
     wanted = normal_name(name)
@@ -82,7 +82,7 @@ def _component(offer: Offer, registry: Registry) -> dict[str, Any]:
         "settings": None,
     }
     if offer.status == "ok":
-        from hoigs.core.settings import describe_settings
+        from hoigs.core.registry.settings import describe_settings
 
         page["settings"] = [
             asdict(s) for s in describe_settings(registry.config_class(offer.exact))
@@ -113,7 +113,6 @@ def _origin(plugin: Plugin) -> dict[str, Any]:
 
 def as_text(page: dict[str, Any]) -> str:
     """A page for reading; what does not apply is left out."""
-    from hoigs.cli.plugins import one_line
 
     lines = []
     for name, value in page.items():
@@ -133,3 +132,8 @@ def as_text(page: dict[str, Any]) -> str:
             if row["meaning"]:
                 lines.append(f"        {row['meaning']}")
     return "\n".join(lines)
+
+
+def one_line(text: str) -> str:
+    """`text` without line breaks and control characters, which text of plugins may contain."""
+    return "".join(c for c in " ".join(text.split()) if c.isprintable())

@@ -1,4 +1,4 @@
-"""`hoigs prepare`: a video with what is known of it in, a clip folder out."""
+"""`hoigs prepare`: make a clip folder from a video."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ from typing import Annotated
 
 import typer
 
-from hoigs.cli.common import print_table, progress_bar
+from hoigs.cli.common import print_table
+from hoigs.cli.display import Display
 
 
 def prepare(
     source: Annotated[
         Path,
-        typer.Argument(
-            help="Folder with a video, or with frames, and what is known of it; or the video."
-        ),
+        typer.Argument(help="A video, or a folder with a video or frames and further inputs."),
     ],
     out: Annotated[Path, typer.Option("--out", help="Clip folder to make.")],
     width: Annotated[
@@ -36,22 +35,24 @@ def prepare(
         int | None, typer.Option("--every", help="Use the sharpest of each n frames.")
     ] = None,
     fps: Annotated[
-        float | None, typer.Option("--fps", help="Use so many frames a second, the sharpest.")
+        float | None, typer.Option("--fps", help="Use this many frames a second, the sharpest.")
     ] = None,
     focal: Annotated[
         float | None, typer.Option("--focal", help="Focal length in pixels of the video, if known.")
     ] = None,
     keep_black: Annotated[
         bool | None,
-        typer.Option("--keep-black", help="Learn flat black patches; default: they are ignored."),
+        typer.Option(
+            "--keep-black", help="Train on uniform black areas; default: they are ignored."
+        ),
     ] = None,
     overwrite: Annotated[bool | None, typer.Option("--overwrite", help="Replace the clip.")] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
-            help="Any option: priors.masks.use=prior:masks-files, priors.masks.path=sam2. "
-            "Repeatable.",
+            help="Any option: estimators.masks.use=estimator:masks-files, "
+            "estimators.masks.path=sam2. Repeatable.",
         ),
     ] = None,
     file: Annotated[
@@ -61,19 +62,21 @@ def prepare(
         bool,
         typer.Option(
             "--allow-commands",
-            help="Let options run the programs that they name (prior:command, prior:mediapipe).",
+            help="Let options run the programs that they name (estimator:command, "
+            "estimator:mediapipe).",
         ),
     ] = False,
     redo: Annotated[
         list[str] | None,
-        typer.Option("--redo", help="Run this stage anew, and what builds on it. Repeatable."),
+        typer.Option(
+            "--redo", help="Run this stage again, and those that depend on it. Repeatable."
+        ),
     ] = None,
     stage: Annotated[
         str | None, typer.Option("--stage", help="Stop after this stage; no clip is written.")
     ] = None,
 ) -> None:
-    """Turn a video and its priors into a clip folder, with a written report."""
-    from hoigs.core.registry import default_registry
+    """Make a clip folder from a video with the given estimators, and a report."""
     from hoigs.preparation.prepare import prepare as run
     from hoigs.preparation.prepare import prepare_until, work_folder
     from hoigs.preparation.settings import load_options
@@ -83,21 +86,19 @@ def prepare(
         "focal": focal, "keep_black": keep_black, "overwrite": overwrite,
     }  # fmt: skip
     options = load_options(file, settings or (), flags)
-    body = default_registry().get("body:anny")()
-    with progress_bar("preparing", 1.0) as bar:
-        if stage is not None:
-            seconds = prepare_until(
-                stage, source, out, options=options, body=body, progress=bar.update,
-                redo=redo or (), allow_commands=allow_commands,
-            )  # fmt: skip
-        else:
-            report = run(
-                source, out, options=options, body=body, progress=bar.update,
-                redo=redo or (), allow_commands=allow_commands,
-            )  # fmt: skip
     if stage is not None:
+        with Display() as show:
+            seconds = prepare_until(
+                stage, source, out, options=options, progress=show.fraction,
+                redo=redo or (), allow_commands=allow_commands,
+            )  # fmt: skip
         rows = [(name, f"{value:.1f} s") for name, value in seconds.items()]
         print_table(f"stages kept in {work_folder(out)}", ("stage", "made in"), rows)
         return
+    with Display() as show:
+        report = run(
+            source, out, options=options, progress=show.fraction,
+            redo=redo or (), allow_commands=allow_commands,
+        )  # fmt: skip
     print_table(f"prepared {out}", ("what", "value", "note"), report.rows())
     typer.echo(f"clip: {out}")

@@ -1,4 +1,4 @@
-"""`hoigs spec list|check|show`: the methods that come with hoigs, and one's own."""
+"""`hoigs spec list|check|show`: built-in specs and spec files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import typer
 from hoigs.cli.common import PluginOption, SetOption
 
 if TYPE_CHECKING:
-    from hoigs.core.spec import Spec
+    from hoigs.core.spec.schema import Spec
 
 app = typer.Typer(help="List, check and show specs.", no_args_is_help=True)
 
@@ -24,7 +24,7 @@ NameOrFile = Annotated[
 @app.command("list")
 def list_specs() -> None:
     """Names and summaries of the built-in specs, and their profiles besides the native one."""
-    from hoigs.core.spec import builtin_specs, builtin_summary, spec_profiles
+    from hoigs.core.spec.schema import builtin_specs, builtin_summary, spec_profiles
 
     for name in builtin_specs():
         profiles = "".join(f" @{profile}" for profile in spec_profiles(name)[1:])
@@ -35,8 +35,8 @@ def list_specs() -> None:
 
 @app.command()
 def check(spec: NameOrFile, settings: SetOption = None, plugin: PluginOption = None) -> None:
-    """Say whether a spec and all its profiles can be used, and what its components are."""
-    from hoigs.core.spec import spec_profiles
+    """Check a spec and all its profiles, and list its components."""
+    from hoigs.core.spec.schema import spec_profiles
 
     profiles = [f"{spec}@{profile}" for profile in spec_profiles(spec)[1:]]
     for loaded in [_load(one, settings, plugin) for one in (spec, *profiles)]:
@@ -47,12 +47,12 @@ def check(spec: NameOrFile, settings: SetOption = None, plugin: PluginOption = N
 
 @app.command()
 def show(spec: NameOrFile, settings: SetOption = None, plugin: PluginOption = None) -> None:
-    """Print a spec with every default filled in; the output is itself a spec."""
+    """Print a spec with all defaults; the output is a spec."""
     typer.echo(_load(spec, settings, plugin).dump(), nl=False)
 
 
 def _load(spec: str, settings: Sequence[str] | None, plugin: Sequence[Path] | None) -> Spec:
-    from hoigs.core.registry import default_registry
-    from hoigs.core.spec import Spec
+    from hoigs.core.registry.registry import default_registry
+    from hoigs.core.spec.schema import Spec
 
     return Spec.load(spec, overrides=settings or (), registry=default_registry(plugin or ()))

@@ -1,4 +1,4 @@
-"""`hoigs stress`: 56 named ways to fail, for every spec that they concern."""
+"""`hoigs stress`: 56 named failure cases, for every spec that they concern."""
 
 from __future__ import annotations
 
@@ -17,28 +17,29 @@ from hoigs.cli.common import (
     SeedsOption,
     SetOption,
     ThreadsOption,
-    pick_device,
 )
+from hoigs.runs.choices import pick_device
 
 
 def stress(
     cases: Annotated[
         str,
         typer.Option(
-            "--cases", help="F01,F10, families (motion, camera, human …) or all, commas between."
+            "--cases", help="Ids and families with commas between: F01,F10,motion,camera; or all."
         ),
     ] = "all",
     specs: Annotated[
-        str, typer.Option("--specs", help="As for `hoigs chart`: hoigs,4dgs@matched,mine.yaml.")
+        str,
+        typer.Option("--specs", help="Specs with commas between: hoigs,4dgs@matched,mine.yaml."),
     ] = "hoigs,static",
     seeds: SeedsOption = 3,
-    steps: Annotated[int, typer.Option("--steps", min=1, help="Of every training.")] = 300,
+    steps: Annotated[int, typer.Option("--steps", min=1, help="Steps of every training.")] = 300,
     points: Annotated[
-        int, typer.Option("--points", min=50, help="Gaussians of every model at its start.")
+        int, typer.Option("--points", min=50, help="Initial Gaussians of every model.")
     ] = 4000,
-    width: Annotated[int, typer.Option("--width", min=32, help="Of the clips, pixels.")] = 96,
+    width: Annotated[int, typer.Option("--width", min=32, help="Width of the clips, pixels.")] = 96,
     whole: Annotated[
-        bool, typer.Option("--whole", help="Go on to harder values after a seed has broken.")
+        bool, typer.Option("--whole", help="Run harder values even after a seed has failed one.")
     ] = False,
     out: Annotated[Path, typer.Option("--out", help="Folder of runs and results.")] = Path(
         "runs/stress"
@@ -50,19 +51,19 @@ def stress(
     device: DeviceOption = "cpu",
     plugin: PluginOption = None,
 ) -> None:
-    """Turn each way to fail into a verdict; what is done stays done, what failed is tried again.
+    """Find out where methods break. The same command continues an interrupted study.
 
-    Direct checks of our own code take seconds. Cases with a knob train on clips that are made
+    Direct checks of hoigs' own code take seconds. Cases with a sweep train on clips that get
     harder until a spec breaks. Writes stress.md, .csv and .json, stress-matrix.png and .svg, and
-    stress-curves.png and .svg. Leaves with 1 if a check of our own code fails.
+    stress-curves.png and .svg. The exit code is 1 if a check of hoigs' own code fails.
     """
-    from hoigs.studies.chart_plan import definition, parse_variants
-    from hoigs.studies.job import Job
+    from hoigs.studies.jobs.job import Job
+    from hoigs.studies.jobs.variants import definition, parse_variants
     from hoigs.studies.stress.case import choose_cases
     from hoigs.studies.stress.plan import BASE, StressStudy
+    from hoigs.studies.stress.report.table import make_table
+    from hoigs.studies.stress.report.write import write_stress
     from hoigs.studies.stress.run import run_stress
-    from hoigs.studies.stress.table import make_table
-    from hoigs.studies.stress.write import write_stress
 
     study = StressStudy(
         cases=choose_cases(cases),
@@ -82,11 +83,11 @@ def stress(
     def report(job: Job, word: str) -> None:
         typer.echo(f"{job.clip_label}/{job.folder.name}: {word}")
 
-    before = signal.signal(signal.SIGTERM, _stop)  # so that a plain kill ends the runs too
+    before = signal.signal(signal.SIGTERM, _stop)  # so that SIGTERM ends the runs too
     try:
         limit = None if minutes is None else 60 * minutes
         verdicts = run_stress(
-            study, workers=jobs, threads=each, limit_s=limit, report=report, tell=typer.echo
+            study, workers=jobs, threads=each, limit_s=limit, report=report, log=typer.echo
         )
     finally:
         signal.signal(signal.SIGTERM, before)
@@ -96,9 +97,9 @@ def stress(
         typer.echo(f"wrote {path}")
     broken = sorted({v.case for v in verdicts if v.ours and v.status == "fail"})
     if any(v.status == "not run" for v in verdicts):
-        typer.echo("some trainings are not done; the same command goes on")
+        typer.echo("some trainings are not done; the same command continues them")
     if broken:
-        typer.echo(f"checks of our own code fail: {', '.join(broken)}")
+        typer.echo(f"checks of hoigs' own code fail: {', '.join(broken)}")
         raise typer.Exit(1)
 
 
@@ -109,9 +110,9 @@ def _stop(*_: object) -> None:
 def _about(study: object, jobs: int, threads: int) -> dict[str, object]:
     from datetime import UTC, datetime
 
-    from hoigs.studies.machine import cpu_model
+    from hoigs.runs.run_folder import versions
+    from hoigs.studies.jobs.machine import cpu_model
     from hoigs.studies.stress.plan import StressStudy
-    from hoigs.training.run_folder import versions
 
     assert isinstance(study, StressStudy)
     return {

@@ -1,4 +1,4 @@
-"""`hoigs tables`: the paper's ablations and comparisons, job by job, on clips of one's own."""
+"""`hoigs tables`: the paper's ablations and comparisons on given clips."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from hoigs.cli.common import (
     SeedsOption,
     SetOption,
     ThreadsOption,
-    pick_device,
 )
 from hoigs.cli.evaluate import LpipsOption
+from hoigs.runs.choices import pick_device
 
 
 def tables(
@@ -28,14 +28,18 @@ def tables(
     ],
     table: Annotated[
         list[str] | None,
-        typer.Option("--table", help="A named table set; default all. Repeatable."),
+        typer.Option("--table", help="Name of a table; default all. Repeatable."),
     ] = None,
     specs: Annotated[
-        str, typer.Option("--specs", help="Also, or instead, a table of these: hoigs,4dgs@matched.")
+        str,
+        typer.Option(
+            "--specs", help="Also, or instead, a table of these specs: hoigs,4dgs@matched."
+        ),
     ] = "",
     seeds: SeedsOption = 3,
     steps: Annotated[
-        int | None, typer.Option("--steps", min=1, help="Of every run; default each spec's own.")
+        int | None,
+        typer.Option("--steps", min=1, help="Steps of every training; default each spec's own."),
     ] = None,
     out: Annotated[Path, typer.Option("--out", help="Folder of runs and tables.")] = Path(
         "runs/tables"
@@ -48,16 +52,16 @@ def tables(
     lpips_weights: LpipsOption = None,
     plugin: PluginOption = None,
 ) -> None:
-    """Run tables of methods on clips; what is done stays done, what failed is tried again.
+    """Compare methods on clips in tables. The same command continues an interrupted study.
 
-    Sets: comparison, ablation-object-motion, ablation-interaction, ablation-human-feature,
+    Tables: comparison, ablation-object-motion, ablation-interaction, ablation-human-feature,
     object-prior, mask-depth-source. Writes tables.md, tables.csv and tables.json.
     """
-    from hoigs.studies.job import Job
-    from hoigs.studies.table_sets import choose_sets
-    from hoigs.studies.tables import Study, circumstances, protocols, run_study
-    from hoigs.studies.write_tables import write_tables
-    from hoigs.training.run_folder import versions
+    from hoigs.runs.run_folder import versions
+    from hoigs.studies.jobs.job import Job
+    from hoigs.studies.tables.run import Study, circumstances, protocols, run_study
+    from hoigs.studies.tables.sets import choose_sets
+    from hoigs.studies.tables.write import write_tables
 
     study = Study(
         clips=_split(clips),
@@ -79,7 +83,7 @@ def tables(
         typer.echo(f"[{ended:>3}] {job.clip_label}/{job.folder.name}: {word}")
 
     def stop(*_: object) -> None:
-        raise KeyboardInterrupt  # so that a plain kill ends the runs too
+        raise KeyboardInterrupt  # so that SIGTERM ends the runs too
 
     limit = None if minutes is None else 60 * minutes
     before = signal.signal(signal.SIGTERM, stop)
@@ -101,7 +105,7 @@ def tables(
     for path in write_tables(results, study.out, about):
         typer.echo(f"wrote {path}")
     if any(r.missing and r.row.spec for t in results for rows in t.rows.values() for r in rows):
-        typer.echo("some rows are not computed; the tables say why")
+        typer.echo("some rows are not computed; the tables give the reason")
 
 
 def _split(names: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""A model's tensors as a compact checkpoint: read by everything that reads checkpoints."""
+"""A model's tensors as a compact checkpoint, which every reader of checkpoints accepts."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from hoigs.compression.packed import pack, unpack
 from hoigs.core.errors import CheckpointError
 
 FORMAT = "hoigs-compact"
-VERSION = 1
-COMPOSED = "composed"  # key of the names of tensors that spec and clip give again
+VERSION = 2
+READABLE = (1, VERSION)
+COMPOSED = "composed"  # key of the tensors that are not written, since spec and clip determine them
 
 
 def write_compact(
@@ -30,10 +31,10 @@ def write_compact(
     """Write `step_000123.safetensors` and `.json`; the JSON comes last and completes it.
 
     Args:
-        state: of the trained model. composed: state of the model as spec and clip compose it, with
-            as many Gaussians; what is equal in both is not written.
+        state: of the trained model. composed: state of the untrained model of spec and clip, with
+            as many Gaussians; tensors that are equal in both are not written.
         meta: of the model's checkpoint (step, counts, spec_name, model_hash).
-        extra: kept to the bit beside the model, by full name ("cameras.…").
+        extra: other tensors, lossless, by full name ("cameras.…").
 
     Returns:
         Bytes of both files.
@@ -67,13 +68,14 @@ def write_compact(
 
 
 def read_compact(streams: Mapping[str, Tensor], meta: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Tensors of a compact checkpoint by their names in an ordinary one.
+    """Tensors of a compact checkpoint, by their names in an ordinary one.
 
     Raises:
         CheckpointError: damaged, or of another version.
     """
-    if meta.get("version") != VERSION:
-        raise CheckpointError(f"{FORMAT} version {meta.get('version')!r}, expected {VERSION}")
+    if meta.get("version") not in READABLE:
+        expected = " or ".join(map(str, READABLE))
+        raise CheckpointError(f"{FORMAT} version {meta.get('version')!r}, expected {expected}")
     found = unpack(streams, meta["tensors"])
     return {
         name: value.float() if name.startswith("cameras.") and value.dtype == torch.float64

@@ -1,4 +1,4 @@
-"""Min-max quantisation: numbers as 8 or 16 bits between the least and the largest of a channel."""
+"""Min-max quantisation: values as 8 or 16 bits between the minimum and maximum of a channel."""
 
 from __future__ import annotations
 
@@ -11,27 +11,26 @@ from torch import Tensor
 
 Bits = Literal[8, 16]
 
-# by the last part of a tensor's name, and by what stands anywhere in it; the first that fits.
-# 8 bits where 1/510 of the range is below what a picture shows; places and weights of networks
-# need 16: 1/131070 of a metre-sized thing is 0.01 mm
+# names of tensors with 8 bits, by the last part or by any part of the name: 1/510 of their range is
+# not visible in an image. Positions and network weights need 16: 1/131070 of 1 m is 0.01 mm
 EIGHT = ("quats", "keyframe_quats", "log_scales", "opacity_logits", "sh", "embedding", "mixture")
 EIGHT_IN = ("planes.",)
 
 
 def bits_of(name: str) -> Bits:
-    """How many bits a tensor of this name gets."""
+    """The number of bits for a tensor of this name."""
     last = name.rpartition(".")[2]
     return 8 if last in EIGHT or any(part in name for part in EIGHT_IN) else 16
 
 
 @dataclass(frozen=True)
 class Levels:
-    """A tensor as levels of its channels.
+    """A quantised tensor.
 
     Attributes:
         codes: of the tensor's shape, 0 to 2^bits - 1, int32.
-        low, step: of each channel (the last axis; one channel of a tensor of fewer than two
-            axes): value = low + step * code, float64.
+        low, step: float64, of each channel: value = low + step * code. Channels are the last axis;
+            a tensor of fewer than two axes is one channel.
     """
 
     codes: Tensor
@@ -41,18 +40,18 @@ class Levels:
 
     @property
     def bound(self) -> Float[Tensor, " C"]:
-        """The largest error of a value of each channel, before it is rounded to its own type."""
+        """The largest error in each channel, before rounding to the tensor's dtype."""
         return self.step / 2
 
 
 def quantise(values: Float[Tensor, "..."], bits: Bits) -> Levels:
-    """The nearest levels.
+    """Quantise to the nearest levels.
 
     Raises:
-        ValueError: a value is not finite; it has no level.
+        ValueError: a value is not finite.
     """
     if not torch.isfinite(values).all():
-        raise ValueError("values that are not finite have no level")
+        raise ValueError("values that are not finite cannot be quantised")
     exact = values.detach().cpu().to(torch.float64)
     channels = exact.reshape(-1, exact.shape[-1]) if exact.dim() > 1 else exact.reshape(-1, 1)
     if channels.numel() == 0:
@@ -65,7 +64,7 @@ def quantise(values: Float[Tensor, "..."], bits: Bits) -> Levels:
 
 
 def restore(levels: Levels, dtype: torch.dtype) -> Tensor:
-    """The values of the levels."""
+    """The values of quantised levels."""
     codes = levels.codes.to(torch.float64)
     if codes.dim() > 1:
         return (levels.low + levels.step * codes).to(dtype)

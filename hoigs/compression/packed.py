@@ -1,8 +1,8 @@
 """A set of tensors in one safetensors file of zlib streams, described by JSON values.
 
-Every tensor is a stream of bytes. Floating ones are quantised first, and the high bytes of 16-bit
-levels stand before the low ones, which zlib likes better; all others are kept to the bit. The JSON
-says of each: shape, type, bits, CRC-32 of what the stream holds.
+Every tensor is a stream of bytes. Floating-point tensors are quantised first, with the high bytes
+of 16-bit levels before the low ones, which compresses better; all others are lossless. The JSON
+holds the shape, dtype, bits and CRC-32 of each.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from hoigs.compression.levels import Bits, Levels, bits_of, quantise, restore
 from hoigs.core.errors import CheckpointError
 
-EFFORT = 9  # of zlib
+ZLIB_LEVEL = 9
 FLOATS = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16,
           "float64": torch.float64}  # fmt: skip
 EXACT = {"int64": torch.int64, "int32": torch.int32, "int16": torch.int16, "int8": torch.int8,
@@ -28,15 +28,15 @@ EXACT = {"int64": torch.int64, "int32": torch.int32, "int16": torch.int16, "int8
 def pack(
     tensors: Mapping[str, Tensor], bits: Callable[[str], Bits] = bits_of
 ) -> tuple[dict[str, Tensor], dict[str, dict[str, Any]]]:
-    """Streams as uint8 tensors by name, and what describes them, JSON values.
+    """Compressed streams, as uint8 tensors by name, and their descriptions, as JSON values.
 
-    Float64 tensors (times of knots) are kept to the bit, as are those that are no floats.
+    Float64 tensors (times of keyframes) and integers are lossless.
 
     Args:
-        bits: how many a tensor of a name gets.
+        bits: number of bits for a tensor of a name.
 
     Raises:
-        ValueError: a value is not finite, or of a type that is not known.
+        ValueError: a value is not finite, or a dtype is not supported.
     """
     streams: dict[str, Tensor] = {}
     described: dict[str, dict[str, Any]] = {}
@@ -56,7 +56,7 @@ def pack(
         else:
             raise ValueError(f"{name}: tensors of {kind} cannot be packed")
         described[name] = {**record, "crc32": zlib.crc32(data)}
-        squeezed = np.frombuffer(zlib.compress(data, EFFORT), np.uint8)
+        squeezed = np.frombuffer(zlib.compress(data, ZLIB_LEVEL), np.uint8)
         streams[name] = torch.from_numpy(squeezed.copy())
     return streams, described
 
@@ -64,10 +64,10 @@ def pack(
 def unpack(
     streams: Mapping[str, Tensor], described: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Tensor]:
-    """What `pack` was given, floats to their levels.
+    """The tensors of `pack`, floating-point ones quantised.
 
     Raises:
-        CheckpointError: a stream is absent, damaged, or not what the description says.
+        CheckpointError: a stream is absent, damaged, or differs from its description.
     """
     found = {}
     for name, record in described.items():
@@ -82,15 +82,15 @@ def unpack(
         try:
             found[name] = _tensor(data, record)
         except (KeyError, ValueError) as error:
-            raise CheckpointError(f"{name}: not as its description says: {error}") from error
+            raise CheckpointError(f"{name}: does not match its description: {error}") from error
     return found
 
 
 def _bytes(levels: Levels) -> bytes:
-    """Ranges of the channels (float64), then the levels, byte plane by byte plane."""
+    """Ranges of the channels (float64), then the levels, one byte plane after the other."""
     ranges = torch.stack((levels.low, levels.step)).numpy().tobytes()
     codes = levels.codes.numpy()
-    # a column at a time: one channel's levels resemble each other
+    # channel by channel: levels of one channel are similar, which compresses better
     columns = codes.reshape(-1, codes.shape[-1]).T if codes.ndim > 1 else codes.reshape(1, -1)
     flat = np.ascontiguousarray(columns).reshape(-1)
     if levels.bits == 8:

@@ -9,8 +9,14 @@ class ComponentConfig(BaseModel):
     """Settings of one component, as they stand in a spec beside `use:`.
 
     Unknown keys are refused, values are checked when assigned, and loading one runs nothing. Some
-    name programs that their component runs when it is used (`prior:command`, `prior:mediapipe`):
-    a component says which in `VideoPrior.commands`, and `hoigs prepare` asks before it does.
+    name programs that their component runs when it is used (`estimator:command`,
+    `estimator:mediapipe`): a component says which in `Estimator.commands`, and `hoigs prepare`
+    asks before it does.
     """
 
-    model_config = ConfigDict(extra="forbid", validate_assignment=True, protected_namespaces=())
+    model_config = ConfigDict(
+        extra="forbid",
+        validate_assignment=True,
+        protected_namespaces=(),
+        use_attribute_docstrings=True,
+    )

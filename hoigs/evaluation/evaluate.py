@@ -1,9 +1,9 @@
-"""A model judged on a clip: every score with its protocol, or the reason why there is none."""
+"""evaluate: scores of a model on a clip, each with its protocol or the reason why it is absent."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,21 +11,22 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from hoigs.core.clip import CAMERAS_REFINED, Clip, Frame
 from hoigs.core.errors import did_you_mean
-from hoigs.core.interaction import EntityKind
-from hoigs.core.rasterizer import RenderOutput
-from hoigs.core.scene import SceneModel
+from hoigs.core.interfaces.rasterizer import RenderOutput
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.progress import Progress, no_progress
+from hoigs.core.values.clip import CAMERAS_REFINED, Clip, Frame
+from hoigs.core.values.tokens import EntityKind
 from hoigs.evaluation.geometry import measure_geometry
-from hoigs.evaluation.lpips import Lpips, find_weights
 from hoigs.evaluation.measure import device_name, model_size, render_time
-from hoigs.evaluation.metrics import region_psnr, ssim_map
 from hoigs.evaluation.posing import FIT_STEPS, posed_clip
 from hoigs.evaluation.protocol import NotComputed, Pixels, Protocol, TestPose, Value
-from hoigs.evaluation.regions import default_band, region_masks
 from hoigs.evaluation.scores import METRICS, Evaluation, FrameScores, ViewScores
+from hoigs.metrics.lpips import Lpips, find_weights
+from hoigs.metrics.psnr import region_psnr
+from hoigs.metrics.regions import default_band, region_masks
+from hoigs.metrics.ssim import ssim_map
 
-Progress = Callable[[float, str], None]
 TIMING_SHARE, FITTING_SHARE = 0.3, 0.5  # of the progress bar
 
 
@@ -50,15 +51,15 @@ def evaluate(
     """Score a model on a split of a clip and on its held-out cameras, and measure it.
 
     Args:
-        lpips_weights: see `lpips.find_weights`; without any, LPIPS is "not computed" and says why.
+        lpips_weights: see `lpips.find_weights`; without any, LPIPS is "not computed".
         held_out: also score the clip's held-out cameras, where it has them.
-        test_pose, test_camera, fit_steps: where body poses and cameras of the scored frames come
-            from; see `posing.posed_clip`. The clip with these is `Evaluation.scored`.
+        test_pose, test_camera, fit_steps: source of body poses and cameras; see
+            `posing.posed_clip`. The clip with these is `Evaluation.scored`.
         pixels: score float renders, or round them to 8 bits first. Clamped to [0, 1] either way.
-        band: pixels of the interaction band; 2 % of the longer side when None.
+        band: width of the interaction band, pixels; by default 2 % of the longer side.
         timing_frames, timing_warmup, timing_budget_s: see `measure.render_time`; 0 frames skip it.
-        device: where to move the model; None leaves it where it is.
-        progress: called with the done fraction and a word.
+        device: to move the model to; None leaves it in place.
+        progress: called with the share that is done, in [0, 1], and the present work.
 
     Raises:
         ValueError: the clip has no such split, or no frames in it.
@@ -75,7 +76,7 @@ def evaluate(
     lpips: Lpips | NotComputed = NotComputed(found.reason)
     if found.location is not None:
         lpips = Lpips.load(found).to(model.device)
-    report = progress or (lambda done, text: None)
+    report = progress or no_progress
     was_training = model.training
     model.eval()
     clip = posed_clip(
@@ -159,14 +160,14 @@ def score_frame(
     protocol: Protocol,
     lpips: Lpips | NotComputed,
 ) -> FrameScores:
-    """Draw one frame and score every region of it."""
+    """Render one frame and score every region of it."""
     device = model.device
     output = model.render(frame.moment.to(device), frame.camera.to(device))
     target = frame.rgb.to(device)
     color = output.color.clamp(0, 1)
     if protocol.pixels == "8-bit":
         color = (color * 255).round() / 255
-    if frame.ignored is not None:  # windows that reach into such pixels see the target there
+    if frame.ignored is not None:  # SSIM and LPIPS windows see the target in these pixels
         color = torch.where(frame.ignored.to(device)[..., None], target, color)
     regions = region_masks(frame, clip.kinds, protocol.band)
     if not torch.isfinite(color).all():
@@ -193,7 +194,7 @@ def score_frame(
             "depth": _mean_depth(depth, mask),
         }
     if not isinstance(lpips, NotComputed) and frame.ignored is None:
-        # of whole images the published definition, which averages each layer before upsampling
+        # whole images: LPIPS as published, which averages each layer before upsampling
         values["full"] = {**values["full"], "lpips": float(lpips(color, target))}
     return FrameScores(frame.position, frame.moment.index, values)
 
@@ -201,7 +202,7 @@ def score_frame(
 def _depth_error(
     output: RenderOutput, frame: Frame, clip: Clip
 ) -> tuple[Tensor, Tensor] | NotComputed:
-    """|rendered - true| at each pixel, metres, and where both are known."""
+    """|rendered - true| depth at each pixel, metres, and the pixels where both are known."""
     if clip.depth_kind != "metric" or frame.depth is None:
         return NotComputed(f"the clip's depth is {clip.depth_kind!r}, not metric")
     truth = frame.depth.to(output.depth)
@@ -220,8 +221,8 @@ def _mean_depth(errors: tuple[Tensor, Tensor] | NotComputed, mask: Tensor) -> Va
 
 def _absence(region: str, kinds: Mapping[str, EntityKind]) -> str:
     present = set(kinds.values())
-    wanted = {"human": {"human"}, "object": {"object"}, "interaction": {"human", "object"}}
-    missing = wanted.get(region, set()) - present
+    needed = {"human": {"human"}, "object": {"object"}, "interaction": {"human", "object"}}
+    missing = needed.get(region, set()) - present
     if missing:
         return f"the clip has no {' and no '.join(sorted(missing))}"
     return "human and object are not close" if region == "interaction" else "no visible pixels"

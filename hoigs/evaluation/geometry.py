@@ -1,4 +1,4 @@
-"""Geometry: hand-object distance as the paper measures it, and errors against a known truth."""
+"""Geometry: hand-object distance as in the HOIGS supplement, and errors against ground truth."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from hoigs.core.clip import Clip
-from hoigs.core.deformation import ProvidesSkeleton
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.scene import SceneModel
+from hoigs.core.interfaces.deformation import ProvidesSkeleton
+from hoigs.core.maths.rotations import kabsch
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.evaluation.protocol import NotComputed, Value
 from hoigs.evaluation.truth import Truth, read_truth
 
-HANDS = (8, 9)  # of hoigs.core.body.PART_NAMES: left and right
-SOLID = 0.5  # opacity from which a Gaussian counts as a point of a surface
+HANDS = (8, 9)  # of hoigs.core.interfaces.body.PART_NAMES: left and right
+SOLID = 0.5  # smallest opacity of a Gaussian that counts as a point of a surface
 SAMPLES = 20_000  # points drawn from a true surface
 Array = np.ndarray
 
@@ -36,8 +37,9 @@ GEOMETRY: Mapping[str, str] = {
 }
 NOTES = (
     "Points are the centres of Gaussians of opacity 0.5 or more. CD_best: (mean squared distance "
-    "object to hand + hand to object) / 2 of the nearer hand, metres² (the paper's supplement, "
-    "Sec. A); it says how near they are, not how right, and rewards sinking in.",
+    "object to hand + hand to object) / 2 of the nearer hand, metres² (HOIGS, supplement, "
+    "Geometry Evaluation of Interaction); it measures distance, not accuracy: interpenetration "
+    "lowers it.",
     "Against the truth: accuracy is the mean distance of points to the true surface, completeness "
     "that of the surface to the points, Chamfer their mean. Object pose: the rigid motion of its "
     "points from one training frame, against the true one; translation at the object's centre.",
@@ -56,15 +58,15 @@ class SurfaceError(NamedTuple):
 
 
 def chamfer_squared(a: Float[Array, "A 3"], b: Float[Array, "B 3"]) -> float:
-    """d_CD(O, H): half the sum of both mean squared nearest distances (supplement, Sec. A)."""
-    there, _ = cKDTree(b).query(a)
-    back, _ = cKDTree(a).query(b)
-    return 0.5 * float((there**2).mean() + (back**2).mean())
+    """d_CD: half the sum of both mean squared nearest distances (HOIGS, supplement)."""
+    a_to_b, _ = cKDTree(b).query(a)
+    b_to_a, _ = cKDTree(a).query(b)
+    return 0.5 * float((a_to_b**2).mean() + (b_to_a**2).mean())
 
 
-def best_hand(thing: Float[Array, "O 3"], hands: Sequence[Float[Array, "_ 3"]]) -> float:
-    """CD_best: of the hand that is nearer, units squared."""
-    return min(chamfer_squared(thing, hand) for hand in hands)
+def best_hand(points: Float[Array, "O 3"], hands: Sequence[Float[Array, "_ 3"]]) -> float:
+    """CD_best: the distance of the object's points to the nearer hand, units squared."""
+    return min(chamfer_squared(points, hand) for hand in hands)
 
 
 def surface_error(
@@ -72,8 +74,8 @@ def surface_error(
 ) -> SurfaceError:
     """Distances between points and a triangle mesh.
 
-    Points are measured to triangles, not to samples of them: to those that hold the nearest of
-    20,000 samples (large ones are found so) and those whose centres are nearest (small ones).
+    Each point is measured to candidate triangles: those with the nearest of 20,000 samples (which
+    finds large triangles) and those with the nearest centres (which finds small ones).
     """
     import trimesh
 
@@ -81,23 +83,20 @@ def surface_error(
     samples, owners = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
     _, near = cKDTree(samples).query(points, k=4)
     _, small = cKDTree(mesh.triangles_center).query(points, k=min(8, len(faces)))
-    chosen = np.concatenate((owners[near], small.reshape(len(points), -1)), 1)
-    asked = np.repeat(points, chosen.shape[1], axis=0)
-    closest = trimesh.triangles.closest_point(mesh.triangles[chosen.ravel()], asked)
-    ahead = np.linalg.norm(closest - asked, axis=-1).reshape(chosen.shape).min(1)
-    back, _ = cKDTree(points).query(samples)
-    return SurfaceError(float(ahead.mean()), float(back.mean()))
+    candidates = np.concatenate((owners[near], small.reshape(len(points), -1)), 1)
+    repeated = np.repeat(points, candidates.shape[1], axis=0)
+    closest = trimesh.triangles.closest_point(mesh.triangles[candidates.ravel()], repeated)
+    to_surface = np.linalg.norm(closest - repeated, axis=-1).reshape(candidates.shape).min(1)
+    from_surface, _ = cKDTree(points).query(samples)
+    return SurfaceError(float(to_surface.mean()), float(from_surface.mean()))
 
 
 def rigid_motion(
     start: Float[Array, "N 3"], end: Float[Array, "N 3"]
 ) -> tuple[Float[Array, "3 3"], Float[Array, 3]]:
-    """R, t of least squares with end = R start + t (Kabsch 1976)."""
-    a, b = start.mean(0), end.mean(0)
-    u, _, v = np.linalg.svd((end - b).T @ (start - a))
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
-    turn = u @ flip @ v
-    return turn, b - turn @ a
+    """R, t of least squares with end = R start + t."""
+    R = kabsch(torch.as_tensor(start), torch.as_tensor(end)).numpy()
+    return R, end.mean(0) - R @ start.mean(0)
 
 
 @torch.no_grad()
@@ -114,17 +113,15 @@ def measure_geometry(model: SceneModel, clip: Clip, positions: Sequence[int]) ->
 
 
 def _cd_best(model: SceneModel, gaussians: Mapping[str, Gaussians]) -> Value:
-    things = [_solid(gaussians[n]) for n in model.names("object")]
-    things = [points for points in things if len(points)]
-    if not things:
+    objects = [_solid(gaussians[n]) for n in model.names("object")]
+    objects = [points for points in objects if len(points)]
+    if not objects:
         return NotComputed(_no_entity(model, "object"))
     hands = []
     for name in model.names("human"):
         deformation = model.entity(name).deformation
         if not isinstance(deformation, ProvidesSkeleton):
-            return NotComputed(
-                f"{type(deformation).__name__} does not say which Gaussians are hands"
-            )
+            return NotComputed(f"{type(deformation).__name__} has no body parts, so no hands")
         parts = deformation.point_parts().cpu().numpy()
         solid = _is_solid(gaussians[name])
         means = _array(gaussians[name])
@@ -132,7 +129,7 @@ def _cd_best(model: SceneModel, gaussians: Mapping[str, Gaussians]) -> Value:
     hands = [points for points in hands if len(points)]
     if not hands:
         return NotComputed(_no_entity(model, "human"))
-    return min(best_hand(thing, hands) for thing in things)
+    return min(best_hand(points, hands) for points in objects)
 
 
 def _pose_error(
@@ -151,11 +148,11 @@ def _pose_error(
         return dict.fromkeys(names, NotComputed(reason))
     assert isinstance(truth, Truth)
     start = clip.moments[train[0]]
-    rest = model(start.to(model.device), ["object"]).gaussians["object"]
-    solid = _is_solid(rest)
+    canonical = model(start.to(model.device), ["object"]).gaussians["object"]
+    solid = _is_solid(canonical)
     if solid.sum() < 3:
         return dict.fromkeys(names, NotComputed("the object has fewer than 3 solid Gaussians"))
-    before, turns, shifts = _array(rest)[solid], [], []
+    before, turns, shifts = _array(canonical)[solid], [], []
     R0, c0 = truth.rotations[start.index], truth.translations[start.index]
     for position, state in states.items():
         frame = clip.moments[position].index
@@ -193,7 +190,7 @@ def _surface(
 
 
 def _why_not(model: SceneModel, truth: Truth | NotComputed, kind: str) -> str | None:
-    """The truth is that of the entities "human" and "object"."""
+    """Why the entity named `kind`, the one that the truth describes, cannot be measured."""
     if isinstance(truth, NotComputed):
         return truth.reason
     return None if kind in model.names(kind) else _no_entity(model, kind)
@@ -201,7 +198,7 @@ def _why_not(model: SceneModel, truth: Truth | NotComputed, kind: str) -> str | 
 
 def _no_entity(model: SceneModel, kind: str) -> str:
     if not model.names(kind):
-        return f"the model does not tell the {kind} from the rest"
+        return f"the model has no separate {kind}"
     part = "hand of the human" if kind == "human" else kind
     return f"no Gaussian of the {part} has opacity {SOLID} or more"
 

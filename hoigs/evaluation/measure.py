@@ -1,4 +1,4 @@
-"""How large a model is and how long it takes to draw."""
+"""Size and render time of a model."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import time
 import torch
 from torch import nn
 
-from hoigs.core.clip import Clip
-from hoigs.core.rasterizer import RenderRequest
-from hoigs.core.scene import SceneModel
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.clip import Clip
 from hoigs.evaluation.scores import PartSize, Timing
 
 
 def model_size(model: SceneModel) -> list[PartSize]:
-    """Each entity and, if there is one, the interaction module."""
+    """The size of each entity, and of the interaction module if there is one."""
     parts = []
     for name in model.entities:
         entity = model.entity(name)
@@ -27,7 +27,7 @@ def model_size(model: SceneModel) -> list[PartSize]:
 
 
 def _stored(module: nn.Module) -> tuple[int, float]:
-    """Trained numbers, and megabytes of everything that a checkpoint keeps."""
+    """The number of trained scalars, and megabytes of all tensors of a checkpoint."""
     trained = sum(p.numel() for p in module.parameters() if p.requires_grad)
     size = sum(t.numel() * t.element_size() for t in module.state_dict().values())
     return trained, size / 1e6
@@ -43,10 +43,9 @@ def render_time(
     warmup: int = 10,
     budget_s: float = 60.0,
 ) -> Timing:
-    """Draw `positions` in turn and time deformation and rasterization apart (methods D.7).
+    """Render `positions` in turn, and time deformation and rasterization separately.
 
-    Stops after `budget_s` seconds with the frames it has, at least 3: `Timing.frames` says how
-    many, and the note that it stopped early.
+    Stops after `budget_s` seconds, but not before 3 frames; `Timing.note` then mentions it.
     """
     device = model.device
     views = [(clip.moments[p].to(device), clip.cameras[p].to(device)) for p in positions]
@@ -98,7 +97,7 @@ def _now(device: torch.device) -> float:
 
 
 def device_name(device: torch.device) -> str:
-    """The device in words: which GPU, or how many CPU threads."""
+    """The name of the GPU, or the number of CPU threads."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     threads = torch.get_num_threads()

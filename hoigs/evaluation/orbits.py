@@ -1,4 +1,4 @@
-"""Camera paths that look around a scene without leaving what the video has seen."""
+"""Orbits: camera paths around a scene that stay near the views of the video."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip
-from hoigs.core.moment import Moment
-from hoigs.core.rotation import axis_angle_to_matrices
-from hoigs.core.scene import SceneModel
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.moment import Moment
 
 
 def orbit_cameras(
@@ -24,15 +24,15 @@ def orbit_cameras(
     amplitude: float = 20.0,
     position: int | None = None,
 ) -> list[Camera]:
-    """A closed path of `count` cameras that swings about the human's pelvis.
+    """A closed path of `count` cameras about the human's pelvis.
 
-    The camera of a training frame is turned rigidly about the pivot by a lying figure of eight:
-    `amplitude` degrees to each side and a quarter of it up and down. A small swing keeps the
-    view within what the video has seen; the pivot stays at its pixel.
+    The camera of a frame is rotated rigidly about the pivot along a horizontal figure of eight:
+    `amplitude` degrees to each side and a quarter of that up and down, so that the view stays near
+    those of the video. The pivot keeps its pixel.
 
     Args:
-        model: tells where the human is. amplitude: degrees.
-        position: frame whose camera and moment the path starts from; the middle one when None.
+        model: gives the pivot. amplitude: degrees.
+        position: of the frame in the clip; by default the middle one.
     """
     position = len(clip) // 2 if position is None else position
     camera = clip.cameras[position]
@@ -50,8 +50,8 @@ def orbit_cameras(
 
 
 def turned(camera: Camera, center: Float[Tensor, " 3"], turn: Float[Tensor, "3 3"]) -> Camera:
-    """The camera, carried by a rotation of the world about `center`."""
-    # the view of the turned camera is the old view of the world turned back
+    """The camera rotated about `center`, metres, by the rotation `turn` of the world."""
+    # a rotated camera sees what the old one sees of the world rotated back
     back = torch.eye(4).to(camera.world_to_camera)
     back[:3, :3] = turn.mT
     back[:3, 3] = center - turn.mT @ center
@@ -60,7 +60,7 @@ def turned(camera: Camera, center: Float[Tensor, " 3"], turn: Float[Tensor, "3 3
 
 @torch.no_grad()
 def pivot(model: SceneModel, clip: Clip, moment: Moment, camera: Camera) -> Float[Tensor, " 3"]:
-    """What to look at, world metres: the pelvis, else the moving Gaussians, else the scene."""
+    """World position of a pelvis, else the mean of the objects, else a point of the scene."""
     moment = moment.to(model.device)
     for name in model.names("human"):
         anchors = model.entity(name).role(moment).anchors
@@ -78,6 +78,6 @@ def pivot(model: SceneModel, clip: Clip, moment: Moment, camera: Camera) -> Floa
 
 
 def world_up(clip: Clip) -> Float[Tensor, " 3"]:
-    """The mean upward direction of the cameras: COLMAP's worlds have no up of their own."""
+    """The mean upward direction of the cameras, as a COLMAP world defines none."""
     ups = torch.stack([-camera.world_to_camera[1, :3] for camera in clip.cameras])
     return torch.nn.functional.normalize(ups.mean(0), dim=0)

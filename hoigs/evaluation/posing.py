@@ -1,9 +1,9 @@
-"""Body poses and cameras of scored frames, by protocol: given, interpolated or fitted."""
+"""Body poses and cameras of scored frames: given, interpolated or fitted."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -11,23 +11,25 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip, Frame
-from hoigs.core.moment import BodyPose, Moment
-from hoigs.core.neighbours import neighbours
-from hoigs.core.rotation import (
+from hoigs.core.maths.rotations import (
     axis_angle_to_quats,
     matrices_to_quats,
     quats_to_axis_angle,
     quats_to_matrices,
     slerp,
 )
-from hoigs.core.scene import SceneModel
-from hoigs.evaluation.metrics import ssim
+from hoigs.core.maths.splines import neighbours
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.progress import Progress, no_progress
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip, Frame
+from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.evaluation.protocol import TestPose
+from hoigs.metrics.image_loss import image_loss
 
 FIT_STEPS = 40
-FIT_RATES = (5e-3, 2e-3)  # radians and metres a step at the start: of body poses, of cameras
+FIT_RATES = (5e-3, 2e-3)  # initial learning rates, radians and metres: body poses, cameras
+FIT_DSSIM = 0.2  # weight of D-SSIM in the image loss
 
 
 def posed_clip(
@@ -38,18 +40,17 @@ def posed_clip(
     test_pose: TestPose = "given",
     test_camera: TestPose = "given",
     fit_steps: int = FIT_STEPS,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Clip:
-    """The clip with the poses and cameras that a protocol gives to the frames of a split.
+    """The clip with the poses and cameras of a protocol for the frames of a split.
 
-    "given" leaves them alone. "interpolated" takes them from the two training frames about each in
-    time, rotations by SLERP, places linearly; what the model has learned to add to poses it then
-    adds as ever, interpolated likewise. "fitted" optimises them on the *image that is scored*, from
-    the given ones on (or the interpolated, of cameras under fitted poses and the reverse), the
-    model frozen. Frames that were trained on, and intrinsics, always stay.
+    "given" changes nothing. "interpolated" takes them from the two neighbouring training frames,
+    rotations by SLERP, positions linearly; the model then adds its learned corrections, which it
+    interpolates likewise. "fitted" optimises them on the *image that is scored*, with the model
+    frozen, starting from the given ones. Training frames and intrinsics never change.
 
-    Views of `clip.held_out` get the body poses of their moments; their cameras stay, and nothing
-    is ever fitted to their images.
+    Views of `clip.held_out` take the body poses of their moments; their cameras stay, and nothing
+    is fitted to their images.
 
     Raises:
         ValueError: there is no training frame to interpolate from.
@@ -61,14 +62,14 @@ def posed_clip(
             raise ValueError("nothing to interpolate from: the clip has no training frames")
         clip = _interpolated(clip, trained, chosen, test_pose, test_camera)
     if "fitted" in (test_pose, test_camera):
+        report = progress or no_progress
         moments, cameras = list(clip.moments), list(clip.cameras)
         for done, p in enumerate(chosen):
             fit = fit_frame(
                 model, clip[p], test_pose == "fitted", test_camera == "fitted", fit_steps
             )
             moments[p], cameras[p] = fit.moment, fit.camera
-            if progress is not None:
-                progress((done + 1) / len(chosen), "fitting poses to test images")
+            report((done + 1) / len(chosen), "fitting poses to test images")
         clip = replace(clip, moments=moments, cameras=cameras)
     if clip.held_out is None or test_pose == "given":
         return clip
@@ -96,11 +97,11 @@ def _interpolated(
 
 
 def pose_between(a: BodyPose, b: BodyPose, r: float) -> BodyPose:
-    """Joints by SLERP, place and shape linearly; r in [0, 1]."""
+    """Joint rotations by SLERP, translation and shape linearly; r in [0, 1]."""
     turned = quats_to_axis_angle(
         slerp(axis_angle_to_quats(a.rotations), axis_angle_to_quats(b.rotations), r)
     )
-    turned = _nearest_form(turned, a.rotations)
+    turned = _nearest_axis_angle(turned, a.rotations)
     return a.replace(
         global_orient=turned[0],
         body=turned[1:22],
@@ -111,22 +112,22 @@ def pose_between(a: BodyPose, b: BodyPose, r: float) -> BodyPose:
     )
 
 
-def _nearest_form(
-    vectors: Float[Tensor, "J 3"], beside: Float[Tensor, "J 3"]
+def _nearest_axis_angle(
+    vectors: Float[Tensor, "J 3"], reference: Float[Tensor, "J 3"]
 ) -> Float[Tensor, "J 3"]:
-    """Of the two axis-angle forms of each rotation the one nearer to `beside`.
+    """Of the two axis-angles of each rotation (below and above pi) the one nearer to `reference`.
 
-    Corrections that are added to axis-angles were learned beside the neighbours' form; about half
-    a turn the other form would take them backwards.
+    Corrections that are added to axis-angles were learned for the neighbours' vector; near half a
+    turn they would act in the opposite direction on the other one.
     """
     angle = vectors.norm(dim=-1, keepdim=True)
     other = vectors - 2 * math.pi * vectors / angle.clamp_min(1e-6)
-    nearer = (other - beside).norm(dim=-1) < (vectors - beside).norm(dim=-1)
+    nearer = (other - reference).norm(dim=-1) < (vectors - reference).norm(dim=-1)
     return torch.where(nearer[:, None] & (angle > 1e-3), other, vectors)
 
 
 def camera_between(a: Camera, b: Camera, r: float) -> Camera:
-    """Rotation by SLERP, centre linearly; the intrinsics of `a`; r in [0, 1]."""
+    """Rotation by SLERP, centre linearly, intrinsics of `a`; r in [0, 1]."""
     quats = [matrices_to_quats(c.world_to_camera[:3, :3]) for c in (a, b)]
     R = quats_to_matrices(slerp(quats[0], quats[1], r))
     viewmat = a.world_to_camera.clone()
@@ -140,7 +141,7 @@ class FrameFit:
     """A frame whose body poses or camera were optimised on its image.
 
     Attributes:
-        loss: at the start and of the best step, which is the one that is kept.
+        loss: at the start, and at the best step, which `moment` and `camera` are from.
     """
 
     moment: Moment
@@ -153,12 +154,13 @@ def fit_frame(
 ) -> FrameFit:
     """Optimise body poses, the camera or both on one frame's image, with the model frozen.
 
-    0.8 L1 + 0.2 (1 - SSIM) of the whole image, Adam with a rate that falls to zero by a cosine; the
-    best step is kept, so that a fit is never worse than its start. ExAvatar fits its test frames so
-    (methods A.9: mks0601/ExAvatar_RELEASE#51, 31 to 36 dB).
+    Minimises 0.8 L1 + 0.2 (1 - SSIM) of the whole image by Adam with a cosine schedule, and keeps
+    the best step. ExAvatar fits its test frames in this way (mks0601/ExAvatar_RELEASE#51: 36 dB
+    with the fit, 31 dB without).
 
     Args:
-        poses: of every human that the model has. camera: turn and shift, not the intrinsics.
+        poses: whether to fit those of all modelled humans. camera: whether to fit its rotation and
+            translation.
     """
     device = model.device
     names = [n for n in frame.moment.poses if n in model.entities] if poses else []
@@ -176,31 +178,31 @@ def fit_frame(
     target = frame.rgb.to(device)
     hidden = None if frame.ignored is None else frame.ignored.to(device)[..., None]
 
-    def guess() -> tuple[Moment, Camera]:
+    def current() -> tuple[Moment, Camera]:
         moment = given
         for n in names:
             moment = moment.with_pose(n, _moved(given.poses[n], turns[n], shifts[n]))
         return moment, start.moved(*view) if camera else start
 
-    def kept() -> tuple[Moment, Camera]:
-        moment, at = guess()
+    def detached() -> tuple[Moment, Camera]:
+        moment, seen_from = current()
         return (
             replace(moment, poses={n: p.map(torch.detach) for n, p in moment.poses.items()}),
-            replace(at, world_to_camera=at.world_to_camera.detach()),
+            replace(seen_from, world_to_camera=seen_from.world_to_camera.detach()),
         )
 
     adam = torch.optim.Adam(groups)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
     losses: list[float] = []
-    best = kept()
+    best = detached()
     with _frozen(model):
-        for step in range(steps + 1):  # the last only looks at what the one before it has made
-            color = model.render(*guess()).color
+        for step in range(steps + 1):  # the last iteration only evaluates the last update
+            color = model.render(*current()).color
             if hidden is not None:
                 color = torch.where(hidden, target, color)
-            loss = 0.8 * (color - target).abs().mean() + 0.2 * (1 - ssim(color, target))
+            loss = image_loss(color, target, FIT_DSSIM)
             if not losses or float(loss.detach()) < min(losses):
-                best = kept()
+                best = detached()
             losses.append(float(loss.detach()))
             if step == steps or not loss.requires_grad:
                 break
@@ -219,7 +221,7 @@ def _moved(pose: BodyPose, turn: Float[Tensor, "52 3"], shift: Float[Tensor, " 3
 
 @contextmanager
 def _frozen(model: SceneModel) -> Iterator[None]:
-    """No parameter of the model takes a gradient within, whoever has called with or without."""
+    """Inside, gradients are enabled, but the model's parameters take none."""
     trained = [p for p in model.parameters() if p.requires_grad]
     model.requires_grad_(False)
     try:

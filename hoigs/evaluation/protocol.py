@@ -1,18 +1,18 @@
-"""Protocol: how a score came about. A number without one is not a result (methods D.6)."""
+"""Protocol: under which conditions a score was measured. Every score is stored with one."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-from hoigs.core.train_spec import TestPose
+from hoigs.core.spec.train_schema import TestPose
 
 Pixels = Literal["float", "8-bit"]
 
 
 @dataclass(frozen=True)
 class NotComputed:
-    """In the place of a number: why there is none."""
+    """The reason why there is no number, in its place."""
 
     reason: str
 
@@ -25,25 +25,25 @@ Value = float | NotComputed
 
 @dataclass(frozen=True)
 class Protocol:
-    """Everything that decides what a score means.
+    """The conditions of a score.
 
     Attributes:
-        views: "training cameras" (held-out times on the training path) or "held-out cameras".
-        split: name of the clip's split whose frames were scored. frames: how many.
-        unseen_times: how many of these frames are at times that were not trained on.
-        region: one of regions.REGIONS. band: pixels of the interaction band.
-        test_pose: where body poses on scored frames come from: "given" with the clip and moved by
-            what neighbouring training frames learned, "interpolated" from these alone, or "fitted"
-            to the test images themselves (`posing.posed_clip`).
+        views: "training cameras" (test times on the training path) or "held-out cameras".
+        split: name of the clip's split whose frames were scored. frames: their number.
+        unseen_times: number of these frames at times without a training frame.
+        region: one of regions.REGIONS. band: width of the interaction band, pixels.
+        test_pose: source of the body poses: "given" by the clip, with the corrections of
+            neighbouring training frames; "interpolated" from these frames; or "fitted" to the test
+            images themselves (`posing.posed_clip`).
         pixels: "float" renders, or rounded to "8-bit"; clamped to [0, 1] either way.
-        background: behind all Gaussians.
+        background: colour behind all Gaussians.
         width, height: of the scored images, pixels.
-        lpips_net: "alex", "vgg", or None when LPIPS was not computed. lpips_range: of its input.
-        device, rasterizer: what drew.
-        test_camera: likewise of cameras; those of held-out views are always given.
-        fit_steps: of "fitted", a frame; 0 where nothing is.
-        cameras_refined: training corrected its cameras, so that given ones are moved too.
-        ignored: part of the scored pixels that the clip says show no scene, left out everywhere.
+        lpips_net: "alex", "vgg", or None if LPIPS was not computed. lpips_range: of its input.
+        device, rasterizer: that drew the images.
+        test_camera: source of the cameras, as `test_pose`; those of held-out views are given.
+        fit_steps: optimizer steps per fitted frame; 0 if nothing was fitted.
+        cameras_refined: training corrected its cameras, so given ones are corrected too.
+        ignored: share of the pixels that show no scene (`Frame.ignored`); they are not scored.
     """
 
     views: str
@@ -71,6 +71,7 @@ class Protocol:
     depth: str = "mean |rendered - true| along z where truth is known and alpha > 0.5, metres"
 
     def of(self, region: str) -> Protocol:
+        """The same protocol for another region."""
         return replace(self, region=region)
 
     def _cameras(self) -> str:
@@ -78,7 +79,7 @@ class Protocol:
         return f"cameras: {self.test_camera}{moved if self.test_camera != 'interpolated' else ''}"
 
     def _warnings(self) -> list[str]:
-        """What was fitted has seen the answer: said before anything else about a score."""
+        """The first note of a score whose poses or cameras were fitted to its images."""
         fitted = [
             what
             for what, how in (("body poses", self.test_pose), ("cameras", self.test_camera))

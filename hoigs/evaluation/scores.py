@@ -1,4 +1,4 @@
-"""What an evaluation says: scores by view, region and metric, times and sizes; tables and JSON."""
+"""Evaluation: scores by view, region and metric, times and sizes, as tables and as JSON."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hoigs.core.clip import Clip
 from hoigs.core.errors import did_you_mean
+from hoigs.core.values.clip import Clip
 from hoigs.evaluation.geometry import GEOMETRY
 from hoigs.evaluation.geometry import NOTES as GEOMETRY_NOTES
 from hoigs.evaluation.protocol import NotComputed, Protocol, Value
-from hoigs.evaluation.regions import REGIONS
+from hoigs.metrics.regions import REGIONS
 
 METRICS = ("psnr", "ssim", "lpips", "depth")
 TITLES = {"psnr": "PSNR dB ↑", "ssim": "SSIM ↑", "lpips": "LPIPS ↓", "depth": "depth error m ↓"}
@@ -22,7 +22,7 @@ DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "depth": 4}
 
 @dataclass(frozen=True)
 class Table:
-    """Plain cells; whoever prints them chooses how."""
+    """A table of texts, for printing and for HTML."""
 
     title: str
     columns: tuple[str, ...]
@@ -56,7 +56,7 @@ class ViewScores:
     frames: list[FrameScores]
 
     def mean(self, region: str, metric: str) -> tuple[Value, int]:
-        """Mean over the frames that have this score, and how many have."""
+        """Mean over the frames that have this score, and their number."""
         values = [frame.values[region][metric] for frame in self.frames]
         numbers = [v for v in values if not isinstance(v, NotComputed)]
         if numbers:
@@ -67,12 +67,12 @@ class ViewScores:
 
 @dataclass(frozen=True)
 class Timing:
-    """Medians over synchronised frames after a warm-up, milliseconds (methods D.7).
+    """Medians over synchronised frames after a warm-up, milliseconds.
 
     Attributes:
-        deform_ms: features, interaction and deformation: a moment in, Gaussians out.
-        raster_ms: Gaussians in, image out. total_ms: both, as one frame takes.
-        drawn: median number of Gaussians with a footprint on screen.
+        frames, warmup: numbers of frames that were timed, and drawn before that.
+        deform_ms: features, interaction and deformation. raster_ms: rasterization.
+        total_ms: of a whole frame. drawn: number of Gaussians with a footprint on the screen.
     """
 
     frames: int
@@ -94,7 +94,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class PartSize:
-    """One entity, or the interaction module. megabytes: of its stored tensors, 10^6 bytes."""
+    """Size of an entity or of the interaction module; megabytes are 10^6 bytes of its tensors."""
 
     name: str
     kind: str
@@ -105,11 +105,11 @@ class PartSize:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A judged model.
+    """All scores of a model on a clip.
 
     Attributes:
         geometry: the measures of `geometry.GEOMETRY` on the scored frames.
-        scored: the clip with the poses and cameras that the protocol gave it; not stored.
+        scored: the clip with the protocol's poses and cameras; not saved.
     """
 
     clip: str
@@ -135,14 +135,14 @@ class Evaluation:
         return self.view(view).mean(region, metric)[0]
 
     def tables(self) -> list[Table]:
-        """One table a view, then geometry, times and sizes."""
+        """One table per view, then geometry, render time and size."""
         tables = [score_table(view) for view in self.views]
         if self.geometry:
             tables.append(geometry_table(self.geometry))
         return [*tables, timing_table(self.timing), size_table(self.sizes)]
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values. Every score carries its protocol; an absent one its reason."""
+        """JSON values: every score with its protocol, and the reason of each that is absent."""
         scores, frames = [], []
         for view in self.views:
             for region in REGIONS:
@@ -187,7 +187,7 @@ class Evaluation:
 
 
 def score_table(view: ViewScores) -> Table:
-    """Regions down, metrics across; metrics that no region has are explained in a note."""
+    """A row per region, a column per metric; notes explain metrics that no region has."""
     rows, notes = [], {}
     shown = [m for m in METRICS if any(view.mean(r, m)[1] for r in REGIONS)]
     for metric in METRICS:
@@ -206,7 +206,7 @@ def score_table(view: ViewScores) -> Table:
 
 
 def geometry_table(geometry: Mapping[str, Value]) -> Table:
-    """Those that there are, a row each; why the others are not there, in notes."""
+    """A row per computed measure; notes explain the others."""
     rows: list[tuple[str, ...]] = []
     reasons: dict[str, list[str]] = {}
     for name, title in GEOMETRY.items():

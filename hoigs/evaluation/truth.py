@@ -1,4 +1,4 @@
-"""Truth: exact geometry of a clip that knows it, read from its truth.npz."""
+"""Truth: the exact geometry of a synthetic clip, read from its truth.npz."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
-from hoigs.core.clip import Clip
 from hoigs.core.errors import ClipError
+from hoigs.core.maths.skinning import skin
+from hoigs.core.values.clip import Clip
 from hoigs.evaluation.protocol import NotComputed
 
 Array = np.ndarray
@@ -49,7 +51,7 @@ class Truth:
 
     def object_at(self, frame: int) -> tuple[Float[Array, "V 3"], Int[Array, "F 3"]]:
         """World vertices, metres, and faces."""
-        from hoigs.synthesis.objects import bend_points
+        from hoigs.synthesis.motion.object_script import bend_points
 
         vertices = self.vertices
         if self.bend[frame] != 0:
@@ -58,11 +60,10 @@ class Truth:
 
     def human_at(self, frame: int) -> tuple[Float[Array, "W 3"], Int[Array, "G 3"]]:
         """World vertices of the outer surface, clothes included, metres, and faces."""
-        joints = self.transforms.shape[1]
-        blended = self.weights @ self.transforms[frame, :, :3].reshape(joints, 12)
-        ahead = np.concatenate((self.dressed, np.ones((len(self.dressed), 1))), 1)
-        placed = np.einsum("vij,vj->vi", blended.reshape(-1, 3, 4), ahead)
-        return placed, self.dressed_faces
+        points, transforms, weights = map(
+            torch.from_numpy, (self.dressed, self.transforms[frame], self.weights)
+        )
+        return skin(points, transforms, weights).numpy(), self.dressed_faces
 
 
 def read_truth(clip: Clip) -> Truth | NotComputed:
@@ -73,7 +74,7 @@ def read_truth(clip: Clip) -> Truth | NotComputed:
     """
     name, root = clip.provenance.get("truth"), clip.store.root
     if name is None or root is None:
-        return NotComputed("the clip does not know its true geometry")
+        return NotComputed("the clip has no true geometry")
     path = Path(root) / str(name)
     try:
         with np.load(path) as file:

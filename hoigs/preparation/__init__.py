@@ -1,0 +1,10 @@
+"""From a video, and what estimators find in it, to a clip folder.
+
+- `prepare`: `prepare`, and `prepare_until` for some of its stages.
+- `pipeline`: runs the stages in order.
+- `options`, `settings`: PrepareOptions, and reading them from files and flags.
+- `estimates`: runs the estimators on the chosen frames.
+- `clip_writing`: writes and checks the clip.
+- `video`, `cameras`, `masks`, `body`, `objects`, `scene`, `report`: the work of the stages.
+- `stages`: their order, saved results and progress.
+"""

@@ -1,29 +1,28 @@
-"""The last stage: frames, tracks and the report into the clip folder, which appears when whole."""
+"""The last stage: frames, tracks and the report become a clip folder, which appears when whole."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from hoigs.core.body import PELVIS
-from hoigs.core.clip_folder import ClipWriter
-from hoigs.preparation.cameras import parallax
-from hoigs.preparation.multiview import angular_factor, full_factor
-from hoigs.preparation.overlay import OverlayVideo
-from hoigs.preparation.report import PrepareReport
+from hoigs.core.clip_folder.write import ClipWriter
+from hoigs.core.interfaces.body import PELVIS
+from hoigs.preparation.cameras.camera_track import parallax
+from hoigs.preparation.cameras.multiview import angular_factor, full_factor
+from hoigs.preparation.pipeline import Pipeline
+from hoigs.preparation.report.overlay import OverlayVideo
+from hoigs.preparation.report.report import PrepareReport
+from hoigs.preparation.stages.cleanup import Cleanup
 
 BODY_JOINTS = 22  # without the hands', which are not fitted
 
-if TYPE_CHECKING:
-    from hoigs.preparation.pipeline import Pipeline
 
-
-def write_clip_folder(made: Pipeline) -> PrepareReport:
-    """Writes what the other stages made, checks it and gives it its name."""
+def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
+    """Writes and checks what the other stages made, and gives the folder its name."""
     options = made.options
     entities: dict[str, Literal["human", "object"]] = {
         options.human: "human",
@@ -34,7 +33,7 @@ def write_clip_folder(made: Pipeline) -> PrepareReport:
         quality=options.quality, depth_kind="none" if made.depth is None else "metric",
         depth_dtype=np.float16,
     ) as writer:  # fmt: skip
-        made.leftovers.note(writer.root)
+        cleanup.register(writer.root)
         with made.stages.stage("writing"):
             _write_frames(made, writer)
         writer.set_body(options.human, made.body_track)
@@ -47,7 +46,7 @@ def write_clip_folder(made: Pipeline) -> PrepareReport:
         )
         report = _report(made, writer.name)
         report.save(writer.root)
-    made.leftovers.remove()
+    cleanup.remove()
     return report
 
 
@@ -58,23 +57,23 @@ def _write_frames(made: Pipeline, writer: ClipWriter) -> None:
     )
     with overlay:
         rows = zip(
-            made.images(), made.cameras, made.masks.human, made.masks.thing, made.masks.blank,
+            made.images(), made.cameras, made.masks.human, made.masks.object, made.masks.blank,
             made.person.posed(made.body), strict=True,
         )  # fmt: skip
-        for i, (image, camera, human, thing, blank, (vertices, _)) in enumerate(
+        for i, (image, camera, human, object_mask, blank, (vertices, _)) in enumerate(
             made.stages.track(rows, len(made.video))
         ):
-            masks = {options.human: human, options.object: thing}
+            masks = {options.human: human, options.object: object_mask}
             writer.add_frame(image, camera, masks, made.metres(i), blank)
             points = made.object.points @ made.object.rotations[i].mT
             points = points + made.object.translations[i]
-            overlay.add(image, camera, vertices, human, thing, points)
+            overlay.add(image, camera, vertices, human, object_mask, points)
 
 
 def _report(made: Pipeline, name: str) -> PrepareReport:
     middle = torch.median(made.scene.points, dim=0).values
     options, person, figures = made.options, made.person, made.track.figures
-    coverage = {options.human: made.masks.human, options.object: made.masks.thing}
+    coverage = {options.human: made.masks.human, options.object: made.masks.object}
     pelvis = person.joints[:, PELVIS]
     moving = torch.cat((person.joints[:, :BODY_JOINTS], made.object.translations[:, None]), 1)
     focal, depth = float(made.cameras[0].K[0, 0]), made.depth

@@ -1,4 +1,4 @@
-"""What can be chosen when a video is prepared."""
+"""Settings of `prepare`."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Literal
 from pydantic import Field
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.spec import ComponentSpec
-from hoigs.core.video_prior import EvidenceKind
-from hoigs.preparation.body_fit import FitOptions
-from hoigs.preparation.frames import Pick
+from hoigs.core.interfaces.estimator import EstimateKind
+from hoigs.core.spec.schema import ComponentSpec
+from hoigs.preparation.body.fit_problem import FitOptions
+from hoigs.preparation.video.frames import Pick
 
 
 class Prompt(ComponentConfig):
-    """Where, or what, an entity is, for segmenters that ask."""
+    """Where, or what, an entity is, for segmenters that need it."""
 
     text: str | None = Field(default=None, description='what to look for: "a man", "football"')
     points: list[tuple[float, float, bool]] = Field(
@@ -23,14 +23,18 @@ class Prompt(ComponentConfig):
     box: tuple[float, float, float, float] | None = Field(
         default=None, description="x0, y0, x1, y1, pixels of the video"
     )
-    frame: int = Field(default=0, ge=0, description="of the video, in which these are meant")
+    frame: int = Field(
+        default=0, ge=0, description="frame of the video that points and box refer to"
+    )
 
 
 class PrepareOptions(ComponentConfig):
     """Settings of `prepare`; the defaults suit a phone's video of one person and one object."""
 
     width: int | None = Field(
-        default=None, ge=16, description="of the stored frames, pixels; None keeps the video's"
+        default=None,
+        ge=16,
+        description="width of the stored frames, pixels; None keeps the video's",
     )
     every: int = Field(default=1, ge=1, description="take every n-th frame")
     fps: float | None = Field(
@@ -44,8 +48,10 @@ class PrepareOptions(ComponentConfig):
         default=30.0, gt=0, description="frames a second of a folder of frames"
     )
     max_frames: int | None = Field(default=None, ge=1, description="stop after so many frames")
-    image_format: Literal["jpg", "png"] = Field(default="jpg", description="of the stored frames")
-    quality: int = Field(default=95, ge=1, le=100, description="of jpg frames")
+    image_format: Literal["jpg", "png"] = Field(
+        default="jpg", description="format of stored frames"
+    )
+    quality: int = Field(default=95, ge=1, le=100, description="quality of jpg frames")
     camera: Literal["auto", "static", "moving", "sfm"] = Field(
         default="auto",
         description='"static": it never moves; "moving": the COLMAP model beside the video, or '
@@ -56,27 +62,29 @@ class PrepareOptions(ComponentConfig):
         default=None,
         gt=0,
         description="focal length in pixels of the *video's* own size, for a static camera; None: "
-        "what the file says, or the landmarks if they say it clearly, or else 0.8 x the longer "
-        "side (64 degrees); it scales all depths",
+        "what the file's metadata give, or the landmarks if they determine it, or else 0.8 x the "
+        "longer side (64 degrees); it scales all depths",
     )
     body: str = Field(default="body:anny", description="key of the body model, for the clip")
-    fit_steps: int = Field(default=FitOptions.steps, ge=1, description="of the body fit")
-    priors: dict[EvidenceKind, ComponentSpec] = Field(
+    fit_steps: int = Field(default=FitOptions.steps, ge=1, description="steps of the body fit")
+    estimators: dict[EstimateKind, ComponentSpec] = Field(
         default_factory=dict,
-        description="where masks, landmarks and depth come from, each a prior with its settings; "
-        "by default from the files beside the video",
+        description="where masks, landmarks and depth come from, each an estimator with its "
+        "settings; by default from the files beside the video",
     )
     prompts: dict[str, Prompt] = Field(
-        default_factory=dict, description="entity to where or what it is"
+        default_factory=dict, description="by entity, where or what it is"
     )
     human: str = Field(default="human", description="name of the person's entity")
     object: str = Field(default="object", description="name of the object's entity")
     ball_radius: float = Field(
-        default=0.11, gt=0, description="of a tracked ball, metres; a football's is 0.11"
+        default=0.11, gt=0, description="radius of a tracked ball, metres; a football's is 0.11"
     )
-    object_points: int = Field(default=4000, ge=8, description="points that start the object")
+    object_points: int = Field(
+        default=4000, ge=8, description="number of the object's first points"
+    )
     scene_points: int = Field(
-        default=25_000, ge=100, description="points that start the background, about"
+        default=25_000, ge=100, description="number of the background's first points, about"
     )
     backdrop: float = Field(
         default=3.0,
@@ -85,9 +93,9 @@ class PrepareOptions(ComponentConfig):
     )
     keep_black: bool = Field(
         default=False,
-        description="learn flat black patches too; by default they show no scene and are ignored",
+        description="train on flat black patches too, which are ignored by default",
     )
     overwrite: bool = Field(default=False, description="replace an older clip at the target")
     overlay_width: int = Field(
-        default=640, ge=0, description="of overlay.mp4, pixels; 0 writes none"
+        default=640, ge=0, description="width of overlay.mp4, pixels; 0 writes none"
     )

@@ -1,25 +1,36 @@
-"""One preparation: each method is a stage, whose result comes from the work folder."""
+"""One preparation: each method is a stage, whose result is kept in the work folder."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 import hoigs
-from hoigs.core.body import LEFT_WRIST, RIGHT_WRIST, BodyModel
-from hoigs.core.clip import BodyTrack, ObjectTrack
+from hoigs.core.diagnostics import ranges
 from hoigs.core.errors import HoigsError
-from hoigs.preparation import saved
-from hoigs.preparation.ball import BallTrack, load_ball, refine_ball
-from hoigs.preparation.blank import blank_pixels
-from hoigs.preparation.camera_choice import ChosenCameras, choose_cameras
-from hoigs.preparation.cameras import scaled_cameras
-from hoigs.preparation.clip_writing import write_clip_folder
-from hoigs.preparation.depth import (
+from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST, BodyModel
+from hoigs.core.values.clip import BodyTrack, ObjectTrack
+from hoigs.preparation.body.person import FittedBody, fit_person
+from hoigs.preparation.body.silhouette import silhouette
+from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras
+from hoigs.preparation.estimates import (
+    EstimateReader,
+    Estimators,
+    UndistortedEstimates,
+    identity,
+    paths_of,
+)
+from hoigs.preparation.masks.entity_masks import EntityMasks, entity_masks
+from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.objects.ball import BallTrack, load_ball, refine_ball
+from hoigs.preparation.objects.make_object import make_object
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.scene.depth import (
     POOR,
     DepthFit,
     DepthSource,
@@ -27,24 +38,16 @@ from hoigs.preparation.depth import (
     seen_points,
     seen_surface,
 )
-from hoigs.preparation.evidence import Gathering, Priors, described, paths_of
-from hoigs.preparation.frames import FrameList, open_frames
-from hoigs.preparation.leftovers import Leftovers
-from hoigs.preparation.masks import MaskStack
-from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.person import FittedBody, fit_person
-from hoigs.preparation.plan import PLAN
-from hoigs.preparation.report import PrepareReport
-from hoigs.preparation.saved import EntityStacks, Inputs
-from hoigs.preparation.scene import ScenePoints, colmap_scene, static_scene
-from hoigs.preparation.silhouette import silhouette
-from hoigs.preparation.source import Source
-from hoigs.preparation.split_masks import entity_masks
-from hoigs.preparation.stages import Stages
-from hoigs.preparation.store import Result, WorkFolder, digest, fingerprint
-from hoigs.preparation.things import make_object
+from hoigs.preparation.scene.scene_points import ScenePoints, colmap_scene, static_scene
+from hoigs.preparation.stages.plan import PLAN
+from hoigs.preparation.stages.progress import Stages
+from hoigs.preparation.stages.saved import from_result, to_result
+from hoigs.preparation.stages.work_folder import Result, WorkFolder, digest, fingerprint
+from hoigs.preparation.video.blank import blank_pixels
+from hoigs.preparation.video.frames import FrameList, open_frames
+from hoigs.preparation.video.source import Source
 
-FORMAT = 3  # of what the stages keep; another number makes older results unread
+FORMAT = 4  # of what the stages keep; another number makes older results unread
 T = TypeVar("T")
 
 
@@ -57,22 +60,21 @@ class Pipeline:
         out: Path,
         body: BodyModel,
         options: PrepareOptions,
-        priors: Priors,
+        estimators: Estimators,
         stages: Stages,
         work: WorkFolder,
-        leftovers: Leftovers,
     ) -> None:
         self.source, self.out, self.body = source, out, body
         self.options, self.stages, self.work = options, stages, work
-        self.priors, self.leftovers = priors, leftovers
+        self.estimators = estimators
         self.warnings: list[str] = []
         self.provenance: dict[str, str] = {}
         self.worth_keeping = False
         self._keys: dict[str, str] = {}
 
     def run(self, until: str | None = None) -> None:
-        """All stages, or those up to `until`; the last sets `report`."""
-        for name in PLAN:
+        """All stages but the writing of the clip, or those up to `until`."""
+        for name in [name for name in PLAN if name != "writing"]:
             getattr(self, f"_{name}")()
             if name == until:
                 return
@@ -85,14 +87,14 @@ class Pipeline:
         self,
         name: str,
         make: Callable[[], T],
-        save: Callable[[T], Result],
-        load: Callable[[Result], T],
         made_from: Any = None,
+        save: Callable[[T], Result] = to_result,
+        load: Callable[[Result], T] = from_result,
     ) -> T:
-        """A stage's result as the work folder has it, made before if it is not there.
+        """A stage's result from the work folder; it is made first where it is not there.
 
-        It is read back even when it has just been made, so that a run that was taken up gives
-        what an unbroken one gives.
+        It is read back even when it has just been made, so that a resumed run gives the same as an
+        unbroken one.
 
         Args:
             made_from: JSON of whatever else the result depends on, beside PLAN's options.
@@ -112,7 +114,7 @@ class Pipeline:
                 stored = self.work.save(
                     name, key, Result(values, made.arrays, made.files, made.folder)
                 )
-                self.worth_keeping |= PLAN[name].long
+                self.worth_keeping |= PLAN[name].slow
             else:
                 notes = stored.values["notes"]
                 self.warnings += notes["warnings"]
@@ -128,7 +130,7 @@ class Pipeline:
             {
                 "format": [FORMAT, hoigs.__version__],
                 "options": {key: options[key] for key in stage.options},
-                "after": {other: self._keys[other] for other in stage.after},
+                "reads": {other: self._keys[other] for other in stage.reads},
                 "from": made_from,
             }
         )
@@ -143,52 +145,52 @@ class Pipeline:
             )  # fmt: skip
             return frames.list
 
-        found = self._stage(
-            "frames", make, saved.save_frames, saved.load_frames, fingerprint([path])
-        )
+        found = self._stage("frames", make, fingerprint([path]))
         self.video = open_frames(path, options.width, known=found)
 
     def _evidence(self) -> None:
-        # all of it before the long work, so that what is wrong is said at once
-        gathering = self.gathering = Gathering(
-            self.source, self.video, self.options, self.priors, self.work.root / "priors"
+        # all estimates before the slow stages, so that errors in them are reported at once
+        self.reader = EstimateReader(
+            self.source, self.video, self.options, self.estimators, self.work.root / "estimators"
         )
-        self._without_dubious_depth()
+        self._without_unusable_depth()
         beside = self.source.beside
-        used = {kind: prior for kind, prior in self.priors.items() if kind != "depth"}
-        paths = [path for prior in used.values() for path in paths_of(prior, self.source.folder)]
+        used = {kind: estimator for kind, estimator in self.estimators.items() if kind != "depth"}
+        paths = [
+            path for estimator in used.values() for path in paths_of(estimator, self.source.folder)
+        ]
         made_from = [
             fingerprint(paths),
-            {kind: described(prior) for kind, prior in used.items()},
+            {kind: identity(estimator) for kind, estimator in used.items()},
             self.source.masked,
         ]
         self.worth_keeping |= any(kind not in beside for kind in used)
         self.raw = self._stage(
-            "evidence", lambda: gathering.gather(self.stages.advance), saved.save_evidence,
-            saved.load_evidence, made_from,
-        )  # fmt: skip
+            "evidence", lambda: self.reader.landmarks_and_masks(self.stages.advance), made_from
+        )
 
-    def _without_dubious_depth(self) -> None:
-        """Depth that nobody asked for, but which lies beside the video, must be in order."""
+    def _without_unusable_depth(self) -> None:
+        """Leaves out depth maps beside the video that were not requested and cannot be used."""
         if "depth" not in self.source.beside:
             return
         try:
-            self.gathering.estimate("depth", lambda _done: None)
+            self.reader.estimate("depth", lambda _done: None)
         except HoigsError as error:
             self.warnings.append(
                 f"depth/ beside the video is not used (name it with --set "
-                f"priors.depth.use=prior:depth-files and its settings, to use it): {error}"
+                f"estimators.depth.use=estimator:depth-files and its settings, to use it): {error}"
             )
-            self.priors = {k: prior for k, prior in self.priors.items() if k != "depth"}
+            self.estimators = {
+                k: estimator for k, estimator in self.estimators.items() if k != "depth"
+            }
 
     def _cameras(self) -> None:
         model = self.source.colmap
         files = None if model is None else [str(model), fingerprint([model])]
         folder = self.work.unfinished("cameras", self._key("cameras", files))
         chosen = self._stage(
-            "cameras", lambda: self._choose_cameras(folder), saved.save_chosen, saved.load_chosen,
-            files,
-        )  # fmt: skip
+            "cameras", lambda: self._choose_cameras(folder), files, save_cameras, load_cameras
+        )
         shutil.rmtree(folder, ignore_errors=True)
         self.track = chosen.track
         self.worth_keeping |= chosen.own_model
@@ -205,14 +207,15 @@ class Pipeline:
         return chosen
 
     def _inputs(self) -> None:
-        def make() -> Inputs:
-            landmarks = self.raw.landmarks.straight(self.track)
-            return Inputs(landmarks, self.raw.masks.straight(self.track), self._ball())
+        def make() -> UndistortedEstimates:
+            landmarks, masks = self.raw.landmarks, self.raw.masks
+            return UndistortedEstimates(
+                landmarks.undistorted(self.track), masks.undistorted(self.track), self._ball()
+            )
 
         ball = self.source.ball
         files = None if ball is None else fingerprint([ball])
-        inputs = self._stage("inputs", make, saved.save_inputs, saved.load_inputs, files)
-        self.landmarks, self.given, self.ball = inputs.landmarks, inputs.given, inputs.ball
+        self.estimates = self._stage("inputs", make, files)
 
     def _ball(self) -> BallTrack | None:
         if self.source.ball is None:
@@ -222,33 +225,36 @@ class Pipeline:
 
     def _body(self) -> None:
         def make() -> FittedBody:
+            found = self.estimates
             person = fit_person(
-                self.landmarks, self.track, self.body, self.options.fit_steps,
-                self.stages.advance, self.raw.landmarks.source, self.given.persons(self.ball),
+                found.landmarks, self.track, self.body, self.options.fit_steps,
+                self.stages.advance, self.raw.landmarks.source, found.masks.persons(found.ball),
             )  # fmt: skip
             self.provenance["body"] = person.provenance
             self.warnings.extend(person.warnings)
             return person
 
         model = [type(self.body).__qualname__, self.body.num_betas, len(self.body.parents)]
-        self.person = self._stage("body", make, saved.save_body, saved.load_body, model)
-        self.cameras = scaled_cameras(self.track.cameras, self.person.scene_scale)
+        self.person = self._stage("body", make, model)
+        scale = self.person.scene_scale
+        self.cameras = [camera.scaled(scale) for camera in self.track.cameras]
 
     def _masks(self) -> None:
-        def make() -> EntityStacks:
-            human, thing, text = entity_masks(
-                self.given, self.ball, self.images, self._silhouettes, self.person.found
-            )
+        def make() -> EntityMasks:
+            human, object_masks, text = entity_masks(
+                self.estimates.masks, self.estimates.ball, self.images, self._silhouettes,
+                self.person.found,
+            )  # fmt: skip
             self.provenance["masks"] = text
-            return EntityStacks(human, thing, self._blank(human, thing))
+            return EntityMasks(human, object_masks, self._blank(human, object_masks))
 
-        self.masks = self._stage("masks", make, saved.save_masks, saved.load_masks)
+        self.masks = self._stage("masks", make)
 
-    def _blank(self, humans: MaskStack, things: MaskStack) -> MaskStack:
-        rows = zip(self.images(), humans, things, strict=True)
+    def _blank(self, humans: MaskStack, objects: MaskStack) -> MaskStack:
+        rows = zip(self.images(), humans, objects, strict=True)
         if self.options.keep_black:
             return MaskStack(np.zeros_like(human) for _, human, _ in rows)
-        blank = MaskStack(blank_pixels(image, human | thing) for image, human, thing in rows)
+        blank = MaskStack(blank_pixels(image, human | held) for image, human, held in rows)
         coverage = blank.coverage()
         if coverage.any():
             self.warnings.append(
@@ -263,22 +269,19 @@ class Pipeline:
         return MaskStack(silhouette(v, self.body.faces, c) for (v, _), c in pairs)
 
     def _object(self) -> None:
-        self.object, self.spread = self._stage(
-            "object", self._place_object, saved.save_object, saved.load_object
-        )
+        self.object, self.spread = self._stage("object", self._place_object)
 
     def _place_object(self) -> tuple[ObjectTrack, float]:
         wrists = self.person.joints[:, [LEFT_WRIST, RIGHT_WRIST]]
         track, spread = make_object(
-            self.ball, self.masks.thing, self.cameras, wrists, self.images,
+            self.estimates.ball, self.masks.object, self.cameras, wrists, self.images,
             radius=self.options.ball_radius, count=self.options.object_points,
         )  # fmt: skip
         self.provenance["object"] = track.provenance
         lost = (~track.observed).nonzero().flatten().tolist()
         if lost:
-            shown = ", ".join(map(str, lost[:12])) + (", …" if len(lost) > 12 else "")
-            self.warnings.append(f"the object is not seen in {len(lost)} frames: {shown}")
-        if self.ball is None:
+            self.warnings.append(f"the object is not seen in {len(lost)} frames: {ranges(lost)}")
+        if self.estimates.ball is None:
             self.warnings.append(
                 "of the object's rotation only the roll is known, and its shape is a cushion "
                 "inflated from one outline: training has to find both"
@@ -286,30 +289,28 @@ class Pipeline:
         return track, spread
 
     def _depth(self) -> None:
-        prior, self.depth_maps = self.priors.get("depth"), None
+        estimator, self.depth_maps = self.estimators.get("depth"), None
         made_from = None
-        if prior is not None:
-            made_from = [described(prior), fingerprint(paths_of(prior, self.source.folder))]
-        self.depth = self._stage(
-            "depth", self._fit_depth, saved.save_depth, saved.load_depth, made_from
-        )
-        if prior is not None and self.depth_maps is None:
+        if estimator is not None:
+            made_from = [identity(estimator), fingerprint(paths_of(estimator, self.source.folder))]
+        self.depth = self._stage("depth", self._fit_depth, made_from)
+        if estimator is not None and self.depth_maps is None:
             self.depth_maps = self._read_depth()
 
     def _read_depth(self) -> DepthSource:
-        maps = self.gathering.estimate("depth", lambda _done: None).depth
+        maps = self.reader.estimate("depth", lambda _done: None).depth
         assert maps is not None  # `checked` saw to it
         return DepthSource(maps, self.video, self.track.undistort)
 
     def _fit_depth(self) -> DepthFit | None:
-        if "depth" not in self.priors:
+        if "depth" not in self.estimators:
             return None
         self.depth_maps = self._read_depth()
         surfaces = [vertices for vertices, _ in self.person.posed(self.body)]
         points = self.track.points * self.person.scene_scale
         fit = fit_depth(
             self.depth_maps,
-            lambda i: seen_points(points, self.cameras[i], self.moving(i)),
+            lambda i: seen_points(points, self.cameras[i], self.masks.moving(i)),
             lambda i: seen_surface(surfaces[i], self.cameras[i], self.masks.human[i]),
             len(self.video),
             self.stages.advance,
@@ -321,31 +322,25 @@ class Pipeline:
             )
         return fit
 
-    def moving(self, frame: int) -> np.ndarray:
-        """Pixels of a frame that show no scene."""
-        masks = self.masks
-        return masks.human[frame] | masks.thing[frame] | masks.blank[frame]
-
     def metres(self, frame: int) -> np.ndarray | None:
-        """Depth of a frame, 0 where it is unknown; None without a prior of depth."""
+        """Depth of a frame, 0 where it is unknown; None without an estimator of depth."""
         if self.depth is None or self.depth_maps is None:
             return None
         return self.depth.metres(self.depth_maps[frame], frame)
 
     def _scene(self) -> None:
-        self.scene = self._stage("scene", self._find_scene, saved.save_scene, saved.load_scene)
+        self.scene = self._stage("scene", self._find_scene)
 
     def _find_scene(self) -> ScenePoints:
-        masks = (self.masks.human, self.masks.thing, self.masks.blank)
         if not self.track.static:
             scale = self.person.scene_scale
             scene = colmap_scene(
-                self.track.points * scale, self.track.colors, masks, self.cameras, self.images,
+                self.track.points * scale, self.track.colors, self.masks, self.cameras, self.images,
                 self.options.scene_points,
             )  # fmt: skip
         else:
             scene = static_scene(
-                self.images, masks, self.cameras[0],
+                self.images, self.masks, self.cameras[0],
                 ground=self.person.ground, distance=self.person.distance(self.cameras),
                 backdrop=self.options.backdrop, count=self.options.scene_points,
                 metres=None if self.depth is None else self._metres_of,
@@ -358,9 +353,6 @@ class Pipeline:
         self.provenance["scene"] = scene.provenance
         return scene
 
-    def _writing(self) -> None:
-        self.report: PrepareReport = write_clip_folder(self)
-
     def _metres_of(self, frame: int) -> np.ndarray:
         depth = self.metres(frame)
         assert depth is not None
@@ -369,3 +361,20 @@ class Pipeline:
     @property
     def body_track(self) -> BodyTrack:
         return BodyTrack(self.options.body, self.person.poses, self.provenance["body"])
+
+
+def save_cameras(chosen: ChosenCameras) -> Result:
+    """With a copy of the COLMAP model that the stage made itself, in a temporary folder."""
+    made, model = to_result(chosen), chosen.track.model
+    if not chosen.own_model or model is None:
+        return made
+    return Result(made.values, made.arrays, lambda to: shutil.copytree(model, to / "colmap"))
+
+
+def load_cameras(result: Result) -> ChosenCameras:
+    """With the path of that copy."""
+    chosen: ChosenCameras = from_result(result)
+    if not chosen.own_model:
+        return chosen
+    assert result.folder is not None
+    return replace(chosen, track=replace(chosen.track, model=result.folder / "colmap"))

@@ -5,20 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from hoigs.core.body import BodyModel
-from hoigs.core.clip_folder import check_clip, refuse_to_overwrite
-from hoigs.core.clip_format import is_clip_folder
+from pydantic import ValidationError
+
+from hoigs.core.clip_folder.check import check_clip
+from hoigs.core.clip_folder.format import is_clip_folder
+from hoigs.core.clip_folder.write import refuse_to_overwrite
 from hoigs.core.errors import ClipError, HoigsError
-from hoigs.preparation.evidence import Priors
-from hoigs.preparation.leftovers import Leftovers
+from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.progress import Progress
+from hoigs.core.registry.registry import default_registry
+from hoigs.preparation.clip_writing import write_clip_folder
+from hoigs.preparation.estimates import Estimators
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.pipeline import Pipeline
-from hoigs.preparation.plan import PLAN, and_after, check_stage
-from hoigs.preparation.report import PrepareReport
-from hoigs.preparation.settings import installed_priors, refuse_commands
-from hoigs.preparation.source import SourceError, find_source
-from hoigs.preparation.stages import Progress, Stages
-from hoigs.preparation.store import WorkFolder
+from hoigs.preparation.report.report import PrepareReport
+from hoigs.preparation.settings import installed_estimators, load_options, refuse_commands
+from hoigs.preparation.stages.cleanup import Cleanup
+from hoigs.preparation.stages.plan import PLAN, check_stage, with_dependents
+from hoigs.preparation.stages.progress import Stages
+from hoigs.preparation.stages.work_folder import WorkFolder
+from hoigs.preparation.video.source import SourceError, find_source
 
 __all__ = ["PrepareOptions", "PrepareReport", "prepare", "prepare_until", "work_folder"]
 
@@ -33,12 +40,21 @@ def prepare(
     source: str | Path,
     out: str | Path,
     *,
-    body: BodyModel,
-    options: PrepareOptions | None = None,
-    progress: Progress | None = None,
-    redo: Sequence[str] = (),
-    priors: Priors | None = None,
+    width: int | None = None,
+    camera: str | None = None,
+    max_frames: int | None = None,
+    every: int | None = None,
+    fps: float | None = None,
+    focal: float | None = None,
+    keep_black: bool | None = None,
+    overwrite: bool | None = None,
+    overrides: Sequence[str] = (),
+    options: PrepareOptions | Path | str | None = None,
     allow_commands: bool = False,
+    redo: Sequence[str] = (),
+    body: BodyModel | None = None,
+    estimators: Estimators | None = None,
+    progress: Progress | None = None,
 ) -> PrepareReport:
     """Turn a source into a clip folder, stage by stage.
 
@@ -47,29 +63,38 @@ def prepare(
     killed, goes on where it was. That folder may be removed at any time.
 
     Args:
-        source: a folder with a video or frames and their priors (see `find_source`), or the video
-            in it.
+        source: a folder with a video or frames and their estimators (see `find_source`), or the
+            video in it.
         out: the clip folder to make, with report.json, report.md and overlay.mp4 in it; it
             appears when it is whole.
-        body: the model to fit; `options.body` is its key.
-        progress: called with 0..1 and the stage's name.
+        width, camera, max_frames, every, fps, focal, keep_black, overwrite: fields of
+            `PrepareOptions`, laid over `options`; None leaves a field as it is.
+        overrides: any field likewise: "estimators.masks.use=estimator:masks-files".
+        options: ready-made, or a YAML or TOML file.
+        body: the model to fit, whose key is `options.body`; by default it is made from that key.
+        progress: called with the done fraction, 0 to 1, and the stage's name.
         redo: stages to run anew, with all that build on them; an older clip is then replaced.
-        priors: by kind of evidence, "masks", "landmarks" or "depth"; those of `options.priors`,
-            which are looked up among the installed plugins, come second.
-        allow_commands: let `options.priors` run the programs that they name.
+        estimators: by kind of estimate, "masks", "landmarks" or "depth"; those of
+            `options.estimators`, which are looked up among the installed plugins, come second.
+        allow_commands: let `options.estimators` run the programs that they name.
 
     Raises:
-        SpecError: `options.priors` would run programs, and may not.
+        SpecError: options are wrong, or `options.estimators` would run programs, and may not.
         SourceError: an input is absent, unreadable or does not fit the others.
         ClipError: `out` is there already, or another process is preparing it.
         HoigsError: there is no stage of a name in `redo`.
     """
-    options = options or PrepareOptions()
+    flags = {
+        "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
+        "focal": focal, "keep_black": keep_black, "overwrite": overwrite,
+    }  # fmt: skip
+    options = load_options(options, overrides, flags)
     replace = options.overwrite or bool(redo)
-    run = _run(
-        source, out, body, options, progress, redo, priors, None, replace, allow_commands
+    _, report = _run(
+        source, out, body, options, progress, redo, estimators, None, replace, allow_commands
     )  # fmt: skip
-    return run.report
+    assert report is not None  # the last stage makes it
+    return report
 
 
 def prepare_until(
@@ -77,12 +102,12 @@ def prepare_until(
     source: str | Path,
     out: str | Path,
     *,
-    body: BodyModel,
-    options: PrepareOptions | None = None,
-    progress: Progress | None = None,
-    redo: Sequence[str] = (),
-    priors: Priors | None = None,
+    options: PrepareOptions | Path | str | None = None,
     allow_commands: bool = False,
+    redo: Sequence[str] = (),
+    body: BodyModel | None = None,
+    estimators: Estimators | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, float]:
     """As `prepare`, but only up to and including `stage`; no clip is written.
 
@@ -95,50 +120,74 @@ def prepare_until(
     check_stage(stage)
     if stage == list(PLAN)[-1]:
         raise HoigsError(f"{stage} is the last stage: run prepare as a whole")
-    options = options or PrepareOptions()
-    run = _run(source, out, body, options, progress, redo, priors, stage, True, allow_commands)
-    return run.stages.seconds
+    options = load_options(options)
+    pipeline, _ = _run(
+        source, out, body, options, progress, redo, estimators, stage, True, allow_commands
+    )
+    return pipeline.stages.seconds
 
 
 def _run(
     source: str | Path,
     out: str | Path,
-    body: BodyModel,
+    body: BodyModel | None,
     options: PrepareOptions,
     progress: Progress | None,
     redo: Sequence[str],
-    priors: Priors | None,
+    estimators: Estimators | None,
     until: str | None,
     replace: bool,
     allow_commands: bool,
-) -> Pipeline:
+) -> tuple[Pipeline, PrepareReport | None]:
     source, out = Path(source), Path(out)
     for name in redo:
         check_stage(name)
     _check_paths(source, out, replace)
-    named = installed_priors(options)
+    named = installed_estimators(options)
     if not allow_commands:
-        refuse_commands(named)  # `priors` are the caller's own code
-    chosen = {**named, **(priors or {})}
+        refuse_commands(named)  # `estimators` are the caller's own code
+    chosen = {**named, **(estimators or {})}
     found = find_source(
         source, human=options.human, object_name=options.object, given=set(chosen),
         own_cameras=options.camera in ("static", "sfm"),
     )  # fmt: skip
-    chosen = {**installed_priors(PrepareOptions(priors=found.beside)), **chosen}
+    chosen = {**installed_estimators(PrepareOptions(estimators=found.beside)), **chosen}
+    body = body or _body(options.body)
     stages = Stages({name: stage.weight for name, stage in PLAN.items()}, progress)
     with WorkFolder(work_folder(out)) as work:
-        leftovers = Leftovers(out.absolute(), work.root)
-        leftovers.remove()
-        for name in and_after(redo):
+        cleanup = Cleanup(out.absolute(), work.root)
+        cleanup.remove()
+        for name in with_dependents(redo):
             work.forget(name)
-        pipeline = Pipeline(found, out, body, options, chosen, stages, work, leftovers)
+        pipeline = Pipeline(found, out, body, options, chosen, stages, work)
         try:
             pipeline.run(until)
+            report = None if until else write_clip_folder(pipeline, cleanup)
         except HoigsError:
             if work.new and not pipeline.worth_keeping:
                 work.discard()
             raise
-    return pipeline
+    return pipeline, report
+
+
+def _body(key: str) -> BodyModel:
+    """The installed body model of a key, with its default settings.
+
+    Raises:
+        HoigsError: no body model has this key, or it has no defaults: its files have to be named.
+    """
+    registry = default_registry()
+    component, config_class = registry.get(key), registry.config_class(key)
+    try:
+        config = config_class()
+    except ValidationError as error:
+        needed = ", ".join(str(wrong["loc"][0]) for wrong in error.errors())
+        raise HoigsError(
+            f"body {key}: has no default for {needed}; make the model and call "
+            "hoigs.prepare(..., body=model)"
+        ) from error
+    made: BodyModel = component.from_config(config, BuildContext())
+    return made
 
 
 def _check_paths(source: Path, out: Path, replace: bool) -> None:
@@ -146,6 +195,6 @@ def _check_paths(source: Path, out: Path, replace: bool) -> None:
         problems = len(check_clip(source))
         state = f"with {problems} problems" if problems else "and whole: train on it"
         raise SourceError(f"{source} is a clip already, {state}")
-    refuse_to_overwrite(out)
     if is_clip_folder(out) and not replace:
         raise ClipError(f"{out} holds a clip already; choose another name or pass --overwrite")
+    refuse_to_overwrite(out, [source])

@@ -1,4 +1,5 @@
-"""Options of `prepare` from a file and from KEY=VALUE settings, and the priors that they name."""
+"""Options of `prepare` from a file and from KEY=VALUE settings, and the estimators that they
+name."""
 
 from __future__ import annotations
 
@@ -8,31 +9,34 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from hoigs.core.context import BuildContext
 from hoigs.core.errors import PluginError, SpecError
-from hoigs.core.registry import Registry, default_registry
-from hoigs.core.spec_errors import explain
-from hoigs.core.spec_loader import Document, load_overrides, read_document
-from hoigs.core.video_prior import EvidenceKind, VideoPrior
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.interfaces.estimator import EstimateKind, Estimator
+from hoigs.core.registry.registry import Registry, default_registry
+from hoigs.core.spec.errors import explain
+from hoigs.core.spec.loader import Document, load_overrides, read_document
 from hoigs.preparation.options import PrepareOptions
 
 
 def load_options(
-    file: Path | None = None,
+    file: PrepareOptions | Path | str | None = None,
     settings: Sequence[str] = (),
     flags: Mapping[str, Any] | None = None,
     registry: Registry | None = None,
 ) -> PrepareOptions:
-    """Options from a YAML or TOML file, with settings and flags laid over it.
+    """Options from a YAML or TOML file, or ready-made, with settings and flags laid over them.
 
     Args:
-        settings: "priors.masks.use=prior:masks-files".
+        settings: "estimators.masks.use=estimator:masks-files".
         flags: options by name; None leaves one alone.
 
     Raises:
         SpecError: everything that is wrong, a line each, with its position.
     """
-    document = read_document(file) if file is not None else Document("options")
+    if isinstance(file, PrepareOptions):
+        document = Document("options", file.model_dump(mode="json"))
+    else:
+        document = Document("options") if file is None else read_document(Path(file))
     given = {name: value for name, value in (flags or {}).items() if value is not None}
     document = document.merged(Document("command line", given))
     if settings:
@@ -41,34 +45,36 @@ def load_options(
         options = PrepareOptions.model_validate(document.data)
     except ValidationError as error:
         raise SpecError("\n".join(explain(error, PrepareOptions, document, ()))) from error
-    installed_priors(options, document, registry)  # what is wrong with them is said at once, too
+    installed_estimators(
+        options, document, registry
+    )  # so that errors in them are reported at once, too
     return options
 
 
-def installed_priors(
+def installed_estimators(
     options: PrepareOptions, document: Document | None = None, registry: Registry | None = None
-) -> dict[EvidenceKind, VideoPrior]:
-    """The priors that `options.priors` names, built from their plugins.
+) -> dict[EstimateKind, Estimator]:
+    """The estimators that `options.estimators` names, built from their plugins.
 
     Args:
         document: where the options came from, for messages.
 
     Raises:
-        SpecError: a prior is unknown, gives something else, or its settings are wrong.
+        SpecError: an estimator is unknown, gives something else, or its settings are wrong.
     """
     registry = registry or default_registry()
     document = document or Document("options", options.model_dump(mode="json"))
-    priors: dict[EvidenceKind, VideoPrior] = {}
+    estimators: dict[EstimateKind, Estimator] = {}
     problems: list[str] = []
-    for kind, spec in options.priors.items():
-        place = ("priors", kind)
-        at = f"{document.where((*place, 'use'))} priors.{kind}.use"
+    for kind, spec in options.estimators.items():
+        place = ("estimators", kind)
+        at = f"{document.where((*place, 'use'))} estimators.{kind}.use"
         try:
             component, config_class = registry.get(spec.use), registry.config_class(spec.use)
         except PluginError as error:
             problems.append(f"{at}: {error}")
             continue
-        if not issubclass(component, VideoPrior) or kind not in component.provides:
+        if not issubclass(component, Estimator) or kind not in component.provides:
             problems.append(
                 f'{at}: "{spec.use}" gives no {kind} of a video; those that do: '
                 f"{', '.join(_givers(registry, kind)) or 'none is installed'}"
@@ -79,32 +85,36 @@ def installed_priors(
         except ValidationError as error:
             problems += explain(error, config_class, document, place)
             continue
-        priors[kind] = component.from_config(config, BuildContext())
+        estimators[kind] = component.from_config(config, BuildContext())
     if problems:
         raise SpecError("\n".join(problems))
-    return priors
+    return estimators
 
 
-def refuse_commands(priors: Mapping[EvidenceKind, VideoPrior]) -> None:
-    """SpecError, showing the command lines, if priors would run programs."""
-    lines = [f"  priors.{kind}: {c}" for kind, prior in priors.items() for c in prior.commands()]
+def refuse_commands(estimators: Mapping[EstimateKind, Estimator]) -> None:
+    """SpecError, showing the command lines, if estimators would run programs."""
+    lines = [
+        f"  estimators.{kind}: {c}"
+        for kind, estimator in estimators.items()
+        for c in estimator.commands()
+    ]
     if lines:
         found = "\n".join(lines)
         raise SpecError(
             f"these options run programs on this machine:\n{found}\n"
-            "nothing was run; if you trust them, say --allow-commands (prepare(..., "
+            "nothing was run; if you trust them, use --allow-commands (prepare(..., "
             "allow_commands=True))"
         )
 
 
-def _givers(registry: Registry, kind: EvidenceKind) -> list[str]:
-    """Keys of the installed priors that give a kind of evidence."""
+def _givers(registry: Registry, kind: EstimateKind) -> list[str]:
+    """Keys of the installed estimators that give a kind of estimate."""
     found = []
-    for key in registry.keys("prior"):
+    for key in registry.keys("estimator"):
         try:
             component = registry.get(key)
         except PluginError:  # one that lacks an extra cannot be chosen now
             continue
-        if issubclass(component, VideoPrior) and kind in component.provides:
+        if issubclass(component, Estimator) and kind in component.provides:
             found.append(key)
     return found

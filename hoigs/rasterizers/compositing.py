@@ -1,6 +1,6 @@
-"""What the torch backends share: splats in depth order, and their blending at pixels.
+"""What the torch backends share: projection, splats in depth order, and their blending at pixels.
 
-The rules are those at the head of `hoigs.core.projection`.
+The rules are those at the head of `hoigs.core.maths.projection`.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from hoigs.core.camera import Camera
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.harmonics import sh_to_colors
-from hoigs.core.projection import project
-from hoigs.core.rasterizer import RenderOutput, RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
+from hoigs.core.maths.projection import Projection, project
+from hoigs.core.maths.spherical_harmonics import sh_to_colors
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 
-CHUNK = 1 << 21  # pixel-splat pairs blended at once: bounds the memory, forward and backward
+CHUNK = 1 << 21  # pixels times splats blended at once: bounds the memory, forward and backward
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Splats:
         means2d: centres, pixels. covs, conics: (xx, xy, yy), as `Projection` has them.
         opacities: activated. extents: half sizes of the box where alpha >= min_alpha, pixels.
         channels: what is composited: RGB, depth, then the features; C = 4 + F.
-        absolutes: takes the absolute gradients (A = 2), or nothing when not asked for (A = 0).
+        absolutes: receives the absolute gradients (A = 2), or empty where not requested (A = 0).
     """
 
     means2d: Float[Tensor, "M 2"]
@@ -53,12 +53,38 @@ class Splats:
         return [Splats(*part) for part in zip(*columns)]
 
 
+def project_gaussians(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> Projection:
+    """The rows that a request draws, on screen, in the dtype of the Gaussians."""
+    dtype = gaussians.means.dtype
+    camera, offsets = camera.to(dtype), request.screen_offsets
+    drawable = torch.isfinite(gaussians.sh).flatten(1).all(-1)
+    if request.features is not None:
+        drawable &= torch.isfinite(request.features).all(-1)
+    if request.subset is not None:
+        drawable &= request.subset
+    return project(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.log_scales,
+        gaussians.opacity_logits,
+        camera.world_to_camera,
+        camera.K,
+        camera.width,
+        camera.height,
+        screen_offsets=None if offsets is None else offsets.to(dtype),
+        drawable=drawable,
+        near=request.near,
+        low_pass=request.low_pass,
+        min_alpha=request.min_alpha,
+    )
+
+
 def prepare(
     gaussians: Gaussians, camera: Camera, request: RenderRequest
 ) -> tuple[Splats, dict[str, Any]]:
     """Project, colour and sort by depth; also the `info` of the output, in the input's order."""
     camera = camera.to(gaussians.means.dtype)
-    shown = project(gaussians, camera, request)
+    shown = project_gaussians(gaussians, camera, request)
     colors = sh_to_colors(
         gaussians.sh[shown.index], gaussians.means[shown.index], camera.center, request.sh_degree
     )
@@ -106,7 +132,7 @@ def squared_distances(
 
 
 class _Absolute(torch.autograd.Function):
-    """Lets values [P, M] pass; the second argument [M] receives sum_p |gradient|."""
+    """The identity on values [P, M]; the second argument [M] receives sum_p |gradient|."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, absolutes: Tensor) -> Tensor:

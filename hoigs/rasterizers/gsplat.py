@@ -6,15 +6,15 @@ The facts that matter, read from its sources:
 
   - quats are wxyz of any length, scales and opacities activated, means in world metres; its clamp
     of the Jacobian, pixel centres, order of the harmonics and `eps2d` (our low_pass) are those of
-    `hoigs.core.projection`.
+    `hoigs.core.maths.projection`.
   - Constants in its kernels: an alpha is clamped to 0.999, skipped below 1/255, and compositing
-    stops before the transmittance falls to 1e-4. `Capabilities.fixed` says so.
+    stops before the transmittance falls to 1e-4. `Capabilities.fixed` declares them.
   - Gradients reach means, quats, scales, opacities, colours and the view matrix, not K. They are
     summed by atomics, so that two runs may differ in the last bits.
-  - A row of NaN, or one that overflows, poisons every pixel of its tiles, and no row at all divides
-    by zero on the host; so rows are chosen here, and gsplat is not called for none.
+  - A row of NaN, or one that overflows, makes every pixel of its tiles NaN, and without any row
+    it divides by zero on the host; so rows are filtered here, and gsplat is not called without any.
   - Its projection culls off the image before offsets could act; with offsets that are not all
-    zero, `hoigs.core.projection` takes its place.
+    zero, `hoigs.core.maths.projection` takes its place.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hoigs.core.camera import Camera
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import RenderError
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.projection import LIMIT, Projection, project
-from hoigs.core.rasterizer import Capabilities, Rasterizer, RenderOutput, RenderRequest
-from hoigs.rasterizers.compositing import to_output
+from hoigs.core.interfaces.rasterizer import Capabilities, Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.maths.projection import LIMIT, Projection
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.rasterizers.compositing import project_gaussians, to_output
 
 TILE = 16  # pixels; gsplat tests no other
 CHANNELS_AT_ONCE = 32  # more need more shared memory in its backward kernel than a block has
@@ -42,13 +42,13 @@ class GsplatConfig(ComponentConfig):
 
 
 class GsplatRasterizer(Rasterizer):
-    """Draws with gsplat on CUDA, by the rules of `hoigs.core.projection` and with its constants.
+    """Draws with gsplat on CUDA, by the rules of `hoigs.core.maths.projection` and its constants.
 
     gsplat compiles its kernels at the first render (minutes, once a machine; it needs nvcc). It
     cannot change `max_alpha`, `min_alpha` and `min_transmittance`.
 
     Raises:
-        RenderError: gsplat or a CUDA device is missing, or the request asks for what it cannot do.
+        RenderError: gsplat or a CUDA device is missing, or gsplat cannot do what is requested.
     """
 
     capabilities = Capabilities(
@@ -76,7 +76,7 @@ class GsplatRasterizer(Rasterizer):
         offsets = request.screen_offsets
         moved = offsets is not None and bool(offsets.any())
         with torch.set_grad_enabled(moved and torch.is_grad_enabled()):
-            shown = project(gaussians, camera, request)
+            shown = project_gaussians(gaussians, camera, request)
         rows = gaussians[shown.index]
         if len(shown) == 0:
             blended = _nothing(rows, camera, request, shown.index)
@@ -129,11 +129,11 @@ def _blend(
     channels = [_colors(gsplat, rows, camera, request), depths[:, None]]
     if request.features is not None:
         channels.append(request.features[shown.index].to(depths))
-    across, down = (-(-size // TILE) for size in (camera.width, camera.height))
+    tiles_x, tiles_y = (-(-size // TILE) for size in (camera.width, camera.height))
     _, keys, members = gsplat.isect_tiles(
-        means2d[None], radii[None], depths[None], TILE, across, down
+        means2d[None], radii[None], depths[None], TILE, tiles_x, tiles_y
     )
-    starts = gsplat.isect_offset_encode(keys, 1, across, down)
+    starts = gsplat.isect_offset_encode(keys, 1, tiles_x, tiles_y)
     drawn = [
         gsplat.rasterize_to_pixels(
             means2d[None],
@@ -148,7 +148,7 @@ def _blend(
         )
         for part in torch.cat(channels, -1).split(CHANNELS_AT_ONCE, dim=-1)
     ]
-    alpha = drawn[0][1]  # the same in all of them
+    alpha = drawn[0][1]  # the same in all parts
     return torch.cat([alpha, *(image for image, _ in drawn)], -1)[0].flatten(0, 1)
 
 

@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor
 
-from hoigs.core.camera import Camera
 from hoigs.core.config import ComponentConfig
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import Capabilities, Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.interfaces.rasterizer import Capabilities, Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.compositing import Splats, blend, prepare, squared_distances, to_output
 
 
 class TorchConfig(ComponentConfig):
-    tile_size: int = Field(16, ge=1, description="side of a tile, pixels")
+    """Settings of TorchRasterizer; the tile size changes speed only, never the picture."""
+
+    tile_size: int = Field(default=16, ge=1, description="side of a tile, pixels")
 
 
 class TorchRasterizer(Rasterizer):
-    """Splats are listed by the tiles that they touch, then each tile is blended on its own.
+    """Finds the tiles that each splat touches, then blends each tile on its own.
 
-    Fit for small trainings and for reading; `rasterizer:warp` draws the same picture faster.
-
-    Args:
-        tile_size: side of a tile in pixels; changes speed only, never the picture.
+    For small trainings and for reading; `rasterizer:warp` draws the same picture faster.
     """
 
+    Config: ClassVar = TorchConfig
     capabilities = Capabilities(
         devices=frozenset({"cpu", "cuda"}),
         dtypes=frozenset({"float32", "float64"}),
@@ -35,10 +37,8 @@ class TorchRasterizer(Rasterizer):
         absolute_gradients=True,
     )
 
-    def __init__(self, tile_size: int = 16) -> None:
-        if tile_size < 1:
-            raise ValueError(f"TorchRasterizer: tile_size {tile_size}, expected at least 1")
-        self.tile_size = tile_size
+    def __init__(self, config: TorchConfig | None = None) -> None:
+        self.config = config or TorchConfig()
 
     def render(
         self, gaussians: Gaussians, camera: Camera, request: RenderRequest | None = None
@@ -48,19 +48,20 @@ class TorchRasterizer(Rasterizer):
         self.check_inputs(gaussians, camera, request)
         camera = camera.to(gaussians.means.dtype)
         splats, info = prepare(gaussians, camera, request)
-        tiles, rows = list_by_tile(splats, camera, self.tile_size, request.min_alpha)
+        size = self.config.tile_size
+        tiles, rows = tile_intersections(splats, camera, size, request.min_alpha)
 
         numbers = torch.arange(camera.height * camera.width, device=tiles.device)
         numbers = numbers.reshape(camera.height, camera.width)
         grid = camera.pixel_grid()
-        across = -(-camera.width // self.tile_size)
+        tiles_x = -(-camera.width // size)
         # the empty first parts tie even a picture without splats to the graph, with zero gradients
         where = [numbers.flatten()[:0]]
         blended = [blend(grid.flatten(0, 1)[:0], splats[rows[:0]], request)]
         touched, counts = tiles.unique_consecutive(return_counts=True)
         for tile, members in zip(touched.tolist(), splats[rows].split(counts.tolist())):
-            y, x = (self.tile_size * i for i in divmod(tile, across))
-            window = (slice(y, y + self.tile_size), slice(x, x + self.tile_size))
+            y, x = (size * i for i in divmod(tile, tiles_x))
+            window = (slice(y, y + size), slice(x, x + size))
             where.append(numbers[window].flatten())
             blended.append(blend(grid[window].flatten(0, 1), members, request))
         values = torch.cat(blended)
@@ -69,27 +70,27 @@ class TorchRasterizer(Rasterizer):
 
 
 @torch.no_grad()
-def list_by_tile(
+def tile_intersections(
     splats: Splats, camera: Camera, tile_size: int, min_alpha: float
 ) -> tuple[Int[Tensor, " L"], Int[Tensor, " L"]]:
-    """All pairs (tile, splat) that may touch: tile numbers ascending, splats in order within each.
+    """Tile and splat of each intersection: tiles ascending, splats in their order within each.
 
-    A splat touches a tile when the ellipse opacity exp(-q / 2) >= min_alpha reaches one of its
-    pixel centres' bounding rectangle: q is smallest at the centre, and outside of it on the edges
-    that face the centre, where it is a parabola (as in Speedy-Splat, Hanson et al. 2025).
+    A splat touches a tile when the ellipse opacity exp(-q / 2) >= min_alpha reaches the bounding
+    rectangle of its pixel centres. q is smallest at the splat's centre; on the edges of a rectangle
+    that does not hold it, q is a parabola (Speedy-Splat, Hanson et al. 2025, arXiv:2412.00578).
     """
     size = splats.means2d.new_tensor([camera.width, camera.height])
     counts = torch.ceil(size / tile_size).long()
-    # half a pixel more than the box: rounding can't lose a pair, and the next test is tight
+    # half a pixel more than the box, so that rounding loses nothing; the next test is exact
     first = ((splats.means2d - splats.extents - 0.5) / tile_size).floor()
     last = ((splats.means2d + splats.extents + 0.5) / tile_size).floor()
     first, last = (
         x.clamp(min=torch.zeros_like(size), max=counts - 1).long() for x in (first, last)
     )
     span = last - first + 1
-    pairs = span.prod(-1)
-    row = torch.repeat_interleave(torch.arange(len(splats), device=pairs.device), pairs)
-    inner = torch.arange(len(row), device=row.device) - (pairs.cumsum(0) - pairs)[row]
+    touched = span.prod(-1)
+    row = torch.repeat_interleave(torch.arange(len(splats), device=touched.device), touched)
+    inner = torch.arange(len(row), device=row.device) - (touched.cumsum(0) - touched)[row]
     column, line = first[row, 0] + inner % span[row, 0], first[row, 1] + inner // span[row, 0]
     tile = line * counts[0] + column
     if min_alpha > 0:

@@ -13,10 +13,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hoigs.core.body import BodyModel
-from hoigs.core.clip import BodyTrack, ObjectTrack, uniform_test_split
-from hoigs.core.clip_folder import ClipWriter
-from hoigs.synthesis.damage import damage, with_frames_dropped
+from hoigs.core.clip_folder.write import ClipWriter
+from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.values.clip import BodyTrack, ObjectTrack, uniform_test_split
+from hoigs.synthesis.config import SceneConfig
+from hoigs.synthesis.degradation.damage import damage, with_frames_dropped
+from hoigs.synthesis.degradation.noise import (
+    noisy_camera,
+    noisy_depth,
+    noisy_mask,
+    noisy_poses,
+    noisy_track,
+)
+from hoigs.synthesis.degradation.shutter import with_shutter
 from hoigs.synthesis.generate import (
     ENTITIES,
     SyntheticScene,
@@ -25,10 +34,7 @@ from hoigs.synthesis.generate import (
     generate,
     unproject,
 )
-from hoigs.synthesis.knobs import SceneKnobs
-from hoigs.synthesis.noise import noisy_camera, noisy_depth, noisy_mask, noisy_poses, noisy_track
-from hoigs.synthesis.person import betas_of
-from hoigs.synthesis.shutter import with_shutter
+from hoigs.synthesis.person.choreography import betas_of
 
 PROVENANCE = "synthetic truth"
 SOURCES_OF_POINTS = 8  # frames from which the initial scene points are back-projected
@@ -44,37 +50,37 @@ def cache_folder() -> Path:
 
 def builtin_clip(
     body: BodyModel,
-    knobs: SceneKnobs | None = None,
+    config: SceneConfig | None = None,
     *,
     body_key: str = "body:anny",
     progress: Progress | None = None,
 ) -> Path:
-    """The clip folder for these knobs and this body, generated unless it is cached.
+    """The clip folder of this config and body, generated unless it is cached.
 
-    The cache key covers every knob, the body's shape and the generator's own source, so a stale
-    clip is never returned. The folder appears under its name only when it is whole.
+    The cache key covers every setting, the body's shape and the generator's own source, so an old
+    clip is never returned. The folder gets its name only when it is complete.
 
     Args:
         body: drawn and posed. body_key: its registry key, written into the clip.
-        knobs: SceneKnobs() by default.
+        config: SceneConfig() by default.
         progress: called with (frames done, frames) after each frame, when one is generated.
 
     Returns:
         folder of a clip that `reader:clip` reads, with `truth.npz` in it (see `save_truth`).
     """
-    knobs = knobs or SceneKnobs()
-    key = knobs.digest(generator_version(), body_digest(body, knobs), body_key)
+    config = config or SceneConfig()
+    key = config.digest(generator_version(), body_digest(body, config), body_key)
     folder = cache_folder() / "clips" / f"builtin-{key}"
     if folder.exists():
         return folder
     folder.parent.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=".builtin-", dir=folder.parent))
     try:
-        write_scene(generate(knobs, body), scratch / "clip", body_key=body_key, progress=progress)
+        write_scene(generate(config, body), scratch / "clip", body_key=body_key, progress=progress)
         try:
             (scratch / "clip").rename(folder)
         except OSError:
-            # another process finished the same clip first; its folder is as good as ours
+            # another process has finished the same clip
             if not folder.exists():
                 raise
     finally:
@@ -84,18 +90,18 @@ def builtin_clip(
 
 @functools.cache
 def generator_version() -> str:
-    """A hash of this package's source: any change of the generator makes new clips."""
+    """A hash of this package's source, so that a changed generator makes new clips."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 
-def body_digest(body: BodyModel, knobs: SceneKnobs) -> str:
+def body_digest(body: BodyModel, config: SceneConfig) -> str:
     """A hash of the zero-pose mesh, joints and skinning weights."""
     digest = hashlib.sha256()
     with torch.no_grad():
-        vertices, joints = body.shaped(betas_of(body, knobs))
+        vertices, joints = body.shaped(betas_of(body, config))
     for values in (vertices, joints, body.faces, body.skinning_weights, body.vertex_parts):
         digest.update(np.ascontiguousarray(values.detach().cpu().numpy()).tobytes())
     return digest.hexdigest()[:16]
@@ -108,53 +114,53 @@ def write_scene(
     body_key: str = "body:anny",
     progress: Progress | None = None,
 ) -> None:
-    """Renders every view and writes a clip folder, with the noise that the knobs ask for.
+    """Render every view and write a clip folder, with the noise of the config.
 
     Raises:
         ClipError: `folder` exists and is no clip.
     """
     scene = with_frames_dropped(scene)
-    knobs = scene.knobs
-    rng = np.random.default_rng(knobs.seed + 3)
+    config = scene.config
+    rng = np.random.default_rng(config.seed + 3)
     gather = _Points(scene, rng)
     with ClipWriter(
         folder,
-        name=f"builtin-{knobs.object.motion}",
-        fps=knobs.fps,
+        name=f"builtin-{config.object.motion}",
+        fps=config.fps,
         entities={"human": "human", "object": "object"},
         depth_kind="metric",
     ) as writer:
-        for view, held_out in with_shutter(scene.views(), knobs.camera.shutter_frames):
-            # held-out views judge, so they stay exact
+        for view, held_out in with_shutter(scene.views(), config.camera.shutter_frames):
+            # held-out views are ground truth for evaluation, so they stay exact
             for other in held_out:
                 masks = {name: other.mask(name) for name in ENTITIES}
                 writer.add_held_out(other.frame, other.image, other.camera, masks, other.depth)
-            masks = {name: noisy_mask(view.mask(name), knobs.noise, rng) for name in ENTITIES}
-            depth = noisy_depth(view.depth, knobs.noise, rng)
-            camera = noisy_camera(view.camera, knobs.noise, rng)
+            masks = {name: noisy_mask(view.mask(name), config.noise, rng) for name in ENTITIES}
+            depth = noisy_depth(view.depth, config.noise, rng)
+            camera = noisy_camera(view.camera, config.noise, rng)
             writer.add_frame(view.image, camera, masks, depth)
             gather.add(view)
             if progress:
-                progress(view.frame + 1, knobs.frames)
-        poses = noisy_poses(scene.poses, knobs.noise, rng)
+                progress(view.frame + 1, config.frames)
+        poses = noisy_poses(scene.poses, config.noise, rng)
         writer.set_body("human", BodyTrack(body_key, poses, PROVENANCE))
         writer.set_object("object", gather.object_track())
         writer.set_points(*gather.scene_points())
-        writer.set_split(uniform_test_split(knobs.frames, knobs.test_frames))
+        writer.set_split(uniform_test_split(config.frames, config.test_frames))
         writer.provenance.update(
             {
                 "generator": f"hoigs.synthesis {generator_version()}",
-                "knobs": knobs.model_dump(mode="json"),
+                "config": config.model_dump(mode="json"),
                 "truth": "truth.npz",
             }
         )
     save_truth(scene, folder / "truth.npz")
-    damage(folder, knobs.noise, knobs.seed)
+    damage(folder, config.noise, config.seed)
 
 
 @torch.no_grad()
 def save_truth(scene: SyntheticScene, path: Path) -> None:
-    """Exact geometry, free of the noise that the clip may carry.
+    """Exact geometry, without the noise of the clip.
 
     Arrays: cameras as in cameras.npz; poses as in bodies/human.npz; `object_vertices` and
     `object_faces` about the object's centre, `object_rotations`, `object_translations`,
@@ -191,11 +197,11 @@ class _Points:
 
     def __init__(self, scene: SyntheticScene, rng: np.random.Generator) -> None:
         self.scene, self.rng = scene, rng
-        knobs = scene.knobs
-        sources = min(SOURCES_OF_POINTS, knobs.frames)
-        self.sources = set(np.linspace(0, knobs.frames - 1, sources).round().astype(int).tolist())
-        self.each = -(-knobs.scene_points // sources)
-        self.each_object = -(-2 * knobs.object_points // knobs.frames)
+        config = scene.config
+        sources = min(SOURCES_OF_POINTS, config.frames)
+        self.sources = set(np.linspace(0, config.frames - 1, sources).round().astype(int).tolist())
+        self.each = -(-config.scene_points // sources)
+        self.each_object = -(-2 * config.object_points // config.frames)
         self.static: list[tuple[np.ndarray, np.ndarray]] = []
         self.object: list[tuple[np.ndarray, np.ndarray]] = []
 
@@ -219,17 +225,17 @@ class _Points:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         points, colors = (np.concatenate(x) for x in zip(*parts, strict=True))
         chosen = np.sort(self.rng.permutation(len(points))[:count])
-        jitter = self.scene.knobs.noise.points_metres * self.rng.normal(size=points.shape)
+        jitter = self.scene.config.noise.points_metres * self.rng.normal(size=points.shape)
         points = (points + jitter)[chosen]
         return torch.from_numpy(points).float(), torch.from_numpy(colors[chosen]).float()
 
     def scene_points(self) -> tuple[torch.Tensor, torch.Tensor]:
-        return self._join(self.static, self.scene.knobs.scene_points)
+        return self._join(self.static, self.scene.config.scene_points)
 
     def object_track(self) -> ObjectTrack:
-        knobs = self.scene.knobs
-        points, colors = self._join(self.object, knobs.object_points)
-        track = noisy_track(self.scene.script.track, knobs.noise, self.rng)
+        config = self.scene.config
+        points, colors = self._join(self.object, config.object_points)
+        track = noisy_track(self.scene.script.track, config.noise, self.rng)
         seen = torch.tensor([len(p) > 0 for p, _ in self.object])
         return ObjectTrack(
             points=points,

@@ -1,4 +1,4 @@
-"""generate(knobs, body): a clip with known truth, one frame at a time."""
+"""generate(config, body): a clip with known truth, one frame at a time."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ import torch
 import warp as wp
 from jaxtyping import Bool, Float, Int, UInt8
 
-from hoigs.core.body import BodyModel
-from hoigs.core.camera import Camera
-from hoigs.core.moment import BodyPose
-from hoigs.synthesis.clothes import DressedBody, dress
-from hoigs.synthesis.designs import crate_faces, faded
-from hoigs.synthesis.knobs import SceneKnobs
-from hoigs.synthesis.meshes import TexturedMesh, box, smooth_normals
-from hoigs.synthesis.objects import MOTIONS, ObjectScript, bent_mesh
-from hoigs.synthesis.paths import camera_path, held_out_views
-from hoigs.synthesis.person import Choreographer
-from hoigs.synthesis.raycast import Layer, RayCaster, fine_array
-from hoigs.synthesis.room import HIGH, LOW, Palette, Room, Stand, build_room
-from hoigs.synthesis.textures import TextureAtlas, to_srgb
+from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.moment import BodyPose
+from hoigs.synthesis.config import SceneConfig
+from hoigs.synthesis.motion.object_motions import MOTIONS
+from hoigs.synthesis.motion.object_script import ObjectScript, bent_mesh
+from hoigs.synthesis.person.choreography import Choreographer
+from hoigs.synthesis.person.clothes import DressedBody, dress
+from hoigs.synthesis.rendering.paths import camera_path, held_out_views
+from hoigs.synthesis.rendering.raycast import Layer, RayCaster, fine_array
+from hoigs.synthesis.room.designs import crate_faces, faded
+from hoigs.synthesis.room.meshes import TexturedMesh, box, smooth_normals
+from hoigs.synthesis.room.room import HIGH, LOW, Palette, Room, Stand, build_room
+from hoigs.synthesis.room.textures import TextureAtlas, to_srgb
 
 Array = np.ndarray
 ENTITIES = ("human", "object")  # numbers 1 and 2 in entity images; 0 is the scene
@@ -61,7 +62,7 @@ class SyntheticScene:
             unbent. cameras: one a frame. held_out: (frame, camera) pairs.
     """
 
-    knobs: SceneKnobs
+    config: SceneConfig
     poses: BodyPose
     script: ObjectScript
     dressed: DressedBody
@@ -79,9 +80,11 @@ class SyntheticScene:
 
     @cached_property
     def _caster(self) -> RayCaster:
-        k = self.knobs
+        config = self.config
         shell = Layer.build(self.shell, np.zeros(len(self.shell.faces), int))
-        return RayCaster(shell, self.atlas, k.light, (LOW, HIGH), k.samples, k.edge_samples)
+        return RayCaster(
+            shell, self.atlas, config.light, (LOW, HIGH), config.samples, config.edge_samples
+        )
 
     @cached_property
     def _fine(self) -> wp.array:
@@ -89,39 +92,39 @@ class SyntheticScene:
 
     def object_at(self, frame: int) -> TexturedMesh:
         """The object's mesh in the world."""
-        angle = float(self.script.bend[frame]) / self.knobs.object.size[0]
+        angle = float(self.script.bend[frame]) / self.config.object.size[0]
         track = self.script.track
         return bent_mesh(self.object_mesh, angle).moved(
             track.rotations[frame], track.translations[frame]
         )
 
-    def things(self, frame: int) -> Layer:
-        """Person, object and furniture of a frame, ready for rays."""
+    def layer(self, frame: int) -> Layer:
+        """Person, object and furniture of a frame, for ray casting."""
         vertices, faces = self.body_vertices[frame], self.dressed.faces
         normals = smooth_normals(vertices, faces)[faces]
         person = TexturedMesh(
             vertices, faces, normals, np.zeros((len(faces), 3, 2)), np.full(len(faces), -1)
         )
         parts = [(1, person), (0, self.props)]
-        if frame >= self.knobs.object.appears * (self.knobs.frames - 1):
+        if frame >= self.config.object.appears * (self.config.frames - 1):
             parts.insert(1, (2, self.object_at(frame)))
         numbers = np.repeat([n for n, _ in parts], [len(mesh.faces) for _, mesh in parts])
         return Layer.build(TexturedMesh.join([mesh for _, mesh in parts]), numbers, self._fine)
 
     def render(self, frame: int, camera: Camera, layer: Layer | None = None) -> TrueView:
         """The moment `frame` from any camera."""
-        picture = self._caster.render(camera, layer or self.things(frame))
-        gain = 1 + self.knobs.light.exposure_ramp * (frame / (self.knobs.frames - 1) - 0.5)
+        picture = self._caster.render(camera, layer or self.layer(frame))
+        gain = 1 + self.config.light.exposure_ramp * (frame / (self.config.frames - 1) - 0.5)
         image = np.round(255 * to_srgb(gain * picture.color)).astype(np.uint8)
         return TrueView(frame, camera, image, picture.depth, picture.entity)
 
     def views(self) -> Iterator[tuple[TrueView, list[TrueView]]]:
         """Every frame from the path's camera, with the held-out views of that moment.
 
-        Frames are rendered side by side, a few ahead of the one that is asked for.
+        Frames are rendered in parallel, a few ahead of the one that is yielded.
         """
         threads = _cores()
-        _ = self.body_vertices, self._caster, self._fine  # made once, before threads ask for them
+        _ = self.body_vertices, self._caster, self._fine  # computed before threads read them
         with ThreadPoolExecutor(threads) as pool:
             ahead: deque[Future[tuple[TrueView, list[TrueView]]]] = deque()
             for frame in range(len(self.cameras)):
@@ -132,9 +135,9 @@ class SyntheticScene:
                 yield ahead.popleft().result()
 
     def _moment(self, frame: int) -> tuple[TrueView, list[TrueView]]:
-        things = self.things(frame)
-        others = [self.render(f, c, things) for f, c in self.held_out if f == frame]
-        return self.render(frame, self.cameras[frame], things), others
+        layer = self.layer(frame)
+        others = [self.render(f, c, layer) for f, c in self.held_out if f == frame]
+        return self.render(frame, self.cameras[frame], layer), others
 
 
 def _cores() -> int:
@@ -144,33 +147,33 @@ def _cores() -> int:
     return os.cpu_count() or 1
 
 
-def generate(knobs: SceneKnobs, body: BodyModel) -> SyntheticScene:
-    """Scripts a scene; deterministic in its arguments.
+def generate(config: SceneConfig, body: BodyModel) -> SyntheticScene:
+    """Script a scene; deterministic in its arguments.
 
     Raises:
-        HoigsError: the person cannot reach what the knobs ask for.
+        HoigsError: the person cannot reach the object.
     """
-    script = MOTIONS[knobs.object.motion](knobs).script()
-    person = Choreographer(body, knobs)
-    poses = person.perform(script, knobs)
+    script = MOTIONS[config.object.motion](config).script()
+    person = Choreographer(body, config)
+    poses = person.perform(script)
     script = script.in_world()
-    room, atlas = _furnished(script.stands, knobs.seed)
-    sides = crate_faces(np.random.default_rng(knobs.seed + 1), 256, knobs.object.textured)
-    sides = [faded(side, knobs.object.contrast) for side in sides]
-    columns = 24 if knobs.object.motion == "bending" else 1
+    room, atlas = _furnished(script.stands, config.seed)
+    sides = crate_faces(np.random.default_rng(config.seed + 1), 256, config.object.textured)
+    sides = [faded(side, config.object.contrast) for side in sides]
+    columns = 24 if config.object.motion == "bending" else 1
     numbers = [len(atlas.levels) + i for i in range(6)]
-    thing = box(knobs.object.size, numbers, columns)
+    mesh = box(config.object.size, numbers, columns)
     return SyntheticScene(
-        knobs=knobs,
+        config=config,
         poses=poses,
         script=script,
-        dressed=dress(body, person.betas, knobs.cloth_thickness, knobs.seed + 2),
-        object_mesh=thing,
+        dressed=dress(body, person.betas, config.cloth_thickness, config.seed + 2),
+        object_mesh=mesh,
         shell=room.shell,
         props=room.props,
         atlas=atlas.extended(sides),
-        cameras=camera_path(knobs),
-        held_out=held_out_views(knobs),
+        cameras=camera_path(config),
+        held_out=held_out_views(config),
     )
 
 

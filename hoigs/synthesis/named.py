@@ -8,14 +8,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from hoigs.core.body import BodyModel
 from hoigs.core.errors import ClipError, did_you_mean
+from hoigs.core.interfaces.body import BodyModel
 from hoigs.synthesis.builtin import Progress, builtin_clip
-from hoigs.synthesis.knobs import SceneKnobs
+from hoigs.synthesis.config import SceneConfig
 
 PREFIX = "builtin:"
 
-# what each clip sets; the rest is SceneKnobs' default
+# what each clip sets; the rest is a default of SceneConfig
 CLIPS: Mapping[str, Mapping[str, Any]] = {
     "lift-and-swing": {},
     "carry": {
@@ -38,17 +38,17 @@ CLIPS: Mapping[str, Mapping[str, Any]] = {
 
 
 def is_named(clip: str | Path) -> bool:
-    """Whether a CLIP argument asks for a built-in clip."""
+    """Whether a CLIP argument names a built-in clip."""
     return str(clip).startswith(PREFIX)
 
 
-def clip_knobs(name: str) -> SceneKnobs:
-    """The knobs behind "builtin:NAME", or "builtin:NAME?knob=value&knob.of=value".
+def clip_config(name: str) -> SceneConfig:
+    """The config of "builtin:NAME", or "builtin:NAME?setting=value&group.setting=value".
 
-    A width alone keeps the aspect.
+    A width alone sets the height too, so that frames are square.
 
     Raises:
-        ClipError: no clip of that name, no such knob, or a value that it cannot take.
+        ClipError: no clip of that name, no such setting, or an invalid value.
     """
     short, _, query = name.removeprefix(PREFIX).partition("?")
     if short not in CLIPS:
@@ -63,7 +63,10 @@ def clip_knobs(name: str) -> SceneKnobs:
     for part in filter(None, query.split("&")):
         key, equals, value = part.partition("=")
         if not equals:
-            raise ClipError(f"{name}: {part!r} is no knob=value; write {PREFIX}{short}?width=128")
+            raise ClipError(
+                f"{name}: {part!r} is not setting=value; write for example "
+                f"{PREFIX}{short}?width=128"
+            )
         *groups, last = key.split(".")
         place = settings
         for group in groups:
@@ -74,18 +77,18 @@ def clip_knobs(name: str) -> SceneKnobs:
     if "width" in settings and "height" not in settings:
         settings["height"] = settings["width"]
     try:
-        return SceneKnobs.model_validate(settings)
+        return SceneConfig.model_validate(settings)
     except ValidationError as error:
-        raise ClipError("\n".join(_told(name, error))) from error
+        raise ClipError("\n".join(_messages(name, error))) from error
 
 
-def _told(name: str, error: ValidationError) -> list[str]:
+def _messages(name: str, error: ValidationError) -> list[str]:
     lines = []
     for problem in error.errors():
         place = [str(step) for step in problem["loc"]]
         near = ""
         if problem["type"] == "extra_forbidden":
-            model: Any = SceneKnobs
+            model: Any = SceneConfig
             for step in place[:-1]:
                 model = model.model_fields[step].annotation
             near = did_you_mean(place[-1], model.model_fields)
@@ -97,6 +100,6 @@ def named_clip(name: str, body: BodyModel, *, progress: Progress | None = None) 
     """The folder of a built-in clip, generated unless it is cached (`builtin_clip`).
 
     Raises:
-        ClipError: as `clip_knobs`.
+        ClipError: as `clip_config`.
     """
-    return builtin_clip(body, clip_knobs(name), progress=progress)
+    return builtin_clip(body, clip_config(name), progress=progress)

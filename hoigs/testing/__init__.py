@@ -1,19 +1,23 @@
-"""The conformance kit: small checks with stable ids that hold a plugin to its interface.
+"""The conformance kit: small checks, with stable ids, that a plugin keeps its interface's contract.
 
     report = hoigs.testing.check("deformation:chs")      # a Report; print it
-    @hoigs.testing.conformance("deformation:chs")        # pytest: one test a check
+    @hoigs.testing.conformance("deformation:chs")        # pytest: one test for each check
     $ hoigs plugins check deformation:chs                # the same from a shell
 
-It needs no pytest. Each interface has its list of checks (`hoigs.testing.rasterizer.CHECKS`), each
-check says by tags that a component declares, never by names, what it needs; every outcome is
-counted. Importing this module loads no torch.
+- `runner.check`, `runner.check_plugin`: run the checks of a component or of a whole plugin.
+- `pytest_plugin.conformance`: the same as pytest parameters.
+- `checks`: Check, CheckList and Report. Each interface has a package with its CHECKS, for example
+  `hoigs.testing.deformation`.
+
+Whether a check applies depends on what a component declares, never on its name. It needs no pytest,
+and importing this module loads no torch.
 """
 
 from __future__ import annotations
 
 from hoigs.testing.checks import Check, CheckError, CheckList, Outcome, Report, Result, run_checks
-from hoigs.testing.door import Options, check, check_plugin
-from hoigs.testing.pytest_door import conformance
+from hoigs.testing.pytest_plugin import conformance
+from hoigs.testing.runner import Options, check, check_plugin
 
 __all__ = [
     "Check",

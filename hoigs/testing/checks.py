@@ -1,4 +1,4 @@
-"""Check, CheckList and Report: how conformance checks are declared, run and counted."""
+"""Check, CheckList and Report: declaring, running and counting conformance checks."""
 
 from __future__ import annotations
 
@@ -11,22 +11,34 @@ from typing import Any, Generic, TypeVar
 from hoigs.core.errors import did_you_mean
 
 Subject = TypeVar("Subject")
-Need = Callable[[Any], str | None]  # why the subject cannot be asked this; None when it can
+Component = TypeVar("Component")
+Need = Callable[[Any], str | None]  # the reason why a check does not apply; None when it does
 
 
 class CheckError(AssertionError):
-    """What was checked, what was expected and what came."""
+    """A failed check; the message contains the expected and the actual value."""
+
+
+@dataclass(frozen=True)
+class ComponentSubject(Generic[Component]):
+    """A component class with its settings: what the checks of its kind run on."""
+
+    cls: type[Component]
+    config: Any
+
+    def __str__(self) -> str:
+        return self.cls.__name__
 
 
 @dataclass(frozen=True)
 class Check(Generic[Subject]):
-    """One question to a plugin.
+    """One check of a plugin.
 
     Attributes:
-        id: stable forever, for example "R07"; a check that is withdrawn leaves its id unused.
+        id: stable, for example "R07"; the id of a removed check is not used again.
         title: one line.
-        function: raises CheckError, or whatever the plugin raises; may return a remark.
-        needs: what the subject must declare for the question to make sense.
+        function: raises CheckError, or what the plugin raises; may return a remark.
+        needs: conditions on what the subject declares, under which the check applies.
     """
 
     id: str
@@ -35,7 +47,7 @@ class Check(Generic[Subject]):
     needs: tuple[Need, ...] = ()
 
     def missing(self, subject: Subject) -> str | None:
-        """Why the subject cannot be asked this, or None."""
+        """The reason why the check does not apply to the subject, or None."""
         return next((why for need in self.needs if (why := need(subject)) is not None), None)
 
     def run(self, subject: Subject) -> str | None:
@@ -47,7 +59,7 @@ class CheckList(Generic[Subject]):
     """The checks of one interface, ordered by id.
 
     Args:
-        letter: what their ids begin with.
+        letter: first letter of the ids.
     """
 
     def __init__(self, letter: str) -> None:
@@ -57,7 +69,7 @@ class CheckList(Generic[Subject]):
     def check(
         self, id: str, *needs: Need
     ) -> Callable[[Callable[[Subject], str | None]], Callable[[Subject], str | None]]:
-        """Decorator: adds a function; the first line of its docstring is the title."""
+        """Decorator that adds a check; the first line of the docstring is its title."""
         if not re.fullmatch(rf"{self.letter}\d\d", id) or id in self._checks:
             raise ValueError(f'check id "{id}": expected {self.letter} and two digits, used once')
 
@@ -90,7 +102,7 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class Result:
-    """What became of one check; `why` says so, and of one that passed it may be a remark."""
+    """The outcome of one check; `why` is the reason, or a remark on a check that passed."""
 
     id: str
     title: str
@@ -144,11 +156,11 @@ def run_checks(
     subject: Subject,
     expected_failures: Mapping[str, str] | None = None,
 ) -> Report:
-    """Run every check that the subject's declarations allow, and count what came of each.
+    """Run every check that applies to the subject.
 
     Args:
-        expected_failures: id of a check -> why this subject is known to fail it. Such a check is
-            run all the same, and its passing is an error too.
+        expected_failures: id of a check -> why this subject is known to fail it. The check runs
+            all the same, and is an error when it passes.
 
     Raises:
         ValueError: `expected_failures` names a check that is not among `checks`.
@@ -160,7 +172,7 @@ def run_checks(
 
 
 def refuse_unknown(expected_failures: Iterable[str], ids: Iterable[str]) -> None:
-    """Raise ValueError when an expected failure is none of these ids."""
+    """Raise ValueError when an expected failure is not among these ids."""
     ids = list(ids)
     for id in expected_failures:
         if id not in ids:
@@ -168,7 +180,7 @@ def refuse_unknown(expected_failures: Iterable[str], ids: Iterable[str]) -> None
 
 
 def run_check(check: Check[Subject], subject: Subject, expected: str | None = None) -> Result:
-    """What becomes of one check; `expected` is why it should fail."""
+    """Run one check; `expected` is the reason why it should fail, if it should."""
     missing = check.missing(subject)
     if missing is not None:
         return Result(check.id, check.title, Outcome.SKIPPED, missing)

@@ -1,4 +1,4 @@
-"""Comparisons that say what differed, by how much and where."""
+"""Comparisons whose errors name what differs, by how much and where."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ def require(condition: Any, message: str) -> None:
 
 
 def require_close(
-    what: str, actual: Tensor | float, wanted: Tensor | float, *, atol: float, rtol: float = 0.0
+    what: str, actual: Tensor | float, expected: Tensor | float, *, atol: float, rtol: float = 0.0
 ) -> None:
-    """Everywhere |actual - wanted| <= atol + rtol |wanted|, in float64; NaN is far from all."""
-    a, b = (torch.as_tensor(x).detach().double().cpu() for x in (actual, wanted))
+    """|actual - expected| <= atol + rtol |expected| everywhere, in float64; NaN never is."""
+    a, b = (torch.as_tensor(x).detach().double().cpu() for x in (actual, expected))
     if a.shape != b.shape:
         raise CheckError(f"{what} has shape {list(a.shape)}, expected {list(b.shape)}")
     excess = (a - b).abs() - (atol + rtol * b.abs())
@@ -37,7 +37,7 @@ def require_close(
 
 
 def require_zero(what: str, value: Tensor | None) -> None:
-    """Every entry is exactly zero; None, a gradient that never came, counts as zeros."""
+    """Every entry is exactly zero; None, an absent gradient, counts as zeros."""
     if value is not None and bool((value != 0).any()):
         place = (value != 0).nonzero()[0].tolist()
         raise CheckError(f"{what} is {float(value[tuple(place)]):g} at {place}, expected zeros")
@@ -49,12 +49,14 @@ def require_finite(what: str, value: Tensor) -> None:
         raise CheckError(f"{what} is {float(value[tuple(place)])} at {place}, expected numbers")
 
 
-def require_close_gradient(what: str, actual: Tensor | None, wanted: Tensor, error: float) -> None:
-    """|actual - wanted| <= error |wanted|, as vectors."""
+def require_close_gradient(
+    what: str, actual: Tensor | None, expected: Tensor, error: float
+) -> None:
+    """|actual - expected| <= error |expected|, as vectors."""
     if actual is None:
         raise CheckError(f"no gradient reached {what}")
     require_finite(f"gradient of {what}", actual)
-    a, b = actual.double().cpu().flatten(), wanted.double().cpu().flatten()
+    a, b = actual.double().cpu().flatten(), expected.double().cpu().flatten()
     off = float((a - b).norm() / b.norm())
     if not off <= error:
         cosine = float(a @ b / (a.norm() * b.norm()))

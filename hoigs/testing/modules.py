@@ -1,28 +1,37 @@
-"""What checks ask of every torch module: perturbing it, its gradients, its optimizer, its state."""
+"""Helpers for checks of torch modules: perturbation, gradients, optimizer moments and state."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import torch
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from hoigs.core.topology import AxisChange, TopologyChange
-from hoigs.testing.checks import CheckError
+from hoigs.core.values.topology import AxisChange, TopologyChange
+from hoigs.testing.checks import CheckError, Component, ComponentSubject
 from hoigs.testing.compare import require_finite
 
 Made = TypeVar("Made")
 
-NUDGE = 0.03  # standard deviation by which parameters leave a start of zeros
-STEPS = (1e-6, 1e-7, 1e-8)  # of difference quotients, in float64; kinks may lie in the larger
+CPU = torch.device("cpu")
+NUDGE = 0.03  # standard deviation of the noise that moves parameters off zero
+STEPS = (1e-6, 1e-7, 1e-8)  # of difference quotients, in float64; a large step may cross a kink
+
+
+@dataclass(frozen=True)
+class DeviceSubject(ComponentSubject[Component]):
+    """A component class with its settings, and the device on which it is checked."""
+
+    device: torch.device = CPU
 
 
 def seeded(make: Callable[[], Made], seed: int = 0) -> Made:
-    """What `make` makes with torch's global random numbers at `seed`, and these left alone."""
+    """Call `make` with torch's global random generator at `seed`, and restore the generator."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return make()
@@ -30,7 +39,7 @@ def seeded(make: Callable[[], Made], seed: int = 0) -> Made:
 
 @torch.no_grad()
 def perturb(module: nn.Module, seed: int = 1, size: float = NUDGE) -> None:
-    """Move every trained parameter a little, so that what starts at zero takes part."""
+    """Add noise to every trained parameter, so that those that start at zero have an effect."""
     generator = torch.Generator().manual_seed(seed)
     for parameter in module.parameters():
         if parameter.requires_grad and parameter.is_floating_point():
@@ -38,8 +47,8 @@ def perturb(module: nn.Module, seed: int = 1, size: float = NUDGE) -> None:
             parameter.add_((size * noise).to(parameter))
 
 
-def weighed(tensors: Mapping[str, Tensor]) -> Tensor:
-    """A sum in which every entry takes part with a weight of its own."""
+def weighted_sum(tensors: Mapping[str, Tensor]) -> Tensor:
+    """A sum of all entries with different weights."""
     total = torch.zeros((), dtype=torch.float64)
     for seed, (_, x) in enumerate(sorted(tensors.items())):
         generator = torch.Generator().manual_seed(seed)
@@ -49,7 +58,7 @@ def weighed(tensors: Mapping[str, Tensor]) -> Tensor:
 
 
 def trained(module: nn.Module) -> dict[str, nn.Parameter]:
-    """Parameters that are trained and hold something."""
+    """Parameters that are trained and not empty."""
     return {n: p for n, p in module.named_parameters() if p.requires_grad and p.numel()}
 
 
@@ -59,17 +68,15 @@ def require_gradients(module: nn.Module, losses: Iterable[Tensor]) -> None:
     for loss in losses:
         if loss.requires_grad:
             loss.backward()
-    dead = []
+    without = []
     for name, parameter in trained(module).items():
         if parameter.grad is None or not bool((parameter.grad != 0).any()):
-            dead.append(name)
+            without.append(name)
         else:
             require_finite(f"gradient of {name}", parameter.grad)
     module.zero_grad()
-    if dead:
-        raise CheckError(
-            f"no gradient reaches {', '.join(dead)}: nothing that was asked of it depends on them"
-        )
+    if without:
+        raise CheckError(f"no gradient reaches {', '.join(without)}: no output depends on them")
 
 
 def require_finite_gradients(module: nn.Module, loss: Tensor) -> None:
@@ -85,12 +92,12 @@ def require_finite_gradients(module: nn.Module, loss: Tensor) -> None:
 def require_true_gradients(
     leaves: Mapping[str, Tensor], loss: Callable[[], Tensor], cut: Sequence[str] = ()
 ) -> None:
-    """In float64, the gradient of every leaf is the slope of `loss` along a direction in it.
+    """In float64, the gradient of every leaf agrees with central differences along a direction.
 
-    The direction leans on the gradient, so that it is never lost among many entries.
+    The direction is close to the gradient, so that the slope is large also with many entries.
 
     Args:
-        cut: prefixes of names that are left out.
+        cut: prefixes of names to leave out.
     """
     leaves = {
         n: x for n, x in leaves.items() if x.numel() and not n.startswith(tuple(cut) or ("\0",))
@@ -115,8 +122,8 @@ def require_true_gradients(
                 break
         else:
             raise CheckError(
-                f"gradient of {name}: along a direction in it the slope is {expected:.6g}, "
-                f"the gradient says {got:.6g}"
+                f"gradient of {name}: the slope along a direction is {expected:.6g}, "
+                f"the gradient gives {got:.6g}"
             )
 
 
@@ -131,7 +138,7 @@ def slope_along(leaf: Tensor, direction: Tensor, loss: Callable[[], Tensor], ste
 
 
 class Moments:
-    """An optimizer's moments, each filled with the parameter's own values, to be followed."""
+    """Stand-ins for an optimizer's moments: copies of the parameters, which follow index maps."""
 
     def __init__(self, parameters: Mapping[str, nn.Parameter]) -> None:
         self.parameters = dict(parameters)
@@ -139,7 +146,7 @@ class Moments:
         self.fresh: dict[str, AxisChange] = {}
 
     def follow(self, name: str, change: TopologyChange | AxisChange) -> None:
-        """Moments of one parameter follow, as an optimizer of hoigs lets them."""
+        """Apply a change to the moments of one parameter, as hoigs' optimizer does."""
         if isinstance(change, TopologyChange):
             change = AxisChange(0, change.source, change.fresh)
         if name in self.values:
@@ -147,12 +154,12 @@ class Moments:
             self.fresh[name] = change
 
     def require_in_step(self, now: Mapping[str, nn.Parameter]) -> None:
-        """Moments have their parameter's shape, and where they are not fresh, its values."""
+        """Moments have their parameter's shape and, where rows are not fresh, its values."""
         for name, parameter in now.items():
             if parameter is not self.parameters.get(name, parameter):
                 raise CheckError(
-                    f"{name} is another Parameter object than before, which the optimizer does "
-                    "not know; change parameter.data"
+                    f"{name} is a new Parameter object, which the optimizer does "
+                    "not have; change parameter.data"
                 )
             if name not in self.values:
                 continue
@@ -167,19 +174,21 @@ class Moments:
                 change = self.fresh[name]
                 kept.index_fill_(change.axis, change.fresh.nonzero().squeeze(1), False)
             if bool((moments[kept] != parameter.detach()[kept]).any()):
-                raise CheckError(f"rows of {name} and of its moments no longer belong together")
+                raise CheckError(f"rows of {name} no longer match the rows of its moments")
 
 
 def plain_state(module: nn.Module) -> dict[str, Tensor]:
-    """The state dict after a trip through safetensors, which knows tensors only, no pickle.
+    """The state dict after a round trip through safetensors, which holds only tensors.
 
     Raises:
-        CheckError: it holds anything else, or tensors that share memory.
+        CheckError: it holds anything but tensors, or tensors that share memory.
     """
     state: dict[str, Any] = module.state_dict()
-    strange = [name for name, value in state.items() if not isinstance(value, Tensor)]
-    if strange:
-        raise CheckError(f"the state dict holds {strange[0]}, which is no tensor; checkpoints do")
+    others = [name for name, value in state.items() if not isinstance(value, Tensor)]
+    if others:
+        raise CheckError(
+            f"the state dict holds {others[0]}, which is not a tensor; use tensors only"
+        )
     try:
         return load(save({name: x.detach().cpu().contiguous() for name, x in state.items()}))
     except (RuntimeError, ValueError) as error:
@@ -199,7 +208,7 @@ def require_same_state(what: str, a: nn.Module, b: nn.Module) -> None:
 
 @contextmanager
 def unchanged(what: str, tensors: Mapping[str, Tensor]) -> Any:
-    """CheckError when any of these tensors is written to in this block."""
+    """Raise CheckError when any of these tensors is written to in this block."""
     before = {name: x.detach().clone() for name, x in tensors.items()}
     yield
     for name, x in tensors.items():

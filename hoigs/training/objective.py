@@ -1,4 +1,4 @@
-"""One step of the joint objective: what is drawn, what it is compared with, and the sum."""
+"""JointObjective: the loss of one training frame and its terms (HOIGS Eq. 15)."""
 
 from __future__ import annotations
 
@@ -9,41 +9,43 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import Frame
-from hoigs.core.density import DensityControl
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.interaction import Residual
-from hoigs.core.moment import Moment
-from hoigs.core.rasterizer import RenderOutput, RenderRequest
-from hoigs.core.scene import SceneModel, SceneState
-from hoigs.core.train_spec import Graphs, LossSpec
-from hoigs.evaluation.lpips import Lpips
-from hoigs.training.camera_refinement import CameraRefinement
-from hoigs.training.face import FaceTexture, face_loss, visible
-from hoigs.training.losses import (
+from hoigs.core.interfaces.density import DensityControl
+from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
+from hoigs.core.model.camera_refinement import CameraRefinement
+from hoigs.core.model.scene import SceneModel, SceneState
+from hoigs.core.spec.train_schema import Graphs, LossSpec
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Frame
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import Residual
+from hoigs.metrics.image_loss import image_loss
+from hoigs.metrics.lpips import Lpips
+from hoigs.metrics.regions import dilate
+from hoigs.training.graphs.graphed_scene import Deformed, GraphedScene
+from hoigs.training.losses.crops import Crop, crop_around, cut, union
+from hoigs.training.losses.face import FaceTexture, face_loss, visible
+from hoigs.training.losses.terms import (
     depth_loss,
-    image_loss,
     masked_loss,
     scene_only_loss,
     term_weights,
 )
-from hoigs.training.recorded import Deformed, RecordedScene
-from hoigs.training.regions import Crop, crop_around, dilate, inside, union
 
-RESTRAINED = ("residual_pose", "residual_means")  # penalties of what the interaction asks for
-CAMERA_WEIGHT = 0.1  # of the penalty on camera corrections: holds what no image decides
+RESIDUAL_PENALTIES = ("residual_pose", "residual_means")  # on corrections by the interaction
+CAMERA_WEIGHT = 0.1  # of camera corrections; moving all cameras and the scene changes no image
 
 
 @dataclass(frozen=True)
 class ObjectiveResult:
-    """What one step produced.
+    """The loss of one frame, and what density control needs after its backward pass.
 
     Attributes:
-        terms: unweighted losses by name. total: their weighted sum.
-        state: the Gaussians that were drawn. composite: the full render.
-        screen_offsets: receives the screen-space gradient of `state.joined()`, pixels.
-        absolute_gradients: receives its absolute sums, where a density control asks for them.
+        terms: unweighted losses by name. weights: of each. total: their weighted sum.
+        state: the Gaussians that were drawn. composite: the render of all entities.
+        screen_offsets: its gradient is the screen-space one of `state.joined()`, per pixel.
+        absolute_gradients: its gradient is the sum of absolute values over pixels; None if no
+            density control needs that.
     """
 
     terms: dict[str, Tensor]
@@ -56,13 +58,20 @@ class ObjectiveResult:
 
 
 class JointObjective:
-    """L = w_h L_human + w_o L_object + w_s L_scene + w_d L_depth + regularisers.
+    """L = w_h L_human + w_o L_object + w_s L_scene + w_d L_depth + regularizers (HOIGS Eq. 15).
 
-    `depth_scale` brings the depth prior to the world's scale, where its own is another.
-    L_human and L_object draw the entity alone over a random background, on the crop of its mask
-    (L_human may compare the composite there instead or too, and adds L_face where asked: LossSpec);
-    L_scene compares the composite (or the scene alone); L_depth compares the composite's depth.
-    Neither is computed where it has no weight.
+    L_human (Eq. 16) and L_object (Eq. 17) render the entity alone over a random background, in the
+    crop of its mask; L_human may compare the composite there, instead or too, and adds LPIPS and
+    L_face as LossSpec declares. L_scene (Eq. 18) compares the composite, or the scene alone.
+    L_depth compares the composite's depth with the prior. A term without weight is not computed.
+
+    Args:
+        spec: settings of the losses. depth_kind: `Clip.depth_kind` of the prior.
+        lpips: needed if `spec.lpips` > 0.
+        density: of each entity; their regularizers are added.
+        faces: textures for L_face, by human. cameras: corrections, which are penalised.
+        depth_scale: factor from the prior's units to metres in the world.
+        graphs: `TrainSpec.graphs`.
     """
 
     def __init__(
@@ -78,14 +87,19 @@ class JointObjective:
         graphs: Graphs = "off",
     ) -> None:
         self.model, self.spec, self.depth_kind, self.lpips = model, spec, depth_kind, lpips
-        self.density = dict(density or {})  # whose regularisers count too
+        self.density = dict(density or {})
         self.faces = dict(faces or {})
         self.cameras, self.depth_scale = cameras, depth_scale
         self.weights = term_weights(spec)
-        restrained = any(spec.regularizers.get(key, 0.0) > 0 for key in RESTRAINED)
-        self.recorded = RecordedScene(model, graphs, self.weight_of, restrained=restrained)
+        restrained = any(spec.regularizers.get(key, 0.0) > 0 for key in RESIDUAL_PENALTIES)
+        self.graphed_scene = GraphedScene(model, graphs, self.weight_of, restrained=restrained)
 
     def __call__(self, frame: Frame, camera: Camera, generator: torch.Generator) -> ObjectiveResult:
+        """The loss of `frame`, which is on the CPU, from `camera`, which is on the model's device.
+
+        Args:
+            camera: the frame's, refined where cameras are. generator: of random backgrounds, CPU.
+        """
         device = camera.K.device
         deformed = self._deform(frame.moment)
         state = deformed.state
@@ -100,14 +114,14 @@ class JointObjective:
             camera,
             RenderRequest(screen_offsets=offsets, absolute_gradients=absolutes),
         )
-        there = frame.to(device)
-        image = there.rgb
+        shown = frame.to(device)
+        image = shown.rgb
         terms: dict[str, Tensor] = {}
-        terms.update(self._scene(there, image, camera, state, composite, offsets, absolutes))
-        if there.depth is not None and self.weights["depth"] > 0:
-            prior = there.depth * self.depth_scale
-            if there.ignored is not None:
-                prior = prior.masked_fill(there.ignored, 0.0)  # 0 = unknown
+        terms.update(self._scene(shown, image, camera, state, composite, offsets, absolutes))
+        if shown.depth is not None and self.weights["depth"] > 0:
+            prior = shown.depth * self.depth_scale
+            if shown.ignored is not None:
+                prior = prior.masked_fill(shown.ignored, 0.0)  # 0 = unknown
             depth = depth_loss(
                 composite.depth, composite.alpha, prior, self.depth_kind, self.spec.depth_fit
             )
@@ -117,13 +131,13 @@ class JointObjective:
             for name in self.model.names(kind):
                 crop = None
                 if name in frame.masks:
-                    crop = crop_around(frame, camera, name, there)
-                if crop is None:  # not seen in this frame: the terms are skipped, not zero
+                    crop = crop_around(frame, camera, name, shown)
+                if crop is None:  # not visible in this frame: it has no terms
                     continue
                 if kind == "object" or self.spec.human_image != "composite":
                     terms.update(self._alone(name, kind, crop, state, generator))
                 if kind == "human":
-                    terms.update(self._human(name, there, crop, camera, image, state, composite))
+                    terms.update(self._human(name, shown, crop, camera, image, state, composite))
         weights = {name: self.weights[name.partition("/")[0]] for name in terms}
         for name in self.model.entities:
             own = None if deformed.penalties is None else deformed.penalties[name]
@@ -132,17 +146,17 @@ class JointObjective:
             terms["regularizer/camera"] = self.cameras.penalty(frame.position)
             weights["regularizer/camera"] = self.spec.regularizers.get("camera", CAMERA_WEIGHT)
         for name, residual in state.residuals.items():
-            self._restrain(name, residual, terms, weights)
+            self._penalise_residual(name, residual, terms, weights)
         total = composite.color.new_zeros(())
         for name, term in terms.items():
             total = total + weights[name] * term
-        if not total.requires_grad:  # a frame that tells nothing
+        if not total.requires_grad:  # no term applies to this frame
             total = total + 0 * composite.color.sum()
         return ObjectiveResult(terms, total, state, composite, offsets, weights, absolutes)
 
     def _deform(self, moment: Moment) -> Deformed:
-        """Apart, so that it can be timed apart."""
-        return self.recorded(moment)
+        """A method of its own, so that benchmarks can time it."""
+        return self.graphed_scene(moment)
 
     def weight_of(self, name: str, penalty: str) -> float:
         """Weight of a penalty of an entity's deformation or density control."""
@@ -161,26 +175,27 @@ class JointObjective:
         offsets: Tensor,
         absolutes: Tensor | None,
     ) -> dict[str, Tensor]:
+        """L_scene (HOIGS Eq. 18): "scene" of the composite, "scene/masked" of the scene alone."""
         terms: dict[str, Tensor] = {}
         if self.weights["scene"] == 0:
             return terms
-        blank = frame.ignored
+        ignored = frame.ignored
         dssim = (self.spec.lambda_dssim, self.spec.ssim)
         if self.spec.scene_loss in ("full", "both"):
             drawn = composite.color
-            if blank is not None:
-                drawn = torch.where(blank[..., None], image, drawn)
+            if ignored is not None:
+                drawn = torch.where(ignored[..., None], image, drawn)
             terms["scene"] = image_loss(drawn, image, *dssim)
         scenes, kind = self.model.names("scene"), self.spec.scene_loss
         modelled = {n: m for n, m in frame.masks.items() if n in self.model.entities}
         left_out = frame.masks if kind == "background" else modelled
-        told = not frame.unknown & {*left_out, *self.model.entities}  # what to leave out is known
-        if kind in ("masked", "both", "background") and scenes and told:
+        complete = not frame.unknown & {*left_out, *self.model.entities}  # no mask is missing
+        if kind in ("masked", "both", "background") and scenes and complete:
             alone = self._scene_alone(camera, state, composite, offsets, absolutes)
             dynamic = union(left_out.values())
             if dynamic is not None:
                 dynamic = dilate(dynamic, self.spec.dilate)
-            hidden = union(m for m in (dynamic, blank) if m is not None)
+            hidden = union(m for m in (dynamic, ignored) if m is not None)
             terms["scene/masked"] = scene_only_loss(alone.color, image, hidden, *dssim)
         return terms
 
@@ -192,8 +207,10 @@ class JointObjective:
         offsets: Tensor,
         absolutes: Tensor | None,
     ) -> RenderOutput:
-        """Without people and things. Where the composite is not compared, density control looks
-        here."""
+        """The render of the scene entities alone.
+
+        Where the composite is not compared, this render has the gradients for density control.
+        """
         scenes, request = self.model.names("scene"), RenderRequest()
         if self.spec.scene_loss != "both":
             if len(scenes) == len(self.model.entities):
@@ -207,7 +224,7 @@ class JointObjective:
     def _alone(
         self, name: str, kind: str, crop: Crop, state: SceneState, generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """An entity over a colour in place of everything else."""
+        """The entity rendered alone over one colour: L_object (Eq. 17), or L_img of Eq. 16."""
         background = torch.zeros(3)
         if self.spec.background == "random":
             background = torch.rand(3, generator=generator)
@@ -233,12 +250,12 @@ class JointObjective:
         state: SceneState,
         composite: RenderOutput,
     ) -> dict[str, Tensor]:
-        """What L_human has beyond the human drawn alone."""
+        """Terms of L_human (HOIGS Eq. 16) besides the human rendered alone."""
         terms = {}
         if self.spec.human_image != "alone":
-            render = inside(composite.color, crop, camera)
+            render = cut(composite.color, crop, camera)
             if frame.ignored is not None:
-                hidden = inside(frame.ignored[..., None], crop, camera)
+                hidden = cut(frame.ignored[..., None], crop, camera)
                 render = torch.where(hidden, crop.image, render)
             dssim = (self.spec.lambda_dssim, self.spec.ssim)
             terms[f"human/{name}/composite"] = image_loss(render, crop.image, *dssim)
@@ -253,11 +270,11 @@ class JointObjective:
                 terms[f"human/{name}/face"] = self.spec.face * face
         return terms
 
-    def _restrain(
+    def _penalise_residual(
         self, name: str, residual: Residual, terms: dict[str, Tensor], weights: dict[str, float]
     ) -> None:
-        """Penalties of what the interaction asked for: mean squared, radians or metres."""
-        for key, value in zip(RESTRAINED, (residual.pose, residual.means), strict=True):
+        """Mean squared correction by the interaction, radians^2 and metres^2."""
+        for key, value in zip(RESIDUAL_PENALTIES, (residual.pose, residual.means), strict=True):
             weight = self.spec.regularizers.get(key, 0.0)
             if weight > 0 and value is not None:
                 terms[f"regularizer/{name}/{key}"] = value.square().sum(-1).mean()
@@ -271,7 +288,11 @@ class JointObjective:
         terms: dict[str, Tensor],
         weights: dict[str, float],
     ) -> None:
-        """`own`: the penalties of the deformation that count, where they are known already."""
+        """Penalties of the deformation and of density control that have a weight.
+
+        Args:
+            own: those of the deformation, if they have been computed already.
+        """
         penalties = dict(self.model.entity(name).regularizers() if own is None else own)
         if name in self.density:
             penalties |= self.density[name].regularizers(current)
@@ -283,6 +304,6 @@ class JointObjective:
 
 
 def _of(names: Sequence[str], state: SceneState, values: Shaped[Tensor, "N C"]) -> Tensor:
-    """Rows of some entities, of what has one for each Gaussian of `state.joined()`."""
+    """The rows of some entities, of values with one row for each Gaussian of `state.joined()`."""
     parts = [values[rows] for name, rows in state.slices().items() if name in names]
     return parts[0] if len(parts) == 1 else torch.cat(parts)

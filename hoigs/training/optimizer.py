@@ -1,4 +1,4 @@
-"""Adam groups by what a parameter is, and the surgery that a change of Gaussian count needs."""
+"""GroupedAdam: Adam with a learning-rate schedule for each role of a parameter."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from itertools import chain
 import torch
 from torch import nn
 
-from hoigs.core.entity import Entity
-from hoigs.core.scene import SceneModel
-from hoigs.core.topology import AxisChange, TopologyChange
-from hoigs.core.train_spec import RatesSpec, WarmupSpec
+from hoigs.core.model.entity import Entity
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.spec.train_schema import RatesSpec, WarmupSpec
+from hoigs.core.values.topology import AxisChange, TopologyChange
 
 FIELD_RATES = {
     "means": "means",
@@ -22,40 +22,41 @@ FIELD_RATES = {
     "sh": "sh",
 }
 
-# Rates that wait for a warm-up: rate -> field of WarmupSpec
-WAITING = {
+# rates that are zero during a warm-up: rate -> field of WarmupSpec
+WARMUPS = {
     "keyframes": "motion",
     "keyframe_rotation": "motion",
     "pose": "poses",
     "shape": "poses",
     "camera": "cameras",
 }
-
-
-SETTLING = 0.8  # of a run, where rates begin to fall by `RatesSpec.settle`
+SETTLE_FROM = 0.8  # share of the run after which rates without a `_final` decay by `settle`
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """Learning rate of one group: zero before `begin`, then `start` until `fall`, then log-linear
-    to `final` at the end; `begin` moves no fall."""
+    """Learning rate of one group, log-linear from `start` to `final`.
+
+    Attributes:
+        begin: share of the run before which the rate is zero. decay_from: share of the run before
+            which it is `start`, a warm-up aside.
+    """
 
     start: float
     final: float
     begin: float = 0.0
-    fall: float = 0.0
+    decay_from: float = 0.0
 
     def at(self, progress: float) -> float:
         """Rate at `progress` in [0, 1] of the run."""
         if progress < self.begin or self.start == 0:
             return 0.0
-        fallen = max(progress - self.fall, 0.0) / (1 - self.fall)
-        return float(self.start * (max(self.final, 1e-12) / self.start) ** fallen)
+        decayed = max(progress - self.decay_from, 0.0) / (1 - self.decay_from)
+        return float(self.start * (max(self.final, 1e-12) / self.start) ** decayed)
 
 
 def entity_extent(entity: Entity, scene_extent: float) -> float:
-    """Metres by which an entity's position rates are scaled: the scene's for the scene itself,
-    the entity's own radius for a person or an object."""
+    """Factor of an entity's position rates, metres: its own radius, or the scene's extent."""
     if entity.kind == "scene" or len(entity) == 0:
         return scene_extent
     means = entity.means.detach()
@@ -83,11 +84,17 @@ def named_rates(model: SceneModel) -> Iterator[tuple[str, nn.Parameter, str, Ent
 
 
 class GroupedAdam:
-    """Adam with a schedule for each parameter; those with the same one are a group, as a group
-    takes a few launches and a tenth of a millisecond, however many parameters it has.
+    """Adam with a schedule for each parameter of a scene.
+
+    Parameters with equal schedules share a group, as each group costs kernel launches. When the
+    number of Gaussians changes the groups stay, and `follow` changes the moments.
 
     Args:
+        scene_extent: metres; see `entity_extent`.
         cameras: its parameters take the rate "camera" and are named "cameras.…".
+
+    Raises:
+        ValueError: a component declares a rate that `train.rates` does not have.
     """
 
     def __init__(
@@ -107,7 +114,7 @@ class GroupedAdam:
             start = getattr(rates, rate, None)
             if start is None:
                 known = sorted(RatesSpec.model_fields)
-                raise ValueError(f"{name} asks for the rate {rate!r}; train.rates has {known}")
+                raise ValueError(f"{name} declares the rate {rate!r}; train.rates has {known}")
             final = getattr(rates, f"{rate}_final", None)
             settles = final is None and rates.settle < 1
             if final is None:
@@ -115,16 +122,16 @@ class GroupedAdam:
             if rate in rates.by_extent and entity is not None:
                 extent = entity_extent(entity, scene_extent)
                 start, final = start * extent, final * extent
-            begin = getattr(warmup, WAITING[rate]) if rate in WAITING else 0.0
-            # fused Adam on a CPU walks memory as if it were dense, and misses a view's elements
+            begin = getattr(warmup, WARMUPS[rate]) if rate in WARMUPS else 0.0
+            # fused Adam on a CPU treats memory as dense, and would miss elements of a view
             parameter.data = parameter.data.contiguous()
             self.names[name] = parameter
             self.roles.append(rate)
-            self.schedules.append(Schedule(start, final, begin, SETTLING if settles else 0.0))
+            self.schedules.append(Schedule(start, final, begin, SETTLE_FROM if settles else 0.0))
         groups: dict[Schedule, list[nn.Parameter]] = {}
         for parameter, schedule in zip(self.names.values(), self.schedules, strict=True):
             groups.setdefault(schedule, []).append(parameter)
-        # eps as in 3DGS: gradients of single Gaussians are tiny, the default would damp them
+        # eps as in 3DGS: gradients of single Gaussians are tiny, the default would dominate them
         self.adam = torch.optim.Adam(
             [{"params": members, "lr": s.start, "schedule": s} for s, members in groups.items()],
             lr=1e-3, eps=1e-15, fused=True,
@@ -136,15 +143,15 @@ class GroupedAdam:
             group["lr"] = group["schedule"].at(progress)
 
     def learning_rates(self) -> dict[str, float]:
-        """Of each parameter, now."""
+        """Present learning rate of each parameter, by name."""
         now = {group["schedule"]: float(group["lr"]) for group in self.adam.param_groups}
         return {name: now[s] for name, s in zip(self.names, self.schedules, strict=True)}
 
     def position_rate(self, entity: str) -> float:
-        """Learning rate now of an entity's positions, metres a step.
+        """Present learning rate of an entity's positions, metres a step.
 
-        Of its rest means, or of the keyframes of a deformation that owns these; 0 when neither
-        is trained.
+        That of its canonical means, or of the keyframes of a deformation that owns the means; 0 if
+        neither is trained.
         """
         prefix, rates = f"entities.{entity}.", self.learning_rates()
         if f"{prefix}means" in rates:
@@ -157,7 +164,11 @@ class GroupedAdam:
         return max(keyed, default=0.0)
 
     def step(self, sh_degree: int | None = None) -> None:
-        """One update; harmonics above `sh_degree` wait, None waits for nothing."""
+        """One update of all parameters.
+
+        Args:
+            sh_degree: spherical harmonics above it get no gradient; None trains all.
+        """
         colors = [p for p, r in zip(self.names.values(), self.roles, strict=True) if r == "sh"]
         if sh_degree is not None:
             for parameter in colors:
@@ -174,7 +185,7 @@ class GroupedAdam:
 
     @torch.no_grad()
     def follow(self, parameter: nn.Parameter, change: TopologyChange | AxisChange) -> None:
-        """Moments follow a change of rows or of another axis; fresh entries start from zero."""
+        """Change the moments of a parameter like its entries; those of fresh entries are zero."""
         if isinstance(change, TopologyChange):
             change = AxisChange(0, change.source, change.fresh)
         state = self.adam.state.get(parameter, {})

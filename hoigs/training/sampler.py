@@ -1,4 +1,4 @@
-"""Which training frame comes next: every frame once, in a new order each epoch."""
+"""EpochSampler: every training frame once an epoch, in a new order."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ import torch
 
 
 class EpochSampler:
-    """Shuffled passes over `positions`; its state is part of a checkpoint."""
+    """Shuffled passes over `positions`; a checkpoint holds its state.
+
+    Raises:
+        ValueError: there are no positions.
+    """
 
     def __init__(self, positions: Sequence[int], generator: torch.Generator) -> None:
         if not positions:

@@ -9,31 +9,42 @@ from typing import Any
 
 import torch
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip, Frame
-from hoigs.core.clip_health import depth_factor
-from hoigs.core.deformation import DeformationModel, StepEvidence
-from hoigs.core.density import DensityControl, DensityStatistics, check_rasterizer
+from hoigs.core.clip_folder.health import depth_factor
 from hoigs.core.errors import CheckpointError
-from hoigs.core.moment import Moment
-from hoigs.core.scene import SceneModel
-from hoigs.core.train_spec import TrainSpec
-from hoigs.evaluation.lpips import Lpips
-from hoigs.evaluation.metrics import psnr, region_psnr
-from hoigs.training.camera_refinement import CameraRefinement, check_camera_gradients
-from hoigs.training.checkpoint import Checkpoint, restore_cameras, restore_model
-from hoigs.training.face import unwrap_faces
-from hoigs.training.guard import NanGuard, first_not_finite, gradients_finite
+from hoigs.core.interfaces.deformation import DeformationModel, StepStatistics
+from hoigs.core.interfaces.density import DensityControl, DensityStatistics, check_rasterizer
+from hoigs.core.model.camera_refinement import CameraRefinement, check_camera_gradients
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.spec.train_schema import TrainSpec
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip, Frame
+from hoigs.core.values.moment import Moment
+from hoigs.metrics.lpips import Lpips
+from hoigs.metrics.psnr import psnr, region_psnr
+from hoigs.runs.checkpoint import (
+    FORMAT,
+    VERSION,
+    Checkpoint,
+    restore_cameras,
+    restore_model,
+)
+from hoigs.runs.run_folder import RunFolder
+from hoigs.training.density_update import EntityDensity, evolve
+from hoigs.training.losses.face import unwrap_faces
+from hoigs.training.nan_guard import NanGuard, first_not_finite, gradients_finite
 from hoigs.training.objective import JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
-from hoigs.training.refinement import EntityDensity, evolve
-from hoigs.training.run_folder import RunFolder
 from hoigs.training.sampler import EpochSampler
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """What a step did, as it goes to `metrics.jsonl` and the progress bar."""
+    """One logged step: a line of `metrics.jsonl`, and the argument of `on_step`.
+
+    Attributes:
+        time_s: of training since the run began, previews aside. loss: the weighted sum.
+        losses: unweighted terms. counts: Gaussians by entity. psnr: of previews by split, dB.
+    """
 
     step: int
     time_s: float
@@ -50,15 +61,19 @@ class StepReport:
 
 
 class Trainer:
-    """The loop.
+    """The training loop: one frame a step, chosen by EpochSampler.
 
     Args:
         model: composed, on its device. clip: at training width.
-        spec: numbers of the optimisation.
-        density: controller by entity; entities without one keep their count.
-        run: where metrics and checkpoints go, or None to keep everything in memory.
-        identity: what goes into checkpoints to recognise the spec (spec_name, model_hash).
-        lpips: the perceptual term, needed when spec.loss.lpips > 0.
+        spec: the `train` section of a spec.
+        density: controller by entity; entities without one keep their number of Gaussians.
+        run: folder for metrics and checkpoints; None keeps everything in memory.
+        identity: stored in checkpoints to recognise the spec (spec_name, model_hash).
+        lpips: the network of the LPIPS term; needed if `spec.loss.lpips` > 0.
+
+    Raises:
+        SpecError: the rasterizer lacks a gradient that the density control or cameras need.
+        ValueError: no LPIPS weights, no face, or no training frames where the spec needs them.
     """
 
     def __init__(
@@ -80,7 +95,7 @@ class Trainer:
         self.sampler = EpochSampler(clip.split["train"], self.generator)
         for control in (density or {}).values():
             check_rasterizer(control, model.rasterizer)
-        # unwrapped from the model as composed, so that a resumed run has the same texture
+        # before a checkpoint is restored, so that a resumed run has the same texture
         faces = unwrap_faces(model, clip) if spec.loss.face > 0 else None
         self.cameras: CameraRefinement | None = None
         if spec.rates.camera > 0:
@@ -104,13 +119,16 @@ class Trainer:
         self.elapsed = 0.0
 
     def train(
-        self, on_step: Callable[[StepReport], None] | None = None, *, until: int | None = None
+        self, on_step: Callable[[StepReport], object] | None = None, *, until: int | None = None
     ) -> None:
-        """Run to `spec.steps`, logging and saving on the way.
+        """Train to `spec.steps`, writing metrics and checkpoints.
 
         Args:
-            until: stop after this step already; another call goes on. Schedules know of
-                `spec.steps` alone.
+            until: stop after this step; another call continues. Schedules depend on `spec.steps`
+                alone.
+
+        Raises:
+            NotFiniteError: see `NanGuard`.
         """
         end = self.spec.steps if until is None else min(until, self.spec.steps)
         self.model.train()
@@ -119,7 +137,7 @@ class Trainer:
             terms = self._step()
             self.elapsed = time.perf_counter() - started
             report = self._report(terms)
-            started = time.perf_counter() - self.elapsed  # previews are not training
+            started = time.perf_counter() - self.elapsed  # previews do not count
             if report is not None:
                 if self.run is not None:
                     self.run.log(report.record())
@@ -132,10 +150,10 @@ class Trainer:
         self.model.set_progress(self.step / self.spec.steps)
 
     def _step(self) -> dict[str, float] | None:
-        """One optimizer step: its loss terms and their "total"; None when the guard skipped it.
+        """One optimizer step: its loss terms and their "total"; None if the guard skipped it.
 
-        Nothing of the graph may outlive this call: autograd remembers the shape of a parameter as
-        long as any graph that used it lives, and refinement changes shapes.
+        No reference to the autograd graph may leave this method: a graph keeps the shapes of its
+        parameters, and density control changes them.
         """
         progress = self.step / self.spec.steps
         self.step += 1
@@ -155,21 +173,21 @@ class Trainer:
         self.guard.passed()
         interval = self.spec.sh_interval
         self.optimizer.step(None if interval is None else self.step // interval)
-        still = replace(camera, world_to_camera=camera.world_to_camera.detach())
-        self._evolve(result, frame.moment, still)
+        fixed = replace(camera, world_to_camera=camera.world_to_camera.detach())
+        self._evolve(result, frame.moment, fixed)
         self._refine(result, camera.width, camera.height)
         terms = {**result.terms, "total": result.total}
-        # one answer of the device, not one a term
+        # one transfer from the device for all terms
         values = torch.stack([term.detach().reshape(()) for term in terms.values()]).tolist()
         return dict(zip(terms, values, strict=True))
 
     def _camera(self, frame: Frame) -> Camera:
-        """Of a frame, as it has been refined so far."""
+        """The frame's camera on the model's device, with its present corrections."""
         camera = frame.camera.to(self.model.device)
         return camera if self.cameras is None else self.cameras(camera, frame.position)
 
     def _evolve(self, result: ObjectiveResult, moment: Moment, camera: Camera) -> None:
-        """Deformations that change their own size get what this step has shown."""
+        """Call `evolve` of the deformations that override it."""
         gradient, radii = result.screen_offsets.grad, result.composite.info["radii"]
         for name, row in result.state.slices().items():
             entity = self.model.entity(name)
@@ -178,7 +196,7 @@ class Trainer:
             own = result.terms.get(f"{entity.kind}/{name}")
             if own is None:
                 own = result.terms.get("scene", result.terms.get("scene/masked"))
-            evidence = StepEvidence(
+            statistics = StepStatistics(
                 moment.to(self.model.device),
                 camera,
                 float(own.detach()) if own is not None else 0.0,
@@ -187,9 +205,10 @@ class Trainer:
                 self.step,
                 self.spec.steps,
             )
-            evolve(entity, evidence, self.optimizer)
+            evolve(entity, statistics, self.optimizer)
 
     def _refine(self, result: ObjectiveResult, width: int, height: int) -> None:
+        """Update the statistics of density control, and apply its decisions."""
         gradient, absolute = result.screen_offsets.grad, None
         if result.absolute_gradients is not None:
             absolute = result.absolute_gradients.grad
@@ -221,7 +240,7 @@ class Trainer:
 
     @torch.no_grad()
     def _preview(self, frames: int = 4) -> dict[str, float]:
-        """PSNR on a few frames of each split, for the curves; the real score is `hoigs eval`."""
+        """PSNR on a few frames of each split, for the curves of the report."""
         scores = {}
         for split, positions in self.clip.split.items():
             stride = max(1, len(positions) // frames)
@@ -240,7 +259,7 @@ class Trainer:
         return scores
 
     def checkpoint(self) -> Checkpoint:
-        """Everything needed to go on: see Checkpoint."""
+        """The complete state of training; see Checkpoint."""
         tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
         tensors |= {f"optimizer.{k}": v for k, v in self.optimizer.tensors().items()}
         for name, density in self.density.items():
@@ -250,8 +269,8 @@ class Trainer:
         tensors["rng.generator"] = self.generator.get_state()
         tensors["rng.torch"] = torch.get_rng_state()
         meta = {
-            "format": "hoigs-checkpoint",
-            "version": 1,
+            "format": FORMAT,
+            "version": VERSION,
             "step": self.step,
             "time_s": self.elapsed,
             "counts": self.model.count(),
@@ -262,15 +281,15 @@ class Trainer:
         return Checkpoint(tensors, meta)
 
     def resume(self, checkpoint: Checkpoint) -> None:
-        """Continue from a checkpoint; the rest of the run equals an unbroken one.
+        """Restore a checkpoint; the rest of the run then equals an unbroken one.
 
         Raises:
-            CheckpointError: it has the model alone.
+            CheckpointError: it belongs to another spec or clip, or holds a model alone.
         """
         if not checkpoint.part("optimizer"):
             raise CheckpointError(
                 f"the checkpoint of step {checkpoint.meta['step']} was pruned or compressed: it "
-                "has a model to draw, but nothing of its optimizer to go on with"
+                "has a model, but no optimizer state to resume with"
             )
         restore_model(self.model, checkpoint, self.identity["model_hash"])
         restore_cameras(self.cameras, checkpoint)

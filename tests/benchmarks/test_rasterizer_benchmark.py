@@ -41,7 +41,7 @@ def test_report_and_chart_are_written(tmp_path: Path) -> None:
     assert 0 < row["total_ms"]["least"] <= low <= row["total_ms"]["median"] <= high
     assert row["difference"] < 1e-6
     stages = report["stages"]["48x32/40"]
-    assert stages["counts"]["pairs"] >= stages["counts"]["visible"] > 0
+    assert stages["counts"]["intersections"] >= stages["counts"]["visible"] > 0
     assert all(0 < x["fraction"] < 1 for x in stages["of_limit"].values())
     assert report["memory"]["bytes_per_pixel"] > 20  # the images themselves
     assert out.with_suffix(".png").stat().st_size > 10_000
@@ -71,7 +71,7 @@ def test_hits_are_those_of_compositing() -> None:
     # splats that hit no pixel do not matter, and one that does is seen
     drawn = torch.zeros(60, dtype=torch.bool)
     drawn[rows] = True
-    whole = OracleRasterizer(cutoffs=True).render(gaussians, camera).alpha
+    whole = OracleRasterizer(OracleRasterizer.Config(cutoffs=True)).render(gaussians, camera).alpha
     part = WarpRasterizer().render(gaussians[drawn], camera).alpha.double()
     torch.testing.assert_close(part, whole, atol=1e-5, rtol=0)
     touched = torch.zeros(34 * 50, dtype=torch.bool)
@@ -115,14 +115,14 @@ def test_memory_of_a_training_step_is_bounded(sh_degree: int) -> None:
     """The bound that docs/design/cpu-rasterizer.md states, with some room."""
     from benchmarks.rasterizers.memory import peak_bytes
     from benchmarks.rasterizers.scenes import synthetic
-    from benchmarks.rasterizers.stages import tile_lists
+    from benchmarks.rasterizers.stages import count_intersections
     from hoigs.rasterizers.warp import WarpRasterizer
 
     for count, size in ((3000, (100, 70)), (500, (300, 200))):
         gaussians, camera = synthetic(count, sh_degree)
         camera = camera.resized(*size)
-        rasterizer = WarpRasterizer(threads=1)
-        _, pairs = tile_lists(gaussians, camera, rasterizer)
+        rasterizer = WarpRasterizer(WarpRasterizer.Config(threads=1))
+        _, intersections = count_intersections(gaussians, camera, rasterizer)
         fields = 4 * (11 + 3 * (sh_degree + 1) ** 2)
-        bound = count * (100 + fields) + size[0] * size[1] * 42 + pairs * 50 + 40_000
+        bound = count * (100 + fields) + size[0] * size[1] * 42 + intersections * 50 + 40_000
         assert peak_bytes(gaussians, camera, rasterizer) < bound

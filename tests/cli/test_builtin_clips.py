@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from hoigs.training.session import LoadedRun
+from hoigs.runs.loaded_run import LoadedRun
 
 TINY = "builtin:carry?frames=8&width=32&held_out_views=0&test_frames=2&samples=1&edge_samples=1"
 QUICK = ("--spec", "static", "--set", "train.preview_every=0", "--no-eval",

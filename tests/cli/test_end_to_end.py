@@ -5,24 +5,55 @@ from __future__ import annotations
 import json
 
 import pytest
+import torch
+
+import hoigs as h
+from hoigs.viewing.films import film_views, playback_of
 
 SMALL = ("--set", "train.steps=60", "--set", "train.preview_every=30")
 
 
 @pytest.mark.slow
-def test_train_eval_render(hoigs, tiny_clip, tmp_path):
-    run = tmp_path / "run"
-    done = hoigs("train", tiny_clip, "--spec", "hoigs", "--out", run, *SMALL)
-    assert done.code == 0, done.err
+def test_train_evaluate_and_render_from_python(hoigs, tiny_clip, tmp_path):
+    """As the commands do it, with progress through callbacks and nothing on stdout."""
+    run, lines, starts, steps, shares = tmp_path / "run", [], [], [], []
+    done = h.train(
+        tiny_clip, "hoigs", out=run, overrides=SMALL[1::2], rasterizer="warp", device="cpu",
+        on_start=starts.append, on_step=steps.append, progress=lambda f, _: shares.append(f),
+        report=lines.append,
+    )  # fmt: skip
+    assert done.path == run and starts == [done.session] and steps[-1].step == 60
+    assert shares == sorted(shares) and shares[-1] == 1.0
+    assert lines == [f"run: {run}", f"report: {run / 'report.html'}"]
+    assert done.evaluated is not None and done.evaluated.report == run / "report.html"
     assert (run / "report.html").stat().st_size > 10_000
-    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    curve = [line["psnr"]["test"] for line in lines if "psnr" in line]
+    records = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    curve = [record["psnr"]["test"] for record in records if "psnr" in record]
     assert curve[-1] > curve[0] + 3.0, "training must help"
-    scored = hoigs("eval", run, "--no-report")
-    assert scored.code == 0 and "psnr" in scored.out.lower()
+
+    again = h.evaluate_run(run, report=False, device="cpu")
+    assert again.report is None and again.scores == run / "evaluation.json"
+    first = done.evaluated.evaluation.score("full", "psnr")
+    assert again.evaluation.score("full", "psnr") == pytest.approx(first, abs=1e-3)
+
+    loaded = h.open_run(run, device="cpu")
+    for path in ("playback", "orbit"):
+        views = film_views(loaded.model, loaded.clip, path)
+        play = playback_of(loaded.model, views)
+        for moment, camera in views[::3]:
+            with torch.no_grad():
+                wanted = loaded.model.render(moment, camera).color
+            torch.testing.assert_close(play(moment, camera).color, wanted, atol=1e-5, rtol=0)
+
+    film = h.render(run, only=["human", "scene"], device="cpu")
+    assert film.path == run / "renders" / "playback.mp4" and film.frames == 12
+    assert film.fps > 0 and film.mode == "cached" and "CUDA" in film.reason
+
     video = tmp_path / "orbit.mp4"
-    assert hoigs("render", run, "--path", "orbit", "--out", video).code == 0
-    assert video.stat().st_size > 1000
+    drawn = hoigs("render", run, "--path", "orbit", "--out", video, "--device", "cpu")
+    assert drawn.code == 0 and video.stat().st_size > 1000
+    assert "12 frames of 64x64" in drawn.out and "frames/s" in drawn.out
+    assert "without CUDA graphs: CUDA graphs need a CUDA device" in drawn.out
     wrong = hoigs("render", run, "--only", "humn")
     assert wrong.code == 2 and '"human"' in wrong.err
 
@@ -33,7 +64,6 @@ def test_resume_equals_the_unbroken_run(hoigs, tiny_clip, tmp_path, request):
 
     On one thread: with more, the CPU's matrix products sum in an order that varies.
     """
-    import torch
     from safetensors.torch import load_file
 
     threads = torch.get_num_threads()

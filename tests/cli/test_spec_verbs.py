@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hoigs.core.spec import Spec, builtin_specs
+from hoigs.core.spec.schema import Spec, builtin_specs
 
 
 def test_list(hoigs):

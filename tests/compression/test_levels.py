@@ -1,4 +1,4 @@
-"""Quantisation keeps its bound; packed tensors read back, and damage is told."""
+"""Quantisation keeps its bound; packed tensors read back, and damage is an error."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_every_value_is_within_half_a_step_of_its_channel(bits, shape):
     errors = (back - values.double()).abs()
     bound = levels.bound if values.dim() > 1 else levels.bound[0]
     assert (errors <= bound + 1e-12).all()
-    if values.numel() > 50:  # and it is no finer than it says
+    if values.numel() > 50:  # and the levels are as coarse as `step`
         assert errors.max() > 0.3 * levels.bound.max()
         spread = values.reshape(-1, shape[-1]).double()
         widths = (spread.amax(0) - spread.amin(0)) / (2**bits - 1)
@@ -40,12 +40,12 @@ def test_channels_have_ranges_of_their_own():
     assert errors[0] < 1e-5 and errors[1] > 0.1
 
 
-def test_what_is_not_finite_is_refused_by_name():
+def test_values_that_are_not_finite_are_refused_by_name():
     with pytest.raises(ValueError, match=r"model\.x: values that are not finite"):
         pack({"model.x": torch.tensor([1.0, float("nan")])})
 
 
-def test_places_and_networks_have_sixteen_bits():
+def test_positions_and_networks_have_sixteen_bits():
     assert bits_of("model.entities.object.sh") == 8
     assert bits_of("model.entities.human.deformation.planes.space") == 8
     for name in ("means", "deformation.keyframe_translations", "deformation.head.0.weight"):
@@ -90,19 +90,19 @@ def test_packing_a_second_time_changes_nothing():
 
 
 @pytest.mark.parametrize("where", [0, 40, -1])
-def test_a_changed_byte_is_told(where):
+def test_a_changed_byte_is_an_error(where):
     streams, described = pack(tensors())
     streams["model.e.means"][where] ^= 0x40
     with pytest.raises(CheckpointError, match=r"model\.e\.means: damaged"):
         unpack(streams, described)
 
 
-def test_an_absent_or_misdescribed_stream_is_told():
+def test_an_absent_or_misdescribed_stream_is_an_error():
     streams, described = pack(tensors())
     del streams["model.e.sh"]
     with pytest.raises(CheckpointError, match=r"model\.e\.sh: described, but not in the file"):
         unpack(streams, described)
     streams, described = pack(tensors())
     described["model.e.sh"]["shape"] = [300, 3, 3]
-    with pytest.raises(CheckpointError, match=r"model\.e\.sh: not as its description says"):
+    with pytest.raises(CheckpointError, match=r"model\.e\.sh: does not match its description"):
         unpack(streams, described)

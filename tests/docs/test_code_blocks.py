@@ -24,7 +24,7 @@ import pytest
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = sorted([*(DOCS / "tutorials").glob("*.md"), *(DOCS / "howto").glob("*.md")])
 BLOCK = re.compile(r"((?:^<!--[^\n]*-->\n)*)^```(\w*)\n(.*?)^```$", re.M | re.S)
-# SceneKnobs.tiny() by name: the clip that other tests use
+# SceneConfig.tiny() by name: the clip that other tests use
 TINY = (
     "builtin:lift-and-swing?frames=12&width=64&height=64&fps=3&edge_samples=4&held_out_views=3"
     "&test_frames=3&scene_points=2000&object_points=300"
@@ -135,7 +135,7 @@ def test_every_page_has_blocks_that_run_and_reasons_for_the_rest():
 
 
 def test_yaml_blocks_are_specs():
-    from hoigs.core.spec_loader import load_yaml
+    from hoigs.core.spec.loader import load_yaml
 
     for page in PAGES:
         for block in blocks_of(page):

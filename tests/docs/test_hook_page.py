@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hoigs.core.component import INTERFACES
+from hoigs.core.registry.component import INTERFACES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "hooks.md").read_text()
 SECTIONS = dict(re.findall(r"^## (\w+)\n(.*?)(?=^## |\Z)", PAGE, re.M | re.S))
@@ -28,6 +28,7 @@ def methods(kind: str) -> dict[str, tuple[str, bool]]:
             for parameter in list(signature.parameters.values())[1:]
         ]
         text = str(inspect.Signature(shown))[1:-1].replace(" = ", "=")
+        text = re.sub(r"<function (\w+) at \w+>", r"\1", text)
         found[key] = (text, getattr(value, "__isabstractmethod__", False))
     return found
 

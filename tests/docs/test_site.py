@@ -55,13 +55,13 @@ def test_every_command_and_option_is_there(made):
     page = made.cli_page()
     for command in ("train", "prepare", "plugins new", "plugins show", "spec check", "tables"):
         assert f"## hoigs {command}\n" in page
-    assert "| `--resume` | Go on with the run in --out, by its own spec and clip. |  |" in page
-    assert "| `--path` | The clip's own cameras, or an orbit while it plays. | `playback` |" in page
+    assert "| `--resume` | Continue the run in --out, with its own spec and clip. |  |" in page
+    assert "| `--path` | The clip's own cameras, or an orbit around it. | `playback` |" in page
 
 
 def test_the_schema_page_has_every_key(made):
     page = made.schema_page()
-    assert "| `steps` | `int >= 1` | `2000` | optimizer steps, one frame each. |" in page
+    assert "| `steps` | `int >= 1` | `2000` | Optimizer steps, one frame each. |" in page
     assert "| `loss.lambda_dssim` | `float >= 0 and <= 1` | `0.2` |" in page
     assert "| `deformation.use` |" in page or "| `deformation` |" in page
 
@@ -76,7 +76,7 @@ def test_the_gallery_has_every_component_with_its_settings(made, monkeypatch):
     assert {line.removeprefix("### ") for line in page.splitlines() if line.startswith("### ")} == {
         part[0] for part in PARTS
     }
-    assert "| `keyframe_step` | `int >= 1` | `4` | frames between knots (the paper's 4). |" in page
+    assert "| `keyframe_step` | `int >= 1` | `4` | Frames between knots (the paper's 4). |" in page
     for picture in re.findall(r"\]\((pictures/[^)]+)\)", page):
         assert files[f"reference/{picture}"].startswith(b"\x89PNG")
 

@@ -10,14 +10,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip, FrameStore
-from hoigs.core.deformation import DeformationModel
-from hoigs.core.entity import Entity
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.interaction import EntityKind, Residual
-from hoigs.core.moment import Moment
-from hoigs.core.scene import SceneModel
+from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.model.entity import Entity
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip, FrameStore
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import EntityKind, Residual
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 
 FRAMES, WIDTH, HEIGHT = 8, 48, 32
@@ -32,11 +32,13 @@ class Swing(DeformationModel):
         self.amplitude = torch.nn.Parameter(torch.tensor(amplitude))
 
     def forward(
-        self, rest: Gaussians, moment: Moment, residual: Residual | None = None
+        self, canonical: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
         del residual
         shift = self.amplitude * math.cos(math.pi * moment.time)
-        return replace(rest, means=rest.means + torch.stack((shift, shift * 0, shift * 0)))
+        return replace(
+            canonical, means=canonical.means + torch.stack((shift, shift * 0, shift * 0))
+        )
 
 
 class MemoryStore(FrameStore):

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from hoigs.core.clip import Clip
-from hoigs.core.scene import SceneModel
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.clip import Clip
 from hoigs.evaluation.evaluate import evaluate
-from hoigs.evaluation.metrics import psnr
 from hoigs.evaluation.protocol import NotComputed
-from hoigs.evaluation.regions import REGIONS
 from hoigs.evaluation.scores import METRICS
+from hoigs.metrics.psnr import psnr
+from hoigs.metrics.regions import REGIONS
 
 QUICK = {"timing_frames": 0}
 

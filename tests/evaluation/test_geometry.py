@@ -12,14 +12,14 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from hoigs.core.clip import Clip
-from hoigs.core.deformation import DeformationModel
-from hoigs.core.entity import Entity
 from hoigs.core.errors import ClipError
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.interaction import Residual
-from hoigs.core.moment import Moment
-from hoigs.core.scene import SceneModel
+from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.model.entity import Entity
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import Residual
 from hoigs.evaluation.geometry import (
     GEOMETRY,
     best_hand,
@@ -35,7 +35,7 @@ from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.synthesis import SceneKnobs, builtin_clip
+from hoigs.synthesis import SceneConfig, builtin_clip
 
 
 def test_chamfer_is_half_the_sum_of_both_mean_squares() -> None:
@@ -86,10 +86,10 @@ class Follow(DeformationModel):
             self.provides = frozenset({"skeleton"})
 
     def forward(
-        self, rest: Gaussians, moment: Moment, residual: Residual | None = None
+        self, canonical: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
         del residual
-        return replace(rest, means=self.tracks[moment.index])
+        return replace(canonical, means=self.tracks[moment.index])
 
     def point_parts(self) -> Tensor:
         assert self.parts is not None
@@ -107,9 +107,9 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> Clip:
     """A built-in clip of 8 frames."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOIGS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        knobs = SceneKnobs.tiny(frames=8, width=16, height=16, samples=1, edge_samples=1,
+        config = SceneConfig.tiny(frames=8, width=16, height=16, samples=1, edge_samples=1,
                                 held_out_views=0, test_frames=2)  # fmt: skip
-        return ClipFolderReader().read(builtin_clip(AnnyBody(), knobs))
+        return ClipFolderReader().read(builtin_clip(AnnyBody(), config))
 
 
 @pytest.fixture(scope="module")
@@ -121,8 +121,8 @@ def truth(known: Clip) -> Truth:
 
 def _entity(tracks: np.ndarray, kind: str, parts: Tensor | None = None) -> Entity:
     points = torch.from_numpy(tracks).float()
-    rest = Gaussians.from_points(points[0], scales=0.01, opacity=0.9)
-    return Entity(rest, Follow(points, parts), kind=kind)  # type: ignore[arg-type]
+    canonical = Gaussians.from_points(points[0], scales=0.01, opacity=0.9)
+    return Entity(canonical, Follow(points, parts), kind=kind)  # type: ignore[arg-type]
 
 
 def _things(truth: Truth) -> np.ndarray:
@@ -191,15 +191,15 @@ def test_what_cannot_be_measured_says_why(
     blob = SceneModel({"scene": Entity(points, Static())}, rasterizer=TorchRasterizer())
     found = measure_geometry(blob, known, known.split["test"])
     assert all(isinstance(v, NotComputed) for v in found.values())
-    assert "does not tell the object from the rest" in str(found["cd_best"])
-    assert "does not tell the human from the rest" in str(found["human_chamfer"])
+    assert "has no separate object" in str(found["cd_best"])
+    assert "has no separate human" in str(found["human_chamfer"])
     table = geometry_table(found)
     assert not table.rows and len(table.notes) == 2
     assert "CD_best" in table.notes[0] and "not computed" in table.notes[0]
     # a clip without truth; its model has a human without a skeleton
     toy = measure_geometry(model, clip, clip.split["test"])
-    assert "does not know its true geometry" in str(toy["object_chamfer"])
-    assert "Swing does not say which Gaussians are hands" in str(toy["cd_best"])
+    assert "has no true geometry" in str(toy["object_chamfer"])
+    assert "Swing has no body parts, so no hands" in str(toy["cd_best"])
     shown = geometry_table(measure_geometry(_true_model(truth, _things(truth)), known, [3]))
     assert len(shown.rows) == len(GEOMETRY)
 

@@ -6,8 +6,8 @@ import math
 
 import torch
 
-from hoigs.core.clip import Clip
-from hoigs.core.scene import SceneModel
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.clip import Clip
 from hoigs.evaluation.orbits import orbit_cameras, pivot, turned, world_up
 
 

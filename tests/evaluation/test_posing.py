@@ -9,19 +9,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip, FrameStore
-from hoigs.core.compose import compose
-from hoigs.core.moment import BodyPose
-from hoigs.core.neighbours import neighbours
-from hoigs.core.rotation import axis_angle_to_quats, multiply_quats, quats_to_axis_angle
-from hoigs.core.scene import SceneModel
-from hoigs.core.spec import Spec
+from hoigs.core.maths.rotations import axis_angle_to_quats, multiply_quats, quats_to_axis_angle
+from hoigs.core.maths.splines import neighbours
+from hoigs.core.model.compose import compose
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.spec.schema import Spec
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip, FrameStore
+from hoigs.core.values.moment import BodyPose
 from hoigs.evaluation.evaluate import evaluate
 from hoigs.evaluation.posing import camera_between, fit_frame, pose_between, posed_clip
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.synthesis import SceneKnobs, builtin_clip
+from hoigs.synthesis import SceneConfig, builtin_clip
 
 TEST, TRAIN = 5, (4, 6)
 
@@ -47,7 +47,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[SceneModel, Clip]:
     """A composed human before a wall, and a clip whose test image it drew itself."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOIGS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        clip = ClipFolderReader().read(builtin_clip(AnnyBody(), SceneKnobs.tiny()))
+        clip = ClipFolderReader().read(builtin_clip(AnnyBody(), SceneConfig.tiny()))
     changes = ["entities=[scene, human]", "model.human.points=2500"]
     model = compose(Spec.load("hoigs", overrides=changes), clip).eval()
     colors = torch.rand(2500, 3, generator=torch.Generator().manual_seed(0))
@@ -76,7 +76,7 @@ def test_neighbours_hold_at_the_ends() -> None:
     assert neighbours(2.0, times) == (2, 2, 0.0)
     low, high, r = neighbours(0.5, times)
     assert (low, high) == (1, 2) and r == pytest.approx(1 / 3)
-    with pytest.raises(ValueError, match="no times"):
+    with pytest.raises(ValueError, match="`times` is empty"):
         neighbours(0.5, [])
 
 

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hoigs.core.clip import Clip
 from hoigs.core.errors import HoigsError
-from hoigs.core.scene import SceneModel
-from hoigs.evaluation.contact_sheet import contact_sheet
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.clip import Clip
 from hoigs.evaluation.evaluate import evaluate
 from hoigs.evaluation.report import write_report
+from hoigs.evaluation.report.contact_sheet import contact_sheet
 from hoigs.evaluation.report.curves import read_metrics, smoothed
 from hoigs.evaluation.report.media import animation, evenly, key_position
 from hoigs.evaluation.report.sections import clock, short

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hoigs.core.moment import BodyPose
+from hoigs.core.values.moment import BodyPose
 from hoigs.testing.material.body import TinyBody
 
 

@@ -14,8 +14,8 @@ import pytest
 
 from hoigs.cli.plugins_show import as_text, describe_all
 from hoigs.core.errors import PluginError
-from hoigs.core.manager import GROUP, PluginManager
-from hoigs.core.registry import Registry
+from hoigs.core.registry.manager import GROUP, PluginManager
+from hoigs.core.registry.registry import Registry
 
 OFFER = """
 @hoigs.hookimpl
@@ -242,9 +242,9 @@ def test_the_page_of_a_component(registry):
     text = as_text(page)
     for line in (
         "component:         deformation:chs@hoigs",
-        "target:            hoigs.plugins.deformation.chs:CubicHermite",
+        "target:            hoigs.plugins.deformation.splines.chs:CubicHermite",
         "    keyframe_step: int >= 1; default 4",
-        "        frames between knots (the paper's 4).",
+        "        Frames between knots (the paper's 4).",
         "    adaptive.begin: float >= 0 and <= 1; default 0.2",
     ):
         assert line in text.splitlines()
@@ -262,7 +262,7 @@ def test_a_name_that_is_not_there(registry):
 def test_stdout_is_the_commands_own_when_classes_are_imported(tmp_path):
     install(tmp_path, "late-talker", OFFER.format(fields="'density:talk', target='talker:Mine'"))
     (tmp_path / "talker.py").write_text(
-        "print('hello')\nfrom hoigs.core.density import DensityControl as Mine\n"
+        "print('hello')\nfrom hoigs.core.interfaces.density import DensityControl as Mine\n"
     )
     done = hoigs(tmp_path, "plugins", "show", "density:talk", "--json")
     assert json.loads(done.stdout)[0]["status"] == "ok" and "hello" in done.stderr

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 
-from hoigs.core.settings import describe_settings
+from hoigs.core.registry.settings import describe_settings
 from hoigs.plugins.builtin import PARTS
 
 

@@ -12,14 +12,14 @@ from PIL import Image
 from test_cameras import FOCAL, colmap_model
 from tiny import BALL, FRAMES, WIDTH, background, landmarks, make_source, masks
 
-from hoigs.core.clip import Clip
-from hoigs.core.clip_folder import check_clip
+from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.errors import ClipError, HoigsError
+from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.preparation.frames import VideoFrames
 from hoigs.preparation.prepare import PrepareOptions, PrepareReport, prepare
-from hoigs.preparation.source import SourceError
+from hoigs.preparation.video.frames import VideoFrames
+from hoigs.preparation.video.source import SourceError
 
 QUICK = {"fit_steps": 30, "overlay_width": 0}  # what is tested here is not the fit
 
@@ -33,7 +33,7 @@ def body() -> AnnyBody:
 def static(
     tmp_path_factory: pytest.TempPathFactory, tiny_video: Path, body: AnnyBody
 ) -> tuple[Path, PrepareReport, list[float]]:
-    """The tiny source, prepared once: the clip, the report and the progress that was told."""
+    """The tiny source, prepared once: the clip, the report and the reported progress."""
     folder = tmp_path_factory.mktemp("static")
     seen: list[float] = []
     report = prepare(
@@ -158,7 +158,22 @@ def test_targets_are_not_overwritten(tiny_source: Path, tmp_path: Path, body: An
     prepare(tiny_source, out, body=body, options=options)
     with pytest.raises(ClipError, match="holds a clip already; choose another name"):
         prepare(tiny_source, out, body=body, options=options)
-    prepare(tiny_source, out, body=body, options=options.model_copy(update={"overwrite": True}))
+    again = options.model_copy(update={"overwrite": True})
+    prepare(tiny_source, out, body=body, options=again)
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(ClipError, match=r"notes\.txt in it did not come from `hoigs prepare`"):
+        prepare(tiny_source, out, body=body, options=again)
+    assert (out / "notes.txt").read_text() == "mine"
+    (out / "notes.txt").unlink()
+    report = prepare(
+        tiny_source, out, options=options, max_frames=5, overrides=["human=she"], overwrite=True
+    )
+    clip = ClipFolderReader().read(out)
+    assert len(clip) == report.frames == 5 and set(clip.kinds) == {"she", "object"}
+    assert clip.cameras[0].width == 48, "what stands in options stays"
+    with pytest.raises(HoigsError, match="body:smplx: has no default for path"):
+        prepare(tiny_source, tmp_path / "third", options=options, overrides=["body=body:smplx"])
+    assert not (tmp_path / "third").exists()
     with pytest.raises(SourceError, match="is a clip already, and whole"):
         prepare(out, tmp_path / "other", body=body)
     with pytest.raises(ClipError, match="is not empty"):

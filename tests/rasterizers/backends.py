@@ -7,20 +7,22 @@ from collections.abc import Callable, Iterator
 import pytest
 import torch
 
-from hoigs.core.rasterizer import Rasterizer
+from hoigs.core.interfaces.rasterizer import Rasterizer
 from hoigs.rasterizers.gsplat import GsplatRasterizer
 from hoigs.rasterizers.oracle import OracleRasterizer
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.rasterizers.warp import WarpRasterizer
+from hoigs.rasterizers.warp import WarpConfig, WarpRasterizer
 from hoigs.testing.checks import Check
 from hoigs.testing.rasterizer import CHECKS, RasterizerSubject
 
 BACKENDS: dict[str, Callable[[], Rasterizer]] = {
     "torch": TorchRasterizer,
-    "oracle": lambda: OracleRasterizer(cutoffs=True),
-    "warp": lambda: WarpRasterizer(threads=2),
+    "oracle": lambda: OracleRasterizer(OracleRasterizer.Config(cutoffs=True)),
+    "warp": lambda: WarpRasterizer(WarpConfig(threads=2)),
     # CUDA's kernels, on the CPU
-    "warp-portable": lambda: WarpRasterizer(cpu_kernels="portable", threads=2),
+    "warp-portable": lambda: WarpRasterizer(
+        WarpRasterizer.Config(cpu_kernels="portable", threads=2)
+    ),
     "gsplat": GsplatRasterizer,
 }
 
@@ -28,7 +30,7 @@ BACKENDS: dict[str, Callable[[], Rasterizer]] = {
 def cases(
     able: Callable[[Rasterizer], bool] = lambda rasterizer: True,
 ) -> Iterator[pytest.ParameterSet]:
-    """Parameters of the fixture `backend`; those that are not able by their own word are none."""
+    """Parameters of the fixture `backend`; only those for which `able` is true."""
     for name, make in BACKENDS.items():
         devices = {"cpu"} if name == "warp-portable" else make().capabilities.devices
         for device in sorted(devices) if able(make()) else ():
@@ -37,7 +39,7 @@ def cases(
 
 
 def cases_with_checks() -> Iterator[pytest.ParameterSet]:
-    """Each backend with each check of the kit that asks nothing that it does not declare."""
+    """Each backend with each check that needs no more than it declares."""
     for case in cases():
         ((name, device),) = case.values
         subject = RasterizerSubject(BACKENDS[name](), torch.device(device))

@@ -10,8 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hoigs.core.harmonics import sh_basis
-from hoigs.core.rotation import quats_to_matrices
+from hoigs.core.maths.rotations import quats_to_matrices
+from hoigs.core.maths.spherical_harmonics import sh_basis
 
 MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE = 0.999, 1 / 255, 1e-4
 
@@ -80,7 +80,7 @@ def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor) -> Te
 
 @torch.no_grad()
 def isect_tiles(
-    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, across: int, down: int
+    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tiles_x: int, tiles_y: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Tiles of each row, keys tile << 32 | bits of depth, and rows, both sorted by key."""
     assert means2d.shape == (*depths.shape, 2) == radii.shape and radii.dtype == torch.int32
@@ -93,9 +93,9 @@ def isect_tiles(
         low = ((means2d[0, row] - radii[0, row]) / tile_size).floor().clamp_min(0).long().tolist()
         high = ((means2d[0, row] + radii[0, row]) / tile_size).ceil().long().tolist()
         tiles = [
-            line * across + column
-            for line in range(low[1], min(high[1], down))
-            for column in range(low[0], min(high[0], across))
+            line * tiles_x + column
+            for line in range(low[1], min(high[1], tiles_y))
+            for column in range(low[0], min(high[0], tiles_x))
         ]
         counts.append(len(tiles))
         keys += [tile << 32 | int(bits[row]) for tile in tiles]
@@ -105,10 +105,10 @@ def isect_tiles(
 
 
 @torch.no_grad()
-def isect_offset_encode(keys: Tensor, images: int, across: int, down: int) -> Tensor:
+def isect_offset_encode(keys: Tensor, images: int, tiles_x: int, tiles_y: int) -> Tensor:
     assert images == 1
-    tiles = torch.arange(across * down)
-    return torch.searchsorted(keys >> 32, tiles).int().view(1, down, across)
+    tiles = torch.arange(tiles_x * tiles_y)
+    return torch.searchsorted(keys >> 32, tiles).int().view(1, tiles_y, tiles_x)
 
 
 def rasterize_to_pixels(
@@ -123,7 +123,7 @@ def rasterize_to_pixels(
     members: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Image [1, H, W, channels] and alpha [1, H, W, 1]."""
-    channels, across = colors.shape[-1], starts.shape[2]
+    channels, tiles_x = colors.shape[-1], starts.shape[2]
     if not 0 < channels <= 513:
         raise ValueError(f"Unsupported number of color channels: {channels}")
     values = torch.cat((colors[0], torch.ones_like(opacities[0])[:, None]), -1)
@@ -134,7 +134,7 @@ def rasterize_to_pixels(
         if start == end:
             continue
         rows = members[start:end].long()
-        top, left = (tile_size * i for i in divmod(tile, across))
+        top, left = (tile_size * i for i in divmod(tile, tiles_x))
         y, x = torch.meshgrid(
             torch.arange(top, min(top + tile_size, height)),
             torch.arange(left, min(left + tile_size, width)),

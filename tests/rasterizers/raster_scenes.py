@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import RenderOutput, RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.testing.compare import require_close, require_close_gradient
 from hoigs.testing.rasterizer.reference import ORACLE, reference
 from hoigs.testing.rasterizer.scenes import (

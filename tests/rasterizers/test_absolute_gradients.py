@@ -5,12 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from backends import cases
-from raster_scenes import Backend, a_camera, front_camera, one_gaussian, random_scene
+from raster_scenes import CUT, Backend, a_camera, front_camera, one_gaussian, random_scene
 from torch import Tensor
 
 from hoigs.core.errors import RenderError
-from hoigs.core.rasterizer import RenderOutput, RenderRequest
-from hoigs.rasterizers.oracle import OracleRasterizer
+from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 
 CAMERA = a_camera(width=20, height=14)
 able = pytest.mark.parametrize(
@@ -19,7 +18,7 @@ able = pytest.mark.parametrize(
 
 
 def a_loss(output: RenderOutput) -> Tensor:
-    """Of every pixel, [H, W]: it looks at all that is composited, with signs of all kinds."""
+    """Loss of each pixel, [H, W], of all composited channels with random signs."""
     generator = torch.Generator().manual_seed(4)
     shape = (*output.alpha.shape, 7)
     weights = torch.randn(shape, generator=generator).to(output.color)
@@ -28,7 +27,7 @@ def a_loss(output: RenderOutput) -> Tensor:
     return (weights * torch.cat(parts, -1)).sum(-1)
 
 
-def watched(backend: Backend, scene, camera, **fields: Tensor) -> Tensor:
+def absolute_gradients(backend: Backend, scene, camera, **fields: Tensor) -> Tensor:
     absolutes = torch.zeros(len(scene), 2, device=backend.device, requires_grad=True)
     request = RenderRequest(absolute_gradients=absolutes, **fields)
     a_loss(backend.render(scene, camera, request)).sum().backward()
@@ -40,7 +39,7 @@ def one_pixel_at_a_time(scene, camera, **fields: Tensor) -> tuple[Tensor, Tensor
     """By the definition, from the screen gradient of each pixel's loss: sums of |.| and of it."""
     offsets = torch.zeros(len(scene), 2, dtype=torch.float64, requires_grad=True)
     request = RenderRequest(screen_offsets=offsets, **fields)
-    losses = a_loss(OracleRasterizer(cutoffs=True).render(scene, camera, request)).flatten()
+    losses = a_loss(CUT.render(scene, camera, request)).flatten()
     rows = [torch.autograd.grad(loss, offsets, retain_graph=True)[0] for loss in losses]
     return torch.stack(rows).abs().sum(0), torch.stack(rows).sum(0)
 
@@ -51,7 +50,7 @@ def test_they_are_the_sum_of_each_pixels_own(backend: Backend, with_features: bo
     scene = random_scene(40, degree=1)
     fields = {"features": torch.randn(40, 2, generator=torch.Generator().manual_seed(1))}
     fields = fields if with_features else {}
-    found = watched(backend, scene, CAMERA, **fields).double()
+    found = absolute_gradients(backend, scene, CAMERA, **fields).double()
     expected, signed = one_pixel_at_a_time(scene, CAMERA, **fields)
     assert float((found - expected).norm() / expected.norm()) < 2e-3  # float32, a cut-off pixel
     assert (expected > signed.abs() * 1.5).any(-1).float().mean() > 0.5  # much does cancel
@@ -60,21 +59,19 @@ def test_they_are_the_sum_of_each_pixels_own(backend: Backend, with_features: bo
 def test_the_oracle_gives_them_too() -> None:
     scene = random_scene(25, degree=0)
     absolutes = torch.zeros(25, 2, requires_grad=True)
-    output = OracleRasterizer(cutoffs=True).render(
-        scene, CAMERA, RenderRequest(absolute_gradients=absolutes)
-    )
+    output = CUT.render(scene, CAMERA, RenderRequest(absolute_gradients=absolutes))
     a_loss(output).sum().backward()
     expected, _ = one_pixel_at_a_time(scene, CAMERA)
     torch.testing.assert_close(absolutes.grad.double(), expected, rtol=1e-5, atol=1e-6)
 
 
 @able
-def test_opposite_pulls_cancel_only_in_the_signed_gradient(backend: Backend) -> None:
+def test_opposite_gradients_cancel_only_in_the_signed_gradient(backend: Backend) -> None:
     offsets = torch.zeros(1, 2, device=backend.device, requires_grad=True)
     absolutes = torch.zeros(1, 2, device=backend.device, requires_grad=True)
     request = RenderRequest(screen_offsets=offsets, absolute_gradients=absolutes)
     output = backend.render(one_gaussian(), front_camera(), request)
-    output.color.sum().backward()  # symmetric: each side pulls its own way
+    output.color.sum().backward()  # symmetric: the two sides have opposite gradients
     assert offsets.grad is not None
     assert absolutes.grad is not None
     assert float(absolutes.grad.min()) > 1.0
@@ -84,10 +81,10 @@ def test_opposite_pulls_cancel_only_in_the_signed_gradient(backend: Backend) -> 
 @able
 def test_they_leave_picture_and_other_gradients_alone(backend: Backend) -> None:
     found = []
-    for asked in (False, True):
+    for requested in (False, True):
         scene = random_scene(40, degree=1).map(lambda x: x.clone().requires_grad_())
         absolutes = torch.full((40, 2), 7.0, device=backend.device, requires_grad=True)
-        request = RenderRequest(absolute_gradients=absolutes if asked else None)
+        request = RenderRequest(absolute_gradients=absolutes if requested else None)
         output = backend.render(scene, CAMERA, request)
         a_loss(output).sum().backward()
         found.append((output.color.detach(), scene.means.grad, scene.opacity_logits.grad))
@@ -99,7 +96,7 @@ def test_they_leave_picture_and_other_gradients_alone(backend: Backend) -> None:
 def test_culled_rows_receive_nothing(backend: Backend) -> None:
     scene = random_scene(12, degree=0)
     subset = torch.arange(12) % 3 != 0
-    found = watched(backend, scene, CAMERA, subset=subset)
+    found = absolute_gradients(backend, scene, CAMERA, subset=subset)
     assert (found[~subset] == 0).all()
     assert (found[subset].sum(-1) > 0).any()
 
@@ -109,7 +106,7 @@ def test_a_backend_that_cannot_says_so(backend: Backend, monkeypatch: pytest.Mon
     cannot = type(capabilities)(**{**vars(capabilities), "absolute_gradients": False})
     monkeypatch.setattr(type(backend.rasterizer), "capabilities", cannot)
     request = RenderRequest(absolute_gradients=torch.zeros(12, 2))
-    with pytest.raises(RenderError, match="cannot give absolute screen gradients"):
+    with pytest.raises(RenderError, match="cannot compute absolute screen gradients"):
         backend.render(random_scene(12), CAMERA, request)
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from raster_scenes import a_camera, images, random_scene
+from raster_scenes import CUT, a_camera, images, random_scene
 
-from hoigs.core.rasterizer import RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.rasterizers import compositing
 from hoigs.rasterizers.compositing import compositing_weights, prepare, splat_alphas
 from hoigs.rasterizers.oracle import OracleRasterizer
-from hoigs.rasterizers.torch_tiles import TorchRasterizer, list_by_tile
+from hoigs.rasterizers.torch_tiles import TorchRasterizer, tile_intersections
 from hoigs.testing.rasterizer import CHECKS, RasterizerSubject
 
 
@@ -39,14 +39,14 @@ def test_tiles_list_every_splat_that_touches_a_pixel(tile_size: int, min_alpha: 
     camera = a_camera()
     request = RenderRequest(min_alpha=min_alpha)
     splats, _ = prepare(random_scene(80, degree=0), camera, request)
-    tiles, rows = list_by_tile(splats, camera, tile_size, min_alpha)
-    across = -(-camera.width // tile_size)
+    tiles, rows = tile_intersections(splats, camera, tile_size, min_alpha)
+    tiles_x = -(-camera.width // tile_size)
     listed = tiles * len(splats) + rows
     assert (listed.diff() > 0).all(), "tiles ascend, and the splats of each are in depth order"
     grid = camera.pixel_grid().flatten(0, 1)
     pixel, row = torch.nonzero(splat_alphas(grid, splats, 0.999, min_alpha), as_tuple=True)
     column, line = (grid[pixel] // tile_size).long().unbind(-1)
-    touching = torch.unique((line * across + column) * len(splats) + row)
+    touching = torch.unique((line * tiles_x + column) * len(splats) + row)
     assert torch.isin(touching, listed).all()
     # pixel-sized tiles leave no slack but the small margin for rounding
     assert tile_size > 1 or not min_alpha or len(listed) <= 1.01 * len(touching)
@@ -54,7 +54,8 @@ def test_tiles_list_every_splat_that_touches_a_pixel(tile_size: int, min_alpha: 
 
 @pytest.mark.parametrize("tile_size", [5, 64])
 def test_tiles_of_any_size_draw_the_same(tile_size: int) -> None:
-    CHECKS["R50"].run(RasterizerSubject(TorchRasterizer(tile_size), torch.device("cpu")))
+    rasterizer = TorchRasterizer(TorchRasterizer.Config(tile_size=tile_size))
+    CHECKS["R50"].run(RasterizerSubject(rasterizer, torch.device("cpu")))
 
 
 @pytest.mark.parametrize("rasterizer", [OracleRasterizer(), TorchRasterizer()])
@@ -69,18 +70,16 @@ def test_chunks_change_nothing(
         torch.testing.assert_close(image, images(whole)[name], atol=1e-12, rtol=0)
 
 
-def test_the_oracle_ignores_cutoffs_unless_asked() -> None:
+def test_the_oracle_ignores_cutoffs_by_default() -> None:
     gaussians, camera = random_scene(100, degree=0), a_camera()
     free = RenderRequest(min_alpha=0.0, min_transmittance=0.0)
     default = OracleRasterizer().render(gaussians, camera)
     assert torch.equal(
-        default.color, OracleRasterizer(cutoffs=True).render(gaussians, camera, free).color
+        default.color,
+        OracleRasterizer(OracleRasterizer.Config(cutoffs=True))
+        .render(gaussians, camera, free)
+        .color,
     )
-    cut = OracleRasterizer(cutoffs=True).render(gaussians, camera)
+    cut = CUT.render(gaussians, camera)
     assert default.color.dtype == torch.float64
     assert 1e-4 < float((default.color - cut.color).abs().max()) < 0.1
-
-
-def test_tile_size_must_be_positive() -> None:
-    with pytest.raises(ValueError, match="tile_size 0"):
-        TorchRasterizer(tile_size=0)

@@ -15,9 +15,9 @@ import torch
 from backends import declared
 
 from hoigs.core.errors import RenderError
-from hoigs.core.rasterizer import RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.rasterizers import gsplat as adapter
-from hoigs.rasterizers.gsplat import GsplatConfig, GsplatRasterizer
+from hoigs.rasterizers.gsplat import GsplatRasterizer
 from hoigs.testing.checks import Check
 from hoigs.testing.rasterizer import RasterizerSubject
 from hoigs.testing.rasterizer.scenes import a_camera, random_gaussians
@@ -45,7 +45,7 @@ def test_the_adapter_conforms_over_a_twin_of_gsplat(
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
 def test_without_a_cuda_device_it_says_so() -> None:
     with pytest.raises(RenderError, match=r"on CUDA only.*on cpu.*rasterizer:warp"):
-        GsplatRasterizer.from_config(GsplatConfig()).render(random_gaussians(3), a_camera())
+        GsplatRasterizer().render(random_gaussians(3), a_camera())
 
 
 def test_without_gsplat_it_has_the_pip_line(monkeypatch: pytest.MonkeyPatch) -> None:

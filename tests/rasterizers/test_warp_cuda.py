@@ -1,4 +1,4 @@
-"""What is particular to Warp on CUDA: lists without waiting, one shared list, captured graphs."""
+"""What is particular to Warp on CUDA: no waiting, one shared list, captured graphs."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import torch
 from raster_scenes import RAW, a_camera, assert_close_gradient, images, random_scene
 from torch import Tensor
 
-from hoigs.core.camera import Camera
 from hoigs.core.errors import RenderError
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.warp import WarpRasterizer
 
 CUDA = torch.device("cuda", 0)
@@ -44,22 +44,22 @@ def drawn(
 
 
 @pytest.mark.parametrize("channels", [0, 6])
-def test_where_pairs_do_not_fit_the_picture_is_the_same(channels: int) -> None:
+def test_where_intersections_do_not_fit_the_picture_is_the_same(channels: int) -> None:
     gaussians, camera = scene()
     request = RenderRequest(features=torch.randn(3000, channels, device=CUDA) if channels else None)
     roomy, tight = WarpRasterizer(), WarpRasterizer()
     wanted = drawn(roomy, gaussians, camera, request)
-    room = tight.path(CUDA).lists.room
-    room.measured(3000, 10**6, 0)  # as if only empty views had been drawn
-    room._room = 3000
+    capacity = tight.pipeline(CUDA).capacity
+    capacity.counted(3000, 10**6, 0)  # as if only empty views had been drawn
+    capacity._capacity = 3000
     actual = drawn(tight, gaussians, camera, request)
     torch.cuda.synchronize()
-    assert int(room.told[0]) > 3000, "the pairs fitted: this tests nothing"
+    assert int(capacity.largest_on_host[0]) > 3000, "the intersections fit: this tests nothing"
     for name, image in wanted[0].items():
         assert torch.equal(actual[0][name], image), name
     for name, gradient in wanted[1].items():
         assert_close_gradient(name, actual[1][name], gradient)
-    again = drawn(tight, gaussians, camera, request)  # there is room now
+    again = drawn(tight, gaussians, camera, request)  # there is memory now
     assert all(torch.equal(again[1][name], wanted[1][name]) for name in RAW)
 
 
@@ -69,24 +69,24 @@ def test_long_lists_are_in_order() -> None:
     request = RenderRequest(min_transmittance=0.0)
     faint = gaussians.replace(opacity_logits=gaussians.opacity_logits * 0.0 - 4.0)
     rasterizer = WarpRasterizer()
-    path = rasterizer.path(CUDA)
-    from hoigs.rasterizers.warp.frame import Inputs
+    pipeline = rasterizer.pipeline(CUDA)
+    from hoigs.rasterizers.warp.common.frame import Inputs
 
-    settings, tensors = rasterizer.door.prepare(rasterizer, faint, camera, request)
-    projected = path.project(Inputs(*tensors), settings)
-    lists = path.bin(projected, settings)
-    offsets, shared = lists.offsets[: lists.tiles + 1].tolist(), lists.offsets[lists.tiles + 1]
+    settings, tensors = rasterizer.inputs.prepare(faint, camera, request)
+    projected = pipeline.project(Inputs(*tensors), settings)
+    tiles = pipeline.intersect(projected, settings)
+    offsets, shared = tiles.offsets[: tiles.tiles + 1].tolist(), tiles.offsets[tiles.tiles + 1]
     assert shared == -1
     assert max(b - a for a, b in pairwise(offsets)) > 5000
-    slots = []
+    partials = []
     for begin, end in pairwise(offsets):
-        rows, here = lists.pairs[begin:end].long().unbind(1)
+        rows, here = tiles.indices[begin:end].long().unbind(1)
         keys = projected.drawn_depths[rows].double() * 2**20 + rows.double() / 2**20
         assert (keys[1:] > keys[:-1]).all()
-        assert (here >= lists.first[rows]).all()
-        assert (here < lists.first[rows] + lists.slots[rows]).all()
-        slots.append(here)
-    assert torch.equal(torch.cat(slots).sort().values, torch.arange(offsets[-1], device=CUDA))
+        assert (here >= tiles.first_partial[rows]).all()
+        assert (here < tiles.first_partial[rows] + tiles.tiles_per_gaussian[rows]).all()
+        partials.append(here)
+    assert torch.equal(torch.cat(partials).sort().values, torch.arange(offsets[-1], device=CUDA))
 
 
 def test_a_steady_step_waits_for_nothing() -> None:
@@ -176,7 +176,7 @@ def test_a_captured_render_follows_its_inputs() -> None:
     assert draw.captures == 1
 
 
-def test_a_captured_render_that_outgrows_its_room_is_right_and_grows() -> None:
+def test_a_captured_render_that_exceeds_its_capacity_is_right_and_grows() -> None:
     gaussians, camera = scene(20_000, 300, 200)
     small = gaussians.replace(log_scales=gaussians.log_scales - 3.0)
     draw = WarpRasterizer().capture(small, camera)
@@ -185,7 +185,7 @@ def test_a_captured_render_that_outgrows_its_room_is_right_and_grows() -> None:
     torch.cuda.synchronize()
     assert draw.captures == 1
     assert torch.equal(draw().color, wanted)
-    assert draw.captures == 2, "the pairs fitted: this tests nothing"
+    assert draw.captures == 2, "the intersections fit: this tests nothing"
 
 
 def test_a_captured_render_refuses_other_sizes() -> None:

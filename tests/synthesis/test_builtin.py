@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from hoigs.core.clip import Clip
-from hoigs.core.clip_folder import check_clip
+from hoigs.core.clip_folder.check import check_clip
+from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.synthesis import SceneKnobs, builtin, builtin_clip, cache_folder
+from hoigs.synthesis import SceneConfig, builtin, builtin_clip, cache_folder
 
 
 @pytest.fixture(scope="module")
@@ -29,14 +29,14 @@ SMALLEST = {"frames": 4, "width": 16, "height": 16, "held_out_views": 1}
 
 def test_the_folder_is_a_whole_clip(clip_folder: Path, clip: Clip) -> None:
     assert check_clip(clip_folder) == []
-    knobs = SceneKnobs.tiny()
-    assert len(clip) == knobs.frames and clip.num_frames == knobs.frames
-    assert clip.depth_kind == "metric" and clip.fps == knobs.fps
+    config = SceneConfig.tiny()
+    assert len(clip) == config.frames and clip.num_frames == config.frames
+    assert clip.depth_kind == "metric" and clip.fps == config.fps
     assert clip.kinds["human"] == "human" and clip.kinds["object"] == "object"
     assert len(clip.split["test"]) == 3
     assert clip.bodies["human"].model == "body:anny"
     assert clip.objects["object"].provenance == "synthetic truth"
-    assert clip.provenance["knobs"]["object"]["motion"] == "held"
+    assert clip.provenance["config"]["object"]["motion"] == "held"
 
 
 def test_frames_read_back(clip: Clip) -> None:
@@ -72,7 +72,7 @@ def test_scene_points_lie_on_what_the_cameras_see(clip: Clip) -> None:
 
 def test_object_points_ride_on_the_track(clip: Clip) -> None:
     track = clip.objects["object"]
-    half = torch.tensor(SceneKnobs().object.size) / 2
+    half = torch.tensor(SceneConfig().object.size) / 2
     assert len(track.points) == 300 and track.observed.all()
     assert ((track.points.abs() - half).max(-1).values.abs() < 0.02).all()
     for position in (0, 6, 11):
@@ -100,8 +100,8 @@ def test_the_second_call_takes_the_cached_folder(
     body: AnnyBody, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[tuple[int, int]] = []
-    knobs = SceneKnobs.tiny(**SMALLEST)
-    first = builtin_clip(body, knobs, progress=lambda done, of: calls.append((done, of)))
+    config = SceneConfig.tiny(**SMALLEST)
+    first = builtin_clip(body, config, progress=lambda done, of: calls.append((done, of)))
     assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert first.is_relative_to(cache)
 
@@ -109,9 +109,9 @@ def test_the_second_call_takes_the_cached_folder(
         raise AssertionError("generated again")
 
     monkeypatch.setattr(builtin, "generate", never)
-    assert builtin_clip(body, knobs) == first
+    assert builtin_clip(body, config) == first
     with pytest.raises(AssertionError, match="generated again"):
-        builtin_clip(body, SceneKnobs.tiny(**SMALLEST, seed=1))
+        builtin_clip(body, SceneConfig.tiny(**SMALLEST, seed=1))
 
 
 def test_a_failure_leaves_nothing(
@@ -122,20 +122,20 @@ def test_a_failure_leaves_nothing(
 
     monkeypatch.setattr(builtin, "save_truth", fail)
     with pytest.raises(RuntimeError, match="the disk is full"):
-        builtin_clip(body, SceneKnobs.tiny(**SMALLEST))
+        builtin_clip(body, SceneConfig.tiny(**SMALLEST))
     assert list((cache / "clips").iterdir()) == []
 
 
-def test_the_name_covers_knobs_body_and_generator(
+def test_the_name_covers_config_body_and_generator(
     body: AnnyBody, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    knobs = SceneKnobs.tiny()
-    base = knobs.digest(builtin.generator_version(), builtin.body_digest(body, knobs))
-    assert knobs.digest("another", builtin.body_digest(body, knobs)) != base
-    other = SceneKnobs.tiny(light={"sun": 0.9})
+    config = SceneConfig.tiny()
+    base = config.digest(builtin.generator_version(), builtin.body_digest(body, config))
+    assert config.digest("another", builtin.body_digest(body, config)) != base
+    other = SceneConfig.tiny(light={"sun": 0.9})
     assert other.digest(builtin.generator_version(), builtin.body_digest(body, other)) != base
-    tall = SceneKnobs.tiny(betas=(1.0,))
-    assert builtin.body_digest(body, tall) != builtin.body_digest(body, knobs)
+    tall = SceneConfig.tiny(betas=(1.0,))
+    assert builtin.body_digest(body, tall) != builtin.body_digest(body, config)
 
 
 def test_the_cache_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,8 +149,8 @@ def test_noise_reaches_the_clip_but_not_its_truth(body: AnnyBody, cache: Path) -
     noise = {"pose_degrees": 5.0, "camera_degrees": 1.0, "object_metres": 0.02,
              "depth_scale": 1.25, "mask_missing": 0.5}  # fmt: skip
     small = {**SMALLEST, "frames": 6}
-    clean = ClipFolderReader().read(builtin_clip(body, SceneKnobs.tiny(**small)))
-    folder = builtin_clip(body, SceneKnobs.tiny(**small, noise=noise))
+    clean = ClipFolderReader().read(builtin_clip(body, SceneConfig.tiny(**small)))
+    folder = builtin_clip(body, SceneConfig.tiny(**small, noise=noise))
     noisy = ClipFolderReader().read(folder)
     assert torch.equal(clean[0].image, noisy[0].image)
     torch.testing.assert_close(noisy[0].depth, 1.25 * clean[0].depth)

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.synthesis import SceneKnobs, SyntheticScene, TrueView, generate
+from hoigs.synthesis import SceneConfig, SyntheticScene, TrueView, generate
 from hoigs.synthesis.generate import canonical, unproject
-from hoigs.synthesis.objects import MOTIONS
-from hoigs.synthesis.paths import camera_path, held_out_views
+from hoigs.synthesis.motion.object_motions import MOTIONS
+from hoigs.synthesis.rendering.paths import camera_path, held_out_views
 
 
 @pytest.fixture(scope="module")
@@ -16,10 +16,10 @@ def view(scene: SyntheticScene) -> TrueView:
     return scene.render(10, scene.cameras[10].resized(160, 160))
 
 
-def test_the_same_knobs_give_the_same_pixels(
+def test_the_same_config_gives_the_same_pixels(
     body: AnnyBody, scene: SyntheticScene, view: TrueView
 ) -> None:
-    again = generate(scene.knobs, body).render(10, view.camera)
+    again = generate(scene.config, body).render(10, view.camera)
     assert np.array_equal(again.image, view.image)
     assert np.array_equal(again.depth, view.depth)
     assert np.array_equal(again.entity, view.entity)
@@ -28,7 +28,7 @@ def test_the_same_knobs_give_the_same_pixels(
 def test_another_seed_gives_other_textures_on_the_same_geometry(
     body: AnnyBody, scene: SyntheticScene, view: TrueView
 ) -> None:
-    other = generate(scene.knobs.model_copy(update={"seed": 5}), body).render(10, view.camera)
+    other = generate(scene.config.model_copy(update={"seed": 5}), body).render(10, view.camera)
     assert not np.array_equal(other.image, view.image)
     human = view.mask("human")
     np.testing.assert_array_equal(other.mask("human"), human)
@@ -38,7 +38,7 @@ def test_another_seed_gives_other_textures_on_the_same_geometry(
 def test_the_object_s_pixels_lie_on_its_surface(scene: SyntheticScene, view: TrueView) -> None:
     points, _ = unproject(view, view.mask("object"))
     local = np.abs(canonical(scene, points, view.frame))
-    half = np.array(scene.knobs.object.size) / 2
+    half = np.array(scene.config.object.size) / 2
     assert len(points) > 200
     assert np.abs((local - half).max(-1)).max() < 1e-3  # on one of the six sides
 
@@ -94,7 +94,7 @@ def test_the_clothed_body_follows_the_body_model(body: AnnyBody, scene: Syntheti
 
 
 def test_views_come_in_order_with_their_held_out_ones(body: AnnyBody) -> None:
-    scene = generate(SceneKnobs.tiny(frames=5, width=24, height=24, held_out_views=2), body)
+    scene = generate(SceneConfig.tiny(frames=5, width=24, height=24, held_out_views=2), body)
     views = list(scene.views())
     assert [v.frame for v, _ in views] == [0, 1, 2, 3, 4]
     held_out = [o for _, others in views for o in others]
@@ -116,8 +116,8 @@ def test_person_and_object_fill_half_of_the_frame(scene: SyntheticScene) -> None
 
 @pytest.mark.parametrize("motion", [m for m in MOTIONS if m != "held"])
 def test_every_motion_renders(body: AnnyBody, motion: str) -> None:
-    knobs = SceneKnobs.tiny(width=32, height=32, object={"motion": motion})
-    scene = generate(knobs, body)
+    config = SceneConfig.tiny(width=32, height=32, object={"motion": motion})
+    scene = generate(config, body)
     frame = 4
     seen = scene.render(frame, scene.cameras[frame])
     assert seen.mask("object").any() and seen.mask("human").any()
@@ -129,36 +129,36 @@ def test_every_motion_renders(body: AnnyBody, motion: str) -> None:
 
 
 def test_an_orbit_turns_about_the_person_by_its_arc() -> None:
-    knobs = SceneKnobs()
-    cameras = camera_path(knobs)
+    config = SceneConfig()
+    cameras = camera_path(config)
     centers = torch.stack([c.center for c in cameras]).numpy()
-    flat = centers[:, [0, 2]] - np.array(knobs.camera.target)[[0, 2]]
-    np.testing.assert_allclose(np.linalg.norm(flat, axis=-1), knobs.camera.distance, rtol=1e-5)
+    flat = centers[:, [0, 2]] - np.array(config.camera.target)[[0, 2]]
+    np.testing.assert_allclose(np.linalg.norm(flat, axis=-1), config.camera.distance, rtol=1e-5)
     azimuth = np.degrees(np.arctan2(*flat.T))
-    assert np.ptp(azimuth) == pytest.approx(knobs.camera.arc_degrees, rel=1e-4)
-    assert np.ptp(centers[:, 1]) == pytest.approx(knobs.camera.height_change, rel=1e-4)
-    pixels, _ = cameras[0].project(torch.tensor(knobs.camera.target))
+    assert np.ptp(azimuth) == pytest.approx(config.camera.arc_degrees, rel=1e-4)
+    assert np.ptp(centers[:, 1]) == pytest.approx(config.camera.height_change, rel=1e-4)
+    pixels, _ = cameras[0].project(torch.tensor(config.camera.target))
     np.testing.assert_allclose(pixels, [128, 128], atol=1e-3)
 
 
 def test_a_static_camera_stands_still_and_a_pan_does_not_turn_much() -> None:
-    still = camera_path(SceneKnobs.model_validate({"camera": {"path": "static"}}))
+    still = camera_path(SceneConfig.model_validate({"camera": {"path": "static"}}))
     assert all(torch.equal(c.world_to_camera, still[0].world_to_camera) for c in still)
-    pan = camera_path(SceneKnobs.model_validate({"camera": {"path": "pan"}}))
+    pan = camera_path(SceneConfig.model_validate({"camera": {"path": "pan"}}))
     way = pan[-1].center - pan[0].center
     assert float(way[[0, 2]].norm()) == pytest.approx(1.2, rel=1e-3)
 
 
 def test_the_principal_point_can_be_off_the_middle() -> None:
     shifted = {"camera": {"principal_point_shift": (0.1, -0.05)}}
-    camera = camera_path(SceneKnobs.model_validate(shifted))[0]
+    camera = camera_path(SceneConfig.model_validate(shifted))[0]
     np.testing.assert_allclose(camera.K[:2, 2], [128 + 25.6, 128 - 12.8], rtol=1e-6)
 
 
 def test_held_out_cameras_are_far_from_every_filming_one() -> None:
-    knobs = SceneKnobs()
-    path = torch.stack([c.center for c in camera_path(knobs)])
-    views = held_out_views(knobs)
+    config = SceneConfig()
+    path = torch.stack([c.center for c in camera_path(config)])
+    views = held_out_views(config)
     assert len(views) == 8 and len({f for f, _ in views}) == 8
     for frame, camera in views:
         assert (path - camera.center).norm(dim=-1).min() > 0.1
@@ -166,7 +166,7 @@ def test_held_out_cameras_are_far_from_every_filming_one() -> None:
 
 
 def test_shape_changes_the_person(body: AnnyBody, scene: SyntheticScene) -> None:
-    other = generate(SceneKnobs.tiny(betas=(2.5,)), body)
+    other = generate(SceneConfig.tiny(betas=(2.5,)), body)
     assert (
         np.abs(np.ptp(other.dressed.vertices, 0) - np.ptp(scene.dressed.vertices, 0)).max() > 0.01
     )
@@ -174,9 +174,9 @@ def test_shape_changes_the_person(body: AnnyBody, scene: SyntheticScene) -> None
 
 
 def test_exposure_ramps(body: AnnyBody) -> None:
-    knobs = SceneKnobs.tiny(
+    config = SceneConfig.tiny(
         width=24, height=24, camera={"path": "static"}, light={"exposure_ramp": 0.6}
     )
-    scene = generate(knobs, body)
+    scene = generate(config, body)
     first, last = (scene.render(f, scene.cameras[f]).image.astype(float) for f in (0, 11))
     assert first[:4].mean() < 0.85 * last[:4].mean()  # the wall above

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import torch
 
-from hoigs.core.body import BodyOutput
 from hoigs.core.config import ComponentConfig
+from hoigs.core.interfaces.body import BodyOutput
 from hoigs.testing.material.body import TinyBody
 
 

@@ -1,4 +1,4 @@
-"""Which check killed which mutant: a table at the end of the run."""
+"""The `kill` fixture, and a table of mutants and the checks that found them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ KILL = "kill"
 
 @pytest.fixture(scope="module", autouse=True)
 def _one_torch_thread() -> Iterator[None]:
-    """Nothing here is large enough for two, which would wait for each other by spinning."""
+    """The tensors here are too small for two threads, which would only wait for each other."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -29,11 +29,11 @@ def kill(record_property: Callable[[str, object], None]) -> Callable[..., None]:
     def run(checks: Iterable[Check[Any]], subject: Any, id: str, mutant: str) -> None:
         report = run_checks(checks, subject)
         failed = {r.id: r.why for r in report.results if r.outcome is Outcome.FAILED}
-        assert id in failed, f"{id} let it live: {report}"
+        assert id in failed, f"{id} did not find it: {report}"
         assert set(failed) == {id}, failed
         assert "TypeCheckError" not in failed[id] and "NameError" not in failed[id], failed[id]
         title = next(check.title for check in checks if check.id == id)
-        record_property(KILL, [id, mutant, title])  # comes back from xdist's workers too
+        record_property(KILL, [id, mutant, title])  # also passed on by xdist's workers
 
     return run
 

@@ -1,4 +1,4 @@
-"""Deformations with one mistake each: for every check the mutant that it has to find."""
+"""Deformations with one mistake each, by the check that must find it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ import torch
 from torch import nn
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.deformation import DeformationModel
-from hoigs.core.topology import reindex
-from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning, HexPlaneSkinningConfig
-from hoigs.plugins.deformation.lbs import Lbs, LbsConfig
+from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.values.topology import reindex
+from hoigs.plugins.deformation.avatars.hexplane_skinning import (
+    HexPlaneSkinning,
+    HexPlaneSkinningConfig,
+)
+from hoigs.plugins.deformation.avatars.lbs import Lbs, LbsConfig
 
-# no dice: two that are built one after the other always differ, and never by what others see
+# a counter instead of random numbers: two instances in a row always differ, deterministically
 BUILT = itertools.count()
 
 
@@ -24,7 +27,7 @@ class RightConfig(ComponentConfig):
 
 
 class Right(DeformationModel):
-    """Keeps a place for each Gaussian, and lets all of them sway."""
+    """Correct: an offset for each Gaussian, and an oscillation of all."""
 
     owns = frozenset({"means"})
     per_gaussian = ("places",)
@@ -35,17 +38,17 @@ class Right(DeformationModel):
         self.size = size
         self.sway = nn.Parameter(0.1 * torch.randn(3))
 
-    def bind(self, rest):
-        self.places = nn.Parameter(rest.means.clone())
+    def bind(self, canonical):
+        self.places = nn.Parameter(canonical.means.clone())
 
-    def moved(self, rest, moment):
+    def moved(self, canonical, moment):
         return self.places + self.size * self.sway * torch.sin(self.sway.new_tensor(moment.time))
 
-    def forward(self, rest, moment, residual=None):
-        means = self.moved(rest, moment)
+    def forward(self, canonical, moment, residual=None):
+        means = self.moved(canonical, moment)
         if residual is not None and residual.means is not None:
             means = means + residual.means
-        return rest.replace(means=means)
+        return canonical.replace(means=means)
 
     def on_topology(self, change):
         super().on_topology(change)
@@ -63,13 +66,13 @@ class GrowsItsSettings(Right):
 
 
 class NeedsOneRow(Right):
-    def moved(self, rest, moment):
-        return super().moved(rest, moment) + 0.0 * self.places.amin()
+    def moved(self, canonical, moment):
+        return super().moved(canonical, moment) + 0.0 * self.places.amin()
 
 
 class AlwaysDouble(Right):
-    def moved(self, rest, moment):
-        return super().moved(rest, moment).double()
+    def moved(self, canonical, moment):
+        return super().moved(canonical, moment).double()
 
 
 class IgnoresPermutations(Right):
@@ -82,15 +85,15 @@ class RemembersTheWay(Right):
     last = -10.0
     back = False
 
-    def moved(self, rest, moment):
+    def moved(self, canonical, moment):
         self.back = self.back or moment.time < self.last
         self.last = moment.time
-        return super().moved(rest, moment) + 5e-5 * self.back
+        return super().moved(canonical, moment) + 5e-5 * self.back
 
 
 class NothingLater(Right):
-    def moved(self, rest, moment):
-        return super().moved(rest, moment) * (torch.nan if moment.time > 1.5 else 1.0)
+    def moved(self, canonical, moment):
+        return super().moved(canonical, moment) * (torch.nan if moment.time > 1.5 else 1.0)
 
 
 class Spare(Right):
@@ -100,14 +103,14 @@ class Spare(Right):
 
 
 class HalfAGradient(Right):
-    def moved(self, rest, moment):
-        means = super().moved(rest, moment)
+    def moved(self, canonical, moment):
+        means = super().moved(canonical, moment)
         return means.detach() + 0.5 * (means - means.detach())
 
 
 class Jumps(Right):
-    def moved(self, rest, moment):
-        return super().moved(rest, moment) + 0.01 * (moment.time > 0.6)
+    def moved(self, canonical, moment):
+        return super().moved(canonical, moment) + 0.01 * (moment.time > 0.6)
 
 
 class PrunesTheLast(Right):
@@ -145,12 +148,12 @@ class UndeclaredRows(Right):
 
 
 class StartIsNotSaved(Right):
-    def bind(self, rest):
-        super().bind(rest)
-        self.register_buffer("start", rest.means.detach().clone(), persistent=False)
+    def bind(self, canonical):
+        super().bind(canonical)
+        self.register_buffer("start", canonical.means.detach().clone(), persistent=False)
 
-    def moved(self, rest, moment):
-        return super().moved(rest, moment) + 0.1 * self.start
+    def moved(self, canonical, moment):
+        return super().moved(canonical, moment) + 0.1 * self.start
 
     def on_topology(self, change):
         super().on_topology(change)
@@ -177,24 +180,24 @@ class StateOfWords(Right):
 
 
 class SpoilsThePose(Right):
-    def moved(self, rest, moment):
+    def moved(self, canonical, moment):
         for pose in moment.poses.values():
             pose.betas.zero_()
-        return super().moved(rest, moment)
+        return super().moved(canonical, moment)
 
 
 class Twice(Right):
-    def forward(self, rest, moment, residual=None):
+    def forward(self, canonical, moment, residual=None):
         if residual is not None and residual.means is not None:
             residual = replace(residual, means=2 * residual.means)
-        return super().forward(rest, moment, residual)
+        return super().forward(canonical, moment, residual)
 
 
 class PoseSum(Right):
     factor = 0.01
 
-    def forward(self, rest, moment, residual=None):
-        out = super().forward(rest, moment, residual)
+    def forward(self, canonical, moment, residual=None):
+        out = super().forward(canonical, moment, residual)
         if residual is None or residual.pose is None:
             return out
         return out.replace(means=out.means + self.factor * residual.pose.sum())
@@ -206,10 +209,10 @@ class HardlyPosed(PoseSum):
 
 
 class DeafToTheLoss(Right):
-    def forward(self, rest, moment, residual=None):
+    def forward(self, canonical, moment, residual=None):
         if residual is not None and residual.means is not None:
             residual = replace(residual, means=residual.means.detach())
-        return super().forward(rest, moment, residual)
+        return super().forward(canonical, moment, residual)
 
 
 class SpreadOfOne(Right):
@@ -218,24 +221,24 @@ class SpreadOfOne(Right):
 
 
 class NewParameter(Right):
-    def evolve(self, rest, evidence):
-        if evidence.step == 500:
+    def evolve(self, canonical, statistics):
+        if statistics.step == 500:
             self.sway = nn.Parameter(self.sway.detach().clone())
         return {}
 
 
 class NothingAtFirst(Right):
-    def moved(self, rest, moment):
+    def moved(self, canonical, moment):
         share = torch.tensor(self.progress if self.training else 1.0)
-        return super().moved(rest, moment) + share.log() - share.log()
+        return super().moved(canonical, moment) + share.log() - share.log()
 
 
 class Backwards(Right):
     provides = frozenset({"velocity"})
 
-    def velocity(self, rest, moment):
+    def velocity(self, canonical, moment):
         slope = self.size * self.sway * torch.cos(self.sway.new_tensor(moment.time))
-        return -slope.expand(len(rest), 3)
+        return -slope.expand(len(canonical), 3)
 
 
 class OnePart(HexPlaneSkinning):
@@ -263,24 +266,24 @@ class OneOpacity(Right):
         super().__init__(size)
         self.logit = nn.Parameter(torch.zeros(()))
 
-    def forward(self, rest, moment, residual=None):
-        logits = self.logit + 0.0 * rest.opacity_logits.detach()
-        return super().forward(rest, moment, residual).replace(opacity_logits=logits)
+    def forward(self, canonical, moment, residual=None):
+        logits = self.logit + 0.0 * canonical.opacity_logits.detach()
+        return super().forward(canonical, moment, residual).replace(opacity_logits=logits)
 
 
 class KeepsPictures(Right):
-    def forward(self, rest, moment, residual=None):
+    def forward(self, canonical, moment, residual=None):
         if self.training or torch.is_grad_enabled() or residual is not None:
-            return super().forward(rest, moment, residual)
+            return super().forward(canonical, moment, residual)
         kept = self.__dict__.setdefault("kept", {})
         if moment.time not in kept:
-            kept[moment.time] = super().forward(rest, moment, residual)
+            kept[moment.time] = super().forward(canonical, moment, residual)
         return kept[moment.time]
 
 
 class OtherWithoutGradients(Right):
-    def moved(self, rest, moment):
-        return super().moved(rest, moment) + (0.0 if torch.is_grad_enabled() else 1e-4)
+    def moved(self, canonical, moment):
+        return super().moved(canonical, moment) + (0.0 if torch.is_grad_enabled() else 1e-4)
 
 
 SMALL = HexPlaneSkinningConfig(resolution=8, channels=2, width=8, field_points=64)

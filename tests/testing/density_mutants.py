@@ -7,8 +7,8 @@ import random
 import torch
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.density import DensityControl, Refinement, step_generator
-from hoigs.core.topology import TopologyChange
+from hoigs.core.interfaces.density import DensityControl, Refinement, step_generator
+from hoigs.core.values.topology import TopologyChange
 
 
 class RightDensityConfig(ComponentConfig):
@@ -16,33 +16,33 @@ class RightDensityConfig(ComponentConfig):
 
 
 class RightDensity(DensityControl):
-    """Every hundred steps, children beside those that ask for them, up to a cap."""
+    """Correct: every hundred steps it clones, with offsets, up to a cap."""
 
     cap = 80
     seed = 0
 
-    def asking(self, statistics):
+    def above(self, statistics):
         return statistics.mean_gradient > 2e-4
 
-    def room(self, rest):
-        return max(0, self.cap - len(rest))
+    def room(self, canonical):
+        return max(0, self.cap - len(canonical))
 
-    def refine(self, rest, current, statistics, *, step, total_steps, extent):
-        if step % 100 or len(rest) == 0:
+    def refine(self, canonical, current, statistics, *, step, total_steps, extent):
+        if step % 100 or len(canonical) == 0:
             return None
-        count = len(rest)
-        chosen = self.asking(statistics).nonzero().squeeze(1)[: self.room(rest)]
+        count = len(canonical)
+        chosen = self.above(statistics).nonzero().squeeze(1)[: self.room(canonical)]
         source = torch.cat((torch.arange(count), chosen))
         fresh = torch.arange(len(source)) >= count
-        generator = step_generator(self.seed, step, rest.means.device)
+        generator = step_generator(self.seed, step, canonical.means.device)
         offsets = 0.01 * torch.randn(len(source), 3, generator=generator) * fresh[:, None]
-        new = rest[source]
+        new = canonical[source]
         new = new.replace(means=new.means + offsets)
         return Refinement(TopologyChange(source, fresh, offsets), new)
 
-    def perturb(self, rest, *, step, total_steps, rate):
-        generator = step_generator(1, step, rest.means.device)
-        return rate * torch.randn(len(rest), 3, generator=generator)
+    def perturb(self, canonical, *, step, total_steps, rate):
+        generator = step_generator(1, step, canonical.means.device)
+        return rate * torch.randn(len(canonical), 3, generator=generator)
 
     def regularizers(self, current):
         return {"opacity": current.opacities.mean()} if len(current) else {}
@@ -54,9 +54,9 @@ class Changed(RightDensity):
     def amend(self, decision, step):
         return decision
 
-    def refine(self, rest, current, statistics, *, step, total_steps, extent):
+    def refine(self, canonical, current, statistics, *, step, total_steps, extent):
         found = super().refine(
-            rest, current, statistics, step=step, total_steps=total_steps, extent=extent
+            canonical, current, statistics, step=step, total_steps=total_steps, extent=extent
         )
         return None if found is None else self.amend(found, step)
 
@@ -66,44 +66,44 @@ class CountsFromTheEnd(Changed):
         change = decision.change
         count = int((~change.fresh).sum())  # no row goes
         source = change.source - count * change.fresh
-        return Refinement(TopologyChange(source, change.fresh, change.offsets), decision.rest)
+        return Refinement(TopologyChange(source, change.fresh, change.offsets), decision.canonical)
 
 
 class NoCap(RightDensity):
-    def room(self, rest):
+    def room(self, canonical):
         return 10
 
 
 class ShrinksAll(Changed):
     def amend(self, decision, step):
-        rest = decision.rest
-        return Refinement(decision.change, rest.replace(log_scales=rest.log_scales - 0.1))
+        canonical = decision.canonical
+        return Refinement(decision.change, canonical.replace(log_scales=canonical.log_scales - 0.1))
 
 
 class HidesOffsets(Changed):
     def amend(self, decision, step):
         change = decision.change
         hidden = TopologyChange(change.source, change.fresh, 0 * change.offsets)
-        return Refinement(hidden, decision.rest)
+        return Refinement(hidden, decision.canonical)
 
 
 class SpreadOfOne(Changed):
     def amend(self, decision, step):
-        rest = decision.rest
-        same = rest.log_scales + 0.0 * rest.log_scales.std(0)
-        return Refinement(decision.change, rest.replace(log_scales=same))
+        canonical = decision.canonical
+        same = canonical.log_scales + 0.0 * canonical.log_scales.std(0)
+        return Refinement(decision.change, canonical.replace(log_scales=same))
 
 
 class NeedsOneRow(RightDensity):
-    def refine(self, rest, *args, **kwargs):
-        rest.means.amax()
-        return super().refine(rest, *args, **kwargs)
+    def refine(self, canonical, *args, **kwargs):
+        canonical.means.amax()
+        return super().refine(canonical, *args, **kwargs)
 
 
 class ResetsToNothing(Changed):
     def amend(self, decision, step):
         ceiling = 0.0 if step == 300 else None
-        return Refinement(decision.change, decision.rest, ceiling)
+        return Refinement(decision.change, decision.canonical, ceiling)
 
 
 class OwnDice(RightDensity):
@@ -115,22 +115,22 @@ class RemembersTheCloud(Changed):
     last = None
     met = 0
 
-    def refine(self, rest, *args, **kwargs):
-        self.met += self.last is not None and self.last is not rest
-        self.last = rest
+    def refine(self, canonical, *args, **kwargs):
+        self.met += self.last is not None and self.last is not canonical
+        self.last = canonical
         self.seed = int(self.met > 0)
-        return super().refine(rest, *args, **kwargs)
+        return super().refine(canonical, *args, **kwargs)
 
 
 class ForgetsRadii(RightDensity):
-    def asking(self, statistics):
+    def above(self, statistics):
         statistics.max_radius.zero_()
-        return super().asking(statistics)
+        return super().above(statistics)
 
 
 class NeverStill(RightDensity):
-    def perturb(self, rest, *, step, total_steps, rate):
-        return super().perturb(rest, step=step, total_steps=total_steps, rate=rate + 1e-6)
+    def perturb(self, canonical, *, step, total_steps, rate):
+        return super().perturb(canonical, step=step, total_steps=total_steps, rate=rate + 1e-6)
 
 
 class MeanOfNone(RightDensity):
@@ -139,7 +139,7 @@ class MeanOfNone(RightDensity):
 
 
 class SecretlyAbsolute(RightDensity):
-    def asking(self, statistics):
+    def above(self, statistics):
         return statistics.mean_absolute_gradient > 6e-4
 
 

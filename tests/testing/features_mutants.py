@@ -9,10 +9,11 @@ import torch
 from torch import nn
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.features import FeatureExtractor, Tokens
-from hoigs.core.topology import reindex
+from hoigs.core.interfaces.features import FeatureExtractor
+from hoigs.core.values.tokens import Tokens
+from hoigs.core.values.topology import reindex
 
-# no dice: two that are built one after the other always differ, and never by what others see
+# a counter instead of random numbers: two instances in a row always differ, deterministically
 BUILT = itertools.count()
 
 
@@ -21,7 +22,7 @@ class RightConfig(ComponentConfig):
 
 
 class Right(FeatureExtractor):
-    """A code for each Gaussian and its velocity, mixed; where it is drawn."""
+    """Correct: a code and the velocity of each Gaussian, at its mean."""
 
     requires = frozenset({"velocity"})
     per_gaussian = ("codes",)
@@ -31,14 +32,14 @@ class Right(FeatureExtractor):
         super().__init__()
         self.mix = nn.Linear(7, 5)
 
-    def bind(self, deformation, rest):
-        self.codes = nn.Parameter(torch.randn(len(rest), 4))
+    def bind(self, deformation, canonical):
+        self.codes = nn.Parameter(torch.randn(len(canonical), 4))
 
-    def forward(self, deformation, rest, moment):
-        velocity = deformation.velocity(rest, moment)
+    def forward(self, deformation, canonical, moment):
+        velocity = deformation.velocity(canonical, moment)
         features = self.mix(torch.cat((velocity, self.codes), 1)) * (1 + moment.time)
         with torch.no_grad():
-            positions = deformation(rest, moment).means
+            positions = deformation(canonical, moment).means
         return self.amend(Tokens(features, positions), moment)
 
     def amend(self, tokens, moment):
@@ -90,9 +91,9 @@ class UndeclaredRows(Right):
 
 
 class StartIsNotSaved(Right):
-    def bind(self, deformation, rest):
-        super().bind(deformation, rest)
-        self.register_buffer("start", rest.means.detach().clone(), persistent=False)
+    def bind(self, deformation, canonical):
+        super().bind(deformation, canonical)
+        self.register_buffer("start", canonical.means.detach().clone(), persistent=False)
 
     def amend(self, tokens, moment):
         return replace(tokens, features=tokens.features + self.start.sum(1, keepdim=True))

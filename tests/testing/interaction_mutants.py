@@ -9,9 +9,10 @@ import torch
 from torch import nn
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.interaction import InteractionModule, Residual
+from hoigs.core.interfaces.interaction import InteractionModule
+from hoigs.core.values.tokens import Residual
 
-# no dice: two that are built one after the other always differ, and never by what others see
+# a counter instead of random numbers: two instances in a row always differ, deterministically
 BUILT = itertools.count()
 
 
@@ -20,7 +21,7 @@ class RightConfig(ComponentConfig):
 
 
 class Right(InteractionModule):
-    """Sums over pairs, each weighed by how far the object's middle is within reach."""
+    """Correct: sums over pairs, weighted by how far the object's centre is within reach."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -29,20 +30,20 @@ class Right(InteractionModule):
         self.from_human = nn.Linear(6, 3, bias=False)
 
     @torch.no_grad()
-    def gate(self, role, thing):
-        if len(thing.positions) == 0:
-            return thing.positions.new_zeros(())
-        apart = (role.anchors[0] - thing.positions.mean(0)).norm()
+    def gate(self, role, item):
+        if len(item.positions) == 0:
+            return item.positions.new_zeros(())
+        apart = (role.anchors[0] - item.positions.mean(0)).norm()
         return (role.reach - apart).clamp_min(0)
 
     def summed(self, features):
         return features.sum(0)
 
-    def pose(self, gate, thing):
-        return gate * self.to_pose(self.summed(thing.features)).reshape(51, 3)
+    def pose(self, gate, item):
+        return gate * self.to_pose(self.summed(item.features)).reshape(51, 3)
 
-    def means(self, gate, human, thing):
-        return gate * (self.to_means(thing.features) + self.from_human(human.features.mean(0)))
+    def means(self, gate, human, item):
+        return gate * (self.to_means(item.features) + self.from_human(human.features.mean(0)))
 
     def forward(self, tokens, roles):
         humans = [n for n in tokens if roles[n].kind == "human"]
@@ -86,9 +87,9 @@ class RestlessAlone(Right):
 
 
 class RootOfNothing(Right):
-    def pose(self, gate, thing):
-        root = torch.sqrt(gate + 0.0 * thing.features.sum())
-        return root * super().pose(1.0, thing)
+    def pose(self, gate, item):
+        root = torch.sqrt(gate + 0.0 * item.features.sum())
+        return root * super().pose(1.0, item)
 
 
 class MeanOfAll(Right):
@@ -104,9 +105,9 @@ class FirstComesFirst(Right):
 
 
 class CountsTokens(Right):
-    def means(self, gate, human, thing):
-        numbers = torch.arange(len(thing.positions))[:, None].to(thing.positions)
-        return super().means(gate, human, thing) + 0.01 * gate * numbers
+    def means(self, gate, human, item):
+        numbers = torch.arange(len(item.positions))[:, None].to(item.positions)
+        return super().means(gate, human, item) + 0.01 * gate * numbers
 
 
 class NeedsTokens(Right):

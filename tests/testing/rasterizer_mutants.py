@@ -14,10 +14,10 @@ import torch
 from remembering import Remembering
 from torch import Tensor
 
-from hoigs.core.camera import Camera
 from hoigs.core.errors import RenderError
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.compositing import Splats, blend, prepare, to_output
 
 Call = tuple[Gaussians, Camera, RenderRequest]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from hoigs.core.clip import FrameStore
 from hoigs.core.errors import ClipError
+from hoigs.core.values.clip import FrameStore
 from hoigs.plugins.readers.clip import ClipFolderReader
 
 

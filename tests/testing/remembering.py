@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 
 RAW = tuple(f.name for f in fields(Gaussians))

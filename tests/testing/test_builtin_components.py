@@ -1,16 +1,16 @@
-"""All that is built in conforms; what has settings without defaults is given some."""
+"""Every built-in component conforms; settings without defaults are set here."""
 
 from __future__ import annotations
 
 import pytest
 
-from hoigs.core.registry import default_registry
+from hoigs.core.registry.registry import default_registry
 from hoigs.testing import Options, Outcome
-from hoigs.testing.door import KINDS, Candidate
 from hoigs.testing.plugin.imports import probe_targets
+from hoigs.testing.runner import KINDS, Candidate
 
 REGISTRY = default_registry()
-SMALL = {  # the same code on less
+SMALL = {  # smaller, but the same code
     "deformation:hexplane-field": {"channels": 2, "resolution": 8, "width": 16, "multires": [1, 2]},
     "deformation:hexplane-skinning": {"resolution": 16, "channels": 4, "width": 16},
     "deformation:triplane-avatar": {"resolution": 16, "channels": 4, "width": 16},
@@ -22,7 +22,7 @@ SMALL = {  # the same code on less
     "density:mcmc": {"cap": 300},
     "density:budget": {"count": 300},
 }
-# rasterizers have tests/rasterizers/test_conformance.py; these need a file of the user's
+# rasterizers are in tests/rasterizers/test_conformance.py; these need a user's file
 ELSEWHERE = {"body:smplx", "body:smpl", "body:smplh"}
 KEYS = [
     key

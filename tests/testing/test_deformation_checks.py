@@ -1,4 +1,4 @@
-"""Every deformation check finds its mutant, and no other does; the right one passes them all."""
+"""Every deformation check finds its mutant and no other; a correct one passes them all."""
 
 from __future__ import annotations
 

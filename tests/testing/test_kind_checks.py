@@ -1,4 +1,4 @@
-"""Every check of densities, bodies, readers, interactions and features kills its mutant alone."""
+"""Each check of every kind but deformations and rasterizers fails its mutant, and only that."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ from typing import Any
 
 import body_mutants
 import density_mutants
+import exporter_mutants
 import features_mutants
 import interaction_mutants
 import pytest
 import reader_mutants
 
 from hoigs.plugins.readers.clip import ClipFolderReader, ClipFolderReaderConfig
-from hoigs.testing import body, density, features, interaction, reader
+from hoigs.testing import body, density, exporter, features, interaction, reader
 from hoigs.testing.checks import run_checks
 from hoigs.testing.material.body import TinyBody
 
-# kind: its package, mutants, the right one, settings
+# kind: checks, subject, mutants, the correct component, settings
 KINDS: dict[str, tuple[Any, ...]] = {
     "density": (
         density.CHECKS, density.DensitySubject, density_mutants.MUTANTS,
@@ -28,6 +29,10 @@ KINDS: dict[str, tuple[Any, ...]] = {
     "reader": (
         reader.CHECKS, reader.ReaderSubject, reader_mutants.MUTANTS, ClipFolderReader,
         ClipFolderReaderConfig(),
+    ),
+    "exporter": (
+        exporter.CHECKS, exporter.ExporterSubject, exporter_mutants.MUTANTS,
+        exporter_mutants.Right, exporter_mutants.RightConfig(),
     ),
     "interaction": (
         interaction.CHECKS, interaction.InteractionSubject, interaction_mutants.MUTANTS,

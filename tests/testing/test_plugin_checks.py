@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from hoigs.core.errors import PluginError
-from hoigs.core.manager import GROUP, PluginManager
-from hoigs.core.registry import Registry
+from hoigs.core.registry.manager import GROUP, PluginManager
+from hoigs.core.registry.registry import Registry
 from hoigs.testing import Options, Outcome, check, check_plugin, conformance
 from hoigs.testing.plugin import CHECKS, subject
 from hoigs.testing.plugin.imports import probe_targets
@@ -26,7 +26,7 @@ def hoigs_components():
 """
 PART = """
 from hoigs.core.config import ComponentConfig
-from hoigs.core.deformation import DeformationModel
+from hoigs.core.interfaces.deformation import DeformationModel
 from hoigs.plugins.deformation.static import Static
 class Config(ComponentConfig):
     pass
@@ -45,7 +45,7 @@ class Mine(DeformationModel):
     def from_config(cls, config, context):
         return Static()
 """
-# what is added to the plugin's module, to the component's, and what the component says otherwise
+# code added to the plugin's module, to the component's module, and other declarations
 MUTANTS: dict[str, tuple[str, str, dict[str, str]]] = {
     "P01": ("import scipy\n", "", {}),
     "P02": ("print('hello')\n", "", {}),
@@ -67,9 +67,11 @@ MUTANTS: dict[str, tuple[str, str, dict[str, str]]] = {
 }
 
 
-def distribution(site: Path, dist: str, code: str = "", part: str = "", **says: str) -> None:
+def distribution(site: Path, dist: str, code: str = "", part: str = "", **declared: str) -> None:
     module = dist.replace("-", "_")
-    hook = HOOK.format(module=module, summary=says.get("summary", "mine"), extra=says.get("extra"))
+    hook = HOOK.format(
+        module=module, summary=declared.get("summary", "mine"), extra=declared.get("extra")
+    )
     (site / f"{module}.py").write_text(code + hook)
     (site / f"{module}_part.py").write_text(PART + part)
     info = site / f"{module}-1.0.dist-info"
@@ -101,10 +103,10 @@ def sites(tmp_path_factory) -> Iterator[dict[str, Path]]:
     sites = {id: tmp_path_factory.mktemp(id) for id in MUTANTS}
     before = list(sys.path)
     sys.path[:0] = [str(site) for site in sites.values()]
-    for id, (code, part, says) in MUTANTS.items():
+    for id, (code, part, declared) in MUTANTS.items():
         dist = f"acme-{id.lower()}"
-        distribution(sites[id], dist, code, part, **says)
-        if "rival" in says:
+        distribution(sites[id], dist, code, part, **declared)
+        if "rival" in declared:
             distribution(sites[id], f"{dist}-rival")
     probe_targets(f"acme_{id.lower()}_part" for id in MUTANTS)
     yield sites
@@ -156,5 +158,5 @@ def test_a_report_loads_no_pytest() -> None:
 def test_as_a_user_would(check) -> None:
     try:
         check()
-    except pytest.skip.Exception as told:  # to a user it is a skip, which says what is not there
-        assert re.search("does not (declare|provide)|declares no", str(told))
+    except pytest.skip.Exception as skipped:  # a skip, with the reason
+        assert re.search("does not (declare|provide)|declares no", str(skipped))

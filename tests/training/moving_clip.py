@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import BodyTrack, Clip, FrameStore, ObjectTrack
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.moment import Moment
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.synthesis import SceneKnobs
-from hoigs.synthesis.objects import MOTIONS
+from hoigs.synthesis import SceneConfig
+from hoigs.synthesis.motion.object_motions import MOTIONS
 
 
 class Recorded(FrameStore):
@@ -66,8 +66,8 @@ def speckled_box(count: int = 80, size: float = 0.5, seed: int = 0) -> Gaussians
 
 def scripted(motion: str, frames: int, shape: Gaussians | None = None) -> Thing:
     """A thing that moves as the built-in clips' object does: its exact poses."""
-    knobs = SceneKnobs.model_validate({"frames": frames, "object": {"motion": motion}})
-    track = MOTIONS[motion](knobs).script().track
+    config = SceneConfig.model_validate({"frames": frames, "object": {"motion": motion}})
+    track = MOTIONS[motion](config).script().track
     return Thing(
         speckled_box() if shape is None else shape,
         torch.from_numpy(np.ascontiguousarray(track.rotations)).float(),

@@ -7,14 +7,14 @@ import functools
 import torch
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import BodyTrack, Clip, FrameStore
-from hoigs.core.entity import Entity
-from hoigs.core.gaussians import SH_C0, Gaussians
-from hoigs.core.moment import BodyPose, Moment
-from hoigs.core.scene import SceneModel
+from hoigs.core.model.entity import Entity
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import BodyTrack, Clip, FrameStore
+from hoigs.core.values.gaussians import SH_C0, Gaussians
+from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
+from hoigs.plugins.deformation.avatars.hexplane_skinning import HexPlaneSkinning
 from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 
@@ -40,11 +40,11 @@ def painted() -> SceneModel:
     """A person with a smoothly coloured head before a wall, the truth of the clip."""
     torch.manual_seed(0)
     body = AnnyBody()
-    model = HexPlaneSkinning(
-        body, resolution=8, channels=4, time_resolution=4, width=16, field_points=160,
-        refine_poses=True, num_frames=FRAMES,
-    )  # fmt: skip
-    person = Entity(body.rest(POINTS), model)
+    config = HexPlaneSkinning.Config(
+        resolution=8, channels=4, time_resolution=4, width=16, field_points=160
+    )
+    model = HexPlaneSkinning(config, body=body, num_frames=FRAMES)
+    person = Entity(body.canonical(POINTS), model)
     with torch.no_grad():
         waves = torch.sin(45 * person.means + torch.tensor([0.0, 1.0, 2.0]))
         person.sh[:, 0] = 0.4 * waves / SH_C0

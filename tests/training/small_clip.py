@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip, FrameStore
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.moment import Moment
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip, FrameStore
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 
 SIZE, FRAMES = 64, 6

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import pytest
-import torch
+from matched import matched, score
 
-from hoigs.core.clip import Clip
-from hoigs.core.compose import compose, compose_density
-from hoigs.core.deformation import DeformationModel
-from hoigs.core.density import DensityControl
-from hoigs.core.moment import Moment
-from hoigs.core.scene import SceneModel
-from hoigs.core.spec import Spec, builtin_summary
-from hoigs.core.train_spec import RatesSpec
-from hoigs.evaluation.metrics import psnr
-from hoigs.training.session import read_clip
+from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.interfaces.density import DensityControl
+from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.spec.schema import Spec, builtin_summary
+from hoigs.core.spec.train_schema import RatesSpec
+from hoigs.core.values.moment import Moment
 from hoigs.training.trainer import Trainer
 
 STEPS = 150
@@ -36,25 +32,7 @@ SMALL: dict[str, tuple[str, ...]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def clip() -> Clip:
-    """The built-in clip at its smallest, 64x64, generated once and cached."""
-    from hoigs.plugins.bodies.anny import AnnyBody
-    from hoigs.synthesis import SceneKnobs, builtin_clip
-
-    return read_clip(builtin_clip(AnnyBody(), SceneKnobs.tiny()))
-
-
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@torch.no_grad()
-def score(model: SceneModel, clip: Clip) -> float:
-    """Mean PSNR, dB, over the training frames."""
-    frames = [clip[position] for position in clip.split["train"]]
-    return sum(
-        psnr(model.render(f.moment, f.camera).color.clamp(0, 1), f.rgb).item() for f in frames
-    ) / len(frames)
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -91,7 +69,7 @@ def of(name: str):
 def test_3dgs(native):
     spec, _, density = native
     assert spec.train.steps == 30_000 and spec.train.sh_interval == 1000
-    assert (density.threshold, density.reset_every) == (2e-4, 3000)
+    assert (density.config.threshold, density.config.reset_every) == (2e-4, 3000)
     assert density.window.refines(600, 30_000) and not density.window.refines(400, 30_000)
     assert not density.window.refines(15_100, 30_000)
     assert spec.train.rates.sh_rest == 0.05 and spec.model["scene"].sh_degree == 3
@@ -101,7 +79,7 @@ def test_3dgs(native):
 @of("4dgs")
 def test_4dgs(native, clip):
     spec, field, density = native
-    assert field.time_span == "half" and field.turning == "added"  # B.1, quirk 1
+    assert field.config.time_span == "half" and field.config.turning == "added"
     assert spec.train.loss.lambda_dssim == 0
     assert spec.train.steps == 3000 + 14_000
     assert field.still  # 3000 static steps
@@ -109,7 +87,7 @@ def test_4dgs(native, clip):
     assert field.still
     field.set_progress(3001 / 17_000)
     assert not field.still
-    assert density.cap == 360_000 and density.reset_every is None
+    assert density.cap == 360_000 and density.config.reset_every is None
     assert set(spec.train.rates.by_extent) == {"means", "planes", "networks"}
     assert field.planes.width == 48 and field.planes.time[2].shape[1] == 150
 
@@ -117,11 +95,14 @@ def test_4dgs(native, clip):
 @of("d3dgs")
 def test_d3dgs(native):
     spec, mlp, density = native
-    assert (mlp.space, mlp.turning) == ("activated", "added")  # B.9
+    assert (mlp.config.space, mlp.config.turning) == ("activated", "added")
     assert mlp.heads.weight.abs().max() > 0  # torch's default start, not rest
     assert mlp.trunk.skip == 5 and len(mlp.trunk.layers) == 8  # "after layer 4"
-    assert density.absolute_gradients and density.threshold == density.split_threshold == 7e-4
-    assert spec.train.steps == 40_000 and mlp.start * 40_000 == pytest.approx(3000)
+    assert (
+        density.absolute_gradients
+        and density.config.threshold == density.config.split_threshold == 7e-4
+    )
+    assert spec.train.steps == 40_000 and mlp.config.start * 40_000 == pytest.approx(3000)
     assert mlp.noise_now() == pytest.approx(0.1 / 12)  # a tenth of a frame of 12
     mlp.set_progress(0.5)
     assert mlp.noise_now() == 0
@@ -132,11 +113,11 @@ def test_d3dgs(native):
 def test_e_d3dgs(native):
     spec, embedded, density = native
     assert not embedded.embedding.any() and not embedded.time_table.any()  # zero starts
-    assert embedded.smoothing == "last-row" and embedded.turning == "added"
+    assert embedded.config.table_smoothness == "last-row" and embedded.config.turning == "added"
     assert embedded.fine_rows == 20
     embedded.set_progress(0.25)
     assert embedded.fine_rows == 100  # 20 000 of 80 000 steps
-    assert spec.train.steps == 80_000 and density.reset_every is None
+    assert spec.train.steps == 80_000 and density.config.reset_every is None
     assert spec.train.loss.lambda_dssim == 0
     assert spec.train.loss.regularizers["embedding_smoothness"] == 1
 
@@ -159,13 +140,13 @@ def test_nerfies(native, clip):
     field.set_progress(0.32)
     assert field.window is None
     assert field.codes.codes.shape == (len(clip.split["train"]), 8)
-    assert not field.ambient
+    assert not field.config.ambient
 
 
 @of("hypernerf-gs")
 def test_hypernerf(native):
     _, field, _ = native
-    assert field.ambient == 2 and field.coordinates.out_features == 2
+    assert field.config.ambient == 2 and field.coordinates.out_features == 2
 
 
 @pytest.mark.parametrize("name", [n for n in SMALL if n.endswith("-gs")])
@@ -176,11 +157,7 @@ def test_compositions_say_what_they_are(name):
 
 @pytest.mark.parametrize("name", SMALL)
 def test_matched_differs_in_the_method_alone(name):
-    ours, hoigs = Spec.load(f"{name}@matched"), Spec.load("hoigs")
-    loss = ours.train.loss.model_copy(update={"regularizers": {}})
-    assert loss == hoigs.train.loss.model_copy(update={"regularizers": {}})
-    assert ours.train.rates == hoigs.train.rates and ours.train.steps == hoigs.train.steps
-    assert ours.rasterizer == hoigs.rasterizer and ours.evaluation == hoigs.evaluation
+    ours, hoigs = matched(name)
     block, theirs = ours.model["scene"], hoigs.model
     assert (block.sh_degree, block.opacity) == (theirs["scene"].sh_degree, theirs["scene"].opacity)
     # one set, in the place of three: as many Gaussians as these have together

@@ -11,18 +11,18 @@ import torch
 from small_clip import FRAMES, small_clip, truth
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import CAMERAS_REFINED, Clip
-from hoigs.core.entity import Entity
 from hoigs.core.errors import CheckpointError, SpecError
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import Rasterizer
-from hoigs.core.scene import SceneModel
-from hoigs.core.train_spec import TrainSpec
+from hoigs.core.interfaces.rasterizer import Rasterizer
+from hoigs.core.model.camera_refinement import CameraRefinement
+from hoigs.core.model.entity import Entity
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.spec.train_schema import TrainSpec
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import CAMERAS_REFINED, Clip
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.rasterizers.warp import WarpRasterizer
-from hoigs.training.camera_refinement import CameraRefinement
 from hoigs.training.trainer import Trainer
 
 WRONG = 2  # the frame whose camera is not where the clip says

@@ -6,15 +6,15 @@ import pytest
 import torch
 from small_clip import small_clip
 
-from hoigs.core.clip import Clip
-from hoigs.core.density import DensityControl
-from hoigs.core.entity import Entity
 from hoigs.core.errors import RenderError, SpecError
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import Capabilities
-from hoigs.core.scene import SceneModel
-from hoigs.core.train_spec import LossSpec, RatesSpec, TrainSpec
-from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.core.interfaces.density import DensityControl
+from hoigs.core.interfaces.rasterizer import Capabilities
+from hoigs.core.model.entity import Entity
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.spec.train_schema import LossSpec, RatesSpec, TrainSpec
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.plugins.deformation.splines.chs import CubicHermite
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.density.absgrad import AbsoluteGradientDensity
 from hoigs.plugins.density.adc import AdaptiveDensity
@@ -28,12 +28,18 @@ STEPS, SHORT, CAP = 60, 20, 150
 # several times the usual rates, so that tens of steps tell
 RATES = RatesSpec(means=2e-3, sh=0.05, opacity=0.1, scale=0.02)
 CONTROLS = {
-    "adc": lambda **kw: AdaptiveDensity(**{"interval": 10, "stop": 0.6, "cap": CAP} | kw),
-    "absgrad": lambda **kw: AbsoluteGradientDensity(
-        **{"interval": 10, "stop": 0.6, "cap": CAP} | kw
+    "adc": lambda **kw: AdaptiveDensity(
+        AdaptiveDensity.Config(**{"interval": 10, "stop": 0.6, "cap": CAP} | kw)
     ),
-    "mcmc": lambda **kw: McmcDensity(**{"interval": 5, "growth": 0.1, "cap": CAP} | kw),
-    "budget": lambda **kw: BudgetDensity(CAP, **{"interval": 10, "stop": 0.6} | kw),
+    "absgrad": lambda **kw: AbsoluteGradientDensity(
+        AbsoluteGradientDensity.Config(**{"interval": 10, "stop": 0.6, "cap": CAP} | kw)
+    ),
+    "mcmc": lambda **kw: McmcDensity(
+        McmcDensity.Config(**{"interval": 5, "growth": 0.1, "cap": CAP} | kw)
+    ),
+    "budget": lambda **kw: BudgetDensity(
+        BudgetDensity.Config(count=CAP, **{"interval": 10, "stop": 0.6} | kw)
+    ),
 }
 
 
@@ -48,10 +54,12 @@ def clip() -> Clip:
 def trainer(
     clip: Clip, control: DensityControl | None, *, moves: bool = False, steps: int = STEPS
 ) -> Trainer:
-    rest = Gaussians.from_points(clip.points, clip.point_colors, opacity=0.3)
-    motion = CubicHermite(keyframes=3) if moves else Static()
-    entity = Entity(rest, motion, kind="scene")
-    model = SceneModel({"scene": entity}, rasterizer=TorchRasterizer(32))
+    canonical = Gaussians.from_points(clip.points, clip.point_colors, opacity=0.3)
+    motion = CubicHermite(CubicHermite.Config(keyframes=3)) if moves else Static()
+    entity = Entity(canonical, motion, kind="scene")
+    model = SceneModel(
+        {"scene": entity}, rasterizer=TorchRasterizer(TorchRasterizer.Config(tile_size=32))
+    )
     spec = TrainSpec(
         steps=steps,
         rates=RATES,
@@ -128,11 +136,11 @@ def _copied(started: Trainer):
 
 
 def test_penalties_of_a_controller_join_the_loss_and_obey_the_spec(clip: Clip) -> None:
-    started = trainer(clip, McmcDensity(opacity_weight=0.5, scale_weight=0.0))
+    started = trainer(clip, McmcDensity(McmcDensity.Config(opacity_weight=0.5, scale_weight=0.0)))
     result = started.objective(clip[0], clip[0].camera, started.generator)
     assert result.weights["regularizer/scene/opacity_l1"] == 0.5
     assert "regularizer/scene/scale_l1" not in result.terms
-    opacities = started.model.entity("scene").rest.opacities
+    opacities = started.model.entity("scene").canonical.opacities
     torch.testing.assert_close(result.terms["regularizer/scene/opacity_l1"], opacities.mean())
     started.objective.spec = LossSpec(regularizers={"opacity_l1": 0.125})
     result = started.objective(clip[0], clip[0].camera, started.generator)
@@ -156,21 +164,21 @@ def test_a_backend_that_cannot_is_refused_before_anything_runs(
 ) -> None:
     cannot = Capabilities(frozenset({"cpu"}), frozenset({"float32"}), True, True)
     monkeypatch.setattr(TorchRasterizer, "capabilities", cannot)
-    with pytest.raises(RenderError, match="AbsoluteGradientDensity decides on absolute"):
+    with pytest.raises(RenderError, match="AbsoluteGradientDensity needs absolute"):
         trainer(clip, AbsoluteGradientDensity())
 
 
 def test_the_spec_names_the_place(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
-    from hoigs.core.compose import compose_density
-    from hoigs.core.registry import default_registry
-    from hoigs.core.spec import Spec
+    from hoigs.core.model.compose import compose_density
+    from hoigs.core.registry.registry import default_registry
+    from hoigs.core.spec.schema import Spec
 
     changes = ["rasterizer.use=rasterizer:torch", "model.scene.density.use=density:absgrad"]
     spec = Spec.load("static", overrides=changes, registry=default_registry())
     assert compose_density(spec, clip)["scene"].absolute_gradients
     cannot = Capabilities(frozenset({"cpu"}), frozenset({"float32"}), True, True)
     monkeypatch.setattr(TorchRasterizer, "capabilities", cannot)
-    with pytest.raises(SpecError, match=r"model\.scene\.density: .*TorchRasterizer does not give"):
+    with pytest.raises(SpecError, match=r"scene\.density: .*TorchRasterizer does not compute"):
         compose_density(spec, clip)
 
 

@@ -4,34 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
+from matched import score
 
-from hoigs.core.clip import Clip
-from hoigs.core.compose import compose, compose_density
-from hoigs.core.scene import SceneModel
-from hoigs.core.spec import Spec
-from hoigs.evaluation.metrics import psnr
-from hoigs.training.session import read_clip
+from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.spec.schema import Spec
 from hoigs.training.trainer import Trainer
 
 MOTION = "model.scene.deformation"
-
-
-@pytest.fixture(scope="module")
-def clip() -> Clip:
-    """The built-in clip at its smallest, 64x64, generated once and cached."""
-    from hoigs.plugins.bodies.anny import AnnyBody
-    from hoigs.synthesis import SceneKnobs, builtin_clip
-
-    return read_clip(builtin_clip(AnnyBody(), SceneKnobs.tiny()))
-
-
-@torch.no_grad()
-def score(model: SceneModel, clip: Clip) -> float:
-    """Mean PSNR, dB, over the training frames."""
-    frames = [clip[position] for position in clip.split["train"]]
-    return sum(
-        psnr(model.render(f.moment, f.camera).color.clamp(0, 1), f.rgb).item() for f in frames
-    ) / len(frames)
 
 
 def test_matched_learns_and_promotes(clip):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
+from matched import matched
 
-from hoigs.core.clip import Clip
-from hoigs.core.compose import compose, compose_density
-from hoigs.core.scene import SceneModel
-from hoigs.core.spec import Spec, builtin_summary
-from hoigs.evaluation.metrics import psnr
-from hoigs.training.session import read_clip
+from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.spec.schema import Spec, builtin_summary
+from hoigs.core.values.clip import Clip
+from hoigs.metrics.psnr import psnr
 from hoigs.training.trainer import Trainer
 
 STEPS = 100
@@ -27,15 +27,6 @@ SMALL: dict[str, tuple[str, ...]] = {
     "d2nerf-gs": ("model.scene.deformation.width=40", "model.scene.deformation.elastic_points=32"),
 }
 WITH_HUMAN = [name for name in SMALL if name != "d2nerf-gs"]
-
-
-@pytest.fixture(scope="module")
-def clip() -> Clip:
-    """The built-in clip at its smallest, 64x64, generated once and cached."""
-    from hoigs.plugins.bodies.anny import AnnyBody
-    from hoigs.synthesis import SceneKnobs, builtin_clip
-
-    return read_clip(builtin_clip(AnnyBody(), SceneKnobs.tiny()))
 
 
 @torch.no_grad()
@@ -84,14 +75,14 @@ def test_exavatar(clip):
     human = model.entity("human").deformation
     assert model.names() == ["scene", "human"]  # no object: its pixels are scene
     assert human.planes.shape == (3, 128, 128, 32) and human.half_box == 1.0
-    assert human.opacity == "one" and human.shape == "isotropic"
-    assert human.skinning == "nearest" and human.candidates is not None
+    assert human.config.opacity == "one" and human.config.shape == "isotropic"
+    assert human.config.skinning == "nearest" and human.candidates is not None
     assert human.posing is not None and len(human.canonical.geometry.linears) == 3
     assert not model.entity("human").means.requires_grad
     loss = spec.train.loss
     assert (loss.scene_loss, loss.human_image) == ("masked", "both")
     assert (loss.lpips, loss.lpips_net, loss.lambda_dssim) == (0.2, "vgg", 0.2)
-    assert loss.regularizers["laplacian"] == 1e5 and human.hand_stiffness == 100
+    assert loss.regularizers["laplacian"] == 1e5 and human.config.hand_stiffness == 100
     assert Spec.load("exavatar").model["human"].points == 167_333  # 10475, subdivided twice
     assert (spec.train.rates.networks, spec.train.rates.pose) == (1e-3, 1e-4)
 
@@ -101,7 +92,8 @@ def test_hugs(clip):
     entity = model.entity("human")
     human = entity.deformation
     assert human.planes.shape == (3, 256, 256, 32)
-    assert (human.opacity, human.shape, human.skinning) == ("learned", "full", "learned")
+    config = human.config
+    assert (config.opacity, config.shape, config.skinning) == ("learned", "full", "learned")
     assert human.posing is None and human.canonical.rotation.out_features == 6
     assert entity.means.requires_grad and entity.sh.shape[1] == 1
     assert model.entity("scene").sh.shape[1] == 16
@@ -116,7 +108,7 @@ def test_hugs(clip):
 def test_neuman_is_skinned_by_the_template(clip):
     spec, model = native("neuman-gs", clip)
     human = model.entity("human").deformation
-    assert human.skinning == "nearest" and human.canonical.skinning is None
+    assert human.config.skinning == "nearest" and human.canonical.skinning is None
     assert model.names() == ["scene", "human"]
     assert spec.train.loss.scene_loss == "masked"
 
@@ -142,7 +134,7 @@ def test_hold_is_rigid(clip):
 def test_d2nerf_sorts_gaussians(clip):
     spec, model = native("d2nerf-gs", clip)
     field = model.entity("scene").deformation
-    assert field.skew == 1.75
+    assert field.config.skew == 1.75
     field.set_progress(0.0)
     ramp = field.regularizers()["entropy"] / field.entropy()
     assert spec.train.loss.regularizers["entropy"] * ramp.item() == pytest.approx(1e-4)
@@ -158,11 +150,7 @@ def test_compositions_say_what_they_are(name):
 
 @pytest.mark.parametrize("name", SMALL)
 def test_matched_differs_in_the_method_alone(name):
-    ours, hoigs = Spec.load(f"{name}@matched"), Spec.load("hoigs")
-    loss = ours.train.loss.model_copy(update={"regularizers": {}})
-    assert loss == hoigs.train.loss.model_copy(update={"regularizers": {}})
-    assert ours.train.rates == hoigs.train.rates and ours.train.steps == hoigs.train.steps
-    assert ours.rasterizer == hoigs.rasterizer and ours.evaluation == hoigs.evaluation
+    ours, hoigs = matched(name)
     parts = [key for key in ("scene", "human", "object") if key in (ours.entities or ())]
     # what a method has no entity for is scene, which then gets its share of Gaussians
     points = sum(ours.model[key].points for key in parts)

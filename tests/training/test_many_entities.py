@@ -5,15 +5,15 @@ from __future__ import annotations
 import torch
 from moving_clip import clip_of, scripted, speckled_box
 
-from hoigs.core.clip import BodyTrack
-from hoigs.core.compose import compose, compose_density
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.moment import BodyPose
-from hoigs.core.spec import Spec
+from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.spec.schema import Spec
+from hoigs.core.values.clip import BodyTrack
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.plugins.deformation.articulated import Articulated
-from hoigs.plugins.deformation.chs import CubicHermite
-from hoigs.plugins.deformation.rigid_spline import RigidSpline
+from hoigs.plugins.deformation.rigid.articulated import Articulated
+from hoigs.plugins.deformation.rigid.rigid_spline import RigidSpline
+from hoigs.plugins.deformation.splines.chs import CubicHermite
 from hoigs.training.trainer import Trainer
 
 FRAMES = 4

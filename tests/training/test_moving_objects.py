@@ -8,11 +8,11 @@ import pytest
 import torch
 from moving_clip import Thing, backdrop, clip_of, scripted
 
-from hoigs.core.clip import Clip, ObjectTrack
-from hoigs.core.compose import compose, compose_density
-from hoigs.core.rotation import axis_angle_to_matrices
-from hoigs.core.scene import SceneModel
-from hoigs.core.spec import Spec
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.spec.schema import Spec
+from hoigs.core.values.clip import Clip, ObjectTrack
 from hoigs.training.trainer import Trainer
 
 FRAMES = 17
@@ -125,7 +125,7 @@ def test_a_resumed_run_equals_an_unbroken_one_though_knots_move(use, clip, thing
 
 def test_parameters_that_are_views_are_made_dense_for_adam():
     """A view's elements lie apart in memory, where fused Adam does not look for them."""
-    from hoigs.core.train_spec import RatesSpec, WarmupSpec
+    from hoigs.core.spec.train_schema import RatesSpec, WarmupSpec
     from hoigs.training.optimizer import GroupedAdam
 
     thing = scripted("pushed", 3)

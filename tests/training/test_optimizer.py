@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from hoigs.core.entity import Entity
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.scene import SceneModel
-from hoigs.core.topology import TopologyChange
-from hoigs.core.train_spec import RatesSpec, WarmupSpec
-from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.core.model.entity import Entity
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.spec.train_schema import RatesSpec, WarmupSpec
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.topology import TopologyChange
+from hoigs.plugins.deformation.splines.chs import CubicHermite
 from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.training.optimizer import GroupedAdam, Schedule, named_rates
@@ -18,11 +18,11 @@ from hoigs.training.optimizer import GroupedAdam, Schedule, named_rates
 
 def make_model() -> SceneModel:
     torch.manual_seed(0)
-    rest = Gaussians.from_points(torch.randn(12, 3) * 0.3 + torch.tensor([0.0, 0.0, 3.0]))
+    canonical = Gaussians.from_points(torch.randn(12, 3) * 0.3 + torch.tensor([0.0, 0.0, 3.0]))
     thing = Gaussians.from_points(torch.randn(5, 3) * 0.1 + torch.tensor([0.0, 0.0, 2.0]))
     entities = {
-        "scene": Entity(rest, Static(), kind="scene"),
-        "object": Entity(thing, CubicHermite(keyframes=4), kind="object"),
+        "scene": Entity(canonical, Static(), kind="scene"),
+        "object": Entity(thing, CubicHermite(CubicHermite.Config(keyframes=4)), kind="object"),
     }
     return SceneModel(entities, rasterizer=TorchRasterizer())
 
@@ -118,8 +118,8 @@ def test_which_rates_are_in_units_of_the_extent():
 
 
 def with_bands(sh_rest: float) -> tuple[GroupedAdam, torch.nn.Parameter]:
-    rest = Gaussians.from_points(torch.randn(6, 3), sh_degree=2)
-    model = SceneModel({"scene": Entity(rest, Static())}, rasterizer=TorchRasterizer())
+    canonical = Gaussians.from_points(torch.randn(6, 3), sh_degree=2)
+    model = SceneModel({"scene": Entity(canonical, Static())}, rasterizer=TorchRasterizer())
     adam = GroupedAdam(model, RatesSpec(sh_rest=sh_rest), WarmupSpec(), scene_extent=1.0)
     adam.set_progress(0.0)
     return adam, adam.names["entities.scene.sh"]

@@ -9,9 +9,9 @@ import torch
 from portrait import SIZE, Shots, portrait
 from torch import Tensor
 
-from hoigs.core.clip import Clip, ObjectTrack
-from hoigs.core.compose import compose
-from hoigs.core.spec import Spec
+from hoigs.core.model.compose import compose
+from hoigs.core.spec.schema import Spec
+from hoigs.core.values.clip import Clip, ObjectTrack
 from hoigs.training.objective import JointObjective
 from hoigs.training.trainer import Trainer
 

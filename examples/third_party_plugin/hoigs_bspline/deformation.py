@@ -9,20 +9,21 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from hoigs.core.clip import ObjectTrack
 from hoigs.core.config import ComponentConfig
-from hoigs.core.context import BuildContext
-from hoigs.core.deformation import DeformationModel
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.interaction import Residual
-from hoigs.core.moment import Moment
-from hoigs.core.topology import TopologyChange
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.values.clip import ObjectTrack
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import Residual
+from hoigs.core.values.topology import TopologyChange
 
 
 class UniformBSplineConfig(ComponentConfig):
-    """Attributes: step: frames between two control points."""
+    """Settings of `deformation:b-spline`."""
 
-    step: int = Field(4, ge=1)
+    step: int = Field(default=4, ge=1)
+    """Frames between two control points."""
 
 
 def basis(u: float) -> tuple[float, float, float, float]:
@@ -40,34 +41,40 @@ def basis_derivative(u: float) -> tuple[float, float, float, float]:
 
 
 class UniformBSpline(DeformationModel):
-    """Means on a B-spline; all else as at rest.
+    """Means on a B-spline; everything else as in the canonical Gaussians.
 
     Args:
-        control_points: K >= 4, that is K - 3 segments.
-        track: where the object starts; without one every control point is at rest.
+        num_frames: of the clip; with `step` it gives the number of segments, at least one.
+        track: poses that the control points start at; without one, all are the canonical means.
     """
 
+    Config: ClassVar = UniformBSplineConfig
     provides = frozenset({"velocity"})  # so that features:spline-motion can describe it
     owns = frozenset({"means"})
     per_gaussian = ("control",)
     rates: ClassVar[Mapping[str, str]] = {"control": "keyframes"}
 
-    def __init__(self, control_points: int, *, track: ObjectTrack | None = None) -> None:
+    def __init__(
+        self,
+        config: UniformBSplineConfig | None = None,
+        *,
+        num_frames: int,
+        track: ObjectTrack | None = None,
+    ) -> None:
         super().__init__()
-        if control_points < 4:
-            raise ValueError(f"a cubic B-spline needs 4 control points, got {control_points}")
-        self.segments, self.track = control_points - 3, track
-        self.rest_space = "world" if track is None else "canonical"
+        self.config = config or UniformBSplineConfig()
+        self.segments = max(1, round((num_frames - 1) / self.config.step))
+        self.track = track
+        self.input_space = "world" if track is None else "canonical"
 
     @classmethod
     def from_config(cls, config: UniformBSplineConfig, context: BuildContext) -> Self:
         if context.clip is None:
             raise ValueError("deformation:b-spline needs a clip, for its number of frames")
-        segments = max(1, round((context.clip.num_frames - 1) / config.step))
-        return cls(segments + 3, track=context.object_track)
+        return cls(config, num_frames=context.clip.num_frames, track=context.object_track)
 
-    def bind(self, rest: Gaussians) -> None:
-        means = rest.means.detach()
+    def bind(self, canonical: Gaussians) -> None:
+        means = canonical.means.detach()
         placed = [self._start(means, (i - 1) / self.segments) for i in range(self.segments + 3)]
         self.control = nn.Parameter(torch.stack(placed, dim=1))
 
@@ -85,17 +92,17 @@ class UniformBSpline(DeformationModel):
         return (self.control[:, k : k + 4] * w[:, None]).sum(1)
 
     def forward(
-        self, rest: Gaussians, moment: Moment, residual: Residual | None = None
+        self, canonical: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
         means = self._at(moment.time, basis)
         if residual is not None and residual.means is not None:
             means = means + residual.means
-        return rest.replace(means=means)
+        return canonical.replace(means=means)
 
-    def velocity(self, rest: Gaussians, moment: Moment) -> Tensor:
+    def velocity(self, canonical: Gaussians, moment: Moment) -> Tensor:
         """Metres per segment."""
         return self._at(moment.time, basis_derivative)
 
     def on_topology(self, change: TopologyChange) -> None:
         super().on_topology(change)
-        self.control.data += change.offsets[:, None]  # a turning object would turn these too
+        self.control.data += change.offsets[:, None]  # exact unless the object turns

@@ -40,7 +40,7 @@ SHOWN_TERMS = 6
 
 
 def read_metrics(file: Path) -> list[dict[str, Any]]:
-    """The records of metrics.jsonl; none when the file is absent.
+    """The records of metrics.jsonl; none if the file is absent.
 
     Raises:
         HoigsError: a line is not JSON; the message has its number.
@@ -85,7 +85,7 @@ def loss_curve(records: Sequence[dict[str, Any]]) -> str:
 
 
 def psnr_curve(records: Sequence[dict[str, Any]]) -> str:
-    """PSNR of a few frames of each split, as training went."""
+    """PSNR of a few frames of each split over training."""
     scored = [r for r in records if r.get("psnr")]
     splits = sorted({split for r in scored for split in r["psnr"]}, reverse=True)
 
@@ -117,7 +117,7 @@ def count_curve(records: Sequence[dict[str, Any]]) -> str:
 
 
 def frame_bars(view: ViewScores) -> str:
-    """PSNR of each scored frame, full and human + object, so that no mean hides a bad one."""
+    """PSNR of each scored frame, of the full image and of human and object."""
     regions = {"full": "full frame", "human_object": "human + object"}
 
     def paint(axes: Axes) -> None:
@@ -141,7 +141,7 @@ def frame_bars(view: ViewScores) -> str:
 
 
 def smoothed(values: Sequence[float], keep: float = 0.8) -> list[float]:
-    """Exponential moving average without the pull of its start."""
+    """Exponential moving average, corrected for its start as in Adam."""
     out, mean, weight = [], 0.0, 0.0
     for value in values:
         mean, weight = keep * mean + (1 - keep) * value, keep * weight + (1 - keep)

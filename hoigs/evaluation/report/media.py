@@ -11,9 +11,11 @@ from typing import TypeVar
 import numpy as np
 from PIL import Image
 
-from hoigs.core.clip import Clip, Frame
-from hoigs.core.scene import SceneModel
-from hoigs.evaluation.draw import (
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.clip import Clip, Frame
+from hoigs.evaluation.orbits import orbit_cameras
+from hoigs.evaluation.protocol import NotComputed
+from hoigs.evaluation.report.draw import (
     cut_out,
     depth_picture,
     depth_range,
@@ -21,10 +23,8 @@ from hoigs.evaluation.draw import (
     error_picture,
     picture,
 )
-from hoigs.evaluation.orbits import orbit_cameras
-from hoigs.evaluation.protocol import NotComputed
-from hoigs.evaluation.regions import default_band, region_masks
 from hoigs.evaluation.scores import Evaluation, FrameScores
+from hoigs.metrics.regions import default_band, region_masks
 
 Item = TypeVar("Item")
 
@@ -81,7 +81,7 @@ def frozen_orbit(model: SceneModel, clip: Clip, position: int) -> str:
 
 
 def cutouts(model: SceneModel, clip: Clip, position: int) -> list[Cutout]:
-    """Every entity alone, as it stands at one moment."""
+    """Every entity rendered alone at one moment."""
     moment, camera = clip.moments[position], clip.cameras[position]
     return [
         Cutout(
@@ -128,7 +128,7 @@ def _compare(model: SceneModel, frame: Frame, scored: FrameScores, name: str) ->
 
 
 def key_position(clip: Clip, samples: int = 24) -> int:
-    """The moment when most of the human and the object are close and seen; the middle if never."""
+    """Position of the frame with the largest interaction region; the middle if there is none."""
     band = default_band(clip.cameras[0].width, clip.cameras[0].height)
     best, area = len(clip) // 2, 0
     for position in evenly(range(len(clip)), samples):
@@ -139,7 +139,7 @@ def key_position(clip: Clip, samples: int = 24) -> int:
 
 
 def evenly(items: Sequence[Item], count: int) -> list[Item]:
-    """At most `count` items, evenly spaced, both ends inset alike."""
+    """At most `count` items, evenly spaced."""
     if len(items) <= count:
         return list(items)
     return [items[int((i + 0.5) * len(items) / count)] for i in range(count)]

@@ -8,7 +8,7 @@ for (const comparer of document.querySelectorAll(".comparer")) {
   buttons.forEach((button, i) => button.addEventListener("click", () => show(i)));
   for (const input of comparer.querySelectorAll("input[type=range]")) {
     input.addEventListener("input", () => {
-      // all stages move together, so that flipping through frames keeps the seam in place
+      // all stages move together, so that flipping through frames keeps the dividing line in place
       comparer.style.setProperty("--at", input.value + "%");
       for (const other of comparer.querySelectorAll("input[type=range]")) other.value = input.value;
     });

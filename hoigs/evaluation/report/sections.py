@@ -1,4 +1,4 @@
-"""The report's sections as HTML; every word from outside is escaped here."""
+"""HTML of the report's sections; all texts from outside are escaped here."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from html import escape
 from typing import Any
 
 from hoigs.evaluation.protocol import NotComputed, Value
-from hoigs.evaluation.regions import MEANING
 from hoigs.evaluation.report.media import Comparison, Cutout
 from hoigs.evaluation.scores import Evaluation, Table, Timing
+from hoigs.metrics.regions import MEANING
 
 
 def tiles(evaluation: Evaluation, records: Sequence[dict[str, Any]]) -> str:
-    """The headline numbers; what was not computed is left out here and explained below."""
+    """The headline numbers, without those that were not computed."""
     shown: list[tuple[str, str, str]] = []
     first = evaluation.views[0]
     for region, label in (("full", "full frame"), ("human_object", "human + object")):
@@ -45,7 +45,7 @@ def _decibels(value: Value, what: str, view: str) -> list[tuple[str, str, str]]:
 
 
 def pair(image: str, left: str, right: str, alt: str) -> str:
-    """One picture whose halves carry a caption each."""
+    """One picture with a caption for each half."""
     return (
         f"<figure class='pair'><img src='{image}' alt='{escape(alt, quote=True)}'>"
         f"<figcaption><span>{escape(left)}</span><span>{escape(right)}</span></figcaption></figure>"
@@ -53,7 +53,7 @@ def pair(image: str, left: str, right: str, alt: str) -> str:
 
 
 def comparer(comparisons: Sequence[Comparison]) -> str:
-    """Video against render under a slider, the error beside it, and thumbnails to choose by."""
+    """Video and render under a slider, the error beside them, and thumbnails to choose a frame."""
     stages, thumbs = [], []
     for i, c in enumerate(comparisons):
         on = " on" if i == 0 else ""
@@ -89,7 +89,7 @@ def apart(cutouts: Sequence[Cutout]) -> str:
 
 
 def table(source: Table) -> str:
-    """A table with its protocol at its foot."""
+    """A table with its notes."""
     head = "".join(f"<th>{escape(c)}</th>" for c in source.columns)
     body = "".join(
         "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>"
@@ -109,7 +109,7 @@ def legend() -> str:
 
 
 def time_bar(timing: Timing | NotComputed) -> str:
-    """Where a frame's time goes."""
+    """The shares of deformation and rasterization in the time of a frame."""
     if isinstance(timing, NotComputed):
         return ""
     share = 100 * timing.deform_ms / (timing.deform_ms + timing.raster_ms)
@@ -122,12 +122,12 @@ def time_bar(timing: Timing | NotComputed) -> str:
 
 
 def document(title: str, text: str) -> str:
-    """A file of the run, folded away."""
+    """The text of a file, collapsed."""
     return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>"
 
 
 def provenance(record: dict[str, Any]) -> str:
-    """Versions as a list; the whole record folded away."""
+    """Versions as a list, and the whole record collapsed."""
     versions = record.get("versions", {})
     items = "".join(
         f"<div><dt>{escape(str(k))}</dt><dd>{escape(str(v))}</dd></div>"

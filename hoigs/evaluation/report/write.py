@@ -1,4 +1,4 @@
-"""write_report: one HTML file that shows what a run made and how good it is."""
+"""write_report: one HTML file with the renders, scores, curves and provenance of a run."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from string import Template
 from typing import Any
 
 import hoigs
-from hoigs.core.clip import Clip
-from hoigs.core.scene import SceneModel
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.progress import Progress, no_progress
+from hoigs.core.values.clip import Clip
 from hoigs.evaluation.report import curves, media, sections
 from hoigs.evaluation.scores import Evaluation, Table, score_table, size_table, timing_table
 
@@ -23,18 +24,18 @@ def write_report(
     clip: Clip,
     evaluation: Evaluation,
     *,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Path:
-    """Draw, tabulate and write `report.html` into a run folder, and return its path.
+    """Write `report.html` into a run folder, and return its path.
 
-    The page is self-contained: pictures are inside it and it asks the network for nothing.
-    Reads the run's metrics.jsonl, spec.yaml and provenance.json, each if it is there.
+    The page is self-contained and loads nothing from the network. It includes the run's
+    metrics.jsonl, spec.yaml and provenance.json where they exist.
 
     Raises:
         HoigsError: metrics.jsonl is damaged.
     """
     folder = Path(run_folder)
-    report = progress or (lambda done, text: None)
+    report = progress or no_progress
     records = curves.read_metrics(folder / "metrics.jsonl")
     was_training = model.training
     model.eval()
@@ -72,7 +73,7 @@ def write_report(
 
 
 def _lead(model: SceneModel, clip: Clip) -> str:
-    """What was reconstructed, in a sentence."""
+    """One sentence on what was reconstructed."""
     kinds = {name: model.entity(name).kind for name in model.entities}
     cast = [name if name == kind else f"{name} ({kind})" for name, kind in kinds.items()]
     listed = " and ".join([", ".join(cast[:-1]), cast[-1]]) if len(cast) > 1 else cast[0]
@@ -94,9 +95,9 @@ def _compared(model: SceneModel, clip: Clip, evaluation: Evaluation) -> str:
     comparisons = media.comparisons(model, clip, evaluation)
     unseen = all(view.protocol.split == "test" for view in evaluation.views)
     return _section(
-        "Frames it never saw" if unseen else "Frame by frame",
+        "Frames outside training" if unseen else "Frame by frame",
         ("None of these images took part in training. " if unseen else "")
-        + "Drag the seam; choose a frame below.",
+        + "Drag the line between them; choose a frame below.",
         sections.comparer(comparisons),
     )
 
@@ -106,11 +107,11 @@ def _space(model: SceneModel, clip: Clip) -> str:
     index = clip.moments[position].index
     orbit = media.frozen_orbit(model, clip, position)
     return _section(
-        "One moment, held still",
+        "One moment from other views",
         f"Frame {index} is stopped while the camera swings 20° to each side of where it was.",
         sections.pair(orbit, "Colour", "Depth, near is bright", "orbit around a frozen moment"),
     ) + _section(
-        "Taken apart",
+        "Entities on their own",
         "Every entity is a model of its own and can be drawn alone, moved or left out.",
         sections.apart(media.cutouts(model, clip, position)),
     )
@@ -140,14 +141,14 @@ def _training(records: Sequence[dict[str, Any]]) -> str:
 def _cost(evaluation: Evaluation) -> str:
     tables = (timing_table(evaluation.timing), size_table(evaluation.sizes))
     return _section(
-        "What it costs",
+        "Time and size",
         "",
         sections.time_bar(evaluation.timing) + "".join(sections.table(t) for t in tables),
     )
 
 
 def _faults(folder: Path) -> str:
-    """What was wrong with the clip, each with what to do; nothing when all was well."""
+    """The clip's defects with their remedies; empty if there are none."""
     provenance = folder / "provenance.json"
     found = json.loads(provenance.read_text()).get("clip_faults") if provenance.is_file() else None
     if not found:
@@ -155,7 +156,7 @@ def _faults(folder: Path) -> str:
     rows = [(fault["what"], fault["do"]) for fault in found]
     return _section(
         "What is wrong with the clip",
-        "Training went on all the same.",
+        "Training tolerated these defects.",
         sections.table(Table("", ("found", "what to do, and what was done"), rows, ())),
     )
 
@@ -171,12 +172,12 @@ def _origin(folder: Path) -> str:
             sections.document("spec.yaml, resolved: it makes this run again", spec.read_text())
         )
     absent = [file.name for file in (provenance, spec) if not file.is_file()]
-    return _section("Where it comes from", f"Absent: {', '.join(absent)}." if absent else "",
+    return _section("Provenance", f"Absent: {', '.join(absent)}." if absent else "",
                     "".join(parts))  # fmt: skip
 
 
-def _section(title: str, say: str, content: str) -> str:
-    words = f"<p class='say'>{escape(say)}</p>" if say else ""
+def _section(title: str, lead: str, content: str) -> str:
+    words = f"<p class='intro'>{escape(lead)}</p>" if lead else ""
     return f"<section><h2>{escape(title)}</h2>{words}{content}</section>"
 
 

@@ -1,4 +1,4 @@
-"""body:anny: the built-in body, an adult of the open Anny model with ten shape directions."""
+"""body:anny: the built-in body, an adult of Anny (an open body model) with ten shape directions."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.rotation import matrices_to_axis_angle
-from hoigs.core.skinning import joint_transforms, skin
+from hoigs.core.maths.rotations import matrices_to_axis_angle
+from hoigs.core.maths.skinning import joint_transforms, skin
 from hoigs.plugins.bodies.linear import LinearBody
 
 ASSET = Path(__file__).parent / "data" / "anny_body.npz"
@@ -24,10 +24,9 @@ class AnnyConfig(ComponentConfig):
 class AnnyBody(LinearBody):
     """13,718 vertices, 52 joints in SMPL-X's order, ten shape directions; CC0 (data/NOTICE.md).
 
-    betas = 0 is the mean, gender-neutral adult; each coefficient counts standard deviations over
-    adults. The asset rests in an A-pose; it is turned into the T-pose once, here, so that zero
-    means to this body what it means to SMPL-X. Shape directions turn with it, which keeps
-    `shaped` linear.
+    betas = 0 is the mean, gender-neutral adult; each coefficient is in standard deviations over
+    adults. The asset is in an A-pose; the constructor turns it into the T-pose, so that the zero
+    pose is that of SMPL-X. Shape directions turn with it, which keeps `shaped` linear.
 
     Attributes:
         uv: texture coordinates, v up, and face_uv: their indices by triangle corner.
@@ -45,8 +44,8 @@ class AnnyBody(LinearBody):
         turn = to_t_pose[:, :3, :3]
         joints = (turn @ _double(asset["joints"])[..., None])[..., 0] + to_t_pose[:, :3, 3]
         blend = torch.einsum("vj,jab->vab", weights, turn)
-        # a joint's shift by betas is carried through the chain of turns like the joint itself,
-        # and moves the skin bound to it, so directions take the way that the template takes
+        # a joint's displacement by betas is turned along the chain like the joint itself, and moves
+        # the skin that is bound to it, so directions are transformed as the template is
         shapes, joint_shapes = _double(asset["shapedirs"]), _double(asset["joint_shapedirs"])
         carried = _carried(joint_shapes, turn, parents)
         slip = carried - torch.einsum("jab,kjb->kja", turn, joint_shapes)
@@ -81,7 +80,7 @@ def _dense_weights(weights: np.ndarray, joints: np.ndarray, count: int) -> Float
 def _carried(
     offsets: Float[Tensor, "B J 3"], turn: Float[Tensor, "J 3 3"], parents: tuple[int, ...]
 ) -> Float[Tensor, "B J 3"]:
-    """Rest offsets of the joints once the tree is turned: bones turn, and add up from the root."""
+    """Offsets of the joints after the tree is turned: bones are turned and summed from the root."""
     places = [offsets[:, 0]]
     for joint in range(1, len(parents)):
         above = parents[joint]
@@ -93,7 +92,7 @@ def _carried(
 def _t_pose_transforms(
     asset: dict[str, np.ndarray], parents: tuple[int, ...]
 ) -> Float[Tensor, "J 4 4"]:
-    """Transforms from the asset's A-pose to the T-pose (`tpose_rot` turns each bone globally)."""
+    """Transforms from the asset's A-pose to the T-pose; `tpose_rot` has global bone rotations."""
     turns = _double(asset["tpose_rot"])
     local = [turns[j] if p < 0 else turns[p].mT @ turns[j] for j, p in enumerate(parents)]
     rotations = matrices_to_axis_angle(torch.stack(local))

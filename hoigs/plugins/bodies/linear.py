@@ -1,4 +1,4 @@
-"""LinearBody: what every body made of a template, shape directions and skinning weights shares."""
+"""LinearBody: a body made of a template, shape directions and skinning weights."""
 
 from __future__ import annotations
 
@@ -8,19 +8,26 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hoigs.core.body import BODY_JOINT_PARTS, PART_NAMES, BodyModel, BodyOutput, BodySurface
 from hoigs.core.errors import HoigsError
-from hoigs.core.moment import BodyPose
-from hoigs.core.skinning import joint_transforms, skin, transform_points
+from hoigs.core.interfaces.body import (
+    BODY_JOINT_PARTS,
+    HEAD_PART,
+    LEFT_HAND_PART,
+    PART_NAMES,
+    RIGHT_HAND_PART,
+    BodyModel,
+    BodyOutput,
+    BodySurface,
+)
+from hoigs.core.maths.skinning import joint_transforms, skin, transform_points
+from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.bodies.sampling import sample_surface
-
-HEAD, LEFT_HAND, RIGHT_HAND = 3, 8, 9
 
 
 def parts_of_joints(count: int) -> tuple[int, ...]:
-    """Part (index of PART_NAMES) of each of a model's 52 or 55 joints."""
-    face = (HEAD,) * (count - 52)
-    return (*BODY_JOINT_PARTS, *face, *(LEFT_HAND,) * 15, *(RIGHT_HAND,) * 15)
+    """Part (an index of PART_NAMES) of each of a model's 52 or 55 joints."""
+    face = (HEAD_PART,) * (count - 52)
+    return (*BODY_JOINT_PARTS, *face, *(LEFT_HAND_PART,) * 15, *(RIGHT_HAND_PART,) * 15)
 
 
 class LinearBody(BodyModel):
@@ -83,9 +90,9 @@ class LinearBody(BodyModel):
         """The same pose in the "flat" hand convention; this body has no mean hand to add."""
         if pose.hand_pose_convention != "flat":
             raise HoigsError(
-                f"{type(self).__name__} has no mean hand: it takes poses with "
-                'hand_pose_convention="flat", got "mean"; convert them with the SMPL-X model '
-                "that they come from: SmplxBody(path).flat_hands(pose)"
+                f"{type(self).__name__} has no mean hand: it expects poses with "
+                'hand_pose_convention="flat", got "mean"; convert them with the SMPL-X model that '
+                "they come from: SmplxBody(config).flat_hands(pose)"
             )
         return pose
 
@@ -122,7 +129,7 @@ class LinearBody(BodyModel):
         if betas.shape[-1] != self.num_betas:
             raise HoigsError(
                 f"{type(self).__name__} takes {self.num_betas} shape coefficients (betas), got "
-                f"{betas.shape[-1]}; pad with zeros or cut them"
+                f"{betas.shape[-1]}; pad them with zeros or truncate them"
             )
         return betas
 

@@ -1,4 +1,4 @@
-"""The users' own model files of the SMPL family, checked, and what a track asks of them."""
+"""The user's own model files of the SMPL family: reading and checking them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.clip import BodyTrack
 from hoigs.core.errors import HoigsError
+from hoigs.core.values.clip import BodyTrack
 
 Layout = Mapping[str, tuple[int | str, ...]]
 GENDERS = ("female", "male", "neutral")
@@ -24,11 +24,11 @@ def read_model(key: str, path: Path, layout: Layout, where: str) -> dict[str, np
     """The arrays of a model file, with their shapes checked; nothing is unpickled.
 
     Args:
-        key: "body:smplx", for messages. where: a sentence on where such files come from.
-        layout: key to shape; a letter has one value in a file.
+        key: of the component, for messages. where: a sentence on where such files come from.
+        layout: shape of each array by its key; a letter has one value within a file.
 
     Raises:
-        HoigsError: the file is absent, no .npz, or of another layout.
+        HoigsError: the file is absent, not an .npz file, or has another layout.
     """
     if not path.is_file():
         raise HoigsError(f"{key}: there is no file {path}; {where}")
@@ -41,7 +41,7 @@ def read_model(key: str, path: Path, layout: Layout, where: str) -> dict[str, np
             missing = [k for k in layout if k not in file.files]
             if missing:
                 raise HoigsError(
-                    f"{path} is not a whole {name} model: it lacks {', '.join(missing)} (found "
+                    f"{path} is not a complete {name} model: it lacks {', '.join(missing)} (found "
                     f"{', '.join(sorted(file.files)) or 'nothing'}); {where}"
                 )
             optional = ("hands_meanl", "hands_meanr")
@@ -60,7 +60,8 @@ def _check_shapes(
         shape = arrays[key].shape
         expected = [sizes.get(n, n) if isinstance(n, str) else n for n in form]
         fits = len(shape) == len(form) and all(
-            isinstance(want, str) or want == got for want, got in zip(expected, shape, strict=True)
+            isinstance(size, str) or size == found
+            for size, found in zip(expected, shape, strict=True)
         )
         if not fits:
             family = any(isinstance(n, int) and n > 3 for n in form)
@@ -78,7 +79,7 @@ def read_template(path: Path) -> Float[Tensor, "V 3"]:
     """A person's zero-pose vertices from a mesh file, in the model's order, metres.
 
     Raises:
-        HoigsError: the file is absent or no mesh.
+        HoigsError: the file is absent or not a mesh.
     """
     import trimesh
 
@@ -87,8 +88,8 @@ def read_template(path: Path) -> Float[Tensor, "V 3"]:
     try:
         mesh: Any = trimesh.load(path, process=False, maintain_order=True, allow_remote=False)
         points = np.asarray(mesh.vertices, dtype=np.float64)
-    except Exception as error:  # its readers raise anything on a damaged file
-        raise HoigsError(f"{path} is no mesh ({type(error).__name__}: {error})") from error
+    except Exception as error:  # trimesh raises errors of any kind on a damaged file
+        raise HoigsError(f"{path} is not a mesh ({type(error).__name__}: {error})") from error
     return torch.from_numpy(points)
 
 
@@ -103,18 +104,18 @@ def file_gender(path: Path) -> str | None:
 
 
 def require_gender(key: str, path: Path, track: BodyTrack | None) -> None:
-    """Refuse a model file of another gender than the track was fitted with.
+    """Refuse a model file of another gender than that of the model the track was fitted with.
 
     A neutral body in place of a male or female one gives overlays that are visibly shifted
-    (zc-alexfan/arctic#52). A file whose name tells no gender is taken as it is.
+    (zc-alexfan/arctic#52). A file whose name has no gender is accepted.
 
     Raises:
-        HoigsError: the file's name says another gender.
+        HoigsError: the file's name has another gender.
     """
-    wanted = track.gender if track else None
-    got = file_gender(path)
-    if wanted is not None and got is not None and wanted != got:
+    expected = track.gender if track else None
+    found = file_gender(path)
+    if expected is not None and found is not None and expected != found:
         raise HoigsError(
-            f"{key}: the clip's poses were fitted with the {wanted} model, {path} is the {got} "
-            f"one; give the {wanted} file"
+            f"{key}: the clip's poses were fitted with the {expected} model, {path} is the {found} "
+            f"one; give the {expected} file"
         )

@@ -1,4 +1,4 @@
-"""Points spread evenly over a body's surface, with everything that rides along."""
+"""Points spread evenly over the surface of a body, with weights, parts and triangles."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hoigs.core.body import BodySurface
-from hoigs.core.gaussians import neighbour_distances
+from hoigs.core.interfaces.body import BodySurface
+from hoigs.core.values.gaussians import neighbour_distances
 
 
 def sample_surface(
@@ -18,25 +18,25 @@ def sample_surface(
     count: int | None,
     seed: int,
 ) -> BodySurface:
-    """One point a vertex (count None), or `count` by area: stratified, so spread evenly.
+    """One point at each vertex (count None), or `count` points spread evenly by area.
 
-    Points sit at equal steps of the cumulated face area with one random shift a step, which keeps
-    clumps and holes away that independent draws would have. The same seed gives the same points.
+    The points are at equal steps of the cumulated face area, each randomly shifted within its step,
+    which avoids the clusters and gaps of independent draws. A seed always gives the same points.
     """
     if count is None:
         face, barycentric = _at_vertices(vertices, faces)
     else:
         face, barycentric = _by_area(vertices, faces, count, seed)
     corners = faces[face]
-    mixed = lambda values: (values[corners] * barycentric[..., None]).sum(1)  # noqa: E731
-    points = mixed(vertices)
+    interpolated = lambda values: (values[corners] * barycentric[..., None]).sum(1)  # noqa: E731
+    points = interpolated(vertices)
     normals = vertex_normals(vertices, faces) if count is None else _directed(vertices, corners)
     nearest = corners.gather(1, barycentric.argmax(1, keepdim=True)).squeeze(1)
     return BodySurface(
         points=points,
         normals=torch.nn.functional.normalize(normals, dim=-1),
         spacing=neighbour_distances(points),
-        weights=mixed(weights),
+        weights=interpolated(weights),
         parts=vertex_parts[nearest],
         faces=face,
         barycentric=barycentric,
@@ -63,7 +63,7 @@ def _directed(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Floa
 def _at_vertices(
     vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
 ) -> tuple[Int[Tensor, " V"], Float[Tensor, "V 3"]]:
-    """For each vertex a face that has it, with all weight on that corner."""
+    """For each vertex a face with that corner, and barycentric coordinates of the corner."""
     count = len(vertices)
     owner = torch.zeros(count, dtype=torch.int64, device=faces.device)
     corner = torch.zeros_like(owner)

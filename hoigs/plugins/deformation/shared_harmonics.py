@@ -1,10 +1,10 @@
-"""deformation:shared-harmonics: a still set whose shine is a mixture of a few shared lobes."""
+"""deformation:shared-harmonics: entities that do not move, with view-dependent colour mixed from a
+few shared sets of SH coefficients."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -12,37 +12,33 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.context import BuildContext
-from hoigs.core.deformation import DeformationModel
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.interaction import Residual
-from hoigs.core.moment import Moment
+from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import Residual, displaced
 
 
 class SharedHarmonicsConfig(ComponentConfig):
-    """How many lobes; how sharp they are is the block's `sh_degree`.
+    """The shared SH coefficients; their degree is the block's `sh_degree`."""
 
-    Attributes:
-        lobes: that all Gaussians share.
-    """
-
-    lobes: int = Field(3, ge=1)
+    lobes: int = Field(default=3, ge=1)
+    """Number of sets of SH coefficients that all Gaussians share. No more than 3 (B - 1) can
+    differ, for B coefficients a colour, and no more are made."""
 
 
 class SharedHarmonics(DeformationModel):
-    """sh_i = [base_i, sum_k share_ik lobe_k]: bands above the base colour are of rank `lobes`.
+    """sh_i = [base_i, sum_k shares_ik lobes_k]: coefficients above degree 0 have rank `lobes`.
 
-    A room is lit by few lamps and shines in few ways, yet 3DGS learns 24 numbers for it at each
-    Gaussian (degree 2). Here these are `shares` [N, lobes], and `lobes` [lobes, B - 1, 3] once for
-    all; `base` [N, 3] starts as the colour of the rest Gaussians, whose own `sh` is not trained.
-
-    Args:
-        lobes: as SharedHarmonicsConfig; no more than 3 (B - 1) can differ, and no more are made.
+    Indoor scenes have few lights, so their view-dependent colours are alike, yet 3DGS learns 24
+    numbers for them at each Gaussian (degree 2). Here these are `shares` [N, lobes], and `lobes`
+    [lobes, B - 1, 3] once for all; `base` [N, 3] starts as the colour of the canonical Gaussians,
+    whose own `sh` is not trained.
     """
 
-    rest_space = "world"
+    Config: ClassVar = SharedHarmonicsConfig
+    input_space = "world"
     moves = False
-    recordable = True
+    cuda_graph_safe = True
     owns = frozenset({"sh"})
     per_gaussian = ("base", "shares")
     rates: ClassVar[Mapping[str, str]] = dict.fromkeys(("base", "shares", "lobes"), "sh")
@@ -51,35 +47,28 @@ class SharedHarmonics(DeformationModel):
     shares: nn.Parameter
     lobes: nn.Parameter
 
-    def __init__(self, lobes: int = 3) -> None:
+    def __init__(self, config: SharedHarmonicsConfig | None = None) -> None:
         super().__init__()
-        self.count = lobes
+        self.config = config or SharedHarmonicsConfig()
 
-    @classmethod
-    def from_config(cls, config: SharedHarmonicsConfig, context: BuildContext) -> Self:
-        del context
-        return cls(config.lobes)
-
-    def bind(self, rest: Gaussians) -> None:
-        bands = rest.sh.shape[1] - 1
-        count = min(self.count, 3 * bands)
+    def bind(self, canonical: Gaussians) -> None:
+        bands = canonical.sh.shape[1] - 1
+        count = min(self.config.lobes, 3 * bands)
         start = torch.empty(count, 3 * bands)
         if count:
-            nn.init.orthogonal_(start)  # lobes that differ, each of length 1
-        self.lobes = nn.Parameter(start.unflatten(1, (bands, 3)).to(rest.sh))
-        self.shares = nn.Parameter(rest.sh.new_zeros(len(rest), count))
-        self.base = nn.Parameter(rest.sh[:, 0].detach().clone())
+            nn.init.orthogonal_(start)  # different ones, each of length 1
+        self.lobes = nn.Parameter(start.unflatten(1, (bands, 3)).to(canonical.sh))
+        self.shares = nn.Parameter(canonical.sh.new_zeros(len(canonical), count))
+        self.base = nn.Parameter(canonical.sh[:, 0].detach().clone())
 
     def harmonics(self) -> Float[Tensor, "N B 3"]:
-        """All bands of every Gaussian."""
-        shine = torch.einsum("nk,kbc->nbc", self.shares, self.lobes)
-        return torch.cat((self.base[:, None], shine), dim=1)
+        """All coefficients of every Gaussian."""
+        higher = torch.einsum("nk,kbc->nbc", self.shares, self.lobes)
+        return torch.cat((self.base[:, None], higher), dim=1)
 
     def forward(
-        self, rest: Gaussians, moment: Moment, residual: Residual | None = None
+        self, canonical: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
         del moment
-        moved = replace(rest, sh=self.harmonics())
-        if residual is None or residual.means is None:
-            return moved
-        return replace(moved, means=rest.means + residual.means)
+        means = displaced(canonical.means, residual)
+        return canonical.replace(means=means, sh=self.harmonics())

@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from hoigs.core.config import ComponentConfig
-from hoigs.core.deformation import DeformationModel
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.interaction import Residual
-from hoigs.core.moment import Moment
+from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import Residual, displaced
 
 
 class StaticConfig(ComponentConfig):
-    """Nothing to set."""
+    """No settings."""
 
 
 class Static(DeformationModel):
-    """The rest Gaussians at every moment, displaced only by a residual if there is one."""
+    """The canonical Gaussians at every moment, displaced only by a residual if there is one."""
 
-    rest_space = "world"
+    input_space = "world"
     moves = False
-    recordable = True
+    cuda_graph_safe = True
 
     def forward(
-        self, rest: Gaussians, moment: Moment, residual: Residual | None = None
+        self, canonical: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
         del moment
-        if residual is None or residual.means is None:
-            return rest
-        return replace(rest, means=rest.means + residual.means)
+        means = displaced(canonical.means, residual)
+        return canonical if means is canonical.means else canonical.replace(means=means)

@@ -1,14 +1,14 @@
-"""density:none: the number of Gaussians stays as it is."""
+"""density:none: the number of Gaussians does not change."""
 
 from __future__ import annotations
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.density import DensityControl, DensityStatistics, Refinement
-from hoigs.core.gaussians import Gaussians
+from hoigs.core.interfaces.density import DensityControl, DensityStatistics, Refinement
+from hoigs.core.values.gaussians import Gaussians
 
 
 class NoDensityConfig(ComponentConfig):
-    """Nothing to set."""
+    """No settings."""
 
 
 class NoDensity(DensityControl):
@@ -16,7 +16,7 @@ class NoDensity(DensityControl):
 
     def refine(
         self,
-        rest: Gaussians,
+        canonical: Gaussians,
         current: Gaussians,
         statistics: DensityStatistics,
         *,
@@ -24,5 +24,5 @@ class NoDensity(DensityControl):
         total_steps: int,
         extent: float,
     ) -> Refinement | None:
-        del rest, current, statistics, step, total_steps, extent
+        del canonical, current, statistics, step, total_steps, extent
         return None

@@ -1,4 +1,4 @@
-"""Dividing one Gaussian among several that look like it (3DGS-MCMC, Kheradmand et al. 2024)."""
+"""Replacing a Gaussian by several coinciding ones that look the same (3DGS-MCMC, Eq. 9)."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.topology import share_opacity
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.topology import share_opacity
 
-MAX_COPIES = 51  # as published: more are treated as this many, else the alternating sum overflows
+MAX_COPIES = 51  # as published: of more copies the alternating sum would overflow
 
 # BINOMIALS[n, k] = C(n, k); all are below 2^53
 BINOMIALS = torch.tensor(
@@ -23,9 +23,9 @@ BINOMIALS = torch.tensor(
 def relocation_shrink(
     opacities: Float[Tensor, " M"], copies: Int[Tensor, " M"]
 ) -> Float[Tensor, " M"]:
-    """Factor by which standard deviations change when a Gaussian becomes n coincident ones.
+    """Factor by which standard deviations change when a Gaussian becomes n coinciding ones.
 
-    With o' = 1 - (1 - o)^(1 / n), 3DGS-MCMC's eq. 9 keeps the integral of alpha along a line
+    With o' = 1 - (1 - o)^(1 / n), Eq. 9 keeps the integral of alpha along a line
     through the centre. Its double sum is, by the hockey-stick identity sum_i C(i - 1, k) =
     C(n, k + 1), the single one used here:
 
@@ -45,11 +45,12 @@ def relocation_shrink(
     return torch.where(copies > 1, o / total, 1.0).to(opacities.dtype)
 
 
-def divided(gaussians: Gaussians, copies: Int[Tensor, " M"], min_opacity: float) -> Gaussians:
-    """Each row as one of `copies` coincident ones that look like it; rows with one stay.
+def shared_among(gaussians: Gaussians, copies: Int[Tensor, " M"], min_opacity: float) -> Gaussians:
+    """Each row as one of `copies` coinciding Gaussians that together look like it before.
 
     Args:
-        copies: n of each row, at most MAX_COPIES. min_opacity: below which none of several falls.
+        copies: n of each row, at most MAX_COPIES; rows with one stay. min_opacity: lowest opacity
+            of a row with several.
     """
     several = copies > 1
     low, high = math.log(min_opacity / (1 - min_opacity)), -math.log(torch.finfo(torch.float32).eps)

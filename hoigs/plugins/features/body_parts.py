@@ -1,4 +1,4 @@
-"""features:body-parts: 16 tokens of a human, one a body part (HOIGS, Sec. "Feature Extraction")."""
+"""features:body-parts: 16 tokens of a human, one for each body part (HOIGS, Eq. 7)."""
 
 from __future__ import annotations
 
@@ -6,23 +6,24 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hoigs.core.body import PART_NAMES
 from hoigs.core.config import ComponentConfig
-from hoigs.core.deformation import DeformationModel, ProvidesField
-from hoigs.core.features import FeatureExtractor, Tokens
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.moment import Moment
+from hoigs.core.interfaces.body import PART_NAMES
+from hoigs.core.interfaces.deformation import DeformationModel, ProvidesField
+from hoigs.core.interfaces.features import FeatureExtractor
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import Tokens
 
 
 class BodyPartConfig(ComponentConfig):
-    """Nothing to set: the width is that of the deformation's field (the paper's 96)."""
+    """No settings: the width is that of the deformation's field (96 in the paper)."""
 
 
 def part_averages(parts: Int[Tensor, " V"]) -> Float[Tensor, "16 V"]:
-    """Rows that average the points of each part: 1 / |V_p| on V_p.
+    """A matrix whose rows average the points of each part: 1 / |V_p| on V_p, else 0.
 
     Raises:
-        ValueError: a part without points has no mean.
+        ValueError: a part has no points.
     """
     member = parts[None] == torch.arange(len(PART_NAMES), device=parts.device)[:, None]
     sizes = member.sum(1, keepdim=True)
@@ -35,20 +36,22 @@ def part_averages(parts: Int[Tensor, " V"]) -> Float[Tensor, "16 V"]:
 class BodyPartFeatures(FeatureExtractor):
     """f_p(t) = mean over V_p of phi(x_i, y_i, z_i, t), at the centroid of the part's points.
 
-    Means, not sums: the head alone has more than half of SMPL-X's vertices (methods C.9).
+    The mean makes tokens comparable: the head alone has more than half of SMPL-X's vertices.
     """
 
     requires = frozenset({"field"})
-    recordable = True
+    cuda_graph_safe = True
     averages: Tensor
 
-    def bind(self, deformation: DeformationModel, rest: Gaussians) -> None:
+    def bind(self, deformation: DeformationModel, canonical: Gaussians) -> None:
         assert isinstance(deformation, ProvidesField)
         self.width = deformation.field_width
-        averages = part_averages(deformation.field_parts()).to(rest.means)
+        averages = part_averages(deformation.field_parts()).to(canonical.means)
         self.register_buffer("averages", averages, persistent=False)
 
-    def forward(self, deformation: DeformationModel, rest: Gaussians, moment: Moment) -> Tokens:
+    def forward(
+        self, deformation: DeformationModel, canonical: Gaussians, moment: Moment
+    ) -> Tokens:
         assert isinstance(deformation, ProvidesField)
-        features, places = deformation.posed_field(rest, moment)
+        features, places = deformation.posed_field(canonical, moment)
         return Tokens(self.averages @ features, self.averages @ places)

@@ -1,4 +1,4 @@
-"""features:embedding: plain learnable tokens, the paper's ablation "w/o human feature"."""
+"""features:embedding: learnable tokens, the ablation "w/o human feature" of HOIGS."""
 
 from __future__ import annotations
 
@@ -10,77 +10,78 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
-from hoigs.core.body import PART_NAMES
 from hoigs.core.config import ComponentConfig
-from hoigs.core.deformation import DeformationModel, ProvidesField
-from hoigs.core.features import FeatureExtractor, Tokens
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.moment import Moment
-from hoigs.core.spline import linear
+from hoigs.core.interfaces.body import PART_NAMES
+from hoigs.core.interfaces.deformation import DeformationModel, ProvidesField
+from hoigs.core.interfaces.features import FeatureExtractor
+from hoigs.core.maths.splines import keyframe_position, linear
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import Tokens
 from hoigs.plugins.features.body_parts import part_averages
 
 
 class EmbeddingConfig(ComponentConfig):
-    """The ablation's size.
+    """The number and the width of the tokens."""
 
-    Attributes:
-        tokens: how many; None is one a body part where the deformation knows them, else one a
-            Gaussian. width: of each.
-        keyframes: None is one embedding for all time; else as many, uniform over the clip and
-            linear between. The paper says neither; None, the default, is the plainer ablation.
-    """
-
-    tokens: int | None = Field(None, ge=1)
-    width: int = Field(96, ge=1)
-    keyframes: int | None = Field(None, ge=2)
+    tokens: int | None = Field(default=None, ge=1)
+    """Number of tokens; None is one for each body part if the deformation has parts, else one for
+    each Gaussian."""
+    width: int = Field(default=96, ge=1)
+    """Width of each token."""
+    keyframes: int | None = Field(default=None, ge=2)
+    """Number of embeddings of each token, uniform over the clip and linear between; None is one for
+    all time. The paper does not specify it; None is the plainer ablation."""
 
 
 class EmbeddingFeatures(FeatureExtractor):
-    """Tokens that know nothing of place, and of time only with `keyframes`.
+    """Tokens that depend neither on place nor, without `keyframes`, on time.
 
-    Their positions, which the interaction measures its distances from, are the centroids of the
-    16 body parts, or each Gaussian's centre, or, for any other number of tokens, the entity's
-    centre. Positions carry no gradient.
+    Their positions, for the distances of the interaction, are the centroids of the 16 body parts,
+    or each Gaussian's mean, or, for any other number of tokens, the centre of the entity.
+    Positions have no gradient.
     """
 
+    Config: ClassVar = EmbeddingConfig
+
     rates: ClassVar[Mapping[str, str]] = {"embedding": "embedding"}
-    recordable = True
+    cuda_graph_safe = True
     averages: Tensor | None
 
-    def __init__(
-        self, tokens: int | None = None, width: int = 96, keyframes: int | None = None
-    ) -> None:
+    def __init__(self, config: EmbeddingConfig | None = None) -> None:
         super().__init__()
-        self.tokens, self.width, self.keyframes = tokens, width, keyframes
-        self.per_gaussian = ()
+        self.config = config or EmbeddingConfig()
+        self.width = self.config.width
 
-    def bind(self, deformation: DeformationModel, rest: Gaussians) -> None:
-        parts = "field" in deformation.provides and self.tokens in (None, len(PART_NAMES))
+    def bind(self, deformation: DeformationModel, canonical: Gaussians) -> None:
+        config = self.config
+        parts = "field" in deformation.provides and config.tokens in (None, len(PART_NAMES))
         averages = None
         if parts:
             assert isinstance(deformation, ProvidesField)
-            averages = part_averages(deformation.field_parts()).to(rest.means)
+            averages = part_averages(deformation.field_parts()).to(canonical.means)
         self.register_buffer("averages", averages, persistent=False)
-        count = self.tokens or (len(PART_NAMES) if parts else len(rest))
-        shape = (
-            (count, self.width) if self.keyframes is None else (count, self.keyframes, self.width)
-        )
-        self.embedding = nn.Parameter(0.1 * torch.randn(shape).to(rest.means))
-        if self.tokens is None and not parts:
+        count = config.tokens or (len(PART_NAMES) if parts else len(canonical))
+        times = () if config.keyframes is None else (config.keyframes,)
+        shape = (count, *times, config.width)
+        self.embedding = nn.Parameter(0.1 * torch.randn(shape).to(canonical.means))
+        if config.tokens is None and not parts:
             self.per_gaussian = ("embedding",)
 
     @torch.no_grad()
     def _positions(
-        self, deformation: DeformationModel, rest: Gaussians, moment: Moment
+        self, deformation: DeformationModel, canonical: Gaussians, moment: Moment
     ) -> Float[Tensor, "M 3"]:
         if self.averages is not None:
             assert isinstance(deformation, ProvidesField)
-            return self.averages @ deformation.posed_field(rest, moment)[1]
-        means = deformation(rest, moment).means
+            return self.averages @ deformation.posed_field(canonical, moment)[1]
+        means = deformation(canonical, moment).means
         return means if self.per_gaussian else means.mean(0).expand(len(self.embedding), 3)
 
-    def forward(self, deformation: DeformationModel, rest: Gaussians, moment: Moment) -> Tokens:
+    def forward(
+        self, deformation: DeformationModel, canonical: Gaussians, moment: Moment
+    ) -> Tokens:
         features: Tensor = self.embedding
-        if self.keyframes is not None:
-            features = linear(features, moment.time)
-        return Tokens(features, self._positions(deformation, rest, moment))
+        if self.config.keyframes is not None:
+            features = linear(features, keyframe_position(moment.time, self.config.keyframes))
+        return Tokens(features, self._positions(deformation, canonical, moment))

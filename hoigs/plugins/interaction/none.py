@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.features import Tokens
-from hoigs.core.interaction import InteractionModule, Residual, Role
+from hoigs.core.interfaces.interaction import InteractionModule
+from hoigs.core.values.tokens import Residual, Role, Tokens
 
 
 class NoInteractionConfig(ComponentConfig):
-    """Nothing to set."""
+    """No settings."""
 
 
 class NoInteraction(InteractionModule):
     """No residuals."""
 
-    recordable = True
+    cuda_graph_safe = True
     reads = False
 
     def forward(

@@ -6,29 +6,29 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from pydantic import BaseModel, Field
 
-from hoigs.core.body_params import pose_from_smplx
-from hoigs.core.clip import BodyTrack, Clip, ObjectTrack, uniform_test_split
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError, did_you_mean
-from hoigs.core.interaction import EntityKind
-from hoigs.core.lens import Lens
-from hoigs.core.reader import ClipReader
-from hoigs.core.rotation import axis_angle_to_matrices
-from hoigs.plugins.readers.frame_order import image_files, video_moments
-from hoigs.plugins.readers.json_file import load_json, parse_json_map
-from hoigs.plugins.readers.lazy_frames import LazyFrames, MaskFiles, image_size
-from hoigs.plugins.readers.listing import Need, require_files
-from hoigs.plugins.readers.pickles import load_pickled_npy
-from hoigs.plugins.readers.poses import checked_rotation, rigid
-from hoigs.plugins.readers.start_points import points_along_rays
-from hoigs.plugins.readers.template_mesh import load_mesh
+from hoigs.core.interfaces.reader import ClipReader
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.model.smpl_params import pose_from_smplx
+from hoigs.core.values.clip import BodyTrack, Clip, ObjectTrack, uniform_test_split
+from hoigs.core.values.lens import Lens
+from hoigs.core.values.tokens import EntityKind
+from hoigs.plugins.readers.common.frame_order import image_files, video_moments
+from hoigs.plugins.readers.common.json_file import load_json, parse_json_map
+from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
+from hoigs.plugins.readers.common.listing import Need, require_files
+from hoigs.plugins.readers.common.pickles import load_pickled_npy
+from hoigs.plugins.readers.common.poses import checked_rotation, rigid
+from hoigs.plugins.readers.common.start_points import points_along_rays
+from hoigs.plugins.readers.common.template_mesh import load_mesh
 
 LAYOUT = "an ARCTIC sequence (images/sXX/SEQUENCE or .../SEQUENCE/VIEW)"
 DOWNLOAD = "`bash/download_*.sh` of zc-alexfan/arctic (a registered download)"
@@ -51,7 +51,7 @@ class ArcticConfig(ComponentConfig):
     )
     start: int = Field(default=0, ge=0, description="first frame of the ground truth")
     count: int | None = Field(default=None, ge=2, description="frames; by default all (HOLD: 300)")
-    masks: bool = Field(default=True, description="False reads it without masks: scene only")
+    masks: bool = Field(default=True, description="False reads only the scene")
     points: int = Field(default=20_000, ge=1, description="scene points to start from")
     cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
@@ -61,31 +61,22 @@ class ArcticReader(ClipReader):
 
     Image numbers are frame numbers plus the subject's ioi_offset; the object's millimetres become
     metres; hands are flat_hand_mean=True; the body is the subject's own template on the model of
-    its gender, which `body:smplx` then insists on. An object's top is put at its median angle, so
-    that it fits "grab" sequences as it stands, and is marked as the moving part.
+    its gender, which `body:smplx` then requires. The top of an object is placed at its median
+    angle, which suits "grab" sequences, and is marked as the moving part.
 
     Args:
         view, start, count, masks, points, cache_mb: see ArcticConfig.
     """
 
-    def __init__(
-        self,
-        view: int | None = None,
-        start: int = 0,
-        count: int | None = None,
-        masks: bool = True,
-        points: int = 20_000,
-        cache_mb: int = 512,
-    ) -> None:
-        self.view, self.start, self.count, self.masks = view, start, count, masks
-        self.points, self.cache_mb = points, cache_mb
+    Config: ClassVar = ArcticConfig
+    config: ArcticConfig
 
     def matches(self, folder: Path) -> bool:
-        return _place(Path(folder), self.view) is not None
+        return _place(Path(folder), self.config.view) is not None
 
     def read(self, folder: Path) -> Clip:
         folder = Path(folder)
-        place = _place(folder, self.view)
+        place = _place(folder, self.config.view)
         if place is None:
             require_files(folder, LAYOUT, [])
             raise ClipError(f"{folder} is not named as {LAYOUT}")
@@ -101,7 +92,7 @@ class ArcticReader(ClipReader):
         frames = self._frames(place, subject, len(truth))
         images = [place.image(f + subject.ioi_offset) for f in frames]
         masks = {n: [place.mask(n, p) for p in images] for n in ("human", "object")}
-        if self.masks:
+        if self.config.masks:
             wanted = [p for paths in masks.values() for p in paths]
             needs = [Need.of(str(p.relative_to(place.root)), maker=MASKS) for p in wanted]
             require_files(place.root, LAYOUT, needs)
@@ -113,20 +104,24 @@ class ArcticReader(ClipReader):
                 f"{lens.height}: the full images are needed, not cropped_images/"
             )
         cameras = [lens.camera(w2c) for w2c in poses]
-        kinds: dict[str, EntityKind] = {"human": "human", "object": "object"} if self.masks else {}
-        bodies = {"human": _body(place, subject, frames)} if self.masks else {}
-        thing, angles = _object(place, truth[frames])
+        kinds: dict[str, EntityKind] = (
+            {"human": "human", "object": "object"} if self.config.masks else {}
+        )
+        bodies = {"human": _body(place, subject, frames)} if self.config.masks else {}
+        track, angles = _object(place, truth[frames])
         store = LazyFrames(
             place.root,
             images,
             cameras,
-            masks={n: MaskFiles(paths) for n, paths in masks.items()} if self.masks else None,
+            masks={n: MaskFiles(paths) for n, paths in masks.items()}
+            if self.config.masks
+            else None,
             lenses=[lens] * len(frames),
-            cache_mb=self.cache_mb,
+            cache_mb=self.config.cache_mb,
         )
-        away = float(cameras[0].to_camera(thing.translations)[:, 2].median())
+        away = float(cameras[0].to_camera(track.translations)[:, 2].median())
         span = (BEHIND[0] * away, BEHIND[1] * away)
-        points, colors = points_along_rays(store, cameras, tuple(kinds), span, self.points)
+        points, colors = points_along_rays(store, cameras, tuple(kinds), span, self.config.points)
         return Clip(
             name=f"{place.subject}_{place.sequence}_{place.view}",
             store=store,
@@ -134,7 +129,7 @@ class ArcticReader(ClipReader):
             moments=video_moments(range(len(frames)), len(frames), bodies),
             kinds=kinds,
             bodies=bodies,
-            objects={"object": thing} if self.masks else {},
+            objects={"object": track} if self.config.masks else {},
             points=points,
             point_colors=colors,
             split=uniform_test_split(len(frames)),
@@ -148,20 +143,21 @@ class ArcticReader(ClipReader):
         )
 
     def _frames(self, place: _Place, subject: Subject, total: int) -> list[int]:
-        """Frames of the ground truth to read: those asked for that lie within the images."""
-        stop = total if self.count is None else min(total, self.start + self.count)
+        """Frames of the ground truth to read: the requested ones that have images."""
+        start, count = self.config.start, self.config.count
+        stop = total if count is None else min(total, start + count)
         there = {int(p.stem) - subject.ioi_offset for p in image_files(place.images)
                  if p.stem.isdigit()}  # fmt: skip
-        inside = [f for f in range(self.start, stop) if f in there]
+        inside = [f for f in range(start, stop) if f in there]
         if not inside:
             raise ClipError(
-                f"{place.images}: no image of frames {self.start} to {stop - 1}, which are images "
-                f"{self.start + subject.ioi_offset:05d} to {stop - 1 + subject.ioi_offset:05d} "
+                f"{place.images}: no image of frames {start} to {stop - 1}, which are images "
+                f"{start + subject.ioi_offset:05d} to {stop - 1 + subject.ioi_offset:05d} "
                 f"(ioi_offset {subject.ioi_offset}); {DOWNLOAD} has them"
             )
-        room = place.images.relative_to(place.root)
+        folder = place.images.relative_to(place.root)
         gaps = range(inside[0], inside[-1] + 1)
-        names = [f"{room}/{f + subject.ioi_offset:05d}.jpg" for f in gaps]
+        names = [f"{folder}/{f + subject.ioi_offset:05d}.jpg" for f in gaps]
         require_files(place.root, LAYOUT, [Need.of(n, maker=DOWNLOAD) for n in names])
         return list(gaps)
 
@@ -178,7 +174,7 @@ class Subject(BaseModel):
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a sequence's files are, about the data folder."""
+    """Paths of a sequence's files in the data folder."""
 
     root: Path
     subject: str
@@ -186,7 +182,7 @@ class _Place:
     view: int
 
     @property
-    def thing(self) -> str:
+    def object_name(self) -> str:
         return self.sequence.split("_", maxsplit=1)[0]
 
     @property
@@ -197,8 +193,8 @@ class _Place:
         return self.images / f"{number:05d}.jpg"
 
     def mask(self, entity: str, image: Path) -> Path:
-        room = self.root / "masks" / self.subject / self.sequence / str(self.view)
-        return room / entity / f"{image.stem}.png"
+        folder = self.root / "masks" / self.subject / self.sequence / str(self.view)
+        return folder / entity / f"{image.stem}.png"
 
     def raw(self, kind: str) -> Path:
         return self.root / "raw_seqs" / self.subject / f"{self.sequence}.{kind}.npy"
@@ -206,15 +202,16 @@ class _Place:
     def needs(self) -> list[Need]:
         kinds = ("smplx", "object", *(("egocam.dist",) if self.view == 0 else ()))
         own = [f"raw_seqs/{self.subject}/{self.sequence}.{kind}.npy" for kind in kinds]
-        things = [f"meta/object_vtemplates/{self.thing}/{n}" for n in ("mesh.obj", "parts.json")]
-        meta = ("meta/misc.json", f"meta/subject_vtemplates/{self.subject}.obj", *things)
-        room = f"images/{self.subject}/{self.sequence}/{self.view}/"
+        template = f"meta/object_vtemplates/{self.object_name}"
+        meta = ("meta/misc.json", f"meta/subject_vtemplates/{self.subject}.obj",
+                f"{template}/mesh.obj", f"{template}/parts.json")  # fmt: skip
+        images = f"images/{self.subject}/{self.sequence}/{self.view}/"
         needs = [Need.of(path, maker=WITHHELD) for path in own]
-        return [*needs, *(Need.of(path, maker=DOWNLOAD) for path in (*meta, room))]
+        return [*needs, *(Need.of(path, maker=DOWNLOAD) for path in (*meta, images))]
 
 
 def _place(folder: Path, view: int | None) -> _Place | None:
-    """Read off the end of the path: images/sXX/SEQUENCE, or that and a view."""
+    """Parse the end of the path: images/sXX/SEQUENCE, or images/sXX/SEQUENCE/VIEW."""
     parts = folder.resolve().parts
     named = len(parts) > 4 and re.fullmatch(r"[0-8]", parts[-1]) is not None
     tail = parts[-4:-1] if named else parts[-3:]
@@ -228,7 +225,8 @@ def _place(folder: Path, view: int | None) -> _Place | None:
 def _cameras(
     place: _Place, subject: Subject, frames: Sequence[int]
 ) -> tuple[Lens, list[Float[np.ndarray, "4 4"]]]:
-    """Views 1 to 8 stand still and are straight; view 0 moves with the head and is bent."""
+    """The lens and world-to-camera. Views 1 to 8 stand still and have no distortion; view 0 moves
+    with the head and is distorted."""
     where, size = f"{place.root}/meta/misc.json: {place.subject}", subject.image_size[place.view]
     if place.view > 0:
         pose = np.asarray(subject.world2cam[place.view - 1], np.float64)
@@ -266,13 +264,13 @@ def _body(place: _Place, subject: Subject, frames: Sequence[int]) -> BodyTrack:
 def _object(
     place: _Place, truth: Float[np.ndarray, "F 7"]
 ) -> tuple[ObjectTrack, Float[np.ndarray, " F"]]:
-    """Track about the middle of the mesh, and the angles of its top, radians."""
-    room = place.root / "meta/object_vtemplates" / place.thing
-    vertices = np.asarray(load_mesh(room / "mesh.obj").vertices, np.float64) / 1000
-    parts = np.asarray(load_json(room / "parts.json"), bool)
+    """The track of the mesh's centre, and the angles of its top, radians."""
+    folder = place.root / "meta/object_vtemplates" / place.object_name
+    vertices = np.asarray(load_mesh(folder / "mesh.obj").vertices, np.float64) / 1000
+    parts = np.asarray(load_json(folder / "parts.json"), bool)
     if len(parts) != len(vertices):
         raise ClipError(
-            f"{room}: parts.json has {len(parts)} entries, mesh.obj {len(vertices)} vertices"
+            f"{folder}: parts.json has {len(parts)} entries, mesh.obj {len(vertices)} vertices"
         )
     angles = truth[:, 0]
     turn = axis_angle_to_matrices(torch.tensor(HINGE).double() * float(np.median(angles))).numpy()

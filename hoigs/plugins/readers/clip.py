@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -15,10 +13,9 @@ from PIL import Image
 from pydantic import Field
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import BodyTrack, Clip, FrameStore, ObjectTrack
-from hoigs.core.clip_check import usable_clip
-from hoigs.core.clip_format import (
+from hoigs.core.clip_folder.check import usable_clip
+from hoigs.core.clip_folder.diagnostics import summarized_for_training
+from hoigs.core.clip_folder.format import (
     HEADER,
     VIEWS,
     ClipHeader,
@@ -30,12 +27,14 @@ from hoigs.core.clip_format import (
     mask_path,
     parse_header,
 )
-from hoigs.core.clip_problem import as_faults
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
-from hoigs.core.interaction import EntityKind
-from hoigs.core.moment import BodyPose, Moment
-from hoigs.core.reader import ClipReader
+from hoigs.core.interfaces.reader import ClipReader
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
+from hoigs.core.values.moment import BodyPose, Moment
+from hoigs.core.values.tokens import EntityKind
+from hoigs.plugins.readers.common.pixel_cache import PixelCache
 
 
 class ClipFolderReaderConfig(ComponentConfig):
@@ -45,14 +44,14 @@ class ClipFolderReaderConfig(ComponentConfig):
 
 
 class ClipFolderReader(ClipReader):
-    """Reads a checked clip folder; pixels are decoded when asked for.
+    """Reads a checked clip folder; pixels are decoded on access.
 
     Args:
         cache_mb: decoded pixels kept in memory, MiB, for the frames and again for held-out views.
     """
 
-    def __init__(self, cache_mb: int = 512) -> None:
-        self.cache_mb = cache_mb
+    Config: ClassVar = ClipFolderReaderConfig
+    config: ClipFolderReaderConfig
 
     def matches(self, folder: Path) -> bool:
         return (Path(folder) / HEADER).is_file()
@@ -60,7 +59,7 @@ class ClipFolderReader(ClipReader):
     def read(self, folder: Path) -> Clip:
         folder = Path(folder)
         header, problems = usable_clip(folder, self.allow_faults)
-        lost = frozenset(p.path for p in problems if p.lost)
+        unusable = frozenset(p.path for p in problems if p.unusable)
         size = (header.height, header.width)
         bodies, objects = {}, {}
         for name, entity in header.entities.items():
@@ -80,15 +79,17 @@ class ClipFolderReader(ClipReader):
             "depth_kind": header.depth_kind,
             "provenance": header.provenance,
         }
-        held_out = self._read_held_out(folder, header, moments, shared, lost)
+        held_out = self._read_held_out(folder, header, moments, shared, unusable)
         return Clip(
             name=header.name,
-            store=FolderStore(folder, header.depth_kind != "none", self.cache_mb, lost, size),
+            store=FolderStore(
+                folder, header.depth_kind != "none", self.config.cache_mb, unusable, size
+            ),
             cameras=_read_cameras(folder / "cameras.npz", header.width, header.height),
             moments=moments,
-            split=_kept({"train": header.split.train, "test": header.split.test}, lost, folder),
+            split=_kept({"train": header.split.train, "test": header.split.test}, unusable, folder),
             held_out=held_out,
-            faults=as_faults(problems, header),
+            faults=summarized_for_training(problems, header),
             **shared,
         )
 
@@ -98,25 +99,27 @@ class ClipFolderReader(ClipReader):
         header: ClipHeader,
         moments: list[Moment],
         shared: dict[str, Any],
-        lost: frozenset[str],
+        unusable: frozenset[str],
     ) -> Clip | None:
         if not (folder / VIEWS).is_file():
             return None
         views, _ = parse_header(folder / VIEWS, ViewsHeader)
         assert views is not None  # usable_clip has read it
-        room = folder / "held_out"
-        lost = frozenset(p.removeprefix("held_out/") for p in lost if p.startswith("held_out/"))
-        views_left = _kept({"train": [], "test": list(range(len(views.frames)))}, lost, room)
+        root = folder / "held_out"
+        unusable = frozenset(
+            p.removeprefix("held_out/") for p in unusable if p.startswith("held_out/")
+        )
+        views_left = _kept({"train": [], "test": list(range(len(views.frames)))}, unusable, root)
         return Clip(
             name=f"{header.name} held out",
             store=FolderStore(
-                room,
+                root,
                 header.depth_kind != "none",
-                self.cache_mb,
-                lost,
+                self.config.cache_mb,
+                unusable,
                 (views.height, views.width),
             ),
-            cameras=_read_cameras(room / "cameras.npz", views.width, views.height),
+            cameras=_read_cameras(root / "cameras.npz", views.width, views.height),
             moments=[moments[i] for i in views.frames],
             split=views_left,
             **shared,
@@ -124,14 +127,14 @@ class ClipFolderReader(ClipReader):
 
 
 class FolderStore(FrameStore):
-    """Pixels of one room of a clip folder, the last used kept in memory.
+    """Pixels of a clip folder or of its held_out folder; the last used are kept in memory.
 
     Args:
-        root: the clip, or its held_out. has_depth: whether depth maps are there.
+        root: the clip folder, or its held_out folder. has_depth: whether depth maps are there.
         cache_mb: decoded pixels kept, MiB; the least recently used go first.
-        lost: files that are absent or hold nothing, by their paths in `root`. Such an image is
-            black and all ignored, such a mask empty and not known, such a depth map None.
-        size: height and width, pixels; needed where files are lost.
+        unusable: absent and unreadable files, by their paths in `root`. Such an image is black and
+            wholly ignored, such a mask empty and not known, such a depth map None.
+        size: height and width, pixels; needed if any file is unusable.
 
     Safe to read from several threads.
     """
@@ -143,61 +146,44 @@ class FolderStore(FrameStore):
         root: Path,
         has_depth: bool,
         cache_mb: int = 512,
-        lost: frozenset[str] = frozenset(),
+        unusable: frozenset[str] = frozenset(),
         size: tuple[int, int] = (0, 0),
     ) -> None:
         self.root, self.has_depth = Path(root), has_depth
-        self.lost, self.size = lost, size
-        self.budget = cache_mb * 2**20
-        self.cached_bytes = 0
-        self._cache: OrderedDict[Path, Tensor] = OrderedDict()
-        self._lock = threading.Lock()
+        self.unusable, self.size = unusable, size
+        self.cache = PixelCache(cache_mb)
 
     def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
         path = image_path(self.root, position)
-        if self._is_lost(path):
+        if self._is_unusable(path):
             return torch.zeros(*self.size, 3, dtype=torch.uint8)
-        return self._get(path, lambda p: _decode(p, "RGB"))
+        return self.cache.get(path, lambda: _decode(path, "RGB"))
 
     def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
         if not self.mask_known(entity, position):
             return torch.zeros(self.size, dtype=torch.bool)
-        return self._get(mask_path(self.root, entity, position), lambda p: _decode(p, "L") > 127)
+        path = mask_path(self.root, entity, position)
+        return self.cache.get(path, lambda: _decode(path, "L") > 127)
 
     def mask_known(self, entity: str, position: int) -> bool:
-        return not self._is_lost(mask_path(self.root, entity, position))
+        return not self._is_unusable(mask_path(self.root, entity, position))
 
-    def _is_lost(self, path: Path) -> bool:
-        return bool(self.lost) and path.relative_to(self.root).as_posix() in self.lost
+    def _is_unusable(self, path: Path) -> bool:
+        return bool(self.unusable) and path.relative_to(self.root).as_posix() in self.unusable
 
     def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
-        if self._is_lost(image_path(self.root, position)):
+        if self._is_unusable(image_path(self.root, position)):
             return torch.ones(self.size, dtype=torch.bool)
         path = ignored_path(self.root, position)
         if not path.is_file():
             return None
-        return self._get(path, lambda p: _decode(p, "L") > 127)
+        return self.cache.get(path, lambda: _decode(path, "L") > 127)
 
     def depth(self, position: int) -> Float[Tensor, "H W"] | None:
-        if not self.has_depth or self._is_lost(depth_path(self.root, position)):
+        path = depth_path(self.root, position)
+        if not self.has_depth or self._is_unusable(path):
             return None
-        return self._get(depth_path(self.root, position), _read_depth)
-
-    def _get(self, path: Path, read: Callable[[Path], Tensor]) -> Tensor:
-        with self._lock:
-            if path in self._cache:
-                self._cache.move_to_end(path)
-                return self._cache[path]
-        value = read(path)  # outside the lock: other threads decode meanwhile
-        size = value.element_size() * value.numel()
-        with self._lock:
-            if path not in self._cache and size <= self.budget:
-                self._cache[path] = value
-                self.cached_bytes += size
-            while self.cached_bytes > self.budget:
-                _, old = self._cache.popitem(last=False)
-                self.cached_bytes -= old.element_size() * old.numel()
-        return value
+        return self.cache.get(path, lambda: _read_depth(path))
 
 
 def _decode(path: Path, mode: str) -> Tensor:
@@ -216,13 +202,17 @@ def _read_depth(path: Path) -> Tensor:
     return torch.from_numpy(np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0)))
 
 
-def _kept(split: dict[str, list[int]], lost: frozenset[str], folder: Path) -> dict[str, list[int]]:
-    """A split without the frames whose images are lost."""
-    gone = {int(Path(p).stem) for p in lost if p.startswith("images/")}
-    left = {name: [i for i in frames if i not in gone] for name, frames in split.items()}
+def _kept(
+    split: dict[str, list[int]], unusable: frozenset[str], folder: Path
+) -> dict[str, list[int]]:
+    """A split without the frames whose images are unusable."""
+    left_out = {int(Path(p).stem) for p in unusable if p.startswith("images/")}
+    left = {name: [i for i in frames if i not in left_out] for name, frames in split.items()}
     for name, frames in split.items():
         if frames and not left[name]:
-            raise ClipError(f"{folder}: no image of split {name} is left: {sorted(gone)} are lost")
+            raise ClipError(
+                f"{folder}: no image of split {name} is left: {sorted(left_out)} are unusable"
+            )
     return left
 
 

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import ClassVar
 
 from pydantic import Field
 
-from hoigs.core.clip import Clip, uniform_test_split
 from hoigs.core.config import ComponentConfig
-from hoigs.core.interaction import EntityKind
-from hoigs.core.reader import ClipReader
-from hoigs.plugins.readers.colmap_model import model_folder, read_sparse, sparse_needs
-from hoigs.plugins.readers.frame_order import image_files, video_moments
-from hoigs.plugins.readers.lazy_frames import LazyFrames, MaskFiles, lens_for
-from hoigs.plugins.readers.listing import Need, require_files
+from hoigs.core.interfaces.reader import ClipReader
+from hoigs.core.values.clip import Clip, uniform_test_split
+from hoigs.core.values.tokens import EntityKind
+from hoigs.plugins.readers.common.colmap_model import model_folder, read_sparse, sparse_needs
+from hoigs.plugins.readers.common.frame_order import image_files, video_moments
+from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, lens_for
+from hoigs.plugins.readers.common.listing import Need, require_files
 
 LAYOUT = "a COLMAP folder (images/ and sparse/)"
-MASK_MAKER = "your segmenter makes masks/ENTITY/, 0/255, one file an image; or remove the folder"
+MASK_MAKER = "your segmenter makes masks/ENTITY/, 0/255, one for each image; or remove the folder"
 NO_POSES = "a COLMAP folder holds none; `hoigs prepare` fits a body to landmarks"
 
 
@@ -39,42 +40,35 @@ class ColmapReader(ClipReader):
 
     Images are in natural order of their names. One that COLMAP could not register is left out,
     but keeps its time. `masks/NAME/` holds the masks of an entity: a human if NAME starts with
-    "human" or "person", else an object. Mask files right in `masks/` are COLMAP's own (where to
-    take no features) and are left alone.
+    "human" or "person", else an object. Mask files directly in `masks/` are COLMAP's own
+    (pixels without features) and are not read.
 
     Args:
         factor, test_every, fps, cache_mb: see ColmapConfig.
     """
 
+    Config: ClassVar = ColmapConfig
+    config: ColmapConfig
     general = True  # NeuMan, ExAvatar and nerfstudio have a COLMAP model too
-
-    def __init__(
-        self,
-        factor: int = 1,
-        test_every: int | None = None,
-        fps: float = 30.0,
-        cache_mb: int = 512,
-    ) -> None:
-        self.factor, self.test_every, self.fps, self.cache_mb = factor, test_every, fps, cache_mb
 
     def matches(self, folder: Path) -> bool:
         return model_folder(Path(folder)) is not None and (Path(folder) / "images").is_dir()
 
     def read(self, folder: Path) -> Clip:
         folder = Path(folder)
-        room = "images" if self.factor == 1 else f"images_{self.factor}"
+        image_folder = "images" if self.config.factor == 1 else f"images_{self.config.factor}"
         shrink = "the video's frames, the ones that COLMAP was run on"
-        if self.factor != 1:
-            shrink = f"images at 1/{self.factor} size: `mogrify -resize {100 / self.factor:g}%`"
-        needs = [Need.of(f"{room}/", maker=shrink), *sparse_needs(folder)]
+        if (factor := self.config.factor) != 1:
+            shrink = f"images at 1/{factor} size: `mogrify -resize {100 / factor:g}%`"
+        needs = [Need.of(f"{image_folder}/", maker=shrink), *sparse_needs(folder)]
         require_files(folder, LAYOUT, needs)
         place = model_folder(folder)
         assert place is not None  # require_files has found it
         model = read_sparse(folder / place)
-        files = _by_stem(folder / room)
+        files = _by_stem(folder / image_folder)
         stems = [_stem(view.name, files) for view in model.views]
         masks = mask_folders(folder)
-        needs = [Need.of(f"{room}/{v.name}", maker=shrink)
+        needs = [Need.of(f"{image_folder}/{v.name}", maker=shrink)
                  for v, stem in zip(model.views, stems) if stem not in files]  # fmt: skip
         for name in masks:
             needs += [Need.of(f"masks/{name}/{s}.png", maker=MASK_MAKER) for s in stems]
@@ -93,7 +87,7 @@ class ColmapReader(ClipReader):
                     n: MaskFiles([folder / "masks" / n / f"{s}.png" for s in stems]) for n in masks
                 },
                 lenses=lenses,
-                cache_mb=self.cache_mb,
+                cache_mb=self.config.cache_mb,
             ),
             cameras=cameras,
             moments=video_moments([order[p] for p in images], len(files)),
@@ -102,8 +96,8 @@ class ColmapReader(ClipReader):
             objects={},
             points=model.points,
             point_colors=model.colors,
-            split=split_of(len(images), self.test_every),
-            fps=self.fps,
+            split=split_of(len(images), self.config.test_every),
+            fps=self.config.fps,
             provenance={
                 "reader": "reader:colmap",
                 "cameras": f"{model.summary}; world in COLMAP's unit",
@@ -112,24 +106,24 @@ class ColmapReader(ClipReader):
         )
 
 
-def _by_stem(room: Path) -> dict[str, Path]:
-    """Images of a folder and of the folders in it (one a camera), by path without suffix."""
-    rooms = [room, *sorted(p for p in room.rglob("*") if p.is_dir())]
-    files = [path for each in rooms for path in image_files(each)]
-    return {path.relative_to(room).with_suffix("").as_posix(): path for path in files}
+def _by_stem(root: Path) -> dict[str, Path]:
+    """Images of a folder and its subfolders (one for each camera), by path without suffix."""
+    folders = [root, *sorted(p for p in root.rglob("*") if p.is_dir())]
+    files = [path for each in folders for path in image_files(each)]
+    return {path.relative_to(root).with_suffix("").as_posix(): path for path in files}
 
 
 def _stem(name: str, files: Mapping[str, Path]) -> str:
-    """As files have it: COLMAP's names may hold folders that are not there any more."""
+    """The key in `files` of a COLMAP image name, whose folders may no longer exist."""
     whole = Path(name).with_suffix("").as_posix()
     return whole if whole in files else Path(name).stem
 
 
 def mask_folders(folder: Path) -> dict[str, EntityKind]:
-    """Entities by the folders in masks/."""
-    rooms = sorted(p.name for p in (folder / "masks").glob("*") if p.is_dir())
+    """Name and kind of each entity, one for each folder in masks/."""
+    names = sorted(p.name for p in (folder / "masks").glob("*") if p.is_dir())
     people = ("human", "person")
-    return {name: "human" if name.lower().startswith(people) else "object" for name in rooms}
+    return {name: "human" if name.lower().startswith(people) else "object" for name in names}
 
 
 def split_of(count: int, every: int | None) -> dict[str, list[int]]:

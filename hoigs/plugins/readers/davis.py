@@ -4,30 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from PIL import Image
 from pydantic import Field
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip, uniform_test_split
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
-from hoigs.core.interaction import EntityKind
-from hoigs.core.reader import ClipReader
-from hoigs.plugins.readers.frame_order import image_files, video_moments
-from hoigs.plugins.readers.lazy_frames import LazyFrames, MaskFiles, image_size
-from hoigs.plugins.readers.listing import Need, require_files
-from hoigs.plugins.readers.start_points import points_along_rays
+from hoigs.core.interfaces.reader import ClipReader
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip, uniform_test_split
+from hoigs.core.values.tokens import EntityKind
+from hoigs.plugins.readers.common.frame_order import image_files, video_moments
+from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
+from hoigs.plugins.readers.common.listing import Need, require_files
+from hoigs.plugins.readers.common.start_points import points_along_rays
 
 LAYOUT = "a DAVIS sequence (JPEGImages/SEQUENCE)"
 FRAMES = "the video's frames, as DAVIS (davischallenge.org) or your own decoder writes them"
-ANNOTATIONS = "DAVIS has it, or DEVA's tracks as DreamScene4D writes them (one folder an object)"
-NO_CAMERAS = "none published: one that stands still, {focal:.1f} px of focal length assumed"
+ANNOTATIONS = "DAVIS has it, or DEVA's tracks as DreamScene4D writes them, a folder for each object"
+NO_CAMERAS = "none published; a static camera with a focal length of {focal:.1f} px is assumed"
 NO_POSES = "DAVIS has none; `hoigs prepare` fits a body to landmarks"
-VOID = 255  # DAVIS's index of pixels that are not to be judged
+VOID = 255  # DAVIS's index of pixels that are not scored
 SPAN = (1.0, 5.0)  # depths of the points to start from, in units of their own
 
 
@@ -48,24 +48,17 @@ class DavisConfig(ComponentConfig):
 class DavisReader(ClipReader):
     """Frames and masks of every annotated object: "object_1", … or "human_1" of `people`.
 
-    Annotations are palette images whose index is the object (DAVIS), or a folder of binary masks
-    an object (DreamScene4D). There are no cameras: one stands still at the origin. There is no
-    depth, so the scene has no unit; objects have no track, so a spec gives each a prior.
+    Annotations are palette images whose index is the object (DAVIS), or one folder of binary
+    masks for each object (DreamScene4D). There are no cameras, so a static one at the origin is
+    assumed. There is no depth, so the scene has no unit. Objects have no track, so a spec names an
+    initializer for each.
 
     Args:
         people, focal, points, fps, cache_mb: see DavisConfig.
     """
 
-    def __init__(
-        self,
-        people: Sequence[int] = (),
-        focal: float | None = None,
-        points: int = 20_000,
-        fps: float = 24.0,
-        cache_mb: int = 512,
-    ) -> None:
-        self.people, self.focal, self.points = list(people), focal, points
-        self.fps, self.cache_mb = fps, cache_mb
+    Config: ClassVar = DavisConfig
+    config: DavisConfig
 
     def matches(self, folder: Path) -> bool:
         return "JPEGImages" in Path(folder).resolve().parts[-3:-1]
@@ -75,7 +68,7 @@ class DavisReader(ClipReader):
         if not self.matches(folder):
             require_files(folder, LAYOUT, [])
             raise ClipError(
-                f"{folder} is no folder within JPEGImages/: give JPEGImages/SEQUENCE, with "
+                f"{folder} is not a folder within JPEGImages/: give JPEGImages/SEQUENCE, with "
                 "Annotations/ beside JPEGImages/"
             )
         images = image_files(folder)
@@ -85,23 +78,23 @@ class DavisReader(ClipReader):
         own = Path("Annotations", *parts[level + 1 :])
         sequence = Path("JPEGImages", *parts[level + 1 :])
         needs = [] if images else [Need.of(f"{sequence}/00000.jpg", maker=FRAMES)]
-        rooms = sorted(p for p in (root / own).glob("*") if p.is_dir() and p.name.isdigit())
-        for place in [own / r.name for r in rooms] or [own]:
+        folders = sorted(p for p in (root / own).glob("*") if p.is_dir() and p.name.isdigit())
+        for place in [own / r.name for r in folders] or [own]:
             needs += [Need.of(f"{place}/{p.stem}.png", maker=ANNOTATIONS) for p in images]
             needs += [] if images else [Need.of(f"{place}/00000.png", maker=ANNOTATIONS)]
         require_files(root, LAYOUT, needs)
-        masks = _folders(rooms, images) if rooms else _palettes(root / own, images)
+        masks = _folders(folders, images) if folders else _palettes(root / own, images)
         if not masks:
             raise ClipError(f"{root / own}: no object is marked in any frame")
-        unknown = sorted(set(self.people) - set(masks))
+        unknown = sorted(set(self.config.people) - set(masks))
         if unknown:
             raise ClipError(f"people={unknown}: annotated objects are {sorted(masks)}")
-        names = {i: f"{'human' if i in self.people else 'object'}_{i}" for i in masks}
+        names = {i: f"{'human' if i in self.config.people else 'object'}_{i}" for i in masks}
         kinds: dict[str, EntityKind] = {
-            names[i]: "human" if i in self.people else "object" for i in masks
+            names[i]: "human" if i in self.config.people else "object" for i in masks
         }
         width, height = image_size(images[0])
-        focal = self.focal or 1.2 * max(width, height)
+        focal = self.config.focal or 1.2 * max(width, height)
         K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
         cameras = [Camera(K, torch.eye(4), width, height)] * len(images)
         store = LazyFrames(
@@ -109,9 +102,9 @@ class DavisReader(ClipReader):
             images,
             cameras,
             masks={names[i]: files for i, files in masks.items()},
-            cache_mb=self.cache_mb,
+            cache_mb=self.config.cache_mb,
         )
-        points, colors = points_along_rays(store, cameras, tuple(kinds), SPAN, self.points)
+        points, colors = points_along_rays(store, cameras, tuple(kinds), SPAN, self.config.points)
         return Clip(
             name=folder.name,
             store=store,
@@ -123,7 +116,7 @@ class DavisReader(ClipReader):
             points=points,
             point_colors=colors,
             split=uniform_test_split(len(images)),
-            fps=self.fps,
+            fps=self.config.fps,
             provenance={
                 "reader": "reader:davis",
                 "cameras": NO_CAMERAS.format(focal=focal),
@@ -133,17 +126,17 @@ class DavisReader(ClipReader):
         )
 
 
-def _folders(rooms: Sequence[Path], images: Sequence[Path]) -> dict[int, MaskFiles]:
-    """DreamScene4D: 001/, 002/, …, anything but 0 is the object."""
+def _folders(folders: Sequence[Path], images: Sequence[Path]) -> dict[int, MaskFiles]:
+    """DreamScene4D's masks: folders 001/, 002/, …; every value but 0 is the object."""
     return {
-        int(room.name): MaskFiles([room / f"{p.stem}.png" for p in images], _shown)
-        for room in rooms
+        int(folder.name): MaskFiles([folder / f"{p.stem}.png" for p in images], _shown)
+        for folder in folders
     }
 
 
-def _palettes(room: Path, images: Sequence[Path]) -> dict[int, MaskFiles]:
-    """DAVIS: one image a frame; an object may enter late, so all of them are looked at."""
-    paths = [room / f"{p.stem}.png" for p in images]
+def _palettes(folder: Path, images: Sequence[Path]) -> dict[int, MaskFiles]:
+    """DAVIS's masks: one image for each frame. All are read, as an object may enter late."""
+    paths = [folder / f"{p.stem}.png" for p in images]
     seen: set[int] = set()
     for path in paths:
         with Image.open(path) as image:

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
 from pydantic import Field
 
-from hoigs.core.clip import Clip
 from hoigs.core.config import ComponentConfig
-from hoigs.core.reader import ClipReader
-from hoigs.plugins.readers.frame_order import timed_moments
-from hoigs.plugins.readers.json_file import parse_json
-from hoigs.plugins.readers.lazy_frames import LazyFrames
-from hoigs.plugins.readers.listing import Need, require_files
-from hoigs.plugins.readers.point_file import Points, read_points
-from hoigs.plugins.readers.poses import opengl_to_world_to_camera
-from hoigs.plugins.readers.transforms import TransformFrame, Transforms, lens_of
+from hoigs.core.interfaces.reader import ClipReader
+from hoigs.core.values.clip import Clip
+from hoigs.plugins.readers.common.frame_order import timed_moments
+from hoigs.plugins.readers.common.json_file import parse_json
+from hoigs.plugins.readers.common.lazy_frames import LazyFrames
+from hoigs.plugins.readers.common.listing import Need, require_files
+from hoigs.plugins.readers.common.point_file import Points, read_points
+from hoigs.plugins.readers.common.poses import opengl_to_world_to_camera
+from hoigs.plugins.readers.common.transforms import TransformFrame, Transforms, lens_of
 
 LAYOUT = "a D-NeRF scene (transforms_train.json …)"
 MAKER = "D-NeRF's data.zip has it (github.com/albertpumarola/D-NeRF), or a Blender export script"
@@ -30,12 +30,13 @@ class DnerfConfig(ComponentConfig):
     """Settings of reader:dnerf."""
 
     background: Literal["white", "black"] = Field(
-        default="black", description="behind the transparent parts; what renders have where empty"
+        default="black",
+        description="of transparent pixels and of renders",
     )
     points: int = Field(
         default=2000, ge=1, description="random points to start from where no file has any (4DGS)"
     )
-    box: float = Field(default=1.3, gt=0, description="they lie within -box and box")
+    box: float = Field(default=1.3, gt=0, description="their coordinates are between -box and box")
     cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
@@ -49,15 +50,8 @@ class DnerfReader(ClipReader):
         background, points, box, cache_mb: see DnerfConfig.
     """
 
-    def __init__(
-        self,
-        background: Literal["white", "black"] = "black",
-        points: int = 2000,
-        box: float = 1.3,
-        cache_mb: int = 512,
-    ) -> None:
-        self.background, self.points, self.box = background, points, box
-        self.cache_mb = cache_mb
+    Config: ClassVar = DnerfConfig
+    config: DnerfConfig
 
     def matches(self, folder: Path) -> bool:
         return (Path(folder) / "transforms_train.json").is_file()
@@ -71,15 +65,15 @@ class DnerfReader(ClipReader):
         files = {name: parse_json(folder / name, Transforms) for name in names}
         rows = [(name, i, frame) for name in names for i, frame in enumerate(files[name].frames)]
         untimed = [(name, i) for name, i, frame in rows if frame.time is None]
-        faults = [f"{name} has no frames" for name in names[:2] if not files[name].frames]
+        problems = [f"{name} has no frames" for name in names[:2] if not files[name].frames]
         if untimed:
             name, i = untimed[0]
-            faults.append(
+            problems.append(
                 f'{name}: frames.{i} has no "time" ({len(untimed)} frames of all): a still Blender '
                 "scene? D-NeRF's frames have a time from 0 to 1"
             )
         needs = [Need.of(*image_names(frame), maker=MAKER) for _, _, frame in rows]
-        require_files(folder, LAYOUT, needs, faults)
+        require_files(folder, LAYOUT, needs, problems)
         images = [path for need in needs if (path := need.found(folder)) is not None]
         wheres = [f"{folder / name}: frames.{i}" for name, i, _ in rows]
         lenses = [
@@ -105,8 +99,8 @@ class DnerfReader(ClipReader):
                 images,
                 cameras,
                 lenses=lenses,
-                background=COLORS[self.background],
-                cache_mb=self.cache_mb,
+                background=COLORS[self.config.background],
+                cache_mb=self.config.cache_mb,
             ),
             cameras=cameras,
             moments=timed_moments(times, split["train"]),
@@ -120,7 +114,7 @@ class DnerfReader(ClipReader):
                 "reader": "reader:dnerf",
                 "cameras": "Blender, exact; the scene has no unit",
                 "points": origin,
-                "images": f"transparent parts over {self.background}",
+                "images": f"transparent parts over {self.config.background}",
             },
         )
 
@@ -128,11 +122,9 @@ class DnerfReader(ClipReader):
         for name in POINT_FILES:
             if (folder / name).is_file():
                 return (*read_points(folder / name), name)
-        rng = np.random.default_rng(0)
-        points = torch.from_numpy(rng.uniform(-self.box, self.box, (self.points, 3))).float()
-        origin = (
-            f"{self.points} at random within ±{self.box:g} (4DGaussians, readNerfSyntheticInfo)"
-        )
+        rng, count, box = np.random.default_rng(0), self.config.points, self.config.box
+        points = torch.from_numpy(rng.uniform(-box, box, (count, 3))).float()
+        origin = f"{count} at random within ±{box:g} (4DGaussians, readNerfSyntheticInfo)"
         return points, torch.full_like(points, 0.5), origin
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -12,27 +12,27 @@ from jaxtyping import Float
 from PIL import Image
 from pydantic import Field
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip, ObjectTrack, uniform_test_split
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
-from hoigs.core.interaction import EntityKind
-from hoigs.core.reader import ClipReader
-from hoigs.core.rotation import axis_angle_to_matrices
-from hoigs.plugins.readers.frame_order import image_files, video_moments
-from hoigs.plugins.readers.lazy_frames import LazyFrames, MaskFiles, image_size
-from hoigs.plugins.readers.listing import Need, require_files
-from hoigs.plugins.readers.pickles import load_pickled_npy
-from hoigs.plugins.readers.poses import rigid
-from hoigs.plugins.readers.start_points import points_along_rays
+from hoigs.core.interfaces.reader import ClipReader
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip, ObjectTrack, uniform_test_split
+from hoigs.core.values.tokens import EntityKind
+from hoigs.plugins.readers.common.frame_order import image_files, video_moments
+from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
+from hoigs.plugins.readers.common.listing import Need, require_files
+from hoigs.plugins.readers.common.pickles import load_pickled_npy
+from hoigs.plugins.readers.common.poses import rigid
+from hoigs.plugins.readers.common.start_points import points_along_rays
 
 LAYOUT = "a HOLD build folder"
 MAKER = "`generator/scripts/build_dataset.py` of zc-alexfan/hold, or its released data, makes it"
 VALUES = {"object": 50, "right": 150, "left": 250}  # of mask pixels
 NEAREST, FARTHEST = 1.0, 4.0  # scene points start within these times the object's distance
 NO_POSES = (
-    "MANO parameters of a hand are no body's: which arm holds it is not in the data, so they are "
-    "not turned into SMPL-X; leave it out with `--set entities=[scene,object]`, or fit a body"
+    "HOLD has MANO hands without a body or an arm, so they are not converted to SMPL-X poses; "
+    "leave them out with `--set entities=[scene,object]`, or fit a body"
 )
 Array = np.ndarray
 
@@ -41,7 +41,7 @@ class HoldConfig(ComponentConfig):
     """Settings of reader:hold."""
 
     points: int = Field(default=20_000, ge=1, description="scene points to start from")
-    fps: float = Field(default=30.0, gt=0, description="of the video; the layout does not say")
+    fps: float = Field(default=30.0, gt=0, description="of the video; the layout has none")
     cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
@@ -50,35 +50,37 @@ class HoldReader(ClipReader):
 
     The world is HOLD's before `scale_mat` shrinks it into the unit sphere. Entities are "object"
     and "hand_right", "hand_left", which have masks and no body poses. Poses of frames that SfM
-    could not place were filled by HOLD's slerp, and cannot be told from the others.
+    could not place were filled by HOLD's slerp; the data does not mark which ones.
 
     Args:
         points, fps, cache_mb: see HoldConfig.
     """
 
-    def __init__(self, points: int = 20_000, fps: float = 30.0, cache_mb: int = 512) -> None:
-        self.points, self.fps, self.cache_mb = points, fps, cache_mb
+    Config: ClassVar = HoldConfig
+    config: HoldConfig
 
     def matches(self, folder: Path) -> bool:
-        room = _build(Path(folder))
-        return (room / "data.npy").is_file() or (room.name == "build" and (room / "image").is_dir())
+        build = _build(Path(folder))
+        return (build / "data.npy").is_file() or (
+            build.name == "build" and (build / "image").is_dir()
+        )
 
     def read(self, folder: Path) -> Clip:
         folder = Path(folder)
         require_files(folder, LAYOUT, [])
-        room = _build(folder)
-        images = image_files(room / "image")
-        prefix = f"{room.relative_to(folder).as_posix()}/" if room != folder else ""
+        build = _build(folder)
+        images = image_files(build / "image")
+        prefix = f"{build.relative_to(folder).as_posix()}/" if build != folder else ""
         needs = [Need.of(f"{prefix}data.npy", maker=MAKER)]
         if not images:
             needs.append(Need.of(f"{prefix}image/0000.png", maker=MAKER))
         needs += [Need.of(f"{prefix}mask/{p.stem}.png", maker=MAKER) for p in images]
         require_files(folder, LAYOUT, needs)
-        data: Any = load_pickled_npy(room / "data.npy")
-        where = str(room / "data.npy")
+        data: Any = load_pickled_npy(build / "data.npy")
+        where = str(build / "data.npy")
         if not isinstance(data, dict) or not {"cameras", "entities"} <= set(data):
             raise ClipError(f"{where}: expected a dictionary with cameras and entities")
-        paths = [room / "mask" / f"{p.stem}.png" for p in images]
+        paths = [build / "mask" / f"{p.stem}.png" for p in images]
         _require_values(paths[0])
         cameras = _cameras(data["cameras"], images, where)
         hands = [h for h in ("right", "left") if h in data["entities"]]
@@ -86,12 +88,12 @@ class HoldReader(ClipReader):
         kinds["object"] = "object"
         masks = {n: MaskFiles(paths, _marked(VALUES[n.removeprefix("hand_")])) for n in kinds}
         track = _object(data["entities"].get("object"), len(images), where)
-        store = LazyFrames(room, images, cameras, masks=masks, cache_mb=self.cache_mb)
+        store = LazyFrames(build, images, cameras, masks=masks, cache_mb=self.config.cache_mb)
         away = float(cameras[0].to_camera(track.translations)[:, 2].median())
         span = (NEAREST * away, FARTHEST * away)
-        points, colors = points_along_rays(store, cameras, tuple(kinds), span, self.points)
+        points, colors = points_along_rays(store, cameras, tuple(kinds), span, self.config.points)
         return Clip(
-            name=(room.parent if room.name == "build" else room).resolve().name,
+            name=(build.parent if build.name == "build" else build).resolve().name,
             store=store,
             cameras=cameras,
             moments=video_moments(range(len(images)), len(images)),
@@ -101,7 +103,7 @@ class HoldReader(ClipReader):
             points=points,
             point_colors=colors,
             split=uniform_test_split(len(images)),
-            fps=self.fps,
+            fps=self.config.fps,
             provenance={
                 "reader": "reader:hold",
                 "cameras": "world_mat of data.npy; scale_mat left out, so metres",
@@ -136,7 +138,7 @@ def decomposed(
     """K and the rigid world-to-camera of P = K [R | t], up to P's scale and sign.
 
     Raises:
-        ClipError: it is no camera's, or one with skew.
+        ClipError: P has no inverse, or its pixels are skewed.
     """
     from scipy.linalg import rq
 

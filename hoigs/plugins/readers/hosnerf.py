@@ -1,11 +1,11 @@
-"""reader:hosnerf: scenes of HOSNeRF (Liu 2023), one person who handles things, a moving camera."""
+"""reader:hosnerf: scenes of HOSNeRF (Liu 2023), one person who handles objects, a moving camera."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -14,22 +14,21 @@ from PIL import Image
 from pydantic import Field
 from torch import Tensor
 
-from hoigs.core.body_params import betas_of_joints, pose_from_smpl
-from hoigs.core.clip import BodyTrack, Clip, FrameStore, uniform_test_split
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
-from hoigs.core.interaction import EntityKind
-from hoigs.core.lens import Lens
-from hoigs.core.reader import ClipReader
-from hoigs.core.registry import default_registry
-from hoigs.core.rotation import axis_angle_to_matrices, matrices_to_axis_angle
-from hoigs.plugins.readers.frame_order import image_files, video_moments
-from hoigs.plugins.readers.json_file import load_json
-from hoigs.plugins.readers.lazy_frames import LazyFrames, MaskFiles, image_size
-from hoigs.plugins.readers.listing import Need, require_files
-from hoigs.plugins.readers.pickles import load_pickle
-from hoigs.plugins.readers.poses import checked_rotation, rigid
-from hoigs.plugins.readers.start_points import points_along_rays
+from hoigs.core.interfaces.reader import ClipReader
+from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
+from hoigs.core.model.smpl_params import betas_of_joints, pose_from_smpl
+from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, uniform_test_split
+from hoigs.core.values.lens import Lens
+from hoigs.core.values.tokens import EntityKind
+from hoigs.plugins.readers.common.frame_order import image_files, video_moments
+from hoigs.plugins.readers.common.json_file import load_json
+from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
+from hoigs.plugins.readers.common.listing import Need, require_files
+from hoigs.plugins.readers.common.pickles import load_pickle
+from hoigs.plugins.readers.common.poses import body_model, checked_rotation, rigid
+from hoigs.plugins.readers.common.start_points import points_along_rays
 
 LAYOUT = "a HOSNeRF scene"
 AUTHORS = "it is in the authors' download (github.com/TencentARC/HOSNeRF)"
@@ -37,7 +36,7 @@ OBJECT_MASKS = "object_masks"  # ours: HOSNeRF has one mask for person and objec
 ANOTHER_PERSON = 0.1  # metres between zero-pose joints
 SAME_SCALE, SAME_VIEW = 0.1, np.radians(5.0)
 NO_POSES = (
-    "no poses without an SMPL model, from which shape and place come: "
+    "no poses without an SMPL model, which gives shape and position: "
     "--reader hosnerf --reader-set smpl=SMPL_NEUTRAL.npz"
 )
 Array = np.ndarray
@@ -50,15 +49,15 @@ class HosnerfConfig(ComponentConfig):
         default=None, description="your SMPL model as .npz (body:smpl); without it, no body poses"
     )
     points: int = Field(default=20_000, ge=1, description="scene points to start from")
-    fps: float = Field(default=30.0, gt=0, description="of the video; the layout does not say")
+    fps: float = Field(default=30.0, gt=0, description="of the video; the layout has none")
     cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class HosnerfReader(ClipReader):
     """Cameras, masks and SMPL poses, matched by frame name, in metres.
 
-    The world is COLMAP's at the scale of the SMPL body (`smpl_to_world` holds the scale). Masks are
-    of person and object together: entity "human"; put masks of the object alone into
+    The world is COLMAP's, scaled to the SMPL body (`smpl_to_world` contains the scale). Masks
+    are of person and object together: entity "human"; put masks of the object alone into
     `object_masks/` to have both. There is neither a point cloud nor depth: scene points start
     along the rays, between the bounds of poses_bounds.npy.
 
@@ -66,15 +65,8 @@ class HosnerfReader(ClipReader):
         smpl, points, fps, cache_mb: see HosnerfConfig.
     """
 
-    def __init__(
-        self,
-        smpl: str | Path | None = None,
-        points: int = 20_000,
-        fps: float = 30.0,
-        cache_mb: int = 512,
-    ) -> None:
-        self.smpl = None if smpl is None else Path(smpl)
-        self.points, self.fps, self.cache_mb = points, fps, cache_mb
+    Config: ClassVar = HosnerfConfig
+    config: HosnerfConfig
 
     def matches(self, folder: Path) -> bool:
         own = ("cameras.pkl", "mesh_infos.pkl", "canonical_joints.pkl")
@@ -83,33 +75,39 @@ class HosnerfReader(ClipReader):
     def read(self, folder: Path) -> Clip:
         folder = Path(folder)
         images = image_files(folder / "images")
-        rooms = ["masks", *([OBJECT_MASKS] if (folder / OBJECT_MASKS).is_dir() else [])]
+        mask_folders = ["masks", *([OBJECT_MASKS] if (folder / OBJECT_MASKS).is_dir() else [])]
         makers = {"masks": AUTHORS, OBJECT_MASKS: "your segmenter makes it; or remove the folder"}
         names = ("cameras.pkl", "mesh_infos.pkl", "poses_bounds.npy")
         needs = [Need.of(name, maker=AUTHORS) for name in names]
         if not images:
             needs.append(Need.of("images/00000.png", "images/00000.jpg", maker=AUTHORS))
         needs += [
-            Need.of(f"{room}/{path.stem}.png", maker=makers[room])
-            for room in rooms
+            Need.of(f"{mask_folder}/{path.stem}.png", maker=makers[mask_folder])
+            for mask_folder in mask_folders
             for path in images
         ]
         require_files(folder, LAYOUT, needs)
         rig = _read_rig(folder, images)
         kinds: dict[str, EntityKind] = {"human": "human"}
         masks = {"human": MaskFiles([folder / "masks" / f"{p.stem}.png" for p in images], _any)}
-        if OBJECT_MASKS in rooms:
+        if OBJECT_MASKS in mask_folders:
             kinds["object"] = "object"
             own = [folder / OBJECT_MASKS / f"{p.stem}.png" for p in images]
             masks["object"] = MaskFiles(own, _any)
         cameras = [lens.camera(w2c) for lens, w2c in zip(rig.lenses, rig.world_to_camera)]
         store: FrameStore = LazyFrames(
-            folder, images, cameras, masks=masks, lenses=rig.lenses, cache_mb=self.cache_mb
+            folder, images, cameras, masks=masks, lenses=rig.lenses, cache_mb=self.config.cache_mb
         )
         if "object" in kinds:
-            store = _Apart(store)
-        bodies = {} if self.smpl is None else {"human": _body(folder, images, rig, self.smpl)}
-        points, colors = points_along_rays(store, cameras, tuple(kinds), rig.span, self.points)
+            store = _ObjectRemoved(store)
+        bodies = (
+            {}
+            if self.config.smpl is None
+            else {"human": _body(folder, images, rig, self.config.smpl)}
+        )
+        points, colors = points_along_rays(
+            store, cameras, tuple(kinds), rig.span, self.config.points
+        )
         provenance: dict[str, Any] = {
             "reader": "reader:hosnerf",
             "cameras": f"cameras.pkl, by name; COLMAP's world divided by {rig.scale:.6g}: metres",
@@ -131,7 +129,7 @@ class HosnerfReader(ClipReader):
             points=points,
             point_colors=colors,
             split=published_split(len(images)),
-            fps=self.fps,
+            fps=self.config.fps,
             provenance=provenance,
         )
 
@@ -212,13 +210,14 @@ def _bounds(
     """Near and far in COLMAP's unit, by image; its rows follow the sorted names.
 
     Raises:
-        ClipError: another number of rows, or rows that turn another way than the cameras do, which
-            is how a wrong pairing shows.
+        ClipError: the number of rows is wrong, or rows are rotated differently from the cameras,
+            as they are if rows and images are paired wrongly.
     """
     rows = np.load(path, allow_pickle=False)
     if rows.shape != (len(images), 17):
         raise ClipError(
-            f"{path} has shape {list(rows.shape)}, expected [{len(images)}, 17]: one row an image"
+            f"{path} has shape {list(rows.shape)}, expected [{len(images)}, 17], "
+            "one row for each image"
         )
     order = np.argsort(np.argsort([p.name for p in images]))  # the image's place by plain sorting
     rows = rows[order].astype(np.float64)
@@ -252,15 +251,16 @@ def _body(folder: Path, images: Sequence[Path], rig: _Rig, smpl: Path) -> BodyTr
         columns[key] = torch.from_numpy(np.stack(rows))
     rest = columns["tpose_joints"].unflatten(-1, (24, 3))
     shapes = rest - rest[:, :1]
-    # HumanNeRF's preparation keeps a shape a frame; joints are linear in it, and so is their mean
+    # HumanNeRF's preparation has a shape for each frame; joints are linear in it, so their
+    # mean is that of the mean shape
     shape = shapes.mean(0)
     spread = float((shapes - shape).norm(dim=-1).max())
     if spread > ANOTHER_PERSON:
         raise ClipError(
             f"{folder}/mesh_infos.pkl: tpose_joints of some frame are {100 * spread:.0f} cm off "
-            "the mean: they are of somebody else"
+            "their mean: they are not of one person"
         )
-    body = default_registry().get("body:smpl")(smpl)
+    body = body_model("body:smpl", smpl)
     betas = betas_of_joints(body, shape[:22])
     pelvis = body.shaped(betas)[1][0].double()
     similar = torch.from_numpy(rig.smpl_to_world)
@@ -278,8 +278,8 @@ def _body(folder: Path, images: Sequence[Path], rig: _Rig, smpl: Path) -> BodyTr
     )
 
 
-class _Apart(FrameStore):
-    """The mask of person and object, without the object, is the person's."""
+class _ObjectRemoved(FrameStore):
+    """Frames whose mask of the person has the pixels of the object removed."""
 
     def __init__(self, base: FrameStore) -> None:
         self.base, self.root = base, base.root

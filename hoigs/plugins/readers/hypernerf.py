@@ -4,22 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from pydantic import BaseModel, Field
 
-from hoigs.core.clip import Clip
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
-from hoigs.core.lens import Lens
-from hoigs.core.moment import Moment
-from hoigs.core.reader import ClipReader
-from hoigs.plugins.readers.frame_order import natural
-from hoigs.plugins.readers.json_file import parse_json, parse_json_map
-from hoigs.plugins.readers.lazy_frames import DepthFiles, LazyFrames, MaskFiles, dark, lens_for
-from hoigs.plugins.readers.listing import Need, require_files
-from hoigs.plugins.readers.point_file import Points, read_points
-from hoigs.plugins.readers.poses import checked_rotation, rigid
+from hoigs.core.interfaces.reader import ClipReader
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.lens import Lens
+from hoigs.core.values.moment import Moment
+from hoigs.plugins.readers.common.frame_order import natural
+from hoigs.plugins.readers.common.json_file import parse_json, parse_json_map
+from hoigs.plugins.readers.common.lazy_frames import (
+    DepthFiles,
+    LazyFrames,
+    MaskFiles,
+    dark,
+    lens_for,
+)
+from hoigs.plugins.readers.common.listing import Need, require_files
+from hoigs.plugins.readers.common.point_file import Points, read_points
+from hoigs.plugins.readers.common.poses import checked_rotation, rigid
 
 LAYOUT = "a Nerfies or HyperNeRF capture (dataset.json, camera/ …)"
 MAKER = (
@@ -75,7 +82,9 @@ class HypernerfConfig(ComponentConfig):
     """Settings of reader:hypernerf."""
 
     factor: int | None = Field(
-        default=None, ge=1, description="reads rgb/FACTORx; 2 if it is there, else the finest"
+        default=None,
+        ge=1,
+        description="reads rgb/FACTORx; by default 2 if there, else the smallest",
     )
     fps: float = Field(default=15.0, gt=0, description="of the capture")
     cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
@@ -92,8 +101,8 @@ class HypernerfReader(ClipReader):
         factor, fps, cache_mb: see HypernerfConfig.
     """
 
-    def __init__(self, factor: int | None = None, fps: float = 15.0, cache_mb: int = 512) -> None:
-        self.factor, self.fps, self.cache_mb = factor, fps, cache_mb
+    Config: ClassVar = HypernerfConfig
+    config: HypernerfConfig
 
     def matches(self, folder: Path) -> bool:
         folder = Path(folder)
@@ -106,12 +115,12 @@ class HypernerfReader(ClipReader):
         dataset = parse_json(folder / "dataset.json", DatasetJson)
         scene = parse_json(folder / "scene.json", SceneJson)
         metadata = parse_json_map(folder / "metadata.json", MetadataJson)
-        room = f"rgb/{self.factor or _usual_factor(folder)}x"
-        require_files(folder, LAYOUT, _needs(dataset, room), _faults(dataset, metadata))
+        image_folder = f"rgb/{self.config.factor or _usual_factor(folder)}x"
+        require_files(folder, LAYOUT, _needs(dataset, image_folder), _problems(dataset, metadata))
         ids = sorted(
             dataset.ids, key=lambda i: (metadata[i].step, metadata[i].camera_id, natural(i))
         )
-        images = [folder / room / f"{name}.png" for name in ids]
+        images = [folder / image_folder / f"{name}.png" for name in ids]
         cameras, lenses = [], []
         for name, image in zip(ids, images):
             path = folder / "camera" / f"{name}.json"
@@ -132,7 +141,7 @@ class HypernerfReader(ClipReader):
                 ignored=MaskFiles(seen, dark) if any(seen) else None,
                 depth=DepthFiles(depths, scene.scale) if any(depths) else None,
                 lenses=lenses,
-                cache_mb=self.cache_mb,
+                cache_mb=self.config.cache_mb,
             ),
             cameras=cameras,
             moments=[Moment(metadata[n].step / last, metadata[n].step) for n in ids],
@@ -142,12 +151,12 @@ class HypernerfReader(ClipReader):
             points=points,
             point_colors=colors,
             split=split,
-            fps=self.fps,
+            fps=self.config.fps,
             depth_kind="metric" if any(depths) else "none",
             provenance={
                 "reader": "reader:hypernerf",
                 "cameras": f"the capture's, (x - {list(scene.center)}) * {scene.scale:g}",
-                "images": room,
+                "images": image_folder,
                 "points": origin,
             },
         )
@@ -158,27 +167,29 @@ def _usual_factor(folder: Path) -> int:
     return USUAL_FACTOR if USUAL_FACTOR in factors or not factors else factors[0]
 
 
-def _needs(dataset: DatasetJson, room: str) -> list[Need]:
+def _needs(dataset: DatasetJson, image_folder: str) -> list[Need]:
     needs = [Need.of(*POINT_FILES[::-1], maker=MAKER)]
     for name in dataset.ids:
         needs.append(Need.of(f"camera/{name}.json", maker=MAKER))
-        needs.append(Need.of(f"{room}/{name}.png", maker=MAKER))
+        needs.append(Need.of(f"{image_folder}/{name}.png", maker=MAKER))
     return needs
 
 
-def _faults(dataset: DatasetJson, metadata: dict[str, MetadataJson]) -> list[str]:
-    faults = []
+def _problems(dataset: DatasetJson, metadata: dict[str, MetadataJson]) -> list[str]:
+    problems = []
     unknown = [name for name in dataset.ids if name not in metadata]
     if unknown:
-        faults.append(f"metadata.json has no {', '.join(unknown[:4])} of dataset.json's ids")
+        problems.append(f"metadata.json has no {', '.join(unknown[:4])} of dataset.json's ids")
     known = set(dataset.ids)
     for key, names in (("train_ids", dataset.train_ids), ("val_ids", dataset.val_ids)):
-        strange = [name for name in names if name not in known]
-        if strange:
-            faults.append(f"dataset.json: {key} has {', '.join(strange[:4])}: not among its ids")
+        unknown_ids = [name for name in names if name not in known]
+        if unknown_ids:
+            problems.append(
+                f"dataset.json: {key} has {', '.join(unknown_ids[:4])}: not among its ids"
+            )
     if dataset.val_ids and not dataset.train_ids:
-        faults.append("dataset.json has val_ids and no train_ids")
-    return faults
+        problems.append("dataset.json has val_ids and no train_ids")
+    return problems
 
 
 def _camera(path: Path, camera: CameraJson, scene: SceneJson) -> tuple[Lens, np.ndarray]:
@@ -207,9 +218,9 @@ def _split(dataset: DatasetJson, ids: Sequence[str]) -> dict[str, list[int]]:
     }
 
 
-def _optional(folder: Path, rooms: str, ids: Sequence[str], suffix: str) -> list[Path | None]:
-    """Files of the finest of the folders that match, where a frame has one."""
-    found = sorted(folder.glob(rooms), key=lambda p: natural(p.as_posix()))
+def _optional(folder: Path, pattern: str, ids: Sequence[str], suffix: str) -> list[Path | None]:
+    """Each frame's file, or None, in the folder of the highest resolution that matches."""
+    found = sorted(folder.glob(pattern), key=lambda p: natural(p.as_posix()))
     if not found:
         return [None] * len(ids)
     paths = [found[0] / f"{name}{suffix}" for name in ids]

@@ -4,28 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
 from pydantic import Field
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip, uniform_test_split
 from hoigs.core.config import ComponentConfig
-from hoigs.core.moment import Moment
-from hoigs.core.reader import ClipReader
-from hoigs.plugins.readers.frame_order import natural, timed_moments, video_moments
-from hoigs.plugins.readers.json_file import parse_json
-from hoigs.plugins.readers.lazy_frames import DepthFiles, LazyFrames, MaskFiles, dark
-from hoigs.plugins.readers.listing import Need, require_files
-from hoigs.plugins.readers.point_file import Points, read_points
-from hoigs.plugins.readers.poses import opengl_to_world_to_camera
-from hoigs.plugins.readers.transforms import TransformFrame, Transforms, lens_of
+from hoigs.core.interfaces.reader import ClipReader
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip, uniform_test_split
+from hoigs.core.values.moment import Moment
+from hoigs.plugins.readers.common.frame_order import natural, timed_moments, video_moments
+from hoigs.plugins.readers.common.json_file import parse_json
+from hoigs.plugins.readers.common.lazy_frames import DepthFiles, LazyFrames, MaskFiles, dark
+from hoigs.plugins.readers.common.listing import Need, require_files
+from hoigs.plugins.readers.common.point_file import Points, read_points
+from hoigs.plugins.readers.common.poses import opengl_to_world_to_camera
+from hoigs.plugins.readers.common.transforms import TransformFrame, Transforms, lens_of
 
 LAYOUT = "a nerfstudio capture (transforms.json)"
 MAKER = "`ns-process-data images` or `video` writes transforms.json and the images beside it"
-MASK_MAKER = "your segmenter makes it: black where nothing shall be learned; or drop mask_path"
-DEPTH_MAKER = "your capture app or depth network makes it; or drop depth_file_path"
+MASK_MAKER = "your segmenter makes it: black where pixels are ignored; or remove mask_path"
+DEPTH_MAKER = "your capture app or depth network makes it; or remove depth_file_path"
 RANDOM_BOX = 5.0  # times the largest camera coordinate: splatfacto's random_scale of 10
 
 
@@ -44,24 +45,16 @@ class NerfstudioConfig(ComponentConfig):
 class NerfstudioReader(ClipReader):
     """Frames in natural order of their names, as nerfstudio sorts them, whatever the file's order.
 
-    The world is the file's, divided by its `applied_scale`, so that capture apps' metres come
-    back. Masks are nerfstudio's: black pixels are ignored. Depth is in metres. Frames without
-    "time" are evenly spaced.
+    The world is the file's, divided by its `applied_scale`, which restores the metres of
+    capture apps. Masks are nerfstudio's: black pixels are ignored. Depth is in metres. Frames
+    without "time" are evenly spaced.
 
     Args:
         factor, depth_unit, points, fps, cache_mb: see NerfstudioConfig.
     """
 
-    def __init__(
-        self,
-        factor: int = 1,
-        depth_unit: float = 0.001,
-        points: int = 50_000,
-        fps: float = 30.0,
-        cache_mb: int = 512,
-    ) -> None:
-        self.factor, self.depth_unit, self.points = factor, depth_unit, points
-        self.fps, self.cache_mb = fps, cache_mb
+    Config: ClassVar = NerfstudioConfig
+    config: NerfstudioConfig
 
     def matches(self, folder: Path) -> bool:
         return (Path(folder) / "transforms.json").is_file()
@@ -72,7 +65,7 @@ class NerfstudioReader(ClipReader):
         file = parse_json(folder / "transforms.json", Transforms)
         rows = sorted(enumerate(file.frames), key=lambda row: natural(row[1].file_path))
         frames = [frame for _, frame in rows]
-        require_files(folder, LAYOUT, self._needs(file, frames), _faults(file, frames))
+        require_files(folder, LAYOUT, self._needs(file, frames), _problems(file, frames))
         wheres = [f"{folder / 'transforms.json'}: frames.{i}" for i, _ in rows]
         images = [folder / self._image(frame) for frame in frames]
         lenses = [lens_of(file, *each) for each in zip(frames, images, wheres)]
@@ -92,9 +85,9 @@ class NerfstudioReader(ClipReader):
                 images,
                 cameras,
                 ignored=MaskFiles(masks, dark) if any(masks) else None,
-                depth=DepthFiles(depths, self.depth_unit) if any(depths) else None,
+                depth=DepthFiles(depths, self.config.depth_unit) if any(depths) else None,
                 lenses=lenses,
-                cache_mb=self.cache_mb,
+                cache_mb=self.config.cache_mb,
             ),
             cameras=cameras,
             moments=_moments(frames, split["train"]),
@@ -104,7 +97,7 @@ class NerfstudioReader(ClipReader):
             points=points,
             point_colors=colors,
             split=split,
-            fps=self.fps,
+            fps=self.config.fps,
             depth_kind="metric" if any(depths) else "none",
             provenance={
                 "reader": "reader:nerfstudio",
@@ -114,9 +107,9 @@ class NerfstudioReader(ClipReader):
         )
 
     def _image(self, frame: TransformFrame) -> str:
-        if self.factor == 1:
+        if self.config.factor == 1:
             return frame.file_path
-        return f"images_{self.factor}/{Path(frame.file_path).name}"
+        return f"images_{self.config.factor}/{Path(frame.file_path).name}"
 
     def _needs(self, file: Transforms, frames: Sequence[TransformFrame]) -> list[Need]:
         needs = [Need.of(self._image(frame), maker=MAKER) for frame in frames]
@@ -126,7 +119,7 @@ class NerfstudioReader(ClipReader):
             if frame.depth_file_path:
                 needs.append(Need.of(frame.depth_file_path, maker=DEPTH_MAKER))
         if file.ply_file_path:
-            needs.append(Need.of(file.ply_file_path, maker="`ns-process-data`; or drop its key"))
+            needs.append(Need.of(file.ply_file_path, maker="`ns-process-data`; or remove its key"))
         return needs
 
     def _points(
@@ -139,28 +132,32 @@ class NerfstudioReader(ClipReader):
         middle = centers.mean(0)
         reach = RANDOM_BOX * max(float((centers - middle).abs().max()), 1e-6)
         rng = np.random.default_rng(0)
-        points = middle + torch.from_numpy(rng.uniform(-reach, reach, (self.points, 3))).float()
-        origin = f"{self.points} at random within ±{reach:.3g} of the cameras, as splatfacto does"
+        points = (
+            middle + torch.from_numpy(rng.uniform(-reach, reach, (self.config.points, 3))).float()
+        )
+        origin = (
+            f"{self.config.points} at random within ±{reach:.3g} of the cameras, as splatfacto does"
+        )
         return points, torch.full_like(points, 0.5), origin
 
 
-def _faults(file: Transforms, frames: Sequence[TransformFrame]) -> list[str]:
-    faults = [] if frames else ["transforms.json has no frames"]
+def _problems(file: Transforms, frames: Sequence[TransformFrame]) -> list[str]:
+    problems = [] if frames else ["transforms.json has no frames"]
     timed = sum(frame.time is not None for frame in frames)
     if 0 < timed < len(frames):
-        faults.append(
+        problems.append(
             f'transforms.json: {timed} of {len(frames)} frames have a "time"; all or none'
         )
     if file.applied_scale <= 0:
-        faults.append(f"transforms.json: applied_scale is {file.applied_scale:g}; expected > 0")
+        problems.append(f"transforms.json: applied_scale is {file.applied_scale:g}; expected > 0")
     named, known = _named(file), {_plain(frame.file_path) for frame in frames}
     for key, names in named.items():
         unknown = [name for name in names if name not in known]
         if unknown:
-            faults.append(f"transforms.json: {key} lists {', '.join(unknown[:4])}: not in frames")
+            problems.append(f"transforms.json: {key} lists {', '.join(unknown[:4])}: not in frames")
     if named and "train_filenames" not in named:
-        faults.append(f"transforms.json has {', '.join(named)} and no train_filenames")
-    return faults
+        problems.append(f"transforms.json has {', '.join(named)} and no train_filenames")
+    return problems
 
 
 def _plain(path: str) -> str:

@@ -5,26 +5,32 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from pydantic import Field
 
-from hoigs.core.body_params import pose_from_smpl
-from hoigs.core.clip import BodyTrack, Clip
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
-from hoigs.core.reader import ClipReader
-from hoigs.core.registry import default_registry
-from hoigs.core.rotation import axis_angle_to_matrices, matrices_to_axis_angle
-from hoigs.plugins.readers.colmap_model import SparseModel, View, read_sparse, sparse_needs
-from hoigs.plugins.readers.frame_order import image_files, video_moments
-from hoigs.plugins.readers.joblib_file import load_joblib
-from hoigs.plugins.readers.lazy_frames import DepthFiles, LazyFrames, MaskFiles, dark, lens_for
-from hoigs.plugins.readers.listing import Need, require_files
-from hoigs.plugins.readers.pickles import load_pickled_npy
+from hoigs.core.interfaces.reader import ClipReader
+from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
+from hoigs.core.model.smpl_params import pose_from_smpl
+from hoigs.core.values.clip import BodyTrack, Clip
+from hoigs.plugins.readers.common.colmap_model import SparseModel, View, read_sparse, sparse_needs
+from hoigs.plugins.readers.common.frame_order import image_files, video_moments
+from hoigs.plugins.readers.common.joblib_file import load_joblib
+from hoigs.plugins.readers.common.lazy_frames import (
+    DepthFiles,
+    LazyFrames,
+    MaskFiles,
+    dark,
+    lens_for,
+)
+from hoigs.plugins.readers.common.listing import Need, require_files
+from hoigs.plugins.readers.common.pickles import load_pickled_npy
+from hoigs.plugins.readers.common.poses import body_model
 
 LAYOUT = "a NeuMan scene"
 AUTHORS = "it is in the authors' download (github.com/apple/ml-neuman)"
@@ -50,15 +56,15 @@ class NeumanConfig(ComponentConfig):
     smpl: Path | None = Field(
         default=None, description="your neutral SMPL model as .npz; without it, no body poses"
     )
-    fps: float = Field(default=30.0, gt=0, description="of the video; the layout does not say")
+    fps: float = Field(default=30.0, gt=0, description="of the video; the layout has none")
     cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class NeumanReader(ClipReader):
     """Cameras, points, MVS depth, person masks and SMPL poses, in metres.
 
-    alignments.npy puts each frame's body into COLMAP's world by a similarity of its own. The median
-    of their scales turns COLMAP's unit into metres. Where a frame's scale is another, its body
+    alignments.npy puts each frame's body into COLMAP's world by its own similarity. The median
+    of their scales turns COLMAP's unit into metres. Where a frame's scale differs, its body
     keeps its size and moves along the line from the camera, so that it looks as it did. Shape is
     the median of the frames' betas.
 
@@ -66,11 +72,8 @@ class NeumanReader(ClipReader):
         smpl, fps, cache_mb: see NeumanConfig.
     """
 
-    def __init__(
-        self, smpl: str | Path | None = None, fps: float = 30.0, cache_mb: int = 512
-    ) -> None:
-        self.smpl = None if smpl is None else Path(smpl)
-        self.fps, self.cache_mb = fps, cache_mb
+    Config: ClassVar = NeumanConfig
+    config: NeumanConfig
 
     def matches(self, folder: Path) -> bool:
         folder = Path(folder)
@@ -94,8 +97,8 @@ class NeumanReader(ClipReader):
         depth = [path if path.is_file() else None for path in depths]
         masks = [folder / "segmentations" / name for name in names]
         bodies = {}
-        if self.smpl is not None:
-            bodies["human"] = _body(folder, names, model, alignments, unit, self.smpl)
+        if self.config.smpl is not None:
+            bodies["human"] = _body(folder, names, model, alignments, unit, self.config.smpl)
         order = {name: i for i, name in enumerate(files)}
         spread = np.ptp(alignments.scales) / unit
         provenance: dict[str, Any] = {
@@ -114,7 +117,7 @@ class NeumanReader(ClipReader):
                 masks={"human": MaskFiles(masks, dark)},
                 depth=DepthFiles(depth, 1 / unit, read_mvs_depth) if any(depth) else None,
                 lenses=lenses,
-                cache_mb=self.cache_mb,
+                cache_mb=self.config.cache_mb,
             ),
             cameras=cameras,
             moments=video_moments([order[name] for name in names], len(files), bodies),
@@ -124,7 +127,7 @@ class NeumanReader(ClipReader):
             points=model.points / unit,
             point_colors=model.colors,
             split={use: _listed(folder, use, names) for use in SPLITS},
-            fps=self.fps,
+            fps=self.config.fps,
             depth_kind="metric" if any(depth) else "none",
             provenance=provenance,
         )
@@ -141,7 +144,7 @@ def _needs(folder: Path, images: Sequence[str]) -> list[Need]:
 
 @dataclass(frozen=True)
 class _Alignments:
-    """x_world = scale R x_smpl + t, a row a frame, in COLMAP's unit."""
+    """x_world = scale R x_smpl + t, one row for each frame, in COLMAP's unit."""
 
     scales: Float[Array, " F"]
     rotations: Float[Array, "F 3 3"]
@@ -184,11 +187,11 @@ def _body(
     unit: float,
     smpl: Path,
 ) -> BodyTrack:
-    """SMPL poses, `transl` 0 in their own space, placed as the class says."""
+    """SMPL poses in the world; NeumanReader describes how they are placed."""
     path = next(folder / name for name in SMPL_FILES if (folder / name).is_file())
     poses, betas = _smpl_rows(path, names)
     shape = betas.median(0).values
-    body = default_registry().get("body:smpl")(smpl)
+    body = body_model("body:smpl", smpl)
     pelvis = body.shaped(betas.float())[1][:, 0].double()
     middle = body.shaped(shape.float())[1][0].double()
     turn = torch.from_numpy(alignments.rotations)
@@ -249,5 +252,5 @@ def read_mvs_depth(path: Path) -> Float[Array, "H W"]:
         start = sum(len(part) + 1 for part in header[:3])
         values = np.frombuffer(content[start:], "<f4").reshape(channels, height, width)
     except ValueError as error:
-        raise ClipError(f"{path} is no depth map of COLMAP's ({error}); write it again") from error
+        raise ClipError(f"{path} is not a depth map of COLMAP ({error}); write it again") from error
     return values[0]

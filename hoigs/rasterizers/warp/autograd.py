@@ -1,4 +1,4 @@
-"""The render as one differentiable function, with a hand-written backward."""
+"""A render as one differentiable function, with a hand-written backward."""
 
 from __future__ import annotations
 
@@ -8,33 +8,36 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.rasterizers.warp.frame import Images, Inputs, Lists, Settings
+from hoigs.rasterizers.warp.common.frame import Images, Inputs, Settings, TileIntersections
 
 
 class Render(torch.autograd.Function):
-    """Inputs in the order of `Inputs`; outputs color, alpha, depth, extra, means2d, depths, radii.
+    """Inputs in the order of `Inputs`; outputs are the four of `Images`, means2d, depths, radii.
 
-    Everything that backward needs goes through `save_for_backward`, so nothing is kept alive or
-    aliased between renders.
+    Everything that backward needs goes through `save_for_backward`, so that nothing is kept alive
+    or aliased between renders.
     """
 
     @staticmethod
-    def forward(ctx: Any, path: Any, settings: Settings, *tensors: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, pipeline: Any, settings: Settings, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
         inputs = Inputs(*tensors)
         with torch.cuda.device_of(inputs.means):
-            projected = path.project(inputs, settings)
-            lists = path.bin(projected, settings)
-            images = path.composite(inputs, settings, projected.records, lists)
-        ctx.path, ctx.settings = path, settings
-        ctx.tiling = (lists.tile_rows, lists.across, lists.down)
+            projected = pipeline.project(inputs, settings)
+            tiles = pipeline.intersect(projected, settings)
+            images = pipeline.blend(inputs, settings, projected.records, tiles)
+        ctx.pipeline, ctx.settings = pipeline, settings
+        ctx.tiling = (tiles.tile_height, tiles.tiles_x, tiles.tiles_y)
         ctx.save_for_backward(
-            *tensors, projected.records, lists.pairs, lists.offsets, lists.first, lists.slots,
-            images.color, images.alpha, images.depth, images.extra,
+            *tensors, projected.records,
+            tiles.offsets, tiles.indices, tiles.first_partial, tiles.tiles_per_gaussian,
+            images.color, images.alpha, images.depth, images.features,
         )  # fmt: skip
         ctx.mark_non_differentiable(projected.means2d, projected.depths, projected.radii)
-        ctx.set_materialize_grads(False)  # else zeros are made for the last three too
+        ctx.set_materialize_grads(False)  # else zeros are made for these three too
         return (
-            images.color, images.alpha, images.depth, images.extra,
+            images.color, images.alpha, images.depth, images.features,
             projected.means2d, projected.depths, projected.radii,
         )  # fmt: skip
 
@@ -42,36 +45,37 @@ class Render(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
-        inputs, saved = Inputs(*saved[:11]), saved[11:]
-        records, lists = saved[0], Lists(*ctx.tiling, *saved[1:5])
-        images = Images(*saved[5:9])
+        count = len(fields(Inputs))
+        inputs, (records, *saved) = Inputs(*saved[:count]), saved[count:]
+        intersections, images = TileIntersections(*ctx.tiling, *saved[:4]), Images(*saved[4:])
         v = Images(
             *(
                 torch.zeros_like(image) if x is None else x.contiguous()
-                for image, x in zip(saved[5:9], upstream)
+                for image, x in zip(saved[4:], upstream)
             )
         )
         needs = Inputs(*ctx.needs_input_grad[2:])
         with torch.cuda.device_of(inputs.means):
-            out = ctx.path.gradients(
-                inputs, ctx.settings, records, lists, images, v, pose=bool(needs.view)
-            )
+            out = ctx.pipeline.gradients(
+                inputs, ctx.settings, records, intersections, images, v,
+                pose=bool(needs.world_to_camera),
+            )  # fmt: skip
         background = None
         if needs.background:
             background = v.color * (1.0 - images.alpha)[..., None]
             if inputs.background.dim() == 1:
                 background = background.sum((0, 1))
-        gradients = {
-            "means": out.means,
-            "quats": out.quats,
-            "log_scales": out.log_scales,
-            "opacity_logits": out.opacity_logits,
-            "sh": out.sh,
-            "features": out.features,
-            "offsets": out.offsets if needs.offsets else None,
-            "background": background,
-            "view": out.view(inputs) if needs.view else None,
-            "K": None,
-            "subset": None,
-        }
-        return (None, None, *(gradients[f.name] for f in fields(Inputs)))
+        gradients = Inputs(
+            means=out.means,
+            quats=out.quats,
+            log_scales=out.log_scales,
+            opacity_logits=out.opacity_logits,
+            sh=out.sh,
+            features=out.features,
+            screen_offsets=out.screen_offsets if needs.screen_offsets else None,
+            background=background,
+            world_to_camera=out.world_to_camera(inputs) if needs.world_to_camera else None,
+            K=None,
+            subset=None,
+        )
+        return (None, None, *vars(gradients).values())

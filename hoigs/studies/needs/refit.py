@@ -1,7 +1,7 @@
-"""A rigid spline that fewer knots follow as closely as anybody could see needs no more of them.
+"""A cheaper candidate instead of the chosen one, where a refit shows no visible difference.
 
-Held-back frames alone cannot say so: two trainings of one rung lie tenths of a dB apart, and a
-spline with knots to spare is a little ahead by chance as often as not.
+Scores on held-back frames cannot decide this: two trainings of one candidate lie tenths of a dB
+apart, and a spline with more knots than it needs is often a little ahead by chance.
 """
 
 from __future__ import annotations
@@ -10,65 +10,64 @@ from collections.abc import Mapping, Sequence
 
 import torch
 
-from hoigs.core.clip import Clip
-from hoigs.core.gaussians import Gaussians
-from hoigs.plugins.deformation.knot_schedule import KnotSchedule, KnotTrial
-from hoigs.plugins.deformation.on_host import on_host
-from hoigs.plugins.deformation.rigid_spline import RigidSpline
-from hoigs.plugins.deformation.static import Static
-from hoigs.studies.needs.prune_knots import Knotted, as_movable, measure
-from hoigs.studies.needs.rungs import Rung
+from hoigs.core.interfaces.deformation import DeformationModel, has_knots
+from hoigs.core.maths.knots import uniform_times
+from hoigs.core.model.knot_refit import KnotTrial, ScreenMotion, as_movable, screen_of
+from hoigs.core.model.on_host import on_host
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.studies.needs.search_space import Candidate
 from hoigs.studies.needs.trial import Trial
 
 UNSEEN = 0.5  # pixels: below the blur that every splat is drawn with (0.3 px^2, so sigma 0.55 px)
 
 
 def cheapest_refit(
-    rungs: Sequence[Rung], place: int, trials: Mapping[str, Trial], clip: Clip
+    candidates: Sequence[Candidate], place: int, trials: Mapping[str, Trial], clip: Clip
 ) -> int:
-    """Place of the cheapest rung whose knots hold the motion of the chosen one.
+    """Index of the cheapest candidate that can reproduce the motion of the chosen one.
 
-    Asked where that is a `deformation:rigid-spline`. Cheaper rungs that can hold it are others of
-    fewer uniform knots, and `deformation:static`: as it stands halfway through the clip.
+    The chosen one itself unless its deformations are splines over knots (`HasKnots`). Compared with
+    it are candidates of the same class with fewer uniform knots, refitted to its motion, and those
+    that do not move, which take its Gaussians halfway through the clip.
 
     Args:
-        rungs: that were tried, cheapest first. place: of the chosen one. trials: by name of rung.
+        candidates: that were tried, cheapest first. place: index of the chosen one. trials: by name
+            of candidate.
     """
-    chosen = trials[rungs[place].name]
+    chosen = trials[candidates[place].name]
     entities = [chosen.model.entity(name) for name in chosen.names]
-    curves = [e.deformation for e in entities if type(e.deformation) is RigidSpline]
-    if len(curves) < len(entities):
+    if not all(has_knots(entity.deformation) for entity in entities):
         return place
-    schedule = measure(clip, UNSEEN)
+    screen = screen_of(clip)
     for cheaper in range(place):
-        trial = trials[rungs[cheaper].name]
-        counts = [_uniform_knots(trial.model.entity(name).deformation) for name in chosen.names]
+        trial = trials[candidates[cheaper].name]
+        others = [trial.model.entity(name).deformation for name in chosen.names]
         if all(
-            count is not None and _held(curve, entity.rest.detach(), count, schedule)
-            for curve, entity, count in zip(curves, entities, counts, strict=True)
+            _held(entity.deformation, other, entity.canonical.detach(), screen)
+            for entity, other in zip(entities, others, strict=True)
         ):
             return cheaper
     return place
 
 
-def _uniform_knots(deformation: object) -> int | None:
-    """Of a rigid spline; 1 of what stands still; None of what can hold no motion of another's."""
-    if type(deformation) is RigidSpline:
-        return None if deformation.knots.movable else len(deformation.knots)
-    return 1 if type(deformation) is Static else None
-
-
 @torch.no_grad()
-def _held(curve: Knotted, rest: Gaussians, count: int, schedule: KnotSchedule) -> bool:
-    """Whether nothing moves by `UNSEEN` pixels when `count` uniform knots have to do."""
-    rest = rest.to("cpu")
+def _held(
+    curve: DeformationModel, cheaper: DeformationModel, canonical: Gaussians, screen: ScreenMotion
+) -> bool:
+    """Whether `cheaper` reproduces the motion of `curve` to within `UNSEEN` pixels."""
+    assert has_knots(curve)
+    canonical = canonical.to("cpu")
     with on_host(curve):
-        still = schedule.screen(curve, rest)
-        if count == 1:
-            middle = curve.traced(rest, [0.5] * len(schedule.frame_times))
-            return schedule.deviation(still, schedule.on_screen(middle)) <= UNSEEN
-        if count >= len(curve.knots):
+        before = screen.paths(curve, canonical)
+        if not cheaper.moves:
+            middle = curve.traced(canonical, [0.5] * len(before))
+            return screen.deviation(before, screen.on_screen(middle)) <= UNSEEN
+        if type(cheaper) is not type(curve) or not has_knots(cheaper):
             return False
-        with as_movable(curve, rest), KnotTrial(curve) as trial:
-            trial.place([k / (count - 1) for k in range(count)], schedule.sample_times())
-            return schedule.deviation(still, schedule.screen(curve, rest)) <= UNSEEN
+        count = len(cheaper.knots)
+        if cheaper.knots.movable or count >= len(curve.knots):
+            return False
+        with as_movable(curve), KnotTrial(curve) as trial:
+            trial.place(uniform_times(count), screen.sample_times())
+            return screen.deviation(before, screen.paths(curve, canonical)) <= UNSEEN

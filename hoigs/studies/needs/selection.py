@@ -1,4 +1,4 @@
-"""The clip as a search sees it: some training frames held back, test frames sealed."""
+"""The clip of a search: some training frames are held back, test frames are sealed."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from dataclasses import replace
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from hoigs.core.clip import Clip, FrameStore
 from hoigs.core.errors import ClipError
+from hoigs.core.values.clip import Clip, FrameStore
 
 SELECTION = "selection"  # name of the split
 
 
 class SealedFrameError(RuntimeError):
-    """Something looked at a frame that the choice of a model must not know."""
+    """A test frame was read during the choice of a model."""
 
 
 class SealedStore(FrameStore):
-    """Another store, of which some frames cannot be looked at.
+    """Another store, some frames of which cannot be read.
 
     Args:
-        base: where pixels come from. sealed: positions; all that is asked of them raises.
+        base: the other store. sealed: positions whose frames raise SealedFrameError.
     """
 
     def __init__(self, base: FrameStore, sealed: Iterable[int]) -> None:
@@ -32,8 +32,9 @@ class SealedStore(FrameStore):
     def _open(self, position: int) -> FrameStore:
         if position in self.sealed:
             raise SealedFrameError(
-                f"frame {position} is a test frame: no model is chosen by it. Whatever reads it "
-                "(a prior, a start from depth) must keep to clip.split['train']"
+                f"frame {position} is a test frame, and a model may not be chosen by it: the "
+                "component that read it (an initializer, for example) may read clip.split['train'] "
+                "only"
             )
         return self.base
 
@@ -69,10 +70,10 @@ def selection_frames(train: Sequence[int], share: float = 0.05, least: int = 3) 
 
 
 def selection_view(clip: Clip, share: float = 0.05, least: int = 3) -> Clip:
-    """`clip` with "train" without, and "selection" with the frames that are held back.
+    """`clip` with the frames that are held back moved from the split "train" to "selection".
 
-    There is no "test" in it, and no held-out view; of every frame that is in neither split not one
-    pixel, mask or depth can be read. Cameras, poses and tracks are as they were.
+    It has no "test" split and no held-out view; pixels, masks and depth of all other frames cannot
+    be read. Cameras, poses and tracks are unchanged.
 
     Raises:
         ClipError: as `selection_frames`.
@@ -83,7 +84,7 @@ def selection_view(clip: Clip, share: float = 0.05, least: int = 3) -> Clip:
 
 
 def sealed_view(clip: Clip) -> Clip:
-    """`clip` with its training frames alone; of all others no pixel, mask or depth can be read."""
+    """`clip` with its training split alone; images, masks and depth of other frames are sealed."""
     sealed = set(range(len(clip))) - set(clip.split["train"])
     return replace(
         clip,

@@ -1,4 +1,4 @@
-"""A trained model with its spec, and the same model under a spec that asks for less of it."""
+"""A trained model with its spec, and the same model composed anew under a smaller spec."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.core.clip import Clip
-from hoigs.core.compose import compose
-from hoigs.core.registry import Registry
-from hoigs.core.scene import SceneModel
-from hoigs.core.spec import Spec
-from hoigs.studies.needs.rungs import as_settings
+from hoigs.core.model.compose import compose
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.registry.registry import Registry
+from hoigs.core.spec.schema import Spec
+from hoigs.core.values.clip import Clip
+from hoigs.studies.needs.search_space import as_settings
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What pruning starts from and ends with.
+    """Input and result of pruning.
 
     Attributes:
         clip: at training width. model: in eval mode, at the end of its training.
@@ -41,17 +41,17 @@ class Trained:
             found.setdefault(block[0], []).append(name)
         return found
 
-    def asking_less(
+    def recomposed(
         self, overrides: Mapping[str, Any], changed: Mapping[str, Tensor] | None = None
     ) -> Trained:
         """The same model composed anew under another spec.
 
         Args:
-            overrides: of the spec. changed: by name in the model's state, tensors that are not to
-                be taken as they are. What the new model has no place for is left behind.
+            overrides: of the spec. changed: tensors that replace those of the model, by name.
+                Tensors that the new model does not have are dropped.
 
         Raises:
-            KeyError: the new model asks for a tensor that there is not.
+            KeyError: the new model needs a tensor that neither has.
         """
         spec = overridden(self.spec, overrides, self.registry)
         model = compose(spec, self.clip, self.registry).to(self.model.device)
@@ -60,7 +60,7 @@ class Trained:
         state = self.model.state_dict() | dict(changed or {})
         missing = [key for key in model.state_dict() if key not in state]
         if missing:
-            raise KeyError(f"the model of {', '.join(overrides)} asks for {', '.join(missing)}")
+            raise KeyError(f"the model with {', '.join(overrides)} lacks {', '.join(missing)}")
         model.load_state_dict({key: state[key] for key in model.state_dict()})
         model.eval()
         model.set_progress(1.0)

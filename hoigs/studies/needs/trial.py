@@ -1,4 +1,4 @@
-"""One rung being tried: its entities trained alone, and scored on the frames held back."""
+"""Trial: a short training of one candidate's entities alone, scored on the selection frames."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from hoigs.core.clip import Clip, Frame
-from hoigs.core.compose import compose, compose_density
 from hoigs.core.errors import HoigsError
-from hoigs.core.registry import Registry
-from hoigs.core.spec import Spec
-from hoigs.evaluation.metrics import psnr_from_mse
-from hoigs.evaluation.regions import dilate
+from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.registry.registry import Registry
+from hoigs.core.spec.schema import Spec
+from hoigs.core.values.clip import Clip, Frame
+from hoigs.metrics.psnr import psnr_from_mse
+from hoigs.metrics.regions import dilate
 from hoigs.studies.needs.criterion import Score
-from hoigs.studies.needs.rungs import Kind, Overrides, Region
+from hoigs.studies.needs.search_space import Kind, Overrides, Region
 from hoigs.studies.needs.selection import SELECTION
 from hoigs.training.trainer import Trainer
 
 CONTACT = 0.05  # of the longer side: how far from an object a human's pixels count as contact
 
 
-def alone(
+def isolated(
     kind: Kind, names: Sequence[str], blocks: Mapping[str, Sequence[str]], steps: int
 ) -> Overrides:
-    """What makes a spec one of a trial: some entities without the others.
+    """Overrides that restrict a spec to some entities, for a trial.
 
-    An entity is drawn alone and compared within its mask, so that nothing that another ladder has
-    still to decide has a part in it. Depth, faces and cameras stay out: they read what a trial has
-    not, or may not.
+    An entity is rendered alone and compared within its mask, so that the trial does not depend on
+    choices of other search spaces. The depth and face losses and camera refinement are off: they
+    need the whole scene.
     """
     found: Overrides = {
         "entities": list(names),
@@ -56,14 +56,14 @@ def alone(
 
 
 class Trial:
-    """A small training that can go on.
+    """A short training that can be continued.
 
     Args:
-        spec: resolved, of a trial. view: from `selection_view`. region: that is scored.
+        spec: resolved, of a trial. view: from `selection_view`. region: where it is scored.
         names: entities that the region "own" is made of.
 
     Raises:
-        SpecError: the rung is none for this clip.
+        SpecError: the candidate cannot be built for this clip.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Trial:
         return sum(p.numel() for p in self.model.parameters() if p.requires_grad)
 
     def advance(self, until: int) -> Score:
-        """Train on to a step, and look."""
+        """Train on to a step, and score."""
         began = time.perf_counter()
         self.trainer.train(until=until)
         score = score_model(self.model, self.view, self.region, self.names)
@@ -139,7 +139,7 @@ def score_model(
 def region_of(
     frame: Frame, clip: Clip, region: Region, names: Sequence[str]
 ) -> Bool[Tensor, "H W"]:
-    """Pixels of a frame that a ladder is scored on; none where a mask that decides is unknown."""
+    """Pixels of a frame that a search space is scored on; none where a needed mask is unknown."""
     empty = torch.zeros(frame.image.shape[:2], dtype=torch.bool)
     masks = frame.masks
     if frame.unknown & (set(names) if region == "own" else set(masks)):
@@ -156,7 +156,7 @@ def region_of(
     elif region == "background":
         found = ~union(list(masks))
     else:
-        things = union([n for n in masks if clip.kinds[n] == "object"])
+        objects = union([n for n in masks if clip.kinds[n] == "object"])
         people = union([n for n in masks if clip.kinds[n] == "human"])
-        found = things | (people & dilate(things, max(2, round(CONTACT * max(empty.shape)))))
+        found = objects | (people & dilate(objects, max(2, round(CONTACT * max(empty.shape)))))
     return found if frame.ignored is None else found & ~frame.ignored

@@ -1,4 +1,4 @@
-"""Bench: a spec composed small on a tiny clip, for checks that need a model and few steps."""
+"""Bench: a small model of a spec on a tiny clip, for checks that need a model and few steps."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 
 import torch
 
-from hoigs.core.clip import Clip
-from hoigs.core.compose import compose, compose_density
-from hoigs.core.density import DensityControl
-from hoigs.core.entity import FIELDS
-from hoigs.core.moment import Moment
-from hoigs.core.registry import default_registry
-from hoigs.core.scene import SceneModel
-from hoigs.core.spec import Spec
+from hoigs.core.interfaces.density import DensityControl
+from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.model.entity import FIELDS
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.registry.registry import default_registry
+from hoigs.core.spec.schema import Spec
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.moment import Moment
 from hoigs.studies.stress.capability import Capability, capabilities
 from hoigs.studies.stress.sizes import small_settings
 from hoigs.training.trainer import Trainer
@@ -30,10 +30,10 @@ POINTS, STEPS = 400, 12
 
 @dataclass(frozen=True)
 class Bench:
-    """What a check of a composed model is given.
+    """A composed model for the checks of a spec.
 
     Attributes:
-        source: name or file of the spec. overrides: laid over it.
+        source: name or file of the spec. overrides: of the spec.
         spec: resolved, small. clip: tiny. model: composed, not trained.
     """
 
@@ -57,10 +57,10 @@ class Bench:
         """A spec on the tiny clip.
 
         Args:
-            clip: another one in its place. more: settings laid over all others.
+            clip: in place of the tiny clip. more: overrides of all other settings.
 
         Raises:
-            SpecError: the spec cannot be used, or does not fit a clip of one human and one object.
+            SpecError: the spec is invalid, or does not fit a clip of one human and one object.
         """
         registry = default_registry([Path(p) for p in plugins])
         clip = clip or tiny_clip()
@@ -72,7 +72,7 @@ class Bench:
         return Bench(source, tuple(overrides), tuple(plugins), spec, clip, model, density)
 
     def anew(self, clip: Clip | None = None, *more: str) -> Bench:
-        """The same spec composed again, on another clip perhaps."""
+        """The same spec composed again, on this clip or another."""
         return Bench.compose(self.source, self.overrides, self.plugins, clip=clip, more=more)
 
     @property
@@ -80,20 +80,20 @@ class Bench:
         return capabilities(self.spec, self.model, self.density)
 
     def trained(self) -> Trainer:
-        """A trainer that has gone all its few steps with this model."""
+        """A trainer that has trained this model for all its steps."""
         trainer = Trainer(self.model, self.clip, self.spec.train, density=self.density)
         trainer.train()
         return trainer
 
     def at(self, time: float) -> Moment:
-        """Any time, with the body poses of the nearest frame."""
+        """A moment at any time, with the body poses of the nearest frame."""
         last = len(self.clip) - 1
         nearest = self.clip.moments[min(max(round(time * last), 0), last)]
         return replace(nearest, time=time)
 
     def shaken(self, size: float = 0.02) -> SceneModel:
-        """The model with every parameter but the rest Gaussians' off its start, so that heads that
-        start at zero let gradients through."""
+        """The model with noise on every parameter but the canonical Gaussians, so that heads that
+        start at zero have gradients."""
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
             for name, parameter in self.model.named_parameters():
@@ -104,7 +104,7 @@ class Bench:
 
 @cache
 def tiny_clip(more: str = "") -> Clip:
-    """The tiny clip, with more settings of the generator."""
-    from hoigs.training.session import read_clip
+    """The tiny clip, with more settings of its generator."""
+    from hoigs.runs.clip_source import read_clip
 
     return read_clip(f"{TINY}&{more}" if more else TINY)

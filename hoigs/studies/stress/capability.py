@@ -1,4 +1,4 @@
-"""What a composed model has, so that a case concerns models by what they are, never by a name."""
+"""Capabilities of a composed model: a case concerns models by these, not by the spec's name."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Literal, get_args
 
 if TYPE_CHECKING:
-    from hoigs.core.density import DensityControl
-    from hoigs.core.entity import Entity
-    from hoigs.core.scene import SceneModel
-    from hoigs.core.spec import Spec
+    from hoigs.core.interfaces.density import DensityControl
+    from hoigs.core.model.entity import Entity
+    from hoigs.core.model.scene import SceneModel
+    from hoigs.core.spec.schema import Spec
 
 Capability = Literal[
     "scene", "body", "object", "whole picture", "moves", "interaction", "density", "depth loss",
@@ -21,10 +21,10 @@ MEANING: Mapping[Capability, str] = {
     "scene": "Gaussians of the background",
     "body": "a human on a skeleton",
     "object": "an object with Gaussians of its own",
-    "whole picture": "people and things modelled as part of the scene",
+    "whole picture": "people and objects modelled as part of the scene",
     "moves": "something whose Gaussians move",
     "interaction": "a module between human and object",
-    "density": "Gaussians that come and go, under a cap",
+    "density": "density control with a cap",
     "depth loss": "a depth prior in the loss",
     "masks": "entities compared within their masks",
     "knots": "positions at keyframes",
@@ -37,7 +37,7 @@ MEANING: Mapping[Capability, str] = {
     "embedding": "a code for each Gaussian",
     "keyed opacity": "opacity that depends on time",
     "refined poses": "body poses that training corrects",
-    "keyframe rate": "keyframes that learn at a rate of their own",
+    "keyframe rate": "keyframes with a learning rate of their own",
 }
 assert set(MEANING) == set(get_args(Capability))
 
@@ -45,14 +45,14 @@ assert set(MEANING) == set(get_args(Capability))
 def capabilities(
     spec: Spec, model: SceneModel, density: Mapping[str, DensityControl]
 ) -> frozenset[Capability]:
-    """What this model, composed for a clip with one human and one object, has."""
+    """Capabilities of a model composed for a clip with one human and one object."""
     return frozenset(_found(spec, model, density))
 
 
 def _found(
     spec: Spec, model: SceneModel, density: Mapping[str, DensityControl]
 ) -> Iterator[Capability]:
-    from hoigs.training.losses import term_weights
+    from hoigs.training.losses.terms import term_weights
 
     names = {kind: model.names(kind) for kind in ("scene", "human", "object")}
     if names["scene"]:
@@ -76,7 +76,7 @@ def _found(
 
 
 def _of_entity(entity: Entity) -> Iterator[Capability]:
-    """By the rates that the deformation's parameters take, which say what they are."""
+    """Capabilities by the learning rates of the deformation's parameters."""
     deformation = entity.deformation
     parameters = dict(deformation.named_parameters())
     if parameters or entity.kind != "scene":
@@ -108,6 +108,6 @@ def _of_entity(entity: Entity) -> Iterator[Capability]:
 
 
 def rate_of(name: str, rates: Mapping[str, str]) -> str:
-    """The learning rate that a parameter of a deformation takes."""
+    """Name of the learning rate of a deformation's parameter."""
     prefixes = [prefix for prefix in rates if name.startswith(prefix)]
     return rates[max(prefixes, key=len)] if prefixes else "networks"

@@ -1,4 +1,4 @@
-"""Cases F01 … F56: what sets each failure off, whom it concerns, how it is judged; from YAML."""
+"""Cases F01 … F56, read from YAML: trigger, criterion, and the models that each concerns."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import HoigsError, did_you_mean
-from hoigs.core.spec_loader import load_yaml
+from hoigs.core.spec.loader import load_yaml
 from hoigs.studies.stress.capability import Capability
 from hoigs.studies.stress.measures import MEASURES
 
@@ -19,16 +19,16 @@ FOLDER = Path(__file__).with_name("cases")
 FAMILIES = ("motion", "camera", "human", "interaction", "optimisation")
 COUNT = 56
 
-Kind = Literal["unit", "per spec", "knob", "not applicable"]
+Kind = Literal["unit", "per spec", "sweep", "not applicable"]
 
 
 class Criterion(ComponentConfig):
-    """One number of a training against a bound; exactly one bound is given.
+    """A bound of one measure of a training; exactly one bound is given.
 
     Attributes:
         measure: a key of `measures.MEASURES`.
-        loses: most that it may be below the same spec and seed at the first value.
-        ratio: most that it may be, as a share of the same spec's and seed's at the first value.
+        loses: the most that it may lose from the first level, of the same spec and seed.
+        ratio: the most that it may be, relative to the first level.
         at_most, at_least: bounds of the number itself.
     """
 
@@ -48,7 +48,7 @@ class Criterion(ComponentConfig):
         return self
 
     def holds(self, value: float, first: float) -> bool:
-        """Whether `value` is within the bound; `first` is the one at the first value."""
+        """Whether `value` is within the bound; `first` is the value at the first level."""
         if self.loses is not None:
             return first - value <= self.loses
         if self.ratio is not None:
@@ -71,66 +71,66 @@ class Criterion(ComponentConfig):
         return f"{measure.title} at least {self.at_least:g}{unit}"
 
 
-class Knob(ComponentConfig):
-    """A knob of the clip's generator, or of a spec, that is turned until a method breaks.
+class Sweep(ComponentConfig):
+    """A setting of the clip's generator or of a spec that is varied until a method breaks.
 
     Attributes:
         clip: built-in clip with any settings of its own: "carry?camera.arc_degrees=20".
-        sets: settings of the clip's name, `{}` standing for the value: "object.cycles={}".
-        blocks: settings in every model block that has one of that name, likewise:
+        sets: settings in the clip's name, with `{}` for the value: "object.cycles={}".
+        blocks: settings of every model block that has them, likewise:
             "deformation.keyframe_step".
-        values: easiest first; the first is what the others are compared with.
-        asked: the hardest value that a method has to stand; None is the last.
+        values: easiest first; the others are compared with the first.
+        required: the hardest value that a method must pass; None is the last.
         unit: of the values, for axes and tables.
-        judged: "own", by the clip's own test frames; "first", by those of the first value's clip,
-            where the knob spoils what training is given and not what happens.
-        faults: whether the clip is broken, so that training has to be told to go on.
-        criteria: all have to hold.
-        draws: measure of breakdown curves; None is the first criterion's.
+        scored_on: "own", the clip's own test frames; "first", those of the first value's clip, for
+            settings that degrade the training data and not the motion.
+        faults: whether the clip has faults that training must be allowed to ignore.
+        criteria: all must hold.
+        draws: measure of the breakdown curves; None is that of the first criterion.
     """
 
     clip: str
     sets: tuple[str, ...] = ()
     blocks: dict[str, str] = Field(default_factory=dict)
     values: tuple[float, ...] = Field(min_length=2)
-    asked: float | None = None
+    required: float | None = None
     unit: str
-    judged: Literal["own", "first"] = "own"
+    scored_on: Literal["own", "first"] = "own"
     faults: bool = False
     criteria: tuple[Criterion, ...] = Field(min_length=1)
     draws: str | None = None
 
     @property
     def drawn(self) -> str:
-        """The measure of breakdown curves."""
+        """The measure of the breakdown curves."""
         return self.draws or self.criteria[0].measure
 
     @model_validator(mode="after")
-    def _asked_is_a_value(self) -> Knob:
-        if self.asked is not None and self.asked not in self.values[1:]:
-            raise ValueError(f"asked is {self.asked}, which is none of {self.values[1:]}")
+    def _required_is_a_value(self) -> Sweep:
+        if self.required is not None and self.required not in self.values[1:]:
+            raise ValueError(f"required is {self.required}, which is none of {self.values[1:]}")
         if not self.sets and not self.blocks:
-            raise ValueError("a knob sets something: give sets or blocks")
+            raise ValueError("a sweep varies a setting: give sets or blocks")
         if self.drawn not in MEASURES:
             raise ValueError(f"no measure {self.drawn!r}{did_you_mean(self.drawn, MEASURES)}")
         return self
 
     @property
-    def must_stand(self) -> float:
-        return self.values[-1] if self.asked is None else self.asked
+    def required_value(self) -> float:
+        return self.values[-1] if self.required is None else self.required
 
 
 class Case(ComponentConfig):
-    """One way to fail. At least one of `check`, `per_spec`, `knob` and `why_not` is given.
+    """One failure case. At least one of `check`, `per_spec`, `sweep` and `why_not` is given.
 
     Attributes:
-        title: what fails. trigger: what sets it off. criterion: what passes, in words.
-        concerns: what a composed model must have for this to mean anything; () is every model.
-        check: name of a direct check of our own code (`checks.CHECKS`).
+        title: what fails. trigger: what causes it. criterion: what passes, in words.
+        concerns: capabilities of the models that the case applies to; () is every model.
+        check: name of a direct check of hoigs' own code (`checks.CHECKS`).
         per_spec: name of a check of a composed model (`checks.PER_SPEC`).
-        knob: what is turned, with short trainings.
-        nature: a model with one of these (or without, "no keyed opacity") that fails does what its
-            method does; () is none.
+        sweep: the setting that is varied, with short trainings.
+        nature: failing is inherent in the method of a model with one of these capabilities (or
+            without: "no keyed opacity").
         advice: what to do about it.
         why_not: why there is nothing to check here.
     """
@@ -142,29 +142,29 @@ class Case(ComponentConfig):
     concerns: tuple[Capability, ...] = ()
     check: str | None = None
     per_spec: str | None = None
-    knob: Knob | None = None
+    sweep: Sweep | None = None
     nature: tuple[Capability | Literal["no keyed opacity"], ...] = ()
     advice: str = ""
     why_not: str | None = None
 
     @model_validator(mode="after")
     def _does_something(self) -> Case:
-        done = [x for x in (self.check, self.per_spec, self.knob) if x is not None]
+        done = [x for x in (self.check, self.per_spec, self.sweep) if x is not None]
         if bool(done) == (self.why_not is not None):
-            raise ValueError("give what is checked (check, per_spec, knob), or why_not")
-        if self.per_spec is not None and self.knob is not None:
-            raise ValueError("per_spec and knob would both decide; give one")
+            raise ValueError("give what is checked (check, per_spec, sweep), or why_not")
+        if self.per_spec is not None and self.sweep is not None:
+            raise ValueError("per_spec and sweep exclude each other; give one")
         return self
 
     def is_nature(self, has: frozenset[Capability]) -> bool:
-        """Whether failing this is what a model with these does."""
+        """Whether failing is inherent in a method with these capabilities."""
         flat = "keyed opacity" not in has
         return any(flat if word == "no keyed opacity" else word in has for word in self.nature)
 
     @property
     def kind(self) -> Kind:
-        if self.knob is not None:
-            return "knob"
+        if self.sweep is not None:
+            return "sweep"
         if self.per_spec is not None:
             return "per spec"
         return "unit" if self.check is not None else "not applicable"

@@ -1,4 +1,4 @@
-"""Direct checks of a study, several at a time in processes of their own."""
+"""Direct checks of a study, several at a time, in worker processes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from contextlib import contextmanager
 from hoigs.studies.stress.bench import TINY, Bench
 from hoigs.studies.stress.capability import Capability
 from hoigs.studies.stress.case import Case
+from hoigs.studies.stress.check_result import CheckResult
 from hoigs.studies.stress.checks import check, per_spec
-from hoigs.studies.stress.finding import Finding
 
 STATIC = f"{TINY}&camera.path=static"  # of composed:static_camera
 Composed = tuple[str, tuple[str, ...], tuple[str, ...]]  # spec, overrides, plugin files
-Told = Callable[[str, str, Finding], None]
+OnResult = Callable[[str, str, CheckResult], None]
 
 
 @contextmanager
@@ -27,7 +27,7 @@ def processes(workers: int, tasks: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def make_clips(
-    names: Sequence[str], workers: int, tell: Callable[[str], None] = lambda line: None
+    names: Sequence[str], workers: int, log: Callable[[str], None] = lambda line: None
 ) -> None:
     """Generate the built-in clips that are not cached yet."""
     unique = list(dict.fromkeys(names))
@@ -36,7 +36,7 @@ def make_clips(
         for i, done in enumerate(as_completed(waiting)):
             done.result()
             if (i + 1) % 10 == 0 or i + 1 == len(unique):
-                tell(f"{i + 1} of {len(unique)} clips")
+                log(f"{i + 1} of {len(unique)} clips")
 
 
 def run_direct(
@@ -44,13 +44,13 @@ def run_direct(
     specs: Mapping[str, Composed],
     has: Mapping[str, frozenset[Capability]],
     workers: int,
-    told: Told = lambda case, spec, finding: None,
-) -> dict[tuple[str, str], Finding]:
-    """Findings by case and label of the spec; those of our own code under the label "".
+    on_result: OnResult = lambda case, spec, result: None,
+) -> dict[tuple[str, str], CheckResult]:
+    """Results by case and label of the spec; those of hoigs' own code have the label "".
 
     Args:
-        specs, has: by label, what is composed and what it has.
-        told: called with each as it comes.
+        specs: what is composed, by label. has: capabilities of each, by label.
+        on_result: called with each result as it is known.
     """
     own = [(case.id, "", case.check) for case in cases if case.check is not None]
     composed = [
@@ -59,38 +59,38 @@ def run_direct(
         for case in cases
         if case.per_spec is not None and set(case.concerns) <= has[label]
     ]
-    found: dict[tuple[str, str], Finding] = {}
+    found: dict[tuple[str, str], CheckResult] = {}
     if not own and not composed:
         return found
     with processes(workers, len(own) + len(composed)) as pool:
-        waiting = {pool.submit(ask, name): (case, label) for case, label, name in own}
+        waiting = {pool.submit(run_check, name): (case, label) for case, label, name in own}
         waiting |= {
-            pool.submit(ask_composed, name, specs[label]): (case, label)
+            pool.submit(run_composed_check, name, specs[label]): (case, label)
             for case, label, name in composed
         }
         for done in as_completed(waiting):
             found[waiting[done]] = done.result()
-            told(*waiting[done], done.result())
+            on_result(*waiting[done], done.result())
     return found
 
 
-def ask(name: str) -> Finding:
-    """The answer of a check of our own code."""
-    return _answer(check(name))
+def run_check(name: str) -> CheckResult:
+    """Run a check of hoigs' own code."""
+    return _result(check(name))
 
 
-def ask_composed(name: str, composed: Composed) -> Finding:
-    """The answer of a check of a model that is composed for it."""
+def run_composed_check(name: str, composed: Composed) -> CheckResult:
+    """Run a check of a model that is composed for it."""
     source, overrides, plugins = composed
-    return _answer(lambda: per_spec(name)(Bench.compose(source, overrides, plugins)))
+    return _result(lambda: per_spec(name)(Bench.compose(source, overrides, plugins)))
 
 
-def _answer(question: Callable[[], Finding]) -> Finding:
-    """A check that cannot finish has failed, and says with what."""
+def _result(run: Callable[[], CheckResult]) -> CheckResult:
+    """A check that raises has failed; its result has the error."""
     try:
-        return question()
+        return run()
     except Exception as error:
-        return Finding(False, f"{type(error).__name__}: {error}")
+        return CheckResult(False, f"{type(error).__name__}: {error}")
 
 
 def _one_thread() -> None:
@@ -100,6 +100,6 @@ def _one_thread() -> None:
 
 
 def _make_clip(name: str) -> None:
-    from hoigs.training.clip_source import clip_folder
+    from hoigs.runs.clip_source import clip_folder
 
     clip_folder(name)

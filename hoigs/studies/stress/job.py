@@ -1,4 +1,4 @@
-"""StressJob: one short training on one value of a knob, and by which clip it is judged."""
+"""StressJob: one short training at one value of a sweep, and the clip that scores it."""
 
 from __future__ import annotations
 
@@ -6,23 +6,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from hoigs.studies.job import Job
+from hoigs.studies.jobs.job import Job
 
 
 @dataclass(frozen=True)
 class StressJob(Job):
-    """A Job with what a broken clip needs.
+    """A Job that may be scored on another clip.
 
     Attributes:
-        judge: folder of the clip whose test frames judge; "" is the training clip's own.
-        allow_faults: go on with what the clip lacks.
+        scoring_clip: folder of the clip whose test frames score the model; "" is the training clip.
+        allow_faults: train in spite of faults of the clip.
     """
 
     worker: ClassVar[str] = "hoigs.studies.stress.worker"
 
-    judge: str = ""
+    scoring_clip: str = ""
     allow_faults: bool = False
 
     @property
     def identity(self) -> dict[str, str]:
-        return super().identity | ({"judge": Path(self.judge).name} if self.judge else {})
+        scoring = {"judge": Path(self.scoring_clip).name} if self.scoring_clip else {}
+        return super().identity | scoring

@@ -1,4 +1,4 @@
-"""What evaluation does not measure: outlines, who covers whom, and how far an object strayed."""
+"""Measures beyond those of evaluation: outlines, coverage, and drift of the object."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.clip import Clip, Frame
-from hoigs.core.rasterizer import RenderRequest
-from hoigs.core.scene import SceneModel
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.clip import Clip, Frame
 from hoigs.evaluation.protocol import NotComputed, Value
 from hoigs.evaluation.truth import read_truth
 
@@ -23,7 +23,7 @@ SHORTEST_PATH = 0.01  # metres
 def observe(
     model: SceneModel, clip: Clip, geometry: Mapping[str, Value]
 ) -> dict[str, float | dict[str, str]]:
-    """The measures of a model on a clip's test frames that `evaluate` has not, as JSON values.
+    """Measures of a model on a clip's test frames that `evaluate` lacks, as JSON values.
 
     Args:
         geometry: of the evaluation on the same frames.
@@ -43,7 +43,7 @@ def observe(
 
 
 def _shares(model: SceneModel, frame: Frame) -> Float[Tensor, "H W 3"]:
-    """How much of each pixel is of the scene, of humans and of objects; what hides is counted."""
+    """Composited share of scene, humans and objects in each pixel."""
     state = model(frame.moment.to(model.device))
     rows = [
         torch.eye(3)[KINDS.index(model.entity(name).kind)].expand(len(gaussians), 3)
@@ -62,9 +62,9 @@ def _iou(
     shares: list[Float[Tensor, "H W 3"]],
     kind: str,
 ) -> Value:
-    """Mean over frames that show it: pixels that are mostly of the kind, against its masks."""
+    """Mean IoU over frames that show the kind: pixels with a share above 0.5 against its masks."""
     if not model.names(kind):
-        return NotComputed(f"the model does not tell the {kind} from the rest")
+        return NotComputed(f"the model does not separate the {kind} from the rest")
     values = []
     for frame, share in zip(frames, shares, strict=True):
         masks = [m for name, m in frame.masks.items() if clip.kinds[name] == kind]
@@ -80,7 +80,7 @@ def _covered(
 ) -> Value:
     """Mean share of the scene in pixels of the human's mask."""
     if not model.names("human") or not model.names("scene"):
-        return NotComputed("the model does not tell the human from the scene")
+        return NotComputed("the model does not separate the human from the scene")
     values = []
     for frame, share in zip(frames, shares, strict=True):
         masks = [m for name, m in frame.masks.items() if clip.kinds[name] == "human"]
@@ -91,7 +91,7 @@ def _covered(
 
 
 def _drift(clip: Clip, error: Value) -> Value:
-    """The object's error of place as a share of the way that it goes in the clip."""
+    """The object's position error, relative to the length of its path."""
     if isinstance(error, NotComputed):
         return error
     truth = read_truth(clip)

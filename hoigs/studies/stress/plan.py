@@ -1,4 +1,4 @@
-"""What a stress study runs: for each case with a knob, spec and seed a chain of harder clips."""
+"""The trainings of a stress study: for each sweep, spec and seed a chain of harder values."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hoigs.core.spec import Spec
-from hoigs.studies.clip_folders import ClipFolders
-from hoigs.studies.job import make_job
+from hoigs.core.spec.schema import Spec
+from hoigs.studies.jobs.clip_folders import ClipFolders
+from hoigs.studies.jobs.job import make_job
+from hoigs.studies.jobs.rows import Row
 from hoigs.studies.stress.capability import Capability
-from hoigs.studies.stress.case import Case, Knob
+from hoigs.studies.stress.case import Case, Sweep
 from hoigs.studies.stress.job import StressJob
 from hoigs.studies.stress.sizes import modelled, small_settings
-from hoigs.studies.table_sets import Row
 
-# of every stressed clip, under what its knob says
+# settings of every clip, which those of the sweep override
 BASE = (
     "width=96&frames=24&fps=6&edge_samples=4&held_out_views=4&test_frames=6&scene_points=5000"
     "&object_points=1000"
@@ -24,13 +24,13 @@ BASE = (
 
 @dataclass(frozen=True)
 class StressStudy:
-    """What to run.
+    """A study to run.
 
     Attributes:
-        cases: chosen. specs: of `chart_plan.parse_variants`. seeds: how many, from 0.
+        cases: chosen. specs: of `jobs.variants.parse_variants`. seeds: how many, from 0.
         steps, points: of every training; Gaussians at its start.
-        base: settings of every clip. whole: run every value even where a seed has broken.
-        settings: laid over every spec. out, device, plugins: as for other studies.
+        base: settings of every clip. whole: run every value even after a seed has failed one.
+        settings: overrides of every spec. out, device, plugins: as for other studies.
     """
 
     cases: Sequence[Case]
@@ -56,18 +56,18 @@ class Chain:
     jobs: tuple[StressJob, ...]
 
     @property
-    def knob(self) -> Knob:
-        assert self.case.knob is not None
-        return self.case.knob
+    def sweep(self) -> Sweep:
+        assert self.case.sweep is not None
+        return self.case.sweep
 
 
-def clip_names(knob: Knob, base: str) -> list[str]:
-    """The built-in clip of each value of a knob; the same one where the clip is not what turns."""
-    start, _, own = knob.clip.partition("?")
+def clip_names(sweep: Sweep, base: str) -> list[str]:
+    """The built-in clip of each value of a sweep; one clip if the sweep varies the spec."""
+    start, _, own = sweep.clip.partition("?")
     found = []
-    for value in knob.values:
-        turned = [setting.replace("{}", f"{value:g}") for setting in knob.sets]
-        found.append(f"builtin:{start}?" + "&".join([base, *filter(None, [own]), *turned]))
+    for value in sweep.values:
+        varied = [setting.replace("{}", f"{value:g}") for setting in sweep.sets]
+        found.append(f"builtin:{start}?" + "&".join([base, *filter(None, [own]), *varied]))
     return found
 
 
@@ -79,7 +79,7 @@ def plan_chains(
     Args:
         capabilities: of each spec, by label.
     """
-    from hoigs.core.registry import default_registry
+    from hoigs.core.registry.registry import default_registry
 
     folders, registry = ClipFolders(), default_registry(list(study.plugins))
     own = {
@@ -91,7 +91,7 @@ def plan_chains(
     return [
         _chain(study, case, row, own[row.label], seed, folders)
         for case in study.cases
-        if case.knob is not None
+        if case.sweep is not None
         for row in study.specs
         if set(case.concerns) <= capabilities[row.label]
         for seed in range(study.seeds)
@@ -101,35 +101,35 @@ def plan_chains(
 def _chain(
     study: StressStudy, case: Case, row: Row, spec: Spec, seed: int, folders: ClipFolders
 ) -> Chain:
-    knob = case.knob
-    assert knob is not None and row.spec is not None
-    laid = [*study.settings, *row.settings]
+    sweep = case.sweep
+    assert sweep is not None and row.spec is not None
+    given = [*study.settings, *row.settings]
     small = small_settings(spec, study.points, study.steps)
-    names = clip_names(knob, study.base)
+    names = clip_names(sweep, study.base)
     first = folders.get(names[0])[0]
     jobs = []
-    for name, value in zip(names, knob.values, strict=True):
+    for name, value in zip(names, sweep.values, strict=True):
         folder, _, digest = folders.get(name)
-        judge = str(first) if knob.judged == "first" and folder != first else ""
-        # by what the clip is: the easiest value of many cases is one clip, trained on once
+        scoring = str(first) if sweep.scored_on == "first" and folder != first else ""
+        # by content of the clip: cases that share their first clip share its training
         key = folder.name.removeprefix("builtin-")[:8]
-        label = f"{knob.clip.partition('?')[0]}-{key}" + ("-judged" if judge else "")
-        settings = [*small, *laid, *turned_blocks(spec, knob, value), f"train.seed={seed}"]
+        label = f"{sweep.clip.partition('?')[0]}-{key}" + ("-judged" if scoring else "")
+        settings = [*small, *given, *block_settings(spec, sweep, value), f"train.seed={seed}"]
         job = make_job(
             study.out, folder, label, digest, row.spec, settings, kind=StressJob,
-            device=study.device, plugins=tuple(map(str, study.plugins)), judge=judge,
-            allow_faults=knob.faults,
+            device=study.device, plugins=tuple(map(str, study.plugins)), scoring_clip=scoring,
+            allow_faults=sweep.faults,
         )  # fmt: skip
         assert isinstance(job, StressJob)
         jobs.append(job)
     return Chain(case, row, seed, tuple(jobs))
 
 
-def turned_blocks(spec: Spec, knob: Knob, value: float) -> list[str]:
-    """What a knob of the spec sets: in each component of a model block that has such a setting."""
+def block_settings(spec: Spec, sweep: Sweep, value: float) -> list[str]:
+    """Overrides by a sweep of the spec, in each component of a model block with such a setting."""
     found = []
     for name, _ in modelled(spec):
-        for place, template in knob.blocks.items():
+        for place, template in sweep.blocks.items():
             part, _, key = place.partition(".")
             if key in getattr(spec.model[name], part).settings:
                 found.append(f"model.{name}.{place}={template.replace('{}', f'{value:g}')}")

@@ -1,4 +1,4 @@
-"""Run a stress study: direct checks, then chains of trainings, each until its seed breaks."""
+"""Run a stress study: direct checks, then chains of trainings, each until its seed fails."""
 
 from __future__ import annotations
 
@@ -6,28 +6,26 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from hoigs.core.registry import default_registry
-from hoigs.core.spec import Spec
+from hoigs.core.registry.registry import default_registry
+from hoigs.core.spec.schema import Spec
 from hoigs.evaluation.protocol import Value
-from hoigs.studies.chart_run import protocol_of
-from hoigs.studies.cost import read_cost
-from hoigs.studies.job import Job, JobState
-from hoigs.studies.pool import Report, run_jobs
+from hoigs.studies.jobs.cost import read_cost
+from hoigs.studies.jobs.job import Job, JobState
+from hoigs.studies.jobs.pool import Report, run_jobs
+from hoigs.studies.jobs.protocol import protocol_of
 from hoigs.studies.stress.bench import TINY, Bench
 from hoigs.studies.stress.capability import MEANING, Capability
 from hoigs.studies.stress.case import Case
+from hoigs.studies.stress.check_result import CheckResult
 from hoigs.studies.stress.direct import STATIC, Composed, make_clips, run_direct
-from hoigs.studies.stress.finding import Finding
-from hoigs.studies.stress.measures import judged_values
+from hoigs.studies.stress.measures import scored_values
 from hoigs.studies.stress.plan import Chain, StressStudy, clip_names, plan_chains
-from hoigs.studies.stress.verdict import Level, Seed, Verdict, judge, verdict_of
-
-Tell = Callable[[str], None]
+from hoigs.studies.stress.verdict import Level, Seed, Verdict, level_of, verdict_of
 
 
 @dataclass
 class _Progress:
-    """Where one chain stands."""
+    """Progress of one chain."""
 
     chain: Chain
     whole: bool
@@ -36,23 +34,23 @@ class _Progress:
     first: Mapping[str, Value] = field(default_factory=dict)
 
     @property
-    def waits_for(self) -> Job | None:
-        """The training that comes next; None when all is known."""
+    def next_job(self) -> Job | None:
+        """The next training; None when the chain is complete."""
         broken = any(not level.stands for level in self.levels)
         if len(self.levels) == len(self.chain.jobs) or (broken and not self.whole):
             return None
         return self.chain.jobs[len(self.levels)]
 
-    def take(self, why: str | None) -> None:
-        """What the training waited for has come to, or why it failed."""
+    def record(self, why: str | None) -> None:
+        """Add the result of the next training, or the reason why it failed."""
         job = self.chain.jobs[len(self.levels)]
-        value, run = self.chain.knob.values[len(self.levels)], job.run.removeprefix(self.out)
+        value, run = self.chain.sweep.values[len(self.levels)], job.run.removeprefix(self.out)
         if why is not None:
             self.levels.append(Level(value, False, f"the training failed: {why}", {}, run))
             return
-        found = judged_values(job.scores())
+        found = scored_values(job.scores())
         self.first = self.first or found
-        self.levels.append(judge(self.chain.knob, value, found, self.first, run))
+        self.levels.append(level_of(self.chain.sweep, value, found, self.first, run))
 
 
 def run_stress(
@@ -62,38 +60,41 @@ def run_stress(
     threads: int = 1,
     limit_s: float | None = None,
     report: Report | None = None,
-    tell: Tell = lambda line: None,
+    log: Callable[[str], None] = lambda line: None,
 ) -> list[Verdict]:
-    """Every case for every spec, in order; see `pool.run_jobs`.
+    """The verdict on every case for every spec, in order; options as for `pool.run_jobs`.
 
-    A seed is given harder values until it breaks; what is harder than that it does not stand
-    either (`StressStudy.whole` runs them all the same).
+    A seed runs harder values until it fails one, and counts as failing all harder ones
+    (`StressStudy.whole` runs them too).
+
+    Args:
+        report: called with jobs, as for `run_jobs`. log: called with lines of text on the rest.
 
     Raises:
-        HoigsError: a spec that cannot be used; nothing has been trained by then.
+        HoigsError: a spec is invalid; this is checked before any training.
     """
     deadline = None if limit_s is None else time.monotonic() + limit_s
     registry = default_registry(list(study.plugins))
-    for row in study.specs:  # a wrong name is told before clips are made
+    for row in study.specs:  # raises before clips are generated
         Spec.load(str(row.spec), overrides=[*study.settings, *row.settings], registry=registry)
-    names = [n for c in study.cases if c.knob is not None for n in clip_names(c.knob, study.base)]
-    make_clips([TINY, STATIC, *names], workers, tell)
+    names = [n for c in study.cases if c.sweep is not None for n in clip_names(c.sweep, study.base)]
+    make_clips([TINY, STATIC, *names], workers, log)
     specs: dict[str, Composed] = {
         row.label: (str(row.spec), (*study.settings, *row.settings), tuple(map(str, study.plugins)))
         for row in study.specs
     }
     has = {label: Bench.compose(*composed).capabilities for label, composed in specs.items()}
 
-    def told(case: str, spec: str, finding: Finding) -> None:
-        word = "holds" if finding.passed else "FAILS"
-        tell(f"{case}{' ' + spec if spec else ''}: {word}: {finding.measured}")
+    def on_result(case: str, spec: str, result: CheckResult) -> None:
+        word = "passed" if result.passed else "FAILED"
+        log(f"{case}{' ' + spec if spec else ''}: {word}: {result.measured}")
 
-    direct = run_direct(study.cases, specs, has, workers, told)
+    direct = run_direct(study.cases, specs, has, workers, on_result)
     chains = plan_chains(study, has)
     left = None if deadline is None else max(0.0, deadline - time.monotonic())
     progress = _train(study, chains, workers, threads, left, report)
     return [
-        _verdict(study, case, row.label, has[row.label], direct, progress)
+        _verdict(case, row.label, has[row.label], direct, progress)
         for case in study.cases
         for row in study.specs
     ]
@@ -108,21 +109,21 @@ def _train(
     report: Report | None,
 ) -> list[_Progress]:
     progress = [_Progress(chain, study.whole, f"{study.out}/") for chain in chains]
-    asked: set[str] = set()
-    over: dict[str, str | None] = {}  # runs that have ended, and why they failed
+    started: set[str] = set()
+    over: dict[str, str | None] = {}  # runs that have ended, and the error if they failed
 
     def follow(job: Job, why: str | None) -> list[Job]:
         over[job.run] = why
         return advance()
 
     def advance() -> list[Job]:
-        """Take what there is, and name the trainings that chains wait for."""
+        """Record trainings that have ended, and return those that chains need next."""
         found = []
         for own in progress:
-            while (job := own.waits_for) is not None and job.run in over:
-                own.take(over[job.run])
-            if job is not None and job.run not in asked:
-                asked.add(job.run)
+            while (job := own.next_job) is not None and job.run in over:
+                own.record(over[job.run])
+            if job is not None and job.run not in started:
+                started.add(job.run)
                 found.append(job)
         return found
 
@@ -133,18 +134,17 @@ def _train(
 
 
 def _verdict(
-    study: StressStudy,
     case: Case,
     label: str,
     has: frozenset[Capability],
-    direct: Mapping[tuple[str, str], Finding],
+    direct: Mapping[tuple[str, str], CheckResult],
     progress: Sequence[_Progress],
 ) -> Verdict:
     if case.why_not is not None:
         return Verdict(case.id, label, "not applicable", case.why_not)
     lacks = [MEANING[c] for c in case.concerns if c not in has]
     if lacks:
-        return Verdict(case.id, label, "not applicable", f"has not: {', '.join(lacks)}")
+        return Verdict(case.id, label, "not applicable", f"lacks: {', '.join(lacks)}")
     nature = case.is_nature(has)
     own = direct.get((case.id, ""))
     if own is not None and (not own.passed or case.kind == "unit"):

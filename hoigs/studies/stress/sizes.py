@@ -1,13 +1,13 @@
-"""A spec made small: Gaussians for a small clip, and what it counts in steps for a short run."""
+"""Settings that adapt a spec to a small clip and a short training."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
 
-from hoigs.core.spec import Spec
+from hoigs.core.spec.schema import Spec
 
-# of all points, where a spec has blocks of their own for them
+# shares of all points, where a spec has such a block
 SHARES = {"human": 0.3, "object": 0.1}
 ROOM = 2.0  # cap of the scene's Gaussians, times those at the start
 # settings of components that are counted in steps, by place
@@ -18,11 +18,11 @@ COUNTED = {
 
 
 def small_settings(spec: Spec, points: int, steps: int) -> list[str]:
-    """Overrides that make a spec one of a short run on a small clip; the same for all methods.
+    """Overrides for a short training on a small clip; the same rules for all methods.
 
-    All entities together start with `points` Gaussians, and the scene has room for twice its own.
-    What a spec counts in steps shrinks with its run. LPIPS and faces, which need files or larger
-    pictures, are left out of the loss.
+    All entities together start with `points` Gaussians, and the scene's cap is twice its own.
+    Settings in steps are scaled with the length of the training. The LPIPS and face losses, which
+    need files or larger images, are off.
     """
     settings = {
         "train.steps": steps,

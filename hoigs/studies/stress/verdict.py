@@ -1,4 +1,4 @@
-"""Verdicts: what each seed stood, and what that says of a case and a spec; plain data."""
+"""Verdicts of cases and specs, from the levels that each seed passed; plain data."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from hoigs.evaluation.protocol import NotComputed, Value
-from hoigs.studies.stress.case import Case, Criterion, Knob
+from hoigs.studies.stress.case import Case, Criterion, Sweep
 
 Status = Literal["pass", "fail", "nature", "not applicable", "not run"]
 
 MEANING: Mapping[Status, str] = {
-    "pass": "stands what the case asks for",
-    "fail": "does not",
-    "nature": "does not, as its method is; see the advice",
-    "not applicable": "the model has nothing of the kind",
+    "pass": "passes what the case requires",
+    "fail": "does not pass what the case requires",
+    "nature": "fails, which is inherent in the method; see the advice",
+    "not applicable": "the model lacks what the case is about",
     "not run": "no verdict yet",
 }
 
 
 @dataclass(frozen=True)
 class Level:
-    """One value of a knob, of one seed.
+    """One value of a sweep, of one seed.
 
     Attributes:
         stands: whether all criteria hold.
-        why: which do not, or why there are no numbers.
+        why: criteria that do not, or why there are no numbers.
         values: by measure. run: folder, relative to the study's.
     """
 
@@ -39,10 +39,10 @@ class Level:
 
 @dataclass(frozen=True)
 class Seed:
-    """What one seed stood, easiest value first.
+    """Levels of one seed, easiest value first.
 
     Attributes:
-        broke_at: first value that it did not stand; None where it stood all that it was given.
+        broke_at: first value that failed; None where all that were run passed.
     """
 
     seed: int
@@ -53,7 +53,7 @@ class Seed:
         return next((level.value for level in self.levels if not level.stands), None)
 
     def stands(self, value: float) -> bool | None:
-        """Whether it stood a value; what broke at an easier one does not. None: not known."""
+        """Whether it passes a value: not if it failed an easier one. None: not known."""
         for level in self.levels:
             if not level.stands:
                 return False
@@ -69,12 +69,12 @@ class Verdict:
     Attributes:
         case, spec: id and label. status: see MEANING.
         measured: of a direct check, or why there is no verdict.
-        rate: share of the seeds that stand what is asked for, of those that are known.
-        seeds: of a knob.
-        breaks_at: the value that half of the seeds or more do not stand; None is beyond the last,
-            or not known.
-        machines, protocol: how the numbers came about.
-        ours: whether a check of our own code decided, before any training.
+        rate: share of the seeds that pass the required value, of those that are known.
+        seeds: of a sweep.
+        breaks_at: the first value that half of the seeds or more fail; None is beyond the last, or
+            not known.
+        machines, protocol: how the numbers were measured.
+        ours: whether a check of hoigs' own code decided, before any training.
     """
 
     case: str
@@ -100,15 +100,15 @@ class Verdict:
         return data
 
 
-def judge(
-    knob: Knob, value: float, found: Mapping[str, Value], first: Mapping[str, Value], run: str
+def level_of(
+    sweep: Sweep, value: float, found: Mapping[str, Value], first: Mapping[str, Value], run: str
 ) -> Level:
-    """One value of one seed, against the criteria.
+    """The level of one value and seed, by the criteria of a sweep.
 
     Args:
         found: its measures. first: those at the first value.
     """
-    broken = [why for c in knob.criteria if (why := _broken(c, found, first)) is not None]
+    broken = [why for c in sweep.criteria if (why := _broken(c, found, first)) is not None]
     return Level(value, not broken, "; ".join(broken), found, run)
 
 
@@ -126,25 +126,25 @@ def _broken(
 
 
 def verdict_of(case: Case, spec: str, nature: bool, seeds: Sequence[Seed], **more: Any) -> Verdict:
-    """What the seeds say together: pass if most of them stand what is asked for.
+    """Verdict over seeds: pass if most of them pass the required value.
 
     Args:
-        nature: whether failing is what this spec's method does.
+        nature: whether failing is inherent in the method.
     """
-    knob = case.knob
-    assert knob is not None
-    known = [s for seed in seeds if (s := seed.stands(knob.must_stand)) is not None]
+    sweep = case.sweep
+    assert sweep is not None
+    known = [s for seed in seeds if (s := seed.stands(sweep.required_value)) is not None]
     rate = sum(known) / len(known) if known else None
     status: Status = "not run"
     if rate is not None and len(known) == len(seeds):
         status = "pass" if rate > 0.5 else "nature" if nature else "fail"
     return Verdict(
-        case.id, spec, status, in_words(seeds), rate, tuple(seeds), breaking(knob, seeds), **more
+        case.id, spec, status, in_words(seeds), rate, tuple(seeds), breaking(sweep, seeds), **more
     )
 
 
 def in_words(seeds: Sequence[Seed]) -> str:
-    """Why seeds broke: each reason once, with the numbers and values of all that it has."""
+    """Why seeds failed: each reason once, with its numbers and values."""
     found: dict[str, list[str]] = {}
     for seed in seeds:
         for level in seed.levels:
@@ -154,9 +154,9 @@ def in_words(seeds: Sequence[Seed]) -> str:
     return "; ".join(f"{words}: {', '.join(numbers)}" for words, numbers in found.items())
 
 
-def breaking(knob: Knob, seeds: Sequence[Seed]) -> float | None:
-    """The first value that half of the seeds or more do not stand."""
-    for value in knob.values:
+def breaking(sweep: Sweep, seeds: Sequence[Seed]) -> float | None:
+    """The first value that half of the seeds or more fail."""
+    for value in sweep.values:
         known = [s for seed in seeds if (s := seed.stands(value)) is not None]
         if known and len(known) == len(seeds) and sum(known) <= 0.5 * len(known):
             return value

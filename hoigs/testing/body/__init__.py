@@ -5,6 +5,6 @@ from __future__ import annotations
 from hoigs.testing.body import motion, shape
 from hoigs.testing.body.subject import CHECKS, BodySubject, subject
 
-FAMILIES = (shape, motion)  # importing them fills CHECKS
+MODULES = (motion, shape)  # importing them fills CHECKS
 
-__all__ = ["CHECKS", "FAMILIES", "BodySubject", "subject"]
+__all__ = ["CHECKS", "MODULES", "BodySubject", "subject"]

@@ -1,10 +1,10 @@
-"""B01 to B06: joints, parts, weights and the surface, at rest."""
+"""B01 to B06: joints, parts, weights and the surface, in the rest pose."""
 
 from __future__ import annotations
 
 import torch
 
-from hoigs.core.body import (
+from hoigs.core.interfaces.body import (
     BODY_JOINT_PARTS,
     LEFT_FOOT,
     LEFT_SHOULDER,
@@ -33,9 +33,9 @@ def joints_are_in_smplx_order(subject: BodySubject) -> None:
     require(first == SMPLX_PARENTS, f"parents of the body's joints are {first}")
     for start, wrist in ((count - 30, LEFT_WRIST), (count - 15, RIGHT_WRIST)):
         for joint in range(start, start + 15):
-            wanted = wrist if (joint - start) % 3 == 0 else joint - 1
+            expected = wrist if (joint - start) % 3 == 0 else joint - 1
             got = body.parents[joint]
-            require(got == wanted, f"joint {joint} of a hand has parent {got}, not {wanted}")
+            require(got == expected, f"joint {joint} of a hand has parent {got}, not {expected}")
 
 
 @CHECKS.check("B02")
@@ -61,8 +61,8 @@ def every_part_has_vertices(subject: BodySubject) -> None:
     require(parts.shape == (len(vertices),), f"vertex_parts has shape {list(parts.shape)}")
     missing = sorted(set(range(len(PART_NAMES))) - set(parts.tolist()))
     require(not missing, f"no vertex is part of {[PART_NAMES[i] for i in missing]}")
-    strange = sorted(set(parts.tolist()) - set(range(len(PART_NAMES))))
-    require(not strange, f"vertex_parts has {strange}; parts are 0 to 15")
+    unknown = sorted(set(parts.tolist()) - set(range(len(PART_NAMES))))
+    require(not unknown, f"vertex_parts has {unknown}; parts are 0 to 15")
     owner = torch.tensor(BODY_JOINT_PARTS, device=parts.device)
     apart = torch.cdist(vertices, joints[:22])
     own = torch.where(owner == parts[:, None], apart, torch.inf).amin(1)
@@ -83,7 +83,7 @@ def weights_blend(subject: BodySubject) -> None:
 
 @CHECKS.check("B05")
 def the_surface_is_on_the_body(subject: BodySubject) -> None:
-    """Points of `surface` are where their faces and coordinates say; the same for one seed."""
+    """Points of `surface` match their faces and coordinates, and repeat with the seed."""
     body, betas = subject.body, subject.pose().betas
     vertices = body.shaped(betas)[0]
     for count in (None, 50):
@@ -91,8 +91,8 @@ def the_surface_is_on_the_body(subject: BodySubject) -> None:
         number = len(vertices) if count is None else count
         require(len(surface.points) == number, f"surface({count}) has {len(surface.points)} points")
         corners = vertices[body.faces[surface.faces]]
-        wanted = (corners * surface.barycentric[..., None]).sum(1)
-        require_close("points", surface.points, wanted, atol=1e-4)
+        expected = (corners * surface.barycentric[..., None]).sum(1)
+        require_close("points", surface.points, expected, atol=1e-4)
         ones = torch.ones(number)
         require_close("length of normals", surface.normals.norm(dim=-1), ones, atol=1e-3)
         require_close("sum of weights", surface.weights.sum(1), ones, atol=1e-3)

@@ -1,35 +1,25 @@
-"""BodySubject: a body model with its settings, and poses to put it in."""
+"""BodySubject: a body model with its settings, and poses."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from hoigs.core.body import BodyModel
-from hoigs.core.context import BuildContext
-from hoigs.core.moment import BodyPose
+from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.values.moment import BodyPose
 from hoigs.testing.checks import CheckList
 from hoigs.testing.material.clip import HUMAN, pose_at, tiny_clip
+from hoigs.testing.modules import DeviceSubject
 
 if TYPE_CHECKING:
-    from hoigs.testing.door import Options
-
-CPU = torch.device("cpu")
+    from hoigs.testing.runner import Options
 
 
-@dataclass(frozen=True)
-class BodySubject:
-    """What is checked."""
-
-    cls: type[BodyModel]
-    config: Any
-    device: torch.device = CPU
-
-    def __str__(self) -> str:
-        return self.cls.__name__
+class BodySubject(DeviceSubject[BodyModel]):
+    """The component under check."""
 
     @cached_property
     def body(self) -> BodyModel:
@@ -37,7 +27,7 @@ class BodySubject:
         return body.to(self.device)
 
     def pose(self, time: float = 0.3, dtype: torch.dtype = torch.float32) -> BodyPose:
-        """Every joint turned a little, the body away from the origin, some shape."""
+        """Every joint rotated a little, a translation, and nonzero betas."""
         betas = 0.5 * torch.cos(torch.arange(self.body.num_betas, dtype=torch.float64))
         return pose_at(time).replace(betas=betas).to(self.device, dtype)
 
@@ -50,5 +40,5 @@ CHECKS: CheckList[BodySubject] = CheckList("B")
 
 def subject(cls: type[BodyModel], config: Any, options: Options) -> BodySubject:
     made = BodySubject(cls, config, torch.device(options.device))
-    made.body  # noqa: B018  (who cannot be made says why)
+    made.body  # noqa: B018  (raises here when it cannot be built)
     return made

@@ -3,16 +3,16 @@
     subject = DeformationSubject(MyDeformation, MyConfig())
     print(run_checks(CHECKS, subject))
 
-They are built, as a spec would build them, for the human or the object of a tiny clip that the kit
-makes itself (hoigs.testing.material).
+Subjects are built, as a spec builds them, for the human or the object of a tiny synthetic clip
+(`hoigs.testing.material`).
 """
 
 from __future__ import annotations
 
 from hoigs.testing.deformation import (
+    contract,
     gradients,
-    keeping,
-    promises,
+    persistence,
     provided,
     residuals,
     time,
@@ -21,7 +21,15 @@ from hoigs.testing.deformation import (
 )
 from hoigs.testing.deformation.subject import CHECKS, DeformationSubject, subject
 
-# importing them fills CHECKS
-FAMILIES = (values, gradients, time, topology, keeping, residuals, promises, provided)
+MODULES = (
+    contract,
+    gradients,
+    persistence,
+    provided,
+    residuals,
+    time,
+    topology,
+    values,
+)  # importing them fills CHECKS
 
-__all__ = ["CHECKS", "FAMILIES", "DeformationSubject", "subject"]
+__all__ = ["CHECKS", "MODULES", "DeformationSubject", "subject"]

@@ -1,4 +1,4 @@
-"""Letting a deformation change its own size, as training does after every step."""
+"""Running `evolve` as training does after every step."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import torch
 
-from hoigs.core.deformation import DeformationModel, StepEvidence
-from hoigs.core.entity import Entity
-from hoigs.core.topology import AxisChange
+from hoigs.core.interfaces.deformation import DeformationModel, StepStatistics
+from hoigs.core.model.entity import Entity
+from hoigs.core.values.topology import AxisChange
 from hoigs.testing.deformation.subject import DeformationSubject
 from hoigs.testing.material.clip import FRAMES, camera_at
 from hoigs.testing.modules import Moments, perturb
@@ -21,23 +21,25 @@ STEPS = 1000
 def evolved(
     subject: DeformationSubject, entity: Entity, moments: Moments | None = None
 ) -> list[Mapping[str, AxisChange]]:
-    """Run `evolve` for as many steps as a short training has; what changed at each that did.
+    """Run `evolve` for the steps of a short training; returns the changes of each step with any.
 
     Args:
-        moments: by names of the deformation's parameters; they follow.
+        moments: of the deformation's parameters; they follow the changes.
     """
     found: list[Mapping[str, AxisChange]] = []
     if type(entity.deformation).evolve is DeformationModel.evolve:
         return found
-    perturb(entity.deformation, seed=4, size=1e-3)  # what has not moved at all is never promoted
+    perturb(
+        entity.deformation, seed=4, size=1e-3
+    )  # a deformation may evolve only parameters that have moved
     if moments is not None:
         moments.values = {n: p.detach().clone() for n, p in moments.parameters.items()}
-    rest = entity.rest.detach()
-    frames = [seen(subject, entity, i) for i in range(FRAMES)]
+    canonical = entity.canonical.detach()
+    frames = [statistics_of(subject, entity, i) for i in range(FRAMES)]
     for step in range(1, STEPS + 1):
-        evidence = replace(frames[step % FRAMES], step=step)
+        statistics = replace(frames[step % FRAMES], step=step)
         entity.deformation.set_progress(step / STEPS)
-        changes = entity.deformation.evolve(rest, evidence)
+        changes = entity.deformation.evolve(canonical, statistics)
         if changes:
             found.append(changes)
         for name, change in changes.items() if moments is not None else ():
@@ -46,10 +48,10 @@ def evolved(
     return found
 
 
-def seen(subject: DeformationSubject, entity: Entity, frame: int) -> StepEvidence:
-    """What training saw at the first step, of one frame."""
+def statistics_of(subject: DeformationSubject, entity: Entity, frame: int) -> StepStatistics:
+    """The statistics of one frame at the first step."""
     time = frame / (FRAMES - 1)
-    return StepEvidence(
+    return StepStatistics(
         moment=subject.at(entity, time),
         camera=camera_at(time).to(entity.means),
         error=1.0 + 0.5 * time,

@@ -1,22 +1,22 @@
-"""DeformationSubject: a class with its settings, made for the tiny clip; and the tags that gate."""
+"""DeformationSubject: a class with its settings, for the tiny clip; and conditions of checks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from hoigs.core.context import BuildContext
-from hoigs.core.deformation import DeformationModel
-from hoigs.core.entity import Entity
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.interaction import EntityKind, Residual
-from hoigs.core.moment import Moment
-from hoigs.core.topology import TopologyChange
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.model.entity import Entity
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import EntityKind, Residual
+from hoigs.core.values.topology import TopologyChange
 from hoigs.testing.checks import CheckList, Need
 from hoigs.testing.compare import require_close
 from hoigs.testing.material.body import TinyBody
@@ -29,33 +29,24 @@ from hoigs.testing.material.clip import (
     object_track,
     tiny_clip,
 )
-from hoigs.testing.modules import perturb, seeded
+from hoigs.testing.modules import DeviceSubject, perturb, seeded
 
 if TYPE_CHECKING:
-    from hoigs.testing.door import Options
+    from hoigs.testing.runner import Options
 
-CPU = torch.device("cpu")
 RAW = tuple(f.name for f in fields(Gaussians))
 COUNT = 7
-INSIDE = (0.0, 0.13, 0.5, 0.77, 1.0)  # of the clip, first and last frame and between frames
+INSIDE = (0.0, 0.13, 0.5, 0.77, 1.0)  # times of the clip: first and last frame, and between frames
 OUTSIDE = (-0.6, -0.01, 1.01, 1.6)
 TRAINED = tuple(i / (FRAMES - 1) for i in range(FRAMES))
 
 
-@dataclass(frozen=True)
-class DeformationSubject:
-    """What is checked: the tiny clip's human if it provides a skeleton, else its object."""
-
-    cls: type[DeformationModel]
-    config: Any
-    device: torch.device = CPU
-
-    def __str__(self) -> str:
-        return self.cls.__name__
+class DeformationSubject(DeviceSubject[DeformationModel]):
+    """The component under check: for the human if it provides a skeleton, else for the object."""
 
     @cached_property
     def declared(self) -> DeformationModel:
-        """One of it, for what it declares."""
+        """An instance, for what it declares."""
         return self.entity(perturbed=False).deformation
 
     @property
@@ -63,7 +54,7 @@ class DeformationSubject:
         return "human" if "skeleton" in self.cls.provides else "object"
 
     def context(self) -> BuildContext:
-        """What a spec would give it."""
+        """The context that a spec would pass."""
         if self.kind == "human":
             return BuildContext(HUMAN, tiny_clip(), body=TinyBody(), body_track=body_track())
         bodies = {HUMAN: TinyBody()}
@@ -82,26 +73,26 @@ class DeformationSubject:
         dtype: torch.dtype = torch.float32,
         config: Any = None,
     ) -> Entity:
-        """An entity of `count` Gaussians, in eval mode; by default no longer at its start."""
+        """An entity of `count` Gaussians, in eval mode; by default with perturbed parameters."""
         model = self.model(seed, config)
-        entity = seeded(lambda: Entity(self.rest(model, count), model, kind=self.kind), seed)
+        entity = seeded(lambda: Entity(self.canonical(model, count), model, kind=self.kind), seed)
         if perturbed:
             perturb(entity.deformation)
         return entity.to(device=self.device, dtype=dtype).eval()
 
-    def rest(self, model: DeformationModel, count: int) -> Gaussians:
-        """Gaussians in the space that it expects, each of a shape and colour of its own."""
+    def canonical(self, model: DeformationModel, count: int) -> Gaussians:
+        """Gaussians in its input space, each with its own shape and colour."""
         if self.kind == "human":
             surface = TinyBody().surface(count, body_track().poses.betas)
             points = surface.points
-            if model.rest_space == "world":
+            if model.input_space == "world":
                 body, pose = TinyBody(), body_track().poses.frame(FRAMES // 2)
                 corners = body(pose).vertices[body.faces[surface.faces]]
                 points = (corners * surface.barycentric[..., None]).sum(1)
         else:
             track = object_track()
             points = track.points[:count]
-            if model.rest_space == "world":
+            if model.input_space == "world":
                 points = points @ track.rotations[0].mT + track.translations[0]
         generator = torch.Generator().manual_seed(2)
 
@@ -130,7 +121,7 @@ CHECKS: CheckList[DeformationSubject] = CheckList("D")
 
 def subject(cls: type[DeformationModel], config: Any, options: Options) -> DeformationSubject:
     made = DeformationSubject(cls, config, torch.device(options.device))
-    made.declared  # noqa: B018  (the tags must be there; who cannot be made says why)
+    made.declared  # noqa: B018  (raises here when it cannot be built)
     return made
 
 
@@ -138,10 +129,10 @@ def by_name(gaussians: Gaussians) -> dict[str, Tensor]:
     return {name: getattr(gaussians, name) for name in RAW}
 
 
-def require_same(what: str, got: Gaussians, wanted: Gaussians, atol: float = 2e-5) -> None:
-    """Every field the same to `atol`, quaternions included, sign and all."""
+def require_same(what: str, got: Gaussians, expected: Gaussians, atol: float = 2e-5) -> None:
+    """Every field the same to `atol`, also the signs of quaternions."""
     for name in RAW:
-        require_close(f"{what}: {name}", getattr(got, name), getattr(wanted, name), atol=atol)
+        require_close(f"{what}: {name}", getattr(got, name), getattr(expected, name), atol=atol)
 
 
 def changed_by(
@@ -149,7 +140,7 @@ def changed_by(
     fresh: Sequence[int] = (),
     offsets: Tensor | None = None,
 ) -> TopologyChange:
-    """An index map; `fresh` are places in the new order."""
+    """An index map; `fresh` are new rows."""
     marks = torch.zeros(len(source), dtype=torch.bool)
     marks[list(fresh)] = True
     shifts = torch.zeros(len(source), 3) if offsets is None else offsets
@@ -157,12 +148,12 @@ def changed_by(
 
 
 def apply(entity: Entity, change: TopologyChange) -> None:
-    """The change with the rest values of its sources, displaced."""
+    """Apply the change, with the canonical values of the sources plus offsets."""
     device = entity.means.device
     offsets = change.offsets.to(entity.means)
     change = TopologyChange(change.source.to(device), change.fresh.to(device), offsets)
-    rest = entity.rest[change.source]
-    entity.apply_topology(change, rest.replace(means=rest.means + offsets))
+    canonical = entity.canonical[change.source]
+    entity.apply_topology(change, canonical.replace(means=canonical.means + offsets))
 
 
 def continuous(subject: DeformationSubject) -> str | None:

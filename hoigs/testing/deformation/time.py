@@ -7,7 +7,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from hoigs.core.rotation import quats_to_matrices
+from hoigs.core.maths.rotations import quats_to_matrices
 from hoigs.testing.compare import require
 from hoigs.testing.deformation.subject import CHECKS, DeformationSubject, continuous
 
@@ -17,8 +17,8 @@ JUMP = 1e-4  # metres, radians, and units of the other fields
 
 @CHECKS.check("D09", continuous)
 @torch.no_grad()
-def it_is_continuous_in_time(subject: DeformationSubject) -> None:
-    """A small step of time is a small change: where it changes most it does not jump."""
+def output_is_continuous_in_time(subject: DeformationSubject) -> None:
+    """The output does not jump where it changes most."""
     entity = subject.entity(dtype=torch.float64)
 
     def at(time: float) -> Tensor:
@@ -42,6 +42,6 @@ def it_is_continuous_in_time(subject: DeformationSubject) -> None:
         jump = float((b - a).abs().max())
         require(
             jump < JUMP,
-            f"it jumps by {jump:.3g} at time {low:.6f}; if that is meant, declare "
+            f"it jumps by {jump:.3g} at time {low:.6f}; if this is intended, declare "
             "continuous = False",
         )

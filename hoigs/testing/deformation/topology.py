@@ -1,11 +1,11 @@
-"""D10 to D14 and D25: rows that go, come and move keep together, optimizer state included."""
+"""D10 to D14 and D25: pruned, cloned, split and relocated rows, with optimizer moments."""
 
 from __future__ import annotations
 
 import torch
 
-from hoigs.core.entity import Entity
-from hoigs.core.topology import TopologyChange
+from hoigs.core.model.entity import Entity
+from hoigs.core.values.topology import TopologyChange
 from hoigs.testing.compare import require
 from hoigs.testing.deformation.evolving import evolved
 from hoigs.testing.deformation.subject import (
@@ -23,33 +23,33 @@ OFFSET = 1e-3  # metres
 
 
 def require_rows(subject: DeformationSubject, change: TopologyChange) -> None:
-    """After the change, each row is its source's, at every moment."""
+    """After the change, each row equals its source's, at every moment."""
     before, after = subject.entity(), subject.entity()
     for entity in (before, after):
         evolved(subject, entity)
     apply(after, change)
     for time in INSIDE:
-        wanted = subject.draw(before, time)[change.source]
+        expected = subject.draw(before, time)[change.source]
         got = subject.draw(after, time)
-        require(len(got) == len(change), f"{len(change)} rows came out as {len(got)}")
-        require_same(f"at {time}", got, wanted)
+        require(len(got) == len(change), f"expected {len(change)} rows, got {len(got)}")
+        require_same(f"at {time}", got, expected)
 
 
 @CHECKS.check("D10")
-def pruned_rows_leave_the_others(subject: DeformationSubject) -> None:
-    """Rows that are pruned leave the others as they were."""
+def pruning_keeps_other_rows(subject: DeformationSubject) -> None:
+    """Pruning does not change the other rows."""
     require_rows(subject, changed_by([0, 2, 3, 5]))
 
 
 @CHECKS.check("D11")
-def clones_are_their_sources(subject: DeformationSubject) -> None:
-    """Clones, appended at the end, look and move as their sources do."""
+def clones_equal_their_sources(subject: DeformationSubject) -> None:
+    """Clones, appended at the end, look and move as their sources."""
     require_rows(subject, changed_by([0, 1, 2, 3, 4, 5, 6, 2, 5], fresh=[7, 8]))
 
 
 @CHECKS.check("D12")
-def split_children_stand_apart(subject: DeformationSubject) -> None:
-    """Children of a split stand beside their source by about their offset, at every moment."""
+def split_children_are_offset(subject: DeformationSubject) -> None:
+    """Children of a split are about their offset away from the source, at every moment."""
     before = subject.entity(dtype=torch.float64)
     after = subject.entity(dtype=torch.float64)
     for entity in (before, after):
@@ -61,23 +61,23 @@ def split_children_stand_apart(subject: DeformationSubject) -> None:
     for time in INSIDE:
         source, children = subject.draw(before, time)[[4, 4]], subject.draw(after, time)[6:]
         apart = (children.means - source.means).norm(dim=-1)
-        # where positions are the rest's, a steep field may carry them farther apart
+        # where means are the canonical ones, a steep field may move children farther apart
         far = 5.0 if "means" in after.deformation.owns else torch.inf
         require(
             ((apart > 0.2 * OFFSET) & (apart < far * OFFSET)).all(),
-            f"children {OFFSET:g} m from their source at rest are {apart.tolist()} m from it at "
-            f"{time}; add TopologyChange.offsets to positions that are kept for each Gaussian",
+            f"children {OFFSET:g} m from their source in canonical space are {apart.tolist()} m "
+            f"from it at {time}; add TopologyChange.offsets to all kept positions",
         )
 
 
 @CHECKS.check("D13")
-def relocated_rows_are_their_new_sources(subject: DeformationSubject) -> None:
-    """Rows that are relocated, their number the same, become what stands where they go."""
+def relocated_rows_equal_their_sources(subject: DeformationSubject) -> None:
+    """Relocated rows equal their new sources; the count stays."""
     require_rows(subject, changed_by([0, 3, 2, 3, 4, 5, 3], fresh=[1, 3, 6]))
 
 
 def follow(entity: Entity, change: TopologyChange, moments: Moments) -> None:
-    """What training does with the optimizer's moments before the rows change."""
+    """Update the moments as training does before rows change."""
     for name, _ in entity.per_gaussian():
         moments.follow(name, change)
     for name, axis in entity.deformation.axis_changes(change).items():
@@ -86,7 +86,7 @@ def follow(entity: Entity, change: TopologyChange, moments: Moments) -> None:
 
 @CHECKS.check("D14")
 def optimizer_moments_follow(subject: DeformationSubject) -> None:
-    """The optimizer's moments follow rows: same parameters, same shapes, row by row."""
+    """Optimizer moments follow their rows; parameters stay the same objects."""
     entity = subject.entity()
     evolved(subject, entity)
     moments = Moments(trained(entity))
@@ -94,14 +94,14 @@ def optimizer_moments_follow(subject: DeformationSubject) -> None:
     follow(entity, change, moments)
     apply(entity, change)
     now = {name: entity.get_parameter(name) for name in moments.parameters}
-    for name in RAW:  # their rest values are the entity's, which the kit itself has set
+    for name in RAW:  # canonical values, which the kit itself has set
         now.pop(name, None)
     moments.require_in_step(now)
 
 
 @CHECKS.check("D25")
-def what_evolves_stays_in_step(subject: DeformationSubject) -> str | None:
-    """A deformation that changes its own size tells the optimizer how, and still moves rows."""
+def evolve_reports_its_changes(subject: DeformationSubject) -> str | None:
+    """`evolve` returns every change of size, and rows still follow density control."""
     entity = subject.entity()
     before = subject.draw(entity, 0.4)
     every = dict(entity.deformation.named_parameters())

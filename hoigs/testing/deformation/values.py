@@ -1,4 +1,4 @@
-"""D01 to D06: settings, shapes, dtypes, rows, moments and numbers."""
+"""D01 to D06: settings, shapes, dtypes, rows, moments and finite values."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from hoigs.testing.deformation.subject import (
     changed_by,
     require_same,
 )
-from hoigs.testing.modules import require_finite_gradients, weighed
+from hoigs.testing.modules import require_finite_gradients, weighted_sum
 
 
 @CHECKS.check("D01")
-def settings_stay_and_survive_json(subject: DeformationSubject) -> None:
-    """Building leaves the settings as they are; from their JSON comes the same model."""
+def settings_are_kept_and_survive_json(subject: DeformationSubject) -> None:
+    """Building does not change the settings, and their JSON builds the same model."""
     before = subject.config.model_dump_json()
     first = subject.draw(subject.entity(), 0.5)
     after = subject.config.model_dump_json()
@@ -34,15 +34,15 @@ def settings_stay_and_survive_json(subject: DeformationSubject) -> None:
 
 @CHECKS.check("D02")
 def shapes_for_any_number(subject: DeformationSubject) -> None:
-    """0, 1 and 7 Gaussians come out as many, each field of its shape."""
+    """0, 1 and 7 Gaussians give as many, with every field in its shape."""
     for count in (0, 1, 7):
         entity = subject.entity(count)
         output = subject.draw(entity, 0.4)
         for name, x in by_name(output).items():
-            wanted = getattr(entity.rest, name).shape
+            expected = getattr(entity.canonical, name).shape
             require(
-                x.shape == wanted,
-                f"with {count} Gaussians, {name} is {list(x.shape)}, expected {list(wanted)}",
+                x.shape == expected,
+                f"with {count} Gaussians, {name} is {list(x.shape)}, expected {list(expected)}",
             )
 
 
@@ -61,19 +61,19 @@ def dtype_and_device_are_kept(subject: DeformationSubject) -> None:
 
 @CHECKS.check("D04")
 def order_of_rows_does_not_matter(subject: DeformationSubject) -> None:
-    """Permuted rows, with what is kept for each, come out permuted and else the same."""
+    """Permuted rows, with their parameters, give permuted outputs."""
     order = [3, 0, 6, 2, 5, 1, 4]
     plain, permuted = subject.entity(), subject.entity()
     apply(permuted, changed_by(order))
     for time in INSIDE:
-        wanted = subject.draw(plain, time)[order]
-        require_same(f"permuted, at {time}", subject.draw(permuted, time), wanted)
+        expected = subject.draw(plain, time)[order]
+        require_same(f"permuted, at {time}", subject.draw(permuted, time), expected)
 
 
 @CHECKS.check("D05")
 @torch.no_grad()
-def moments_stand_for_themselves(subject: DeformationSubject) -> None:
-    """Several moments in a row, in any order, are what each is alone."""
+def moments_are_independent(subject: DeformationSubject) -> None:
+    """Several moments in any order give the same as each alone."""
     together = subject.entity()
     order = (0.0, 0.77, 0.13, 1.3, 0.77, 0.0)
     drawn = [(time, subject.draw(together, time).clone()) for time in order]
@@ -85,12 +85,12 @@ def moments_stand_for_themselves(subject: DeformationSubject) -> None:
 
 
 @CHECKS.check("D06")
-def numbers_everywhere(subject: DeformationSubject) -> None:
-    """Values and gradients are finite within the clip, at its ends and beyond, from the start."""
+def values_are_finite(subject: DeformationSubject) -> None:
+    """Values and gradients are finite inside the clip, at its ends and outside, also untrained."""
     for perturbed in (False, True):
         entity = subject.entity(perturbed=perturbed)
         for time in (*INSIDE, *OUTSIDE):
             output = subject.draw(entity, time)
             for name in RAW:
                 require_finite(f"{name} at {time}", getattr(output, name))
-            require_finite_gradients(entity, weighed(by_name(output)))
+            require_finite_gradients(entity, weighted_sum(by_name(output)))

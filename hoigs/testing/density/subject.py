@@ -1,45 +1,36 @@
-"""DensitySubject: a controller with its settings, and what a training run would show it."""
+"""DensitySubject: a controller with its settings, and inputs as of a training run."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from hoigs.core.context import BuildContext
-from hoigs.core.density import DensityControl, DensityStatistics, Refinement
-from hoigs.core.gaussians import Gaussians
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.interfaces.density import DensityControl, DensityStatistics, Refinement
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.testing.checks import CheckList
 from hoigs.testing.material.clip import OBJECT, tiny_clip
+from hoigs.testing.modules import DeviceSubject
 
 if TYPE_CHECKING:
-    from hoigs.testing.door import Options
+    from hoigs.testing.runner import Options
 
-CPU = torch.device("cpu")
 COUNT = 60
-TOTAL = 2000  # steps of the run that is played
+TOTAL = 2000  # steps of the simulated run
 EXTENT = 2.0
-LARGEST = 150_000  # Gaussians that a check of the cap is willing to make
+LARGEST = 150_000  # cap that a check still tests, in Gaussians
 
 
-@dataclass(frozen=True)
-class DensitySubject:
-    """What is checked."""
-
-    cls: type[DensityControl]
-    config: Any
-    device: torch.device = CPU
-
-    def __str__(self) -> str:
-        return self.cls.__name__
+class DensitySubject(DeviceSubject[DensityControl]):
+    """The component under check."""
 
     def control(self) -> DensityControl:
         return self.cls.from_config(self.config, BuildContext(OBJECT, tiny_clip()))
 
     def cloud(self, count: int = COUNT, seed: int = 0) -> Gaussians:
-        """Gaussians of all sizes, some of them all but transparent."""
+        """Gaussians of all sizes, some of them nearly transparent."""
         generator = torch.Generator().manual_seed(seed)
 
         def normal(*shape: int) -> Tensor:
@@ -55,7 +46,7 @@ class DensitySubject:
         return cloud.to(self.device)
 
     def statistics(self, count: int = COUNT, seed: int = 0) -> DensityStatistics:
-        """What some views have gathered: a third asks for refinement, some were never seen."""
+        """Statistics of some views: a third is above usual thresholds, some were never visible."""
         generator = torch.Generator().manual_seed(100 + seed)
 
         def uniform() -> Tensor:
@@ -76,17 +67,19 @@ class DensitySubject:
         self,
         control: DensityControl,
         step: int,
-        rest: Gaussians,
+        canonical: Gaussians,
         statistics: DensityStatistics | None = None,
     ) -> Refinement | None:
-        statistics = statistics or self.statistics(len(rest))
-        return control.refine(rest, rest, statistics, step=step, total_steps=TOTAL, extent=EXTENT)
+        statistics = statistics or self.statistics(len(canonical))
+        return control.refine(
+            canonical, canonical, statistics, step=step, total_steps=TOTAL, extent=EXTENT
+        )
 
-    def first(self, control: DensityControl, rest: Gaussians) -> tuple[int, Refinement] | None:
+    def first(self, control: DensityControl, canonical: Gaussians) -> tuple[int, Refinement] | None:
         """The first step that changes rows, and the decision; None when none does."""
-        seen = self.statistics(len(rest))
+        seen = self.statistics(len(canonical))
         for step in range(1, TOTAL + 1):
-            found = self.refine(control, step, rest, seen)
+            found = self.refine(control, step, canonical, seen)
             if found is not None and found.change is not None:
                 return step, found
         return None
@@ -110,9 +103,9 @@ def caps(subject: DensitySubject) -> str | None:
     cap = subject.control().cap
     if cap is None:
         return "it declares no cap"
-    return None if cap <= LARGEST else f"its cap is {cap}: give a smaller one in the settings"
+    return None if cap <= LARGEST else f"its cap is {cap}: set a smaller one in the settings"
 
 
 def perturbs(subject: DensitySubject) -> str | None:
     offsets = subject.control().perturb(subject.cloud(), step=7, total_steps=TOTAL, rate=1e-3)
-    return None if offsets is not None else "it moves no Gaussians of its own"
+    return None if offsets is not None else "its `perturb` returns no offsets"

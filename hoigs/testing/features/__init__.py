@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from hoigs.testing.features import keeping, tokens
+from hoigs.testing.features import persistence, tokens
 from hoigs.testing.features.subject import CHECKS, FeaturesSubject, subject
 
-FAMILIES = (tokens, keeping)  # importing them fills CHECKS
+MODULES = (persistence, tokens)  # importing them fills CHECKS
 
-__all__ = ["CHECKS", "FAMILIES", "FeaturesSubject", "subject"]
+__all__ = ["CHECKS", "MODULES", "FeaturesSubject", "subject"]

@@ -1,42 +1,33 @@
-"""FeaturesSubject: a class with its settings, bound to a motion that the kit makes."""
+"""FeaturesSubject: an extractor with its settings, on an entity with a synthetic motion."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from hoigs.core.context import BuildContext
-from hoigs.core.entity import Entity
-from hoigs.core.features import FeatureExtractor, Tokens
-from hoigs.core.gaussians import Gaussians
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.interfaces.features import FeatureExtractor
+from hoigs.core.model.entity import Entity
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.tokens import Tokens
 from hoigs.testing.checks import CheckList
 from hoigs.testing.compare import require_close
 from hoigs.testing.material.clip import OBJECT, moment_at, object_track, tiny_clip
 from hoigs.testing.material.motion import TinyMotion
-from hoigs.testing.modules import perturb, seeded
+from hoigs.testing.modules import DeviceSubject, perturb, seeded
 
 if TYPE_CHECKING:
-    from hoigs.testing.door import Options
+    from hoigs.testing.runner import Options
 
 COUNT = 7
-CPU = torch.device("cpu")
 INSIDE = (0.0, 0.13, 0.5, 1.0)
 OUTSIDE = (-0.2, 1.2)
 
 
-@dataclass(frozen=True)
-class FeaturesSubject:
-    """What is checked: it describes an entity that sways."""
-
-    cls: type[FeatureExtractor]
-    config: Any
-    device: torch.device = CPU
-
-    def __str__(self) -> str:
-        return self.cls.__name__
+class FeaturesSubject(DeviceSubject[FeatureExtractor]):
+    """The component under check; it describes an entity that moves."""
 
     def entity(
         self,
@@ -52,8 +43,8 @@ class FeaturesSubject:
 
         def make() -> Entity:
             features = self.cls.from_config(self.config, context)
-            rest = Gaussians.from_points(points, scales=0.02)
-            return Entity(rest, TinyMotion(), features, kind="object")
+            canonical = Gaussians.from_points(points, scales=0.02)
+            return Entity(canonical, TinyMotion(), features, kind="object")
 
         entity = seeded(make, seed)
         if perturbed:
@@ -80,8 +71,8 @@ def by_name(tokens: Tokens) -> dict[str, Tensor]:
     return {"features": tokens.features, "positions": tokens.positions}
 
 
-def require_same(what: str, got: Tokens, wanted: Tokens, atol: float = 1e-5) -> None:
-    for name, x in by_name(wanted).items():
+def require_same(what: str, got: Tokens, expected: Tokens, atol: float = 1e-5) -> None:
+    for name, x in by_name(expected).items():
         require_close(f"{what}: {name}", by_name(got)[name], x, atol=atol)
 
 

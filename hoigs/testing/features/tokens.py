@@ -1,10 +1,10 @@
-"""F01 to F07: what tokens are, and where."""
+"""F01 to F07: shapes, values, gradients and positions of tokens."""
 
 from __future__ import annotations
 
 import torch
 
-from hoigs.core.deformation import ProvidesField
+from hoigs.core.interfaces.deformation import ProvidesField
 from hoigs.testing.compare import require, require_close, require_finite
 from hoigs.testing.deformation.subject import apply, changed_by
 from hoigs.testing.features.subject import (
@@ -22,7 +22,7 @@ from hoigs.testing.modules import (
     require_gradients,
     require_true_gradients,
     trained,
-    weighed,
+    weighted_sum,
 )
 
 
@@ -35,7 +35,7 @@ def as_many_positions_as_features(subject: FeaturesSubject) -> None:
         assert features is not None
         number, width = len(tokens.features), features.width
         got = list(tokens.features.shape)
-        require(got == [number, width], f"features are {got}, width says {width}")
+        require(got == [number, width], f"features are {got}, width is {width}")
         require(
             tokens.positions.shape == (number, 3),
             f"{number} tokens have positions {list(tokens.positions.shape)}",
@@ -53,36 +53,36 @@ def dtype_and_device_are_kept(subject: FeaturesSubject) -> None:
 
 
 @CHECKS.check("F03")
-def numbers_everywhere(subject: FeaturesSubject) -> None:
-    """Tokens and their gradients are finite within the clip, at its ends and beyond."""
+def values_are_finite(subject: FeaturesSubject) -> None:
+    """Tokens and their gradients are finite inside the clip, at its ends and outside."""
     for perturbed in (False, True):
         entity = subject.entity(perturbed=perturbed)
         for time in (*INSIDE, *OUTSIDE):
             tokens = by_name(subject.tokens(entity, time))
             for name, x in tokens.items():
                 require_finite(f"{name} at {time}", x)
-            require_finite_gradients(entity, weighed(tokens))
+            require_finite_gradients(entity, weighted_sum(tokens))
 
 
 @CHECKS.check("F04")
 def order_of_gaussians_does_not_matter(subject: FeaturesSubject) -> None:
-    """Permuted Gaussians have permuted tokens where these are one each, else the same tokens."""
+    """Permuted Gaussians have permuted tokens, or the same where tokens are not one each."""
     order = [3, 0, 6, 2, 5, 1, 4]
     plain, permuted = subject.entity(), subject.entity()
     apply(permuted, changed_by(order))
-    wanted, got = subject.tokens(plain, 0.4), subject.tokens(permuted, 0.4)
-    if len(wanted.features) == len(order):
-        wanted = type(wanted)(wanted.features[order], wanted.positions[order])
-    require_same("permuted", got, wanted)
+    expected, got = subject.tokens(plain, 0.4), subject.tokens(permuted, 0.4)
+    if len(expected.features) == len(order):
+        expected = type(expected)(expected.features[order], expected.positions[order])
+    require_same("permuted", got, expected)
 
 
 @CHECKS.check("F05", learns)
-def every_parameter_learns(subject: FeaturesSubject) -> None:
+def every_parameter_gets_a_gradient(subject: FeaturesSubject) -> None:
     """Every trained parameter gets a gradient from some moment."""
     entity = subject.entity()
     assert entity.features is not None
     times = [i / 16 for i in range(17)]
-    losses = (weighed({"features": subject.tokens(entity, t).features}) for t in times)
+    losses = (weighted_sum({"features": subject.tokens(entity, t).features}) for t in times)
     require_gradients(entity.features, losses)
 
 
@@ -94,7 +94,7 @@ def gradients_are_derivatives(subject: FeaturesSubject) -> None:
     for time in (0.37, 0.81):
         require_true_gradients(
             trained(entity.features),
-            lambda time=time: weighed(by_name(subject.tokens(entity, time))),  # type: ignore[misc]
+            lambda time=time: weighted_sum(by_name(subject.tokens(entity, time))),  # type: ignore[misc]
         )
 
 
@@ -106,10 +106,10 @@ def tokens_are_where_the_entity_is(subject: FeaturesSubject) -> None:
         moment = moment_at(time, entity.means.dtype, entity.means.device)
         drawn = entity(moment).means
         assert isinstance(entity.deformation, ProvidesField)
-        field = entity.deformation.posed_field(entity.rest, moment)[1]
-        places = subject.tokens(entity, time).positions
+        field = entity.deformation.posed_field(entity.canonical, moment)[1]
+        positions = subject.tokens(entity, time).positions
         far = []
         for around in (drawn, field):
             low, high = around.amin(0), around.amax(0)
-            far.append(float((places - places.clamp(low, high)).norm(dim=-1).max()))
+            far.append(float((positions - positions.clamp(low, high)).norm(dim=-1).max()))
         require_close(f"distance of tokens to the entity at {time}", min(far), 0.0, atol=0.05)

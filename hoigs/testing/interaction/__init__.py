@@ -1,10 +1,10 @@
-"""Conformance of interactions: `CHECKS`, I01 to I13, on humans and objects that the kit makes."""
+"""Conformance of interactions: `CHECKS`, I01 to I15, on synthetic humans and objects."""
 
 from __future__ import annotations
 
-from hoigs.testing.interaction import company, keeping, reach
+from hoigs.testing.interaction import combinations, persistence, reach
 from hoigs.testing.interaction.subject import CHECKS, InteractionSubject, subject
 
-FAMILIES = (reach, company, keeping)  # importing them fills CHECKS
+MODULES = (combinations, persistence, reach)  # importing them fills CHECKS
 
-__all__ = ["CHECKS", "FAMILIES", "InteractionSubject", "subject"]
+__all__ = ["CHECKS", "MODULES", "InteractionSubject", "subject"]

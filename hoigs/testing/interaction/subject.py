@@ -1,4 +1,4 @@
-"""InteractionSubject: a class with its settings, bound to two humans, two objects and a scene."""
+"""InteractionSubject: a module with its settings, for two humans, two objects and a scene."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from hoigs.core.body import PART_NAMES
-from hoigs.core.context import BuildContext
-from hoigs.core.features import Tokens
-from hoigs.core.interaction import EntityKind, InteractionModule, Residual, Role
+from hoigs.core.interfaces.body import PART_NAMES
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.interfaces.interaction import InteractionModule
+from hoigs.core.values.tokens import EntityKind, Residual, Role, Tokens
 from hoigs.testing.checks import CheckList
 from hoigs.testing.compare import require, require_close
 from hoigs.testing.material.clip import tiny_clip
-from hoigs.testing.modules import perturb, seeded
+from hoigs.testing.modules import DeviceSubject, perturb, seeded
 
 if TYPE_CHECKING:
-    from hoigs.testing.door import Options
+    from hoigs.testing.runner import Options
 
-CPU = torch.device("cpu")
 KINDS: dict[str, EntityKind] = {
     "ann": "human", "bob": "human", "cup": "object", "box": "object", "scene": "scene",
 }  # fmt: skip
@@ -32,22 +31,22 @@ FAR = 1e3
 
 
 @dataclass(frozen=True)
-class Gathering:
-    """What an interaction is given: tokens and roles by entity."""
+class Inputs:
+    """The inputs of an interaction: tokens and roles by entity."""
 
     tokens: dict[str, Tokens]
     roles: dict[str, Role]
 
-    def only(self, *names: str) -> Gathering:
+    def only(self, *names: str) -> Inputs:
         """These entities, and the scene, in this order."""
         tokens = {n: self.tokens[n] for n in names}
-        return Gathering(tokens, {n: self.roles[n] for n in (*names, "scene")})
+        return Inputs(tokens, {n: self.roles[n] for n in (*names, "scene")})
 
-    def with_tokens(self, name: str, tokens: Tokens) -> Gathering:
+    def with_tokens(self, name: str, tokens: Tokens) -> Inputs:
         return replace(self, tokens={**self.tokens, name: tokens})
 
-    def shifted(self, *names: str, by: tuple[float, float, float]) -> Gathering:
-        """These entities elsewhere, anchors too."""
+    def shifted(self, *names: str, by: tuple[float, float, float]) -> Inputs:
+        """These entities translated, with their anchors."""
         tokens, roles = dict(self.tokens), dict(self.roles)
         for name in names:
             step = self.tokens[name].positions.new_tensor(by)
@@ -55,24 +54,16 @@ class Gathering:
             anchors = roles[name].anchors
             if anchors is not None:
                 roles[name] = replace(roles[name], anchors=anchors + step)
-        return Gathering(tokens, roles)
+        return Inputs(tokens, roles)
 
 
-@dataclass(frozen=True)
-class InteractionSubject:
-    """What is checked."""
-
-    cls: type[InteractionModule]
-    config: Any
-    device: torch.device = CPU
-
-    def __str__(self) -> str:
-        return self.cls.__name__
+class InteractionSubject(DeviceSubject[InteractionModule]):
+    """The component under check."""
 
     def module(
         self, *, seed: int = 0, perturbed: bool = True, dtype: torch.dtype = torch.float32
     ) -> InteractionModule:
-        """Bound to all five; by default no longer at its start."""
+        """A module bound to all five entities; by default with perturbed parameters."""
 
         def make() -> InteractionModule:
             module = self.cls.from_config(self.config, BuildContext(clip=tiny_clip()))
@@ -84,7 +75,7 @@ class InteractionSubject:
             perturb(module, size=0.2)
         return module.to(device=self.device, dtype=dtype).eval()
 
-    def gathering(self, dtype: torch.dtype = torch.float32) -> Gathering:
+    def inputs(self, dtype: torch.dtype = torch.float32) -> Inputs:
         """Two humans and two objects, all in reach of each other."""
         generator = torch.Generator().manual_seed(31)
 
@@ -100,10 +91,10 @@ class InteractionSubject:
             if KINDS[name] == "human":
                 anchors, reach = place[[0, 8, 9, 14, 15]], torch.tensor(0.7).to(place)
             roles[name] = Role(KINDS[name], anchors, reach)
-        return Gathering(tokens, roles)
+        return Inputs(tokens, roles)
 
-    def ask(self, module: InteractionModule, asked: Gathering) -> Mapping[str, Residual]:
-        return module(asked.tokens, asked.roles)
+    def run(self, module: InteractionModule, inputs: Inputs) -> Mapping[str, Residual]:
+        return module(inputs.tokens, inputs.roles)
 
 
 CHECKS: CheckList[InteractionSubject] = CheckList("I")
@@ -116,7 +107,7 @@ def subject(cls: type[InteractionModule], config: Any, options: Options) -> Inte
 
 
 def corrections(residuals: Mapping[str, Residual]) -> dict[str, Tensor]:
-    """Every tensor that is asked for, as "entity.part"."""
+    """Every tensor of the residuals, as "entity.part"."""
     return {
         f"{name}.{part}": value
         for name, residual in residuals.items()
@@ -126,10 +117,10 @@ def corrections(residuals: Mapping[str, Residual]) -> dict[str, Tensor]:
 
 
 def require_same(
-    what: str, got: Mapping[str, Residual], wanted: Mapping[str, Residual], atol: float = 1e-6
+    what: str, got: Mapping[str, Residual], expected: Mapping[str, Residual], atol: float = 1e-6
 ) -> None:
-    one, two = corrections(got), corrections(wanted)
-    require(set(one) == set(two), f"{what}: {sorted(set(one) ^ set(two))} is asked for once only")
+    one, two = corrections(got), corrections(expected)
+    require(set(one) == set(two), f"{what}: {sorted(set(one) ^ set(two))} is present only once")
     for name, x in two.items():
         require_close(f"{what}: {name}", one[name], x, atol=atol)
 

@@ -1,1 +1,5 @@
-"""What subjects are built from: a tiny body, a tiny clip, made here and read from no file."""
+"""Synthetic inputs of the checks.
+
+- `body.TinyBody`: a body model. `motion.TinyMotion`: a deformation.
+- `clip.tiny_clip`, `clip.write_tiny_clip`: a clip in memory and as a folder.
+"""

@@ -1,4 +1,4 @@
-"""A tiny body on SMPL-X's joint tree: six vertices about each of 52 joints."""
+"""A tiny body on SMPL-X's joint tree, with six vertices around each of 52 joints."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from hoigs.core.body import BODY_JOINT_PARTS, BodyModel, BodyOutput, BodySurface
-from hoigs.core.clock import constant
-from hoigs.core.moment import BodyPose
-from hoigs.core.skinning import joint_transforms, skin, transform_points
+from hoigs.core.cuda_graphs.device_constants import constant
+from hoigs.core.interfaces.body import BODY_JOINT_PARTS, BodyModel, BodyOutput, BodySurface
+from hoigs.core.maths.skinning import joint_transforms, skin, transform_points
+from hoigs.core.values.moment import BodyPose
 
 # SMPL-X's body joints: pelvis, hips, spine1, knees, spine2, ankles, spine3, feet, neck, collars,
 # head, shoulders, elbows, wrists; left before right
@@ -26,7 +26,7 @@ FACES = ((0, 2, 4), (2, 1, 4), (1, 3, 4), (3, 0, 4), (2, 0, 5), (1, 2, 5), (3, 1
 
 
 class TinyBody(BodyModel):
-    """Octahedra about joints, a fifth of their weight the parent's; two shape coefficients.
+    """Octahedra around joints, with a skinning weight of 0.2 for the parent; two betas.
 
     It computes in the dtype of the pose.
     """
@@ -86,7 +86,7 @@ class TinyBody(BodyModel):
     def surface(
         self, count: int | None = None, betas: Float[Tensor, " B"] | None = None, seed: int = 0
     ) -> BodySurface:
-        """`count` points at random; or one a vertex."""
+        """`count` random points, or one for each vertex."""
         betas = self.template.new_zeros(2) if betas is None else betas.to(self.template)
         vertices = self.shaped(betas)[0]
         if count is None:

@@ -1,4 +1,4 @@
-"""A tiny clip: a human who moves, an object that turns, a camera that walks; also as a folder."""
+"""A tiny clip with a moving human, object and camera; also written as a folder."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import BodyTrack, Clip, FrameStore, ObjectTrack
-from hoigs.core.moment import BodyPose, Moment
-from hoigs.core.rotation import axis_angle_to_matrices
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
+from hoigs.core.values.moment import BodyPose, Moment
 
 HUMAN, OBJECT = "human", "object"
 FRAMES = 9
@@ -24,7 +24,7 @@ BETAS = (0.4, -0.3)
 
 @cache
 def phases() -> dict[str, Tensor]:
-    """At which each joint's sway starts, radians."""
+    """The phase of each joint's oscillation, radians."""
     generator = torch.Generator().manual_seed(7)
     sizes = {"global_orient": (3,), "body": (21, 3), "left_hand": (15, 3), "right_hand": (15, 3)}
     return {
@@ -34,7 +34,7 @@ def phases() -> dict[str, Tensor]:
 
 
 def pose_at(time: float, dtype: torch.dtype = torch.float32) -> BodyPose:
-    """The human at any time, also beyond the clip: every joint sways, the pelvis walks."""
+    """The human at any time, also beyond the clip: every joint oscillates, the pelvis moves."""
     turns: dict[str, Any] = {
         name: (0.3 * torch.sin(2.5 * time + phase)).to(dtype) for name, phase in phases().items()
     }
@@ -59,7 +59,7 @@ def camera_at(time: float) -> Camera:
 
 @cache
 def object_track() -> ObjectTrack:
-    """A thing of 64 points, half of them said to be its moving part, that rises and turns."""
+    """64 points, half of them marked as the moving part, that rise and rotate."""
     generator = torch.Generator().manual_seed(3)
     time = torch.linspace(0, 1, FRAMES)
     axis = torch.tensor((0.3, 0.9, 0.2))
@@ -87,7 +87,7 @@ def body_track() -> BodyTrack:
 
 
 class TinyFrames(FrameStore):
-    """Pixels made when they are asked for; the pattern shifts from frame to frame."""
+    """Pixels computed on access; the pattern shifts from frame to frame."""
 
     def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
         rows = torch.arange(HEIGHT)[:, None, None] * 9
@@ -132,7 +132,7 @@ def tiny_clip() -> Clip:
 
 def write_tiny_clip(folder: Path) -> Path:
     """The tiny clip as a clip folder of hoigs."""
-    from hoigs.core.clip_folder import write_clip
+    from hoigs.core.clip_folder.write import write_clip
 
     write_clip(tiny_clip(), folder)
     return folder

@@ -1,4 +1,4 @@
-"""A deformation that provides everything that features may ask for, for checks of these."""
+"""A deformation that provides everything that feature extractors may use."""
 
 from __future__ import annotations
 
@@ -6,21 +6,20 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from hoigs.core.deformation import DeformationModel
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.interaction import Residual
-from hoigs.core.moment import Moment
-from hoigs.core.topology import TopologyChange
+from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import Residual
 from hoigs.testing.material.body import TinyBody
 from hoigs.testing.material.clip import HUMAN
 
 
 class TinyMotion(DeformationModel):
-    """Every Gaussian sways by itself; a field on the tiny body, and tangents at five keyframes."""
+    """Every Gaussian moves on its own; a field on the tiny body, and tangents at five keyframes."""
 
     provides = frozenset({"velocity", "field"})
     per_gaussian = ("tangents",)
-    rest_space = "world"
+    input_space = "world"
     field_width = 6
     keyframes = 5
 
@@ -33,32 +32,29 @@ class TinyMotion(DeformationModel):
         codes = torch.randn(len(self._body[0].vertex_parts), self.field_width, generator=generator)
         self.register_buffer("codes", codes)
 
-    def bind(self, rest: Gaussians) -> None:
-        rows = torch.linspace(0.5, 1.0, max(len(rest), 1))[: len(rest), None, None]
+    def bind(self, canonical: Gaussians) -> None:
+        rows = torch.linspace(0.5, 1.0, max(len(canonical), 1))[: len(canonical), None, None]
         knots = torch.linspace(-1.0, 1.0, self.keyframes)[:, None] * torch.tensor((0.3, 0.1, -0.2))
-        self.tangents = nn.Parameter((rows * knots).to(rest.means))
+        self.tangents = nn.Parameter((rows * knots).to(canonical.means))
 
     def forward(
-        self, rest: Gaussians, moment: Moment, residual: Residual | None = None
+        self, canonical: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
-        means = rest.means + self.tangents.mean(1) + self.tangents[:, -1] * moment.time
+        means = canonical.means + self.tangents.mean(1) + self.tangents[:, -1] * moment.time
         if residual is not None and residual.means is not None:
             means = means + residual.means
-        return rest.replace(means=means)
+        return canonical.replace(means=means)
 
-    def velocity(self, rest: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
-        del rest, moment
+    def velocity(self, canonical: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
+        del canonical, moment
         return self.tangents[:, -1]
 
     def posed_field(
-        self, rest: Gaussians, moment: Moment
+        self, canonical: Gaussians, moment: Moment
     ) -> tuple[Float[Tensor, "V D"], Float[Tensor, "V 3"]]:
-        del rest
+        del canonical
         places = self._body[0](moment.poses[HUMAN]).vertices
         return self.codes + moment.time, places
 
     def field_parts(self) -> Int[Tensor, " V"]:
         return self._body[0].vertex_parts
-
-    def on_topology(self, change: TopologyChange) -> None:
-        super().on_topology(change)

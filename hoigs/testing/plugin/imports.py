@@ -1,4 +1,4 @@
-"""P01 to P07: what importing a plugin costs everybody, and a component whoever uses it."""
+"""P01 to P07: side effects and time of importing a plugin and a component."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from hoigs.core.component import INTERFACES
-from hoigs.core.manager import HOOK
+from hoigs.core.registry.component import INTERFACES
+from hoigs.core.registry.manager import HOOK
 from hoigs.testing.checks import CheckError
 from hoigs.testing.plugin.subject import CHECKS, PluginSubject
 
 HEAVY = ("torch", "warp", "scipy", "pycolmap", "kornia")
-SLOW = 1.0  # seconds that a listing may take for one plugin
+SLOW = 1.0  # seconds to list one plugin
 PROBE = Path(__file__).with_name("probe.py")
 
 _targets: dict[tuple[str, ...], dict[str, Any]] = {}  # of modules, by (module, *sys.path)
 
 
 def _probe(steps: Sequence[str], first: Sequence[str], hook: str | None) -> dict[str, Any]:
-    """What importing each step does, in one process that has imported `first`."""
+    """What importing each of `steps` does, in one process that has imported `first`."""
     with tempfile.TemporaryDirectory() as folder:
         job, result = Path(folder) / "job.json", Path(folder) / "result.json"
         job.write_text(
@@ -38,33 +38,33 @@ def _probe(steps: Sequence[str], first: Sequence[str], hook: str | None) -> dict
 
 
 def _where(module: str) -> str:
-    """What the probe is to import: a module's name, or the file of one that has no other."""
+    """What the probe imports: a module's name, or the file of a plugin without an import name."""
     if not module.startswith("hoigs_plugin_"):
         return module.partition(":")[0]
     return str(sys.modules[module].__file__)
 
 
 def probe_targets(modules: Iterable[str]) -> None:
-    """Import these modules in one process, after torch, and remember what each does."""
-    wanted = [m for m in dict.fromkeys(modules) if (m, *sys.path) not in _targets]
-    if wanted:
-        found = _probe([_where(m) for m in wanted], ["torch", "hoigs.core.scene"], None)
-        _targets.update({(m, *sys.path): found[_where(m)] for m in wanted})
+    """Import these modules in one process, after torch, and keep what each does."""
+    expected = [m for m in dict.fromkeys(modules) if (m, *sys.path) not in _targets]
+    if expected:
+        found = _probe([_where(m) for m in expected], ["torch", "hoigs.core.model.scene"], None)
+        _targets.update({(m, *sys.path): found[_where(m)] for m in expected})
 
 
 def _listing(subject: PluginSubject) -> dict[str, Any]:
-    """What importing the plugin's module, and asking it for its components, does."""
+    """What importing the plugin's module and calling its hook does."""
     key = ("listing", subject.offer.plugin.module, *sys.path)
     if key not in _targets:
         where = _where(subject.offer.plugin.module)
-        _targets[key] = _probe([where], ["hoigs.core.manager"], HOOK)[where]
+        _targets[key] = _probe([where], ["hoigs.core.registry.manager"], HOOK)[where]
     if _targets[key]["error"]:
         raise CheckError(f"importing the plugin fails: {_targets[key]['error']}")
     return _targets[key]
 
 
 def _target(subject: PluginSubject) -> dict[str, Any]:
-    """What importing the component's module does, once torch is there."""
+    """What importing the component's module does, after torch."""
     module = subject.component.target.partition(":")[0]
     probe_targets([module])
     found = _targets[(module, *sys.path)]
@@ -74,8 +74,8 @@ def _target(subject: PluginSubject) -> dict[str, Any]:
 
 
 @CHECKS.check("P01")
-def listing_is_light(subject: PluginSubject) -> None:
-    """Listing the plugin imports neither torch nor anything else that is heavy."""
+def listing_imports_nothing_heavy(subject: PluginSubject) -> None:
+    """Listing the plugin imports neither torch nor another heavy package."""
     loaded = [name for name in HEAVY if name in _listing(subject)["modules"]]
     if loaded:
         raise CheckError(
@@ -85,7 +85,7 @@ def listing_is_light(subject: PluginSubject) -> None:
 
 
 @CHECKS.check("P02")
-def listing_is_quiet(subject: PluginSubject) -> None:
+def listing_prints_nothing(subject: PluginSubject) -> None:
     """Listing the plugin prints nothing."""
     printed = _listing(subject)["printed"]
     if printed:
@@ -110,8 +110,8 @@ def listing_is_quick(subject: PluginSubject) -> str:
 
 
 @CHECKS.check("P05")
-def target_is_of_the_kinds_interface(subject: PluginSubject) -> None:
-    """The target can be imported, and is a concrete class of its kind's interface."""
+def target_implements_its_interface(subject: PluginSubject) -> None:
+    """The target is a concrete class of its kind's interface."""
     found = subject.registry.get(subject.offer.exact)
     if inspect.isabstract(found):
         missing = ", ".join(sorted(found.__abstractmethods__))
@@ -122,8 +122,8 @@ def target_is_of_the_kinds_interface(subject: PluginSubject) -> None:
 
 
 @CHECKS.check("P06")
-def target_is_quiet(subject: PluginSubject) -> str:
-    """Importing the component prints nothing; how long it takes is reported."""
+def target_prints_nothing(subject: PluginSubject) -> str:
+    """Importing the component prints nothing; the time is reported."""
     found = _target(subject)
     if found["printed"]:
         raise CheckError(f"importing {subject.component.target} prints {found['printed'][:200]!r}")

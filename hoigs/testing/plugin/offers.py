@@ -1,20 +1,20 @@
-"""P08, P09 and P11: what a plugin says of a component."""
+"""P08, P09 and P11: how a plugin declares a component."""
 
 from __future__ import annotations
 
 from importlib import metadata
 
-from hoigs.core.component import API
-from hoigs.core.manager import Status
+from hoigs.core.registry.component import API
+from hoigs.core.registry.manager import Status
 from hoigs.testing.checks import CheckError
 from hoigs.testing.plugin.subject import CHECKS, PluginSubject, has_extra, installed
 
-LONGEST = 100  # characters of a summary, which stands on one line of the listing
+LONGEST = 100  # characters of a summary, which has one line in the listing
 
 
 @CHECKS.check("P08")
 def it_can_be_used_by_its_key(subject: PluginSubject) -> None:
-    """The component is in order: a good key, this interface's number, no rival, no lack."""
+    """The component is usable: a valid key, this API version, no conflict, nothing missing."""
     api, offer = subject.component.api, subject.offer
     if api != API:
         raise CheckError(f"api is {api}, this hoigs has {API}")
@@ -25,7 +25,7 @@ def it_can_be_used_by_its_key(subject: PluginSubject) -> None:
 
 @CHECKS.check("P09")
 def summary_is_one_line(subject: PluginSubject) -> None:
-    """It has a summary, of one line."""
+    """The summary is one line."""
     summary = subject.component.summary
     if not summary.strip():
         raise CheckError("summary is empty; `hoigs plugins` shows it beside the key")
@@ -34,9 +34,9 @@ def summary_is_one_line(subject: PluginSubject) -> None:
 
 
 @CHECKS.check("P11", has_extra, installed)
-def extra_is_one_of_the_distribution(subject: PluginSubject) -> None:
+def extra_exists_in_the_distribution(subject: PluginSubject) -> None:
     """The extra that it declares is one that its distribution offers."""
     dist, extra = subject.offer.plugin.dist, subject.component.extra
     offered = metadata.metadata(dist).get_all("Provides-Extra") or []
     if extra not in offered:
-        raise CheckError(f'"{extra}" is no extra of {dist}, which has {offered or "none"}')
+        raise CheckError(f'"{extra}" is not an extra of {dist}, which has {offered or "none"}')

@@ -1,4 +1,4 @@
-"""Importing in a process of its own: what is loaded, printed and started, and how long it takes.
+"""Import modules in a separate process; report what they load, print and start, and the time.
 
     python -P probe.py RESULT.json JOB.json
 
@@ -32,7 +32,7 @@ def load(target: str) -> Any:
 
 
 def step(target: str, hook: str | None) -> dict[str, Any]:
-    """Import one target; what the process prints meanwhile goes to a file."""
+    """Import one target, with the output of the process in a file."""
     before, threads = set(sys.modules), threading.active_count()
     with tempfile.TemporaryFile() as captured:
         kept = [os.dup(1), os.dup(2)]
@@ -44,7 +44,7 @@ def step(target: str, hook: str | None) -> dict[str, Any]:
             module = load(target)
             if hook is not None:
                 list(getattr(module, hook)())
-        except (Exception, SystemExit) as caught:  # a stranger's module may raise anything
+        except (Exception, SystemExit) as caught:  # a plugin may raise anything
             error = f"{type(caught).__name__}: {caught}"
         seconds = time.perf_counter() - start
         sys.stdout.flush()
@@ -70,7 +70,7 @@ def main() -> None:
         importlib.import_module(name)
     found = {target: step(target, job["hook"]) for target in job["steps"]}
     result.write_text(json.dumps(found))
-    os._exit(0)  # without waiting for threads that a plugin may have started
+    os._exit(0)  # do not wait for threads that a plugin has started
 
 
 if __name__ == "__main__":

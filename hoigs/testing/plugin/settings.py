@@ -1,4 +1,4 @@
-"""P10, P12 and P13: the component's settings, and what is built from them."""
+"""P10, P12 and P13: the component's settings, and building it from them."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import json
 from pydantic import ValidationError
 
 from hoigs.testing.checks import CheckError
-from hoigs.testing.door import KINDS
 from hoigs.testing.plugin.subject import CHECKS, PluginSubject, takes_settings
+from hoigs.testing.runner import KINDS
 
 NONSENSE = "no_setting_has_this_name"
 
 
 @CHECKS.check("P10")
 def it_is_built_from_its_settings(subject: PluginSubject) -> str | None:
-    """It is built from its default settings, or from those that were given."""
+    """It can be built from its default or given settings."""
     needed = [
         name
         for name, field in subject.config_class().model_fields.items()
@@ -24,12 +24,12 @@ def it_is_built_from_its_settings(subject: PluginSubject) -> str | None:
     ]
     if needed:
         raise CheckError(
-            f"{', '.join(needed)} has no default; give the check one: "
+            f"{', '.join(needed)} has no default; set it for the check: "
             f'settings={{"{needed[0]}": …}}, or --set {needed[0]}=…'
         )
     config = subject.config()
     if subject.component.kind not in KINDS:
-        return "there are no checks of its kind yet: it was not built"
+        return "its kind has no checks: it was not built"
     package = importlib.import_module(KINDS[subject.component.kind])
     package.subject(subject.registry.get(subject.offer.exact), config, subject.options)
     return None
@@ -37,15 +37,15 @@ def it_is_built_from_its_settings(subject: PluginSubject) -> str | None:
 
 @CHECKS.check("P12", takes_settings)
 def unknown_settings_are_refused(subject: PluginSubject) -> None:
-    """A setting that it does not have is refused."""
+    """Unknown settings are refused."""
     try:
         subject.config_class().model_validate({**subject.options.settings, NONSENSE: 1})
     except ValidationError as error:
         if any(problem["loc"][-1:] == (NONSENSE,) for problem in error.errors()):
             return
     raise CheckError(
-        f'{subject.component.config} takes the setting "{NONSENSE}"; keep extra="forbid" of '
-        "ComponentConfig, so that misspelt keys are found"
+        f'{subject.component.config} accepts the setting "{NONSENSE}"; keep extra="forbid" of '
+        "ComponentConfig, so that misspelt keys are errors"
     )
 
 

@@ -1,27 +1,23 @@
-"""PluginSubject: one component and the plugin that offers it; and the tags that gate checks."""
+"""PluginSubject: one component and the plugin that offers it; and conditions of checks."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from hoigs.core.component import Component
 from hoigs.core.errors import PluginError
-from hoigs.core.manager import Offer, normal_name
-from hoigs.core.registry import Registry
+from hoigs.core.registry.component import Component
+from hoigs.core.registry.manager import Offer, normal_name
+from hoigs.core.registry.registry import Registry
 from hoigs.testing.checks import CheckList
 
 if TYPE_CHECKING:
-    from hoigs.testing.door import Options
+    from hoigs.testing.runner import Options
 
 
 @dataclass(frozen=True)
 class PluginSubject:
-    """What is checked: an offer, as a registry knows it.
-
-    Attributes:
-        settings: of the component, where its defaults are not meant, or where it has none.
-    """
+    """The offer under check, in its registry."""
 
     offer: Offer
     registry: Registry
@@ -38,7 +34,7 @@ class PluginSubject:
         return self.registry.config_class(self.offer.exact)
 
     def config(self) -> Any:
-        """Its settings: the defaults, or those that were given."""
+        """Its settings: the given ones, and defaults for the others."""
         return self.config_class().model_validate(dict(self.options.settings))
 
 
@@ -46,10 +42,10 @@ CHECKS: CheckList[PluginSubject] = CheckList("P")
 
 
 def subject(key: str, registry: Registry, options: Options) -> PluginSubject:
-    """The one offer that `key` means, whatever its status.
+    """The offer of `key`, whatever its status.
 
     Raises:
-        PluginError: nobody offers it, or several distributions do and `key` does not say which.
+        PluginError: no distribution offers it, or several do and `key` names none of them.
     """
     name, _, dist = key.partition("@")
     found = [o for o in registry.manager.offers if o.key == name]
@@ -58,7 +54,7 @@ def subject(key: str, registry: Registry, options: Options) -> PluginSubject:
     builtin = [o for o in found if o.plugin.builtin]
     chosen = builtin or found
     if len(chosen) != 1:
-        registry.component(key)  # says what is wrong with the name
+        registry.component(key)  # raises with the nearest name
         raise PluginError(f"{key} is offered by {', '.join(o.exact for o in found)}; write one")
     return PluginSubject(chosen[0], registry, options)
 

@@ -1,24 +1,17 @@
-"""Conformance of rasterizers: `CHECKS`, questions R01 to R86 to a backend on a device.
+"""Conformance of rasterizers: `CHECKS`, the checks R01 to R86 of a backend on a device.
 
     subject = RasterizerSubject(MyRasterizer(), torch.device("cpu"))
     print(run_checks(CHECKS, subject))
 
-The rules are those at the head of `hoigs.core.projection`; the reference is `rasterizer:oracle`.
+The rules are those of `hoigs.core.maths.projection`; the reference is `rasterizer:oracle`.
 """
 
 from __future__ import annotations
 
 from hoigs.testing.checks import run_checks
-from hoigs.testing.rasterizer import (
-    bad_rows,
-    gradients,
-    pictures,
-    promises,
-    rows,
-    rules,
-)
+from hoigs.testing.rasterizer import bad_rows, contract, gradients, pictures, rows, rules
 from hoigs.testing.rasterizer.subject import CHECKS, RasterizerSubject, subject
 
-FAMILIES = (rules, pictures, rows, gradients, bad_rows, promises)  # importing them fills CHECKS
+FAMILIES = (rules, pictures, rows, gradients, bad_rows, contract)  # importing them fills CHECKS
 
 __all__ = ["CHECKS", "FAMILIES", "RasterizerSubject", "run_checks", "subject"]

@@ -1,4 +1,4 @@
-"""R60 to R65: broken and extreme numbers cost only the rows that hold them."""
+"""R60 to R65: broken and extreme numbers affect only the rows that hold them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from hoigs.core.errors import RenderError
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.projection import project
-from hoigs.core.rasterizer import RenderOutput, RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.rasterizers.compositing import project_gaussians
 from hoigs.testing.compare import require, require_close, require_finite, require_zero
 from hoigs.testing.rasterizer.rows import squares
 from hoigs.testing.rasterizer.scenes import (
@@ -28,7 +28,7 @@ from hoigs.testing.rasterizer.subject import CHECKS, RasterizerSubject
 
 ROWS = (*RAW, "features", "screen_offsets")
 NOT_FINITE = (math.nan, math.inf, -math.inf)
-# rows that the rules of `hoigs.core.projection` do not draw, whatever the rest of them holds
+# rows that the rules of `hoigs.core.maths.projection` do not draw, whatever else they hold
 CULLED = (
     *((name, value) for name in ROWS for value in NOT_FINITE),
     ("quats", 0.0),
@@ -69,12 +69,12 @@ def require_only_good_rows(subject: RasterizerSubject, scene: Scene, good: Tenso
 
 def rows_of(scene: Scene, rows: Tensor) -> Scene:
     """Some rows of a scene."""
-    asked = {
+    fields = {
         name: value[rows]
         for name in ("features", "screen_offsets")
         if (value := getattr(scene.request, name)) is not None
     }
-    return Scene(scene.gaussians[rows], scene.camera, scene.request.replace(**asked))
+    return Scene(scene.gaussians[rows], scene.camera, scene.request.replace(**fields))
 
 
 def corrupted(scene: Scene, damage: Callable[[dict[str, Tensor]], None]) -> Scene:
@@ -83,13 +83,13 @@ def corrupted(scene: Scene, damage: Callable[[dict[str, Tensor]], None]) -> Scen
     for name in ("features", "screen_offsets"):
         parts[name] = getattr(scene.request, name).clone()
     damage(parts)
-    asked = {name: parts[name] for name in ("features", "screen_offsets")}
+    fields = {name: parts[name] for name in ("features", "screen_offsets")}
     gaussians = Gaussians(*(parts[name] for name in RAW))
-    return Scene(gaussians, scene.camera, scene.request.replace(**asked))
+    return Scene(gaussians, scene.camera, scene.request.replace(**fields))
 
 
 @CHECKS.check("R60")
-def bad_rows_cost_only_themselves(subject: RasterizerSubject) -> None:
+def bad_rows_affect_only_themselves(subject: RasterizerSubject) -> None:
     """NaN, infinities, zero quaternions, huge scales and places, in whole rows and in one entry."""
     for seed in range(2):
         generator = torch.Generator().manual_seed(seed)
@@ -110,7 +110,7 @@ def bad_rows_cost_only_themselves(subject: RasterizerSubject) -> None:
 
 
 @CHECKS.check("R61")
-def random_bits_cost_only_themselves(subject: RasterizerSubject) -> None:
+def random_bits_affect_only_their_rows(subject: RasterizerSubject) -> None:
     """Rows whose fields are random bits, in each field alone and in all of them."""
     for seed, names in enumerate(((name,) for name in ROWS), start=1):
         _random_bits(subject, seed, names)
@@ -132,14 +132,14 @@ def _random_bits(subject: RasterizerSubject, seed: int, names: tuple[str, ...]) 
     # some random bits are numbers that are drawn by the rules; those rows are left out
     exact = scene.gaussians.to(torch.float64)
     culled = torch.ones(count, dtype=torch.bool)
-    culled[project(exact, scene.camera, scene.request).index] = False
+    culled[project_gaussians(exact, scene.camera, scene.request).index] = False
     keep = culled | ~broken
     require(int((culled & broken).sum()) > 10, "too few rows are broken")
     require_only_good_rows(subject, rows_of(scene, keep), ~broken[keep])
 
 
 @CHECKS.check("R62")
-def denormal_numbers_are_as_good_as_zero(subject: RasterizerSubject) -> None:
+def denormal_numbers_draw_as_zero(subject: RasterizerSubject) -> None:
     """Denormal values in every field draw what zeros draw, with finite gradients."""
     gaussians, quats = random_gaussians(40, degree=1), random_gaussians(40, seed=1).quats
 
@@ -159,15 +159,15 @@ def denormal_numbers_are_as_good_as_zero(subject: RasterizerSubject) -> None:
 
 
 @CHECKS.check("R63")
-def large_values_stay_where_they_are(subject: RasterizerSubject) -> None:
+def large_values_change_only_their_pixels(subject: RasterizerSubject) -> None:
     """A colour or feature of 1e30 and opacities at their ends change only pixels they cover."""
     scene = random_scene(60, degree=0, channels=2, offset=0.0)
     behind_all = scene.camera.to_camera(scene.gaussians.means)[:, 2].argmax()
-    loud = scene.gaussians.means.clone()
-    loud[behind_all] = scene.camera.unproject(torch.tensor([5.0, 5.0]), torch.tensor(9.0))
+    means = scene.gaussians.means.clone()
+    means[behind_all] = scene.camera.unproject(torch.tensor([5.0, 5.0]), torch.tensor(9.0))
     scales = scene.gaussians.log_scales.clone()
     scales[behind_all] = math.log(0.3)
-    gaussians = scene.gaussians.replace(means=loud, log_scales=scales)
+    gaussians = scene.gaussians.replace(means=means, log_scales=scales)
     alone = torch.zeros(60, dtype=torch.bool)
     alone[behind_all] = True
     covered = (subject.render(gaussians, scene.camera, RenderRequest(subset=alone)).alpha > 0).cpu()
@@ -177,14 +177,14 @@ def large_values_stay_where_they_are(subject: RasterizerSubject) -> None:
         values = [image[~covered.to(image.device)] for image in images(output).values()]
         return sum((value.square().sum() for value in values), torch.zeros(()))
 
-    quiet = Scene(gaussians, scene.camera, scene.request)
-    wanted, wanted_gradients = subject.drawn(quiet, elsewhere)
+    plain = Scene(gaussians, scene.camera, scene.request)
+    wanted, wanted_gradients = subject.drawn(plain, elsewhere)
 
-    def shout(parts: dict[str, Tensor]) -> None:
+    def enlarge(parts: dict[str, Tensor]) -> None:
         parts["sh"][behind_all] = 1e30
         parts["features"][behind_all] = -1e30
 
-    output, gradients = subject.drawn(corrupted(quiet, shout), elsewhere)
+    output, gradients = subject.drawn(corrupted(plain, enlarge), elsewhere)
     for name, image in images(wanted).items():
         got = images(output)[name].detach().cpu()[~covered]
         require_close(
@@ -204,8 +204,8 @@ def large_values_stay_where_they_are(subject: RasterizerSubject) -> None:
 
 
 @CHECKS.check("R64")
-def a_broken_camera_is_answered(subject: RasterizerSubject) -> None:
-    """NaN, infinity and zero in the camera make a finite picture or a RenderError."""
+def a_broken_camera_is_drawn_or_refused(subject: RasterizerSubject) -> None:
+    """NaN, infinity and zero in the camera give a finite picture or a RenderError."""
     gaussians, camera = random_gaussians(30, degree=1), a_camera()
     for field, place in (("K", (0, 0)), ("K", (1, 2)), ("world_to_camera", (0, 0)),
                          ("world_to_camera", (2, 3))):  # fmt: skip
@@ -228,7 +228,7 @@ def a_broken_camera_is_answered(subject: RasterizerSubject) -> None:
 
 
 @CHECKS.check("R65")
-def a_broken_background_pixel_stays_one(subject: RasterizerSubject) -> None:
+def a_broken_background_pixel_affects_no_other(subject: RasterizerSubject) -> None:
     """NaN in one pixel of the background shows there and nowhere else."""
     scene = random_scene(60, degree=0, channels=1, offset=0.0)
     clean = subject.draw(scene)

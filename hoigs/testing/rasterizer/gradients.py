@@ -1,4 +1,4 @@
-"""R40 to R49: gradients, against the oracle's, against rules and against differences."""
+"""R40 to R50: gradients, against the oracle's, the rules and finite differences."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from torch.autograd.gradcheck import GradcheckError
 
-from hoigs.core.camera import Camera
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.testing.checks import CheckError
 from hoigs.testing.compare import require, require_close, require_finite, require_zero
 from hoigs.testing.rasterizer.reference import (
@@ -78,7 +78,7 @@ def gradients_of_every_harmonic_degree(subject: RasterizerSubject) -> None:
 
 @CHECKS.check("R44")
 def background_colour_takes_its_gradient(subject: RasterizerSubject) -> None:
-    """The gradient of a background colour is the sum of what shines through."""
+    """The gradient of a background colour is the sum of (1 - alpha)."""
     request = RenderRequest(background=torch.tensor([0.2, 0.5, 0.7]))
     scene = Scene(random_gaussians(50, degree=0), a_camera(), request)
     output, gradients = subject.drawn(scene, lambda output: output.color.sum())
@@ -161,7 +161,7 @@ def culled_rows_get_zero_gradients(subject: RasterizerSubject) -> None:
 def gradcheck_in_float64(subject: RasterizerSubject) -> None:
     """torch.autograd.gradcheck of every input in float64, without cut-offs.
 
-    Its fast mode: a random direction of each input and output tells as surely, 20 times sooner.
+    Its fast mode, a random direction of each input and output, takes a twentieth of the time.
     """
     generator = torch.Generator().manual_seed(1)
 

@@ -7,8 +7,8 @@ from functools import cache
 
 import torch
 
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.testing.compare import require, require_close
 from hoigs.testing.rasterizer.reference import reference, require_reference_picture
 from hoigs.testing.rasterizer.scenes import (
@@ -66,11 +66,11 @@ def giant_scene() -> Scene:
 
 @CHECKS.check("R20")
 def pictures_are_the_oracles(subject: RasterizerSubject) -> None:
-    """Colour, alpha, depth, features and what `info` tells are the oracle's."""
+    """Colour, alpha, depth, features and `info` are the oracle's."""
     for seed in (0, 1):
         scene = rich_scene(seed)
         wanted = reference(scene).output
-        require(0.3 < wanted.alpha.mean() < 0.95, "the scene is too empty or too full to tell")
+        require(0.3 < wanted.alpha.mean() < 0.95, "the scene is too empty or too full")
         output = require_reference_picture(subject, scene)
         radii = output.info["radii"]
         require_close("info['radii']", radii, wanted.info["radii"], atol=1.0, rtol=1e-3)
@@ -130,7 +130,7 @@ def opacity_near_zero_and_one(subject: RasterizerSubject) -> None:
 
 @CHECKS.check("R25")
 def partly_culled(subject: RasterizerSubject) -> None:
-    """A cloud that is half out of the image, some of it behind the camera."""
+    """Random Gaussians, half of them outside the image, some behind the camera."""
     scene = spread_scene()
     shown = reference(scene).output.info["radii"] > 0
     require(20 < int(shown.sum()) < 180, "the scene is not partly culled")
@@ -141,7 +141,7 @@ def partly_culled(subject: RasterizerSubject) -> None:
 
 @CHECKS.check("R26")
 def a_splat_beyond_the_image(subject: RasterizerSubject) -> None:
-    """A giant far off the image whose edge reaches in: the clamp of the Jacobian is at work."""
+    """A giant far off the image whose edge reaches in: the clamp of the Jacobian applies."""
     wanted = reference(giant_scene()).output
     require(wanted.alpha.max() > 0.1, "the giant is not in the picture")
     require_reference_picture(subject, giant_scene())
@@ -169,7 +169,7 @@ def _peak(device: torch.device) -> int:
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     if sys.platform == "win32":
-        return 0  # nothing there tells without another package
+        return 0  # Windows needs another package for it
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -9,13 +9,13 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from hoigs.core.rasterizer import Capabilities, RenderOutput
-from hoigs.rasterizers.oracle import OracleRasterizer
+from hoigs.core.interfaces.rasterizer import Capabilities, RenderOutput
+from hoigs.rasterizers.oracle import OracleConfig, OracleRasterizer
 from hoigs.testing.compare import require, require_close, require_close_gradient, require_zero
 from hoigs.testing.rasterizer.scenes import Scene, images
 from hoigs.testing.rasterizer.subject import INPUTS, RasterizerSubject
 
-ORACLE = RasterizerSubject(OracleRasterizer(cutoffs=True), torch.device("cpu"))
+ORACLE = RasterizerSubject(OracleRasterizer(OracleConfig(cutoffs=True)), torch.device("cpu"))
 PARTS = ("color", "alpha", "depth", "features")
 
 

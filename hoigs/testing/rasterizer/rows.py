@@ -1,11 +1,11 @@
-"""R30 to R35: rows are a set: their order, absence and company change nothing else."""
+"""R30 to R35: the order of rows does not matter, nor do rows change each other."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from hoigs.core.rasterizer import RenderOutput, RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.testing.compare import require, require_close, require_zero
 from hoigs.testing.rasterizer.scenes import (
     Scene,
@@ -67,8 +67,8 @@ def subset_draws_only_those(subject: RasterizerSubject) -> None:
     only = subject.render(scene.gaussians[mask], scene.camera, fewer)
     require_same_images(some, only)
     require_zero("info['radii'] outside the subset", some.info["radii"].cpu()[~mask])
-    nobody = torch.zeros(90, dtype=torch.bool)
-    none = subject.render(scene.gaussians, scene.camera, RenderRequest(subset=nobody))
+    no_rows = torch.zeros(90, dtype=torch.bool)
+    none = subject.render(scene.gaussians, scene.camera, RenderRequest(subset=no_rows))
     require_zero("alpha of an empty subset", none.alpha)
 
 

@@ -8,9 +8,9 @@ from functools import cache
 
 import torch
 
-from hoigs.core.camera import Camera
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.testing.compare import require, require_close
 from hoigs.testing.rasterizer.reference import require_reference_picture
 from hoigs.testing.rasterizer.scenes import (
@@ -61,7 +61,7 @@ def outputs_keep_their_shapes(subject: RasterizerSubject) -> None:
     radii = output.info["radii"]
     require(radii.shape == (9,), f"info['radii'] has shape {list(radii.shape)}, expected [9]")
     bare = subject.render(random_gaussians(9), a_camera(6, 4))
-    require(bare.features is None, "features came that were not asked for")
+    require(bare.features is None, "there are features that were not requested")
 
 
 @CHECKS.check("R03")

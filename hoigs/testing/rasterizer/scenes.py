@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import RenderOutput, RenderRequest
+from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 
 Value = TypeVar("Value")
 RAW = tuple(f.name for f in fields(Gaussians))
@@ -30,7 +30,7 @@ class Scene:
 
 
 def random_gaussians(count: int = 150, *, degree: int = 3, seed: int = 0) -> Gaussians:
-    """A cloud around the origin, splats of one to ten pixels, as `a_camera` sees it."""
+    """Random Gaussians around the origin, one to ten pixels large in `a_camera`."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -117,7 +117,7 @@ def on(device: torch.device, value: Value) -> Value:
 
 
 def forged(value: Value, **changes: Any) -> Value:
-    """A frozen dataclass with fields replaced behind the back of its own checks."""
+    """A copy of a frozen dataclass with fields replaced, without its own checks."""
     result = copy.copy(value)
     for name, change in changes.items():
         object.__setattr__(result, name, change)

@@ -1,4 +1,4 @@
-"""RasterizerSubject: a backend on a device, as the checks see it; and the tags that gate them."""
+"""RasterizerSubject: a backend on a device; and the conditions on which checks depend."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.context import BuildContext
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.testing.checks import CheckList, Need
 from hoigs.testing.rasterizer.scenes import RAW, Scene, forged, on
 
 if TYPE_CHECKING:
-    from hoigs.testing.door import Options
+    from hoigs.testing.runner import Options
 
 INPUTS = (*RAW, "features", "screen_offsets", "background", "world_to_camera")
 
@@ -35,7 +35,7 @@ class RasterizerSubject:
     def render(
         self, gaussians: Gaussians, camera: Camera, request: RenderRequest | None = None
     ) -> RenderOutput:
-        """Draw on the device what was made on the CPU."""
+        """Draw on the device; the inputs are on the CPU."""
         request = None if request is None else on(self.device, request)
         return self.rasterizer.render(on(self.device, gaussians), on(self.device, camera), request)
 
@@ -47,8 +47,8 @@ class RasterizerSubject:
     ) -> tuple[RenderOutput, dict[str, Tensor | None]]:
         """The output, and the gradients of loss(output) by name (INPUTS), on the CPU.
 
-        Names that the scene lacks are left out; None stands for a gradient that did not come. The
-        pose takes part where the backend declares `camera_gradients`.
+        Inputs that the scene lacks are left out; None stands for a missing gradient. The pose is
+        included where the backend declares `camera_gradients`.
         """
         parts: dict[str, Any] = {name: getattr(scene.gaussians, name) for name in RAW}
         for name in ("features", "screen_offsets", "background"):
@@ -59,11 +59,12 @@ class RasterizerSubject:
             name: x.detach().clone().requires_grad_() for name, x in parts.items() if x is not None
         }
         view = {k: leaves[k] for k in ("world_to_camera",) if k in leaves}
-        asked = {k: leaves[k] for k in ("features", "screen_offsets", "background") if k in leaves}
+        names = ("features", "screen_offsets", "background")
+        fields = {name: leaves[name] for name in names if name in leaves}
         output = self.render(
             Gaussians(*(leaves[name] for name in RAW)),
             forged(scene.camera, **view),
-            scene.request.replace(**asked),
+            scene.request.replace(**fields),
         )
         loss(output).backward()
         return output, {name: x.grad for name, x in leaves.items()}

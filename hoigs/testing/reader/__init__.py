@@ -5,6 +5,6 @@ from __future__ import annotations
 from hoigs.testing.reader import folders, reading
 from hoigs.testing.reader.subject import CHECKS, ReaderSubject, subject
 
-FAMILIES = (folders, reading)  # importing them fills CHECKS
+MODULES = (folders, reading)  # importing them fills CHECKS
 
-__all__ = ["CHECKS", "FAMILIES", "ReaderSubject", "subject"]
+__all__ = ["CHECKS", "MODULES", "ReaderSubject", "subject"]

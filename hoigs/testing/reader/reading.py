@@ -1,4 +1,4 @@
-"""C05 to C08: what is read."""
+"""C05 to C08: the clip that is read."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def frames_are_bytes_of_one_size(subject: ReaderSubject) -> None:
 
 
 @CHECKS.check("C06", has_folder)
-def the_clip_hangs_together(subject: ReaderSubject) -> None:
-    """A camera and a moment a frame, times in [0, 1], tracks of every frame, split within it."""
+def the_clip_is_consistent(subject: ReaderSubject) -> None:
+    """Each frame has a camera, a moment in [0, 1] and all tracks; the split names its frames."""
     with subject.folder() as folder:
         clip = subject.reader().read(folder)
         frames = len(clip.cameras)
@@ -53,15 +53,15 @@ def the_clip_hangs_together(subject: ReaderSubject) -> None:
             require(set(moment.poses) == set(clip.bodies), "a moment lacks the pose of a human")
         for part, positions in clip.split.items():
             inside = all(0 <= p < frames for p in positions)
-            require(inside, f"split {part} names frames beyond the {frames} that there are")
+            require(inside, f"split {part} has frames beyond the {frames} of the clip")
         for camera in clip.cameras:
             turn = camera.world_to_camera[:3, :3].double()
             require_close("R R^T of a camera", turn @ turn.mT, torch.eye(3), atol=1e-4)
 
 
 @CHECKS.check("C07", has_image_files)
-def pixels_are_read_when_asked_for(subject: ReaderSubject) -> None:
-    """Pixels are decoded when they are asked for, not when the clip is read."""
+def pixels_are_read_lazily(subject: ReaderSubject) -> None:
+    """Pixels are decoded on access, not when the clip is read."""
     with subject.folder() as folder:
         clip = subject.reader().read(folder)
         for path in images_of(folder):
@@ -69,12 +69,12 @@ def pixels_are_read_when_asked_for(subject: ReaderSubject) -> None:
                 blank = Image.new(image.mode, image.size)
             blank.save(path)
         brightest = int(clip.store.image(len(clip) - 1).max())
-        require(brightest < 8, "an image was decoded before it was asked for")
+        require(brightest < 8, "an image was decoded before it was accessed")
 
 
 @CHECKS.check("C08", has_folder)
-def reading_is_harmless(subject: ReaderSubject) -> None:
-    """Reading writes nothing, and twice is the same."""
+def reading_writes_nothing(subject: ReaderSubject) -> None:
+    """Reading writes nothing, and reading twice gives the same clip."""
     with subject.folder() as folder:
         before = {path: path.read_bytes() for path in files_of(folder)}
         first, second = (subject.reader().read(folder) for _ in range(2))

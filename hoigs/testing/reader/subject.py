@@ -1,4 +1,4 @@
-"""ReaderSubject: a reader with its settings, and a folder of its layout where there is one."""
+"""ReaderSubject: a reader with its settings, and a folder in its layout if there is one."""
 
 from __future__ import annotations
 
@@ -11,40 +11,35 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hoigs.core.context import BuildContext
-from hoigs.core.reader import ClipReader
-from hoigs.testing.checks import CheckList
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.interfaces.reader import ClipReader
+from hoigs.testing.checks import CheckList, ComponentSubject
 from hoigs.testing.material.clip import write_tiny_clip
 
 if TYPE_CHECKING:
-    from hoigs.testing.door import Options
+    from hoigs.testing.runner import Options
 
 IMAGES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True)
-class ReaderSubject:
-    """What is checked.
+class ReaderSubject(ComponentSubject[ClipReader]):
+    """The component under check.
 
     Attributes:
-        given: a folder in the reader's layout; None tries the clip folder of hoigs.
+        given: a folder in the reader's layout; None uses a clip folder of hoigs.
     """
 
-    cls: type[ClipReader]
-    config: Any
     given: Path | None = None
-
-    def __str__(self) -> str:
-        return self.cls.__name__
 
     def reader(self) -> ClipReader:
         return self.cls.from_config(self.config, BuildContext())
 
     @contextmanager
     def folder(self) -> Iterator[Path]:
-        """A copy of a clip in its layout, that a check may break."""
-        with tempfile.TemporaryDirectory() as room:
-            folder = Path(room) / "clip"
+        """A copy of a clip in its layout, which a check may damage."""
+        with tempfile.TemporaryDirectory() as root:
+            folder = Path(root) / "clip"
             if self.given is not None:
                 shutil.copytree(self.given, folder)
             else:
@@ -71,7 +66,7 @@ def subject(cls: type[ClipReader], config: Any, options: Options) -> ReaderSubje
 def has_folder(subject: ReaderSubject) -> str | None:
     if subject.has_folder:
         return None
-    return "it does not take the clip folder of hoigs: give a clip in its layout (folder=…)"
+    return "it does not read the clip folder of hoigs: pass a clip in its layout (folder=…)"
 
 
 def files_of(folder: Path) -> list[Path]:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from hoigs.core.body import LEFT_WRIST, PART_NAMES, RIGHT_WRIST
-from hoigs.core.context import BuildContext
 from hoigs.core.errors import HoigsError
-from hoigs.core.moment import BodyPose
-from hoigs.core.rotation import axis_angle_to_matrices
+from hoigs.core.interfaces.body import LEFT_WRIST, PART_NAMES, RIGHT_WRIST
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.bodies.anny import ASSET, AnnyBody, AnnyConfig
 
 
@@ -76,7 +76,7 @@ def test_shape_directions_survive_the_turn_into_the_t_pose(body: AnnyBody) -> No
     with np.load(ASSET) as file:
         asset = {k: file[k].astype(np.float64) for k in file.files if k != "joint_names"}
     betas = np.linspace(-2, 2, 10)
-    rest = asset["v_rest"] + np.tensordot(betas, asset["shapedirs"], 1)
+    canonical = asset["v_rest"] + np.tensordot(betas, asset["shapedirs"], 1)
     joints = asset["joints"] + np.tensordot(betas, asset["joint_shapedirs"], 1)
     turns = asset["tpose_rot"]
     moved = [joints[0]]
@@ -86,7 +86,7 @@ def test_shape_directions_survive_the_turn_into_the_t_pose(body: AnnyBody) -> No
     moved = np.stack(moved)
     rows = asset["weight_joints"].astype(int)
     share = asset["weights"] / asset["weights"].sum(1, keepdims=True)
-    each = np.einsum("vkab,vkb->vka", turns[rows], rest[:, None] - joints[rows]) + moved[rows]
+    each = np.einsum("vkab,vkb->vka", turns[rows], canonical[:, None] - joints[rows]) + moved[rows]
     expected = (share[..., None] * each).sum(1)
     vertices, shaped = body.shaped(torch.tensor(betas))
     np.testing.assert_allclose(vertices.numpy(), expected, atol=2e-6)
@@ -95,12 +95,14 @@ def test_shape_directions_survive_the_turn_into_the_t_pose(body: AnnyBody) -> No
 
 def test_bones_keep_their_length_and_the_pelvis_its_place(body: AnnyBody) -> None:
     pose = posed(1)
-    _, rest = body.shaped(pose.betas)
+    _, canonical = body.shaped(pose.betas)
     joints = body(pose).joints
-    torch.testing.assert_close(joints[0], rest[0] + pose.transl)
+    torch.testing.assert_close(joints[0], canonical[0] + pose.transl)
     for j, parent in enumerate(body.parents[1:], start=1):
         length = (joints[j] - joints[parent]).norm()
-        torch.testing.assert_close(length, (rest[j] - rest[parent]).norm(), atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(
+            length, (canonical[j] - canonical[parent]).norm(), atol=1e-5, rtol=1e-5
+        )
 
 
 def test_a_bent_elbow_moves_the_forearm_only(body: AnnyBody) -> None:

@@ -11,7 +11,10 @@ from scipy.spatial.transform import Rotation
 from toy_smplh import SMPL_JOINTS, write_smpl, write_smplh
 from toy_smplx import PARENTS, write_toy
 
-from hoigs.core.body_params import (
+from hoigs.core.errors import ClipError, HoigsError
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.model.smpl_params import (
     betas_of_joints,
     hand_convention,
     moved_pose,
@@ -22,11 +25,8 @@ from hoigs.core.body_params import (
     smpl_from_pose,
     smplh_from_pose,
 )
-from hoigs.core.clip import BodyTrack
-from hoigs.core.context import BuildContext
-from hoigs.core.errors import ClipError, HoigsError
-from hoigs.core.moment import BodyPose
-from hoigs.core.rotation import axis_angle_to_matrices
+from hoigs.core.values.clip import BodyTrack
+from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.bodies.model_files import file_gender
 from hoigs.plugins.bodies.smplh import SmplBody, SmplConfig, SmplhBody, SmplhConfig
 from hoigs.plugins.bodies.smplx import SmplxBody, SmplxConfig
@@ -64,8 +64,8 @@ def test_smplh_moves_the_skin_as_smplx_does(files: Path) -> None:
     """Of equal toy files, so that only the joints' order can differ."""
     vector = 0.4 * draw(3, 156)
     pose = pose_from_smplh(vector, draw(3, 3, seed=1), draw(10, seed=2), "flat")
-    plus_h = SmplhBody(files / "male" / "model.npz").double()
-    smplx = SmplxBody(files / "SMPLX_MALE.npz").double()
+    plus_h = SmplhBody(SmplhBody.Config(path=files / "male" / "model.npz")).double()
+    smplx = SmplxBody(SmplxBody.Config(path=files / "SMPLX_MALE.npz")).double()
     torch.testing.assert_close(plus_h(pose).vertices, smplx(pose).vertices)
     kept = [*range(22), *range(25, 55)]
     torch.testing.assert_close(plus_h(pose).joints, smplx(pose).joints[:, kept])
@@ -74,7 +74,7 @@ def test_smplh_moves_the_skin_as_smplx_does(files: Path) -> None:
 def test_smpl_by_its_own_formulas(files: Path) -> None:
     """24 joints, one matrix at a time, against body:smpl behind a BodyPose."""
     vector, transl, betas = 0.4 * draw(72), draw(3, seed=1), draw(10, seed=2)
-    body = SmplBody(files / "SMPL_NEUTRAL.npz").double()
+    body = SmplBody(SmplBody.Config(path=files / "SMPL_NEUTRAL.npz")).double()
     with np.load(files / "SMPL_NEUTRAL.npz") as npz:
         file = dict(npz)
     shaped = file["v_template"] + file["shapedirs"] @ betas.numpy()
@@ -124,7 +124,7 @@ def test_smplx_parameters_flat_or_by_joint() -> None:
 
 
 def test_a_pose_moves_with_its_world(files: Path) -> None:
-    body = SmplxBody(files / "SMPLX_MALE.npz").double()
+    body = SmplxBody(SmplxBody.Config(path=files / "SMPLX_MALE.npz")).double()
     pose = pose_from_smplh(0.4 * draw(3, 156), draw(3, 3), draw(10), "flat")
     turn, shift = axis_angle_to_matrices(draw(3, seed=8)), draw(3, seed=9)
     pelvis = body.shaped(pose.betas)[1][0]
@@ -138,7 +138,7 @@ def test_a_pose_moves_with_its_world(files: Path) -> None:
 def test_hand_convention_is_told_from_what_it_gives(
     files: Path, convention: str, what: str
 ) -> None:
-    body = SmplxBody(files / "SMPLX_MALE.npz").double()
+    body = SmplxBody(SmplxBody.Config(path=files / "SMPLX_MALE.npz")).double()
     truth = pose_from_smplh(0.3 * draw(4, 156), draw(4, 3), draw(10), convention)  # type: ignore[arg-type]
     seen = getattr(body(truth), what)
     seen = seen + 1e-4 * draw(*seen.shape, seed=3)
@@ -151,7 +151,7 @@ def test_hand_convention_is_told_from_what_it_gives(
 
 
 def test_a_file_without_mean_hands_refuses_the_mean_convention(files: Path) -> None:
-    body = SmplhBody(files / "female" / "model.npz").double()
+    body = SmplhBody(SmplhBody.Config(path=files / "female" / "model.npz")).double()
     pose = pose_from_smplh(draw(156), draw(3), draw(10))
     with pytest.raises(HoigsError, match="has no mean hand"):
         body(pose)
@@ -159,7 +159,7 @@ def test_a_file_without_mean_hands_refuses_the_mean_convention(files: Path) -> N
 
 
 def test_betas_come_back_from_rest_joints(files: Path) -> None:
-    body = SmplBody(files / "SMPL_NEUTRAL.npz")
+    body = SmplBody(SmplBody.Config(path=files / "SMPL_NEUTRAL.npz"))
     betas = draw(10).float()
     joints = body.shaped(betas)[1][:22] + torch.tensor([1.0, 2.0, 3.0])
     torch.testing.assert_close(betas_of_joints(body, joints), betas, atol=1e-3, rtol=1e-3)
@@ -201,7 +201,7 @@ def test_a_silent_neutral_body_is_refused(files: Path) -> None:
 def test_the_clips_template_is_used_and_another_can_be_given(files: Path, tmp_path: Path) -> None:
     import trimesh
 
-    plain = SmplxBody(files / "SMPLX_MALE.npz")
+    plain = SmplxBody(SmplxBody.Config(path=files / "SMPLX_MALE.npz"))
     own = plain.template + 0.01 * draw(*plain.template.shape).float()
     context = BuildContext(body_track=track(template=own))
     config = SmplxConfig(path=files / "SMPLX_MALE.npz")
@@ -214,7 +214,7 @@ def test_the_clips_template_is_used_and_another_can_be_given(files: Path, tmp_pa
     shifted = SmplxBody.from_config(given, context).template
     torch.testing.assert_close(shifted, plain.template + 1.0, atol=1e-5, rtol=0)
     with pytest.raises(HoigsError, match="template has 7 vertices, the model 1100"):
-        SmplxBody(config.path, template=own[:7])
+        SmplxBody(config, template=own[:7])
     with pytest.raises(HoigsError, match="no such file"):
         SmplxBody.from_config(SmplxConfig(path=config.path, template=tmp_path / "n.obj"), context)
 
@@ -226,6 +226,6 @@ def test_other_families_files_are_refused(files: Path) -> None:
         (SmplBody, files / "SMPLX_MALE.npz"),
     ):
         with pytest.raises(HoigsError, match=r"do not fit each other|lacks"):
-            family(path)
+            family(family.Config(path=path))
     with pytest.raises(HoigsError, match="11"):
-        SmplBody(files / "SMPL_NEUTRAL.npz", num_betas=11)
+        SmplBody(SmplBody.Config(path=files / "SMPL_NEUTRAL.npz", num_betas=11))

@@ -10,10 +10,10 @@ import torch
 from scipy.spatial.transform import Rotation
 from toy_smplx import PARENTS, toy_smplx, write_toy
 
-from hoigs.core.context import BuildContext
 from hoigs.core.errors import HoigsError
-from hoigs.core.moment import BodyPose
-from hoigs.core.rotation import axis_angle_to_matrices
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.bodies.smplx import SmplxBody, SmplxConfig
 
 
@@ -24,7 +24,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def body(path: Path) -> SmplxBody:
-    return SmplxBody(path).double()
+    return SmplxBody(SmplxBody.Config(path=path)).double()
 
 
 def random_pose(*batch: int, seed: int = 0, betas: int = 10) -> BodyPose:
@@ -152,14 +152,14 @@ def test_root_parent_and_face_joints(body: SmplxBody) -> None:
 
 
 def test_number_of_betas(path: Path, tmp_path: Path) -> None:
-    body = SmplxBody(path, num_betas=4)
+    body = SmplxBody(SmplxBody.Config(path=path, num_betas=4))
     assert body.shaped(torch.zeros(4))[0].shape == (1100, 3)
     with pytest.raises(HoigsError, match=r"takes 4 shape coefficients.*got 10"):
         body(BodyPose.zeros())
-    with pytest.raises(HoigsError, match=r"has 10 shape directions, num_betas asks for 11"):
-        SmplxBody(path, num_betas=11)
+    with pytest.raises(HoigsError, match=r"has 10 shape directions, num_betas is 11"):
+        SmplxBody(SmplxBody.Config(path=path, num_betas=11))
     big = write_toy(tmp_path / "big.npz", shapedirs=toy_smplx(directions=400)["shapedirs"])
-    assert SmplxBody(big, num_betas=300).num_betas == 300
+    assert SmplxBody(SmplxBody.Config(path=big, num_betas=300)).num_betas == 300
 
 
 def test_config_builds_it(path: Path) -> None:
@@ -171,7 +171,7 @@ def test_config_builds_it(path: Path) -> None:
 
 def test_absent_file_says_where_to_get_it(tmp_path: Path) -> None:
     with pytest.raises(HoigsError, match=r"no file .*nothing\.npz.*smpl-x\.is\.tue\.mpg\.de"):
-        SmplxBody(tmp_path / "nothing.npz")
+        SmplxBody(SmplxBody.Config(path=tmp_path / "nothing.npz"))
 
 
 def test_partial_file_names_the_absent_keys(tmp_path: Path) -> None:
@@ -179,24 +179,25 @@ def test_partial_file_names_the_absent_keys(tmp_path: Path) -> None:
     del arrays["posedirs"], arrays["hands_meanl"]
     np.savez(tmp_path / "part.npz", **arrays)
     with pytest.raises(HoigsError, match=r"lacks posedirs, hands_meanl .*registered"):
-        SmplxBody(tmp_path / "part.npz")
+        SmplxBody(SmplxBody.Config(path=tmp_path / "part.npz"))
 
 
 def test_smpl_file_is_refused(tmp_path: Path) -> None:
     path = write_toy(tmp_path / "smplh.npz", weights=np.ones((1100, 52)))
     with pytest.raises(HoigsError, match=r"weights has shape \[1100, 52\].*\[1100, 55\].*SMPL\+H"):
-        SmplxBody(path)
+        SmplxBody(SmplxBody.Config(path=path))
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     text = tmp_path / "text.npz"
     text.write_text("not an archive")
     with pytest.raises(HoigsError, match=r"not an SMPL-X \.npz"):
-        SmplxBody(text)
+        SmplxBody(SmplxBody.Config(path=text))
     np.save(tmp_path / "array.npy", np.zeros(3))
     with pytest.raises(HoigsError, match=r"not an SMPL-X \.npz"):
-        SmplxBody(tmp_path / "array.npy")
+        SmplxBody(SmplxBody.Config(path=tmp_path / "array.npy"))
     template = toy_smplx()["v_template"]
     template[3] = np.nan
     with pytest.raises(HoigsError, match="v_template holds NaN"):
-        SmplxBody(write_toy(tmp_path / "nan.npz", v_template=template))
+        path = write_toy(tmp_path / "nan.npz", v_template=template)
+        SmplxBody(SmplxBody.Config(path=path))

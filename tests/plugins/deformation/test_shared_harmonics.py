@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from hoigs.core.entity import Entity
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.moment import Moment
-from hoigs.core.topology import TopologyChange
+from hoigs.core.model.entity import Entity
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.topology import TopologyChange
 from hoigs.plugins.deformation.shared_harmonics import SharedHarmonics
 
 COUNT = 30
@@ -16,16 +16,16 @@ COUNT = 30
 
 def entity(lobes: int = 3) -> Entity:
     torch.manual_seed(0)
-    rest = Gaussians.from_points(
+    canonical = Gaussians.from_points(
         torch.randn(COUNT, 3, dtype=torch.float64), scales=0.1, sh_degree=2
     )
-    return Entity(rest, SharedHarmonics(lobes))
+    return Entity(canonical, SharedHarmonics(SharedHarmonics.Config(lobes=lobes)))
 
 
 def test_starts_as_the_base_colour_and_learns_any_mixture_of_so_many_lobes():
     made = entity()
     assert not made.sh.requires_grad
-    torch.testing.assert_close(made(Moment(0.3)).sh, made.rest.sh)
+    torch.testing.assert_close(made(Moment(0.3)).sh, made.canonical.sh)
     goal = torch.randn(COUNT, 3, dtype=torch.float64) @ torch.randn(3, 24, dtype=torch.float64)
     errors = {}
     for count in (2, 3):
@@ -48,13 +48,13 @@ def test_rows_take_their_shares_along():
     torch.nn.init.normal_(made.deformation.shares)
     before = made(Moment(0.0)).sh
     mask = torch.arange(COUNT) % 3 == 0
-    made.apply_topology(TopologyChange.keep(mask), made.rest[mask])
+    made.apply_topology(TopologyChange.keep(mask), made.canonical[mask])
     torch.testing.assert_close(made(Moment(1.0)).sh, before[mask])
 
 
 @pytest.mark.parametrize(("degree", "lobes"), [(0, 0), (1, 3), (2, 3)])
 def test_as_many_bands_as_the_rest_has(degree, lobes):
-    rest = Gaussians.from_points(torch.randn(4, 3), torch.rand(4, 3), sh_degree=degree)
-    made = Entity(rest, SharedHarmonics(3))
+    canonical = Gaussians.from_points(torch.randn(4, 3), torch.rand(4, 3), sh_degree=degree)
+    made = Entity(canonical, SharedHarmonics())
     assert made.deformation.shares.shape == (4, lobes)
-    torch.testing.assert_close(made(Moment(0.0)).sh, rest.sh)
+    torch.testing.assert_close(made(Moment(0.0)).sh, canonical.sh)

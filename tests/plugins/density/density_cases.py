@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from hoigs.core.density import DensityControl, DensityStatistics, Refinement
-from hoigs.core.gaussians import Gaussians
+from hoigs.core.interfaces.density import DensityControl, DensityStatistics, Refinement
+from hoigs.core.values.gaussians import Gaussians
 
 EXTENT = 2.0  # so that scales up to 0.02 are cloned
 
@@ -14,10 +14,10 @@ def cloud(scales, opacities=None, seed: int = 0) -> Gaussians:
     scales = torch.as_tensor(scales)
     generator = torch.Generator().manual_seed(seed)
     points = torch.randn(len(scales), 3, generator=generator)
-    rest = Gaussians.from_points(points, scales=scales)
+    canonical = Gaussians.from_points(points, scales=scales)
     if opacities is not None:
-        rest = rest.replace(opacity_logits=torch.logit(torch.as_tensor(opacities)))
-    return rest
+        canonical = canonical.replace(opacity_logits=torch.logit(torch.as_tensor(opacities)))
+    return canonical
 
 
 def varied(count: int, seed: int = 0) -> Gaussians:
@@ -44,7 +44,9 @@ def statistics(gradients, radii=None, *, absolute=None, loss=None) -> DensitySta
 
 
 def refine(
-    control: DensityControl, rest: Gaussians, stats=None, step=100, total=1000, current=None
+    control: DensityControl, canonical: Gaussians, stats=None, step=100, total=1000, current=None
 ) -> Refinement | None:
-    stats = statistics(torch.zeros(len(rest))) if stats is None else stats
-    return control.refine(rest, current or rest, stats, step=step, total_steps=total, extent=EXTENT)
+    stats = statistics(torch.zeros(len(canonical))) if stats is None else stats
+    return control.refine(
+        canonical, current or canonical, stats, step=step, total_steps=total, extent=EXTENT
+    )

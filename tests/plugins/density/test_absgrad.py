@@ -6,10 +6,10 @@ import pytest
 import torch
 from density_cases import cloud, refine, statistics
 
-from hoigs.core.context import BuildContext
-from hoigs.core.density import DensityStatistics, check_rasterizer
 from hoigs.core.errors import RenderError
-from hoigs.core.rasterizer import Capabilities
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.interfaces.density import DensityStatistics, check_rasterizer
+from hoigs.core.interfaces.rasterizer import Capabilities
 from hoigs.plugins.density.absgrad import AbsoluteGradientConfig, AbsoluteGradientDensity
 from hoigs.plugins.density.adc import AdaptiveDensity
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
@@ -17,36 +17,44 @@ from hoigs.rasterizers.torch_tiles import TorchRasterizer
 SMALL, LARGE = 0.01, 0.5
 
 
-def sources(control: AdaptiveDensity, rest, stats) -> list[int]:
-    decision = refine(control, rest, stats)
+def sources(control: AdaptiveDensity, canonical, stats) -> list[int]:
+    decision = refine(control, canonical, stats)
     return [] if decision.change is None else decision.change.source.tolist()
 
 
 def test_large_ones_are_split_by_the_absolute_gradient() -> None:
-    rest = cloud([SMALL, SMALL, LARGE, LARGE])
+    canonical = cloud([SMALL, SMALL, LARGE, LARGE])
     stats = statistics([1e-3, 1e-5, 1e-5, 1e-5], absolute=[1e-3, 1e-3, 1e-3, 1e-5])
-    control = AbsoluteGradientDensity(keep=1)
-    assert sources(control, rest, stats) == [0, 1, 3, 0, 2, 2]  # 0 cloned, 2 split
-    assert sources(AdaptiveDensity(keep=1), rest, stats) == [0, 1, 2, 3, 0]  # 3DGS is blind to 2
+    control = AbsoluteGradientDensity(AbsoluteGradientDensity.Config(keep=1))
+    assert sources(control, canonical, stats) == [0, 1, 3, 0, 2, 2]  # 0 cloned, 2 split
+    assert sources(AdaptiveDensity(AdaptiveDensity.Config(keep=1)), canonical, stats) == [
+        0,
+        1,
+        2,
+        3,
+        0,
+    ]  # 3DGS is blind to 2
 
 
 def test_clones_by_the_absolute_gradient_too() -> None:
-    rest = cloud([SMALL, SMALL, LARGE])
+    canonical = cloud([SMALL, SMALL, LARGE])
     stats = statistics([1e-3, 1e-5, 1e-3], absolute=[1e-3, 1e-3, 7e-4])
     config = AbsoluteGradientConfig(clone="absolute", threshold=8e-4, split_threshold=8e-4, keep=1)
     control = AbsoluteGradientDensity.from_config(config, BuildContext())
-    assert sources(control, rest, stats) == [0, 1, 2, 0, 1]
+    assert sources(control, canonical, stats) == [0, 1, 2, 0, 1]
 
 
-def test_the_cap_holds_at_a_threshold_far_too_low() -> None:  # F40
-    rest = cloud([LARGE] * 50)
-    control = AbsoluteGradientDensity(cap=70, split_threshold=1e-9, threshold=1e-9)
+def test_the_cap_holds_at_a_threshold_far_too_low() -> None:
+    canonical = cloud([LARGE] * 50)
+    control = AbsoluteGradientDensity(
+        AbsoluteGradientDensity.Config(cap=70, split_threshold=1e-9, threshold=1e-9)
+    )
     for step in (100, 200, 300):
-        stats = statistics(torch.rand(len(rest)), absolute=torch.rand(len(rest)) + 1)
-        decision = refine(control, rest, stats, step)
-        rest = decision.rest if decision.rest is not None else rest
-        assert len(rest) <= 70
-    assert len(rest) == 70
+        stats = statistics(torch.rand(len(canonical)), absolute=torch.rand(len(canonical)) + 1)
+        decision = refine(control, canonical, stats, step)
+        canonical = decision.canonical if decision.canonical is not None else canonical
+        assert len(canonical) <= 70
+    assert len(canonical) == 70
 
 
 def test_statistics_keep_both_gradients() -> None:

@@ -1,4 +1,4 @@
-"""cap: auto counts the pixels of a frame."""
+"""A cap of "auto" depends on the pixels of a frame."""
 
 from __future__ import annotations
 
@@ -6,52 +6,50 @@ from dataclasses import replace
 
 import pytest
 
-from hoigs.core.context import BuildContext
+from hoigs.core.interfaces.context import BuildContext
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.density.adc import AdaptiveDensity, AdaptiveDensityConfig
-from hoigs.plugins.density.frame_cap import LEAST, MOST, cap_in
+from hoigs.plugins.density.frame_cap import LEAST, MOST, resolve_cap
 from hoigs.plugins.density.mcmc import McmcDensity, McmcDensityConfig
-from hoigs.synthesis import SceneKnobs, builtin_clip
-from hoigs.training.session import read_clip
+from hoigs.runs.clip_source import read_clip
+from hoigs.synthesis import SceneConfig, builtin_clip
 
 
 @pytest.fixture(scope="module")
 def clip():
-    return read_clip(builtin_clip(AnnyBody(), SceneKnobs.tiny()))
+    return read_clip(builtin_clip(AnnyBody(), SceneConfig.tiny()))
 
 
 @pytest.mark.parametrize(
     ("width", "height", "cap"), [(368, 480, 100_684), (64, 64, LEAST), (4000, 3000, MOST)]
 )
 def test_it_goes_by_the_pixels_within_bounds(clip, width, height, cap):
-    cameras = [c.resized(width, height) for c in clip.cameras]
-    context = BuildContext(entity="scene", clip=replace(clip, cameras=cameras))
-    assert cap_in(context, "auto") == cap
+    clip = replace(clip, cameras=[c.resized(width, height) for c in clip.cameras])
+    context = BuildContext(entity="scene", clip=clip)
+    assert resolve_cap("auto", clip) == cap
     assert AdaptiveDensity.from_config(AdaptiveDensityConfig(cap="auto"), context).cap == cap
     assert McmcDensity.from_config(McmcDensityConfig(cap="auto"), context).cap == cap
 
 
 def test_a_scene_that_shows_more_gets_more(clip):
-    context = BuildContext(entity="scene", clip=clip)
-    assert cap_in(context, "auto+14000") == LEAST + 14_000
+    assert resolve_cap("auto+14000", clip) == LEAST + 14_000
     assert AdaptiveDensityConfig(cap="auto+14000").cap == "auto+14000"
     with pytest.raises(ValueError, match="auto"):
         AdaptiveDensityConfig(cap="many")
 
 
 def test_a_scene_that_needs_less_gets_a_part(clip):
-    context = BuildContext(entity="scene", clip=clip)
-    assert cap_in(context, "auto/2") == LEAST // 2
-    assert cap_in(context, "auto/4+500") == LEAST // 4 + 500
+    assert resolve_cap("auto/2", clip) == LEAST // 2
+    assert resolve_cap("auto/4+500", clip) == LEAST // 4 + 500
     assert AdaptiveDensityConfig(cap="auto/2").cap == "auto/2"
     with pytest.raises(ValueError, match="auto"):
         AdaptiveDensityConfig(cap="auto/0")
 
 
 def test_a_number_stays():
-    assert cap_in(BuildContext(), 123) == 123
+    assert resolve_cap(123, None) == 123
 
 
 def test_without_a_clip_there_is_nothing_to_count():
-    with pytest.raises(ValueError, match="say a number"):
-        cap_in(BuildContext(), "auto")
+    with pytest.raises(ValueError, match="set a number"):
+        resolve_cap("auto", None)

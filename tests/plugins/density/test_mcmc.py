@@ -6,21 +6,21 @@ import pytest
 import torch
 from density_cases import cloud, refine, varied
 
-from hoigs.core.context import BuildContext
-from hoigs.core.entity import Entity
-from hoigs.core.moment import Moment
-from hoigs.core.rotation import quats_to_matrices
-from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.maths.rotations import quats_to_matrices
+from hoigs.core.model.entity import Entity
+from hoigs.core.values.moment import Moment
+from hoigs.plugins.deformation.splines.chs import CubicHermite
 from hoigs.plugins.density.mcmc import McmcDensity, McmcDensityConfig
 from hoigs.plugins.density.relocation import relocation_shrink
 
 
 def test_dead_rows_move_to_the_living() -> None:
-    rest = varied(40)
+    canonical = varied(40)
     dead = torch.arange(40) % 5 == 0
-    rest = rest.replace(opacity_logits=torch.where(dead, -6.0, rest.opacity_logits))
-    decision = refine(McmcDensity(growth=0.0), rest)
-    change, new = decision.change, decision.rest
+    canonical = canonical.replace(opacity_logits=torch.where(dead, -6.0, canonical.opacity_logits))
+    decision = refine(McmcDensity(McmcDensity.Config(growth=0.0)), canonical)
+    change, new = decision.change, decision.canonical
     assert len(new) == 40
     assert not dead[change.source].any()
     assert torch.equal(change.source[~dead], torch.arange(40)[~dead])  # the others keep their row
@@ -29,7 +29,7 @@ def test_dead_rows_move_to_the_living() -> None:
     assert torch.equal(change.copies, taken)
     assert torch.equal(change.fresh, taken > 1)  # sources and what joins them, nothing else
     # eq. 9, row by row
-    old = rest[change.source]
+    old = canonical[change.source]
     shared = 1 - (1 - old.opacities) ** (1 / taken)
     torch.testing.assert_close(new.opacities, shared.clamp_min(0.005), rtol=1e-4, atol=1e-6)
     shrink = relocation_shrink(old.opacities, taken)
@@ -39,63 +39,69 @@ def test_dead_rows_move_to_the_living() -> None:
 
 
 def test_copies_may_stand_apart_but_sources_stay() -> None:
-    rest = varied(40)
+    canonical = varied(40)
     dead = torch.arange(40) < 10
-    rest = rest.replace(opacity_logits=torch.where(dead, -6.0, rest.opacity_logits))
-    decision = refine(McmcDensity(growth=0.5, spread=0.5), rest)
+    canonical = canonical.replace(opacity_logits=torch.where(dead, -6.0, canonical.opacity_logits))
+    decision = refine(McmcDensity(McmcDensity.Config(growth=0.5, spread=0.5)), canonical)
     source, offsets = decision.change.source, decision.change.offsets
     assert (offsets[10:40] == 0).all()
     joined = torch.cat((torch.arange(10), torch.arange(40, 60)))
     assert float(offsets[joined].norm(dim=1).min()) > 0
-    torch.testing.assert_close(decision.rest.means, rest.means[source] + offsets)
+    torch.testing.assert_close(decision.canonical.means, canonical.means[source] + offsets)
     # in standard deviations of the source: half of one, but for copies of copies
-    local = (quats_to_matrices(rest.quats[source]).mT @ offsets[..., None]).squeeze(-1)
-    assert 0.3 < float((local / rest.scales[source])[joined].square().mean().sqrt()) < 0.8
+    local = (quats_to_matrices(canonical.quats[source]).mT @ offsets[..., None]).squeeze(-1)
+    assert 0.3 < float((local / canonical.scales[source])[joined].square().mean().sqrt()) < 0.8
 
 
 def test_relocation_prefers_the_opaque() -> None:
     opacities = torch.full((1000,), 1e-3)
     opacities[:10], opacities[10:20] = 0.1, 0.9
-    decision = refine(McmcDensity(growth=0.0), cloud([0.1] * 1000, opacities))
+    decision = refine(McmcDensity(McmcDensity.Config(growth=0.0)), cloud([0.1] * 1000, opacities))
     arrivals = torch.bincount(decision.change.source, minlength=1000)[:20] - 1
     assert int(arrivals.sum()) == 980
     assert float(arrivals[10:].sum() / 980) == pytest.approx(0.9, abs=0.03)
 
 
 def test_the_count_grows_by_a_fraction_to_the_cap() -> None:
-    control, rest, counts = McmcDensity(cap=130, growth=0.05), varied(100), []
+    control, canonical, counts = (
+        McmcDensity(McmcDensity.Config(cap=130, growth=0.05)),
+        varied(100),
+        [],
+    )
     for step in range(100, 800, 100):
-        decision = refine(control, rest, step=step)
-        rest = decision.rest if decision is not None else rest
-        counts.append(len(rest))
+        decision = refine(control, canonical, step=step)
+        canonical = decision.canonical if decision is not None else canonical
+        counts.append(len(canonical))
     assert counts == [105, 110, 115, 120, 126, 130, 130]
-    assert refine(McmcDensity(cap=50), varied(100)) is None  # too many at the start stay
+    assert (
+        refine(McmcDensity(McmcDensity.Config(cap=50)), varied(100)) is None
+    )  # too many at the start stay
 
 
 def test_growth_after_relocation_is_one_index_map() -> None:
-    rest = varied(60)
-    rest = rest.replace(
-        opacity_logits=torch.where(torch.arange(60) < 20, -7.0, rest.opacity_logits)
+    canonical = varied(60)
+    canonical = canonical.replace(
+        opacity_logits=torch.where(torch.arange(60) < 20, -7.0, canonical.opacity_logits)
     )
-    decision = refine(McmcDensity(growth=0.5), rest)
+    decision = refine(McmcDensity(McmcDensity.Config(growth=0.5)), canonical)
     source, copies = decision.change.source, decision.change.copies
     assert len(source) == 90
     assert (source >= 20).all()
     # whatever the order of draws, the shares of one source's opacity make up the whole again
-    clear = torch.zeros(60).index_add(0, source, torch.log1p(-decision.rest.opacities))
+    clear = torch.zeros(60).index_add(0, source, torch.log1p(-decision.canonical.opacities))
     whole = torch.zeros(60).index_add(0, source, 1.0 / copies)
     torch.testing.assert_close(whole[20:], torch.ones(40))
-    kept = decision.rest.opacities > 0.0051  # the floor adds a little to the faintest
+    kept = decision.canonical.opacities > 0.0051  # the floor adds a little to the faintest
     full = torch.ones(60, dtype=torch.bool).index_put((source[~kept],), torch.tensor(False))[20:]
     torch.testing.assert_close(
-        1 - clear[20:].exp()[full], rest.opacities[20:][full], rtol=1e-4, atol=1e-5
+        1 - clear[20:].exp()[full], canonical.opacities[20:][full], rtol=1e-4, atol=1e-5
     )
 
 
 def test_all_dead_or_nothing_to_do() -> None:
-    rest = cloud([0.1] * 20, [1e-3] * 20)
-    assert refine(McmcDensity(growth=0.0), rest) is None  # nowhere to go
-    assert refine(McmcDensity(growth=0.0), varied(20)) is None
+    canonical = cloud([0.1] * 20, [1e-3] * 20)
+    assert refine(McmcDensity(McmcDensity.Config(growth=0.0)), canonical) is None  # nowhere to go
+    assert refine(McmcDensity(McmcDensity.Config(growth=0.0)), varied(20)) is None
     assert refine(McmcDensity(), varied(0)) is None
 
 
@@ -124,7 +130,9 @@ def test_noise_is_shaped_by_the_covariance_and_gated_by_opacity() -> None:
         many = one[torch.zeros(40_000, dtype=torch.long)].replace(
             opacity_logits=torch.full((40_000,), opacity).logit()
         )
-        offsets = McmcDensity(noise=noise).perturb(many, step=7, total_steps=100, rate=rate)
+        offsets = McmcDensity(McmcDensity.Config(noise=noise)).perturb(
+            many, step=7, total_steps=100, rate=rate
+        )
         covariance = one.covariances()[0]
         expected = (gate * rate * noise) ** 2 * covariance @ covariance.T
         found = offsets.T @ offsets / len(offsets)
@@ -136,7 +144,7 @@ def test_noise_is_shaped_by_the_covariance_and_gated_by_opacity() -> None:
 def test_noise_stops_with_the_positions_and_can_be_off() -> None:
     kwargs = {"step": 5, "total_steps": 100}
     assert McmcDensity().perturb(varied(9), rate=0.0, **kwargs) is None
-    assert McmcDensity(noise=0.0).perturb(varied(9), rate=1.0, **kwargs) is None
+    assert McmcDensity(McmcDensity.Config(noise=0.0)).perturb(varied(9), rate=1.0, **kwargs) is None
     same = [McmcDensity(seed=2).perturb(varied(9), rate=1.0, **kwargs) for _ in range(2)]
     assert torch.equal(*same)
     other = McmcDensity(seed=2).perturb(varied(9), rate=1.0, step=6, total_steps=100)
@@ -144,20 +152,22 @@ def test_noise_stops_with_the_positions_and_can_be_off() -> None:
 
 
 def test_penalties_are_means_of_activated_values() -> None:
-    rest = varied(30).map(lambda x: x.requires_grad_())
-    found = McmcDensity(opacity_weight=0.3).regularizers(rest)
-    torch.testing.assert_close(found["opacity_l1"], torch.sigmoid(rest.opacity_logits).mean())
-    torch.testing.assert_close(found["scale_l1"], rest.log_scales.exp().mean())
+    canonical = varied(30).map(lambda x: x.requires_grad_())
+    found = McmcDensity(McmcDensity.Config(opacity_weight=0.3)).regularizers(canonical)
+    torch.testing.assert_close(found["opacity_l1"], torch.sigmoid(canonical.opacity_logits).mean())
+    torch.testing.assert_close(found["scale_l1"], canonical.log_scales.exp().mean())
     sum(found.values()).backward()
-    assert float(rest.opacity_logits.grad.min()) > 0
-    assert float(rest.log_scales.grad.min()) > 0
-    assert McmcDensity(opacity_weight=0.3).regularizer_weights["opacity_l1"] == 0.3
+    assert float(canonical.opacity_logits.grad.min()) > 0
+    assert float(canonical.log_scales.grad.min()) > 0
+    assert (
+        McmcDensity(McmcDensity.Config(opacity_weight=0.3)).regularizer_weights["opacity_l1"] == 0.3
+    )
 
 
 def keyed_entity() -> Entity:
     """Keyframes, rotations and opacities that differ from knot to knot."""
     generator = torch.Generator().manual_seed(5)
-    entity = Entity(varied(12), CubicHermite(keyframes=4))
+    entity = Entity(varied(12), CubicHermite(CubicHermite.Config(keyframes=4)))
     draw = lambda like: torch.randn(like.shape, generator=generator)  # noqa: E731
     with torch.no_grad():
         for name in entity.deformation.per_gaussian:
@@ -175,12 +185,12 @@ def test_a_relocated_row_takes_the_keyframes_of_its_source() -> None:
         name: parameter.detach().clone()
         for name, parameter in entity.deformation.named_parameters()
     }
-    decision = refine(McmcDensity(growth=0.2), entity.at_peak.detach())
+    decision = refine(McmcDensity(McmcDensity.Config(growth=0.2)), entity.at_peak.detach())
     source, copies = decision.change.source, decision.change.copies
     assert len(source) == 14
     assert source[3] != 3
     assert source[7] == 7
-    entity.apply_topology(decision.change, decision.rest)
+    entity.apply_topology(decision.change, decision.canonical)
     for name in ("keyframe_means", "keyframe_quats", "tangents"):
         assert torch.equal(entity.deformation.get_parameter(name).data, before[name][source])
     old = torch.sigmoid(before["opacity_logits"])[source]
@@ -197,17 +207,17 @@ def test_a_relocated_row_takes_the_keyframes_of_its_source() -> None:
 def test_noise_turns_with_a_keyframed_object() -> None:
     entity = keyed_entity()
     before = [entity(Moment(k / 3)).detach() for k in range(4)]
-    offsets = McmcDensity(noise=1.0).perturb(
-        entity.rest.detach().replace(opacity_logits=torch.full((12,), -9.0)),
+    offsets = McmcDensity(McmcDensity.Config(noise=1.0)).perturb(
+        entity.canonical.detach().replace(opacity_logits=torch.full((12,), -9.0)),
         step=1,
         total_steps=9,
         rate=1.0,
     )
-    rest = entity.rest.detach().clone()
+    canonical = entity.canonical.detach().clone()
     entity.displace(offsets)
-    torch.testing.assert_close(entity.means.data, rest.means + offsets)
+    torch.testing.assert_close(entity.means.data, canonical.means + offsets)
     for k in range(4):
-        turn = quats_to_matrices(before[k].quats) @ quats_to_matrices(rest.quats).mT
+        turn = quats_to_matrices(before[k].quats) @ quats_to_matrices(canonical.quats).mT
         moved = entity(Moment(k / 3)).means - before[k].means
         torch.testing.assert_close(
             moved, (turn @ offsets[..., None]).squeeze(-1), atol=1e-5, rtol=1e-4

@@ -9,11 +9,11 @@ import torch
 from density_cases import varied
 from scipy.integrate import quad
 
-from hoigs.core.camera import Camera
-from hoigs.core.rasterizer import RenderRequest
-from hoigs.core.topology import share_opacity
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.topology import share_opacity
 from hoigs.plugins.density.children import Window, drawn_rows
-from hoigs.plugins.density.relocation import MAX_COPIES, divided, relocation_shrink
+from hoigs.plugins.density.relocation import MAX_COPIES, relocation_shrink, shared_among
 from hoigs.rasterizers.oracle import OracleRasterizer
 
 OPACITIES = (0.01, 0.3, 0.9, 0.999)
@@ -66,7 +66,7 @@ def test_the_picture_stays_where_one_becomes_three() -> None:
     camera = Camera.look_at(
         one.means[0] + torch.tensor([0.0, 0.0, -2.0]), one.means[0], width=32, height=32, fov_y=0.5
     )
-    three = divided(one[[0, 0, 0]], torch.tensor([3, 3, 3]), 0.005)
+    three = shared_among(one[[0, 0, 0]], torch.tensor([3, 3, 3]), 0.005)
     draw = lambda g: OracleRasterizer().render(g, camera, RenderRequest(low_pass=0.0)).alpha  # noqa: E731
     before, after = draw(one), draw(three)
     # eq. 9 keeps a line integral, not every pixel: the middle is exact, the whole is near
@@ -77,16 +77,18 @@ def test_the_picture_stays_where_one_becomes_three() -> None:
 
 
 def test_dividing_leaves_the_rest_of_a_gaussian_alone() -> None:
-    rest = varied(4)
-    new = divided(rest, torch.tensor([1, 2, 1, 4]), 0.005)
+    canonical = varied(4)
+    new = shared_among(canonical, torch.tensor([1, 2, 1, 4]), 0.005)
     for field in ("means", "quats", "sh"):
-        assert torch.equal(getattr(new, field), getattr(rest, field))
+        assert torch.equal(getattr(new, field), getattr(canonical, field))
     for row in (0, 2):
-        assert torch.equal(new.log_scales[row], rest.log_scales[row])
-        assert torch.equal(new.opacity_logits[row], rest.opacity_logits[row])
-    change = new.log_scales - rest.log_scales  # the shape stays: all three axes alike
+        assert torch.equal(new.log_scales[row], canonical.log_scales[row])
+        assert torch.equal(new.opacity_logits[row], canonical.opacity_logits[row])
+    change = new.log_scales - canonical.log_scales  # the shape stays: all three axes alike
     torch.testing.assert_close(change[1], change[1, :1].expand(3))
-    faint = divided(rest.replace(opacity_logits=torch.full((4,), -5.2)), torch.full((4,), 4), 0.005)
+    faint = shared_among(
+        canonical.replace(opacity_logits=torch.full((4,), -5.2)), torch.full((4,), 4), 0.005
+    )
     torch.testing.assert_close(faint.opacities, torch.full((4,), 0.005))  # never dead on arrival
 
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
-from hoigs.core.context import BuildContext
-from hoigs.core.entity import Entity
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.moment import BodyPose, Moment
-from hoigs.core.spline import catmull_rom
-from hoigs.core.topology import TopologyChange
-from hoigs.plugins.deformation.chs import CubicHermite
-from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
-from hoigs.plugins.deformation.mlp import MlpDeformation
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.maths.splines import catmull_rom, keyframe_position
+from hoigs.core.model.entity import Entity
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import BodyPose, Moment
+from hoigs.core.values.topology import TopologyChange
+from hoigs.plugins.deformation.avatars.hexplane_skinning import HexPlaneSkinning
+from hoigs.plugins.deformation.fields.mlp import MlpDeformation
+from hoigs.plugins.deformation.splines.chs import CubicHermite
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.features.body_parts import BodyPartConfig, BodyPartFeatures, part_averages
 from hoigs.plugins.features.embedding import EmbeddingConfig, EmbeddingFeatures
@@ -22,14 +22,19 @@ from hoigs.plugins.features.spline_motion import SplineMotionConfig, SplineMotio
 
 def human(body, features) -> Entity:
     torch.manual_seed(0)
-    model = HexPlaneSkinning(body, resolution=16, time_resolution=4, field_points=320)
-    return Entity(body.rest(100), model, features)
+    model = HexPlaneSkinning(
+        HexPlaneSkinning.Config(
+            resolution=16, time_resolution=4, field_points=320, refine_poses=False
+        ),
+        body=body,
+    )
+    return Entity(body.canonical(100), model, features)
 
 
 def thing(features, count: int = 12, **settings) -> Entity:
     torch.manual_seed(0)
     points = torch.randn(count, 3)
-    model = CubicHermite(keyframes=5, **settings)
+    model = CubicHermite(CubicHermite.Config(keyframes=5, **settings))
     entity = Entity(Gaussians.from_points(points, scales=0.1), model, features)
     with torch.no_grad():
         model.keyframe_means += 0.3 * torch.randn_like(model.keyframe_means)
@@ -43,7 +48,7 @@ def test_body_parts_are_means_over_each_part(toy_body, toy_pose):
         entity.deformation.planes.time.normal_()
     tokens = entity.tokens(moment)
     assert tokens.features.shape == (16, 96) and entity.features.width == 96
-    features, places = entity.deformation.posed_field(entity.rest, moment)
+    features, places = entity.deformation.posed_field(entity.canonical, moment)
     parts = entity.deformation.field_parts()
     for part in range(16):
         torch.testing.assert_close(tokens.features[part], features[parts == part].mean(0))
@@ -73,11 +78,12 @@ def test_spline_motion(kind):
     assert tokens.features.shape == (12, 32)
     torch.testing.assert_close(tokens.positions, entity(Moment(0.6)).means)
     assert not tokens.positions.requires_grad
-    velocity = entity.deformation.velocity(entity.rest, Moment(0.6))
+    velocity = entity.deformation.velocity(entity.canonical, Moment(0.6))
     code = features.embedded(12, 0.6)
     if kind == "per-gaussian":
         assert features.embedding.shape == (12, 5, 29)
-        torch.testing.assert_close(code, catmull_rom(features.embedding, 0.6))
+        at = keyframe_position(0.6, features.embedding.shape[1])
+        torch.testing.assert_close(code, catmull_rom(features.embedding, at))
     entry = torch.cat((velocity, code, torch.full((12, 1), 0.6)), -1)
     assert entry.shape == (12, 33)
     torch.testing.assert_close(tokens.features, features.mlp(entry))
@@ -110,46 +116,50 @@ def test_readings_of_the_interpolated_embedding():
 
 
 def test_velocity_is_the_derivative_or_the_interpolated_tangents():
-    entity = thing(SplineMotionFeatures(velocity="keyframes"))
+    entity = thing(SplineMotionFeatures(SplineMotionConfig(velocity="keyframes")))
     model, features = entity.deformation, entity.features
     with torch.no_grad():
         model.tangents.normal_()
     for k in range(5):  # the derivative at a keyframe is its tangent: both readings agree there
         moment = Moment(k / 4)
         torch.testing.assert_close(
-            features._velocity(model, entity.rest, moment), model.velocity(entity.rest, moment)
+            features._velocity(model, entity.canonical, moment),
+            model.velocity(entity.canonical, moment),
         )
     between = Moment(0.375)
     tau = model.tangents.double()
     ends = (tau[:, 2] - tau[:, 0]) / 2, (tau[:, 3] - tau[:, 1]) / 2
     halfway = 0.5 * (tau[:, 1] + tau[:, 2]) + 0.125 * (ends[0] - ends[1])
-    read = features._velocity(model, entity.rest, between)
+    read = features._velocity(model, entity.canonical, between)
     torch.testing.assert_close(read.double(), halfway, atol=1e-6, rtol=0)
-    assert (read - model.velocity(entity.rest, between)).abs().max() > 0.1
+    assert (read - model.velocity(entity.canonical, between)).abs().max() > 0.1
     entity.tokens(between).features.square().sum().backward()
     assert model.tangents.grad[:, 1:3].abs().max() > 0  # and no position is needed
     assert model.keyframe_means.grad is None
     with pytest.raises(ValueError, match="no learned tangents"):
-        thing(SplineMotionFeatures(velocity="keyframes"), tangents="finite-difference")
+        thing(
+            SplineMotionFeatures(SplineMotionConfig(velocity="keyframes")),
+            tangents="finite-difference",
+        )
     model.knots.movable = True
-    with pytest.raises(ValueError, match="at keyframes that stay"):
-        features.bind(model, entity.rest)
+    with pytest.raises(ValueError, match="at fixed keyframes"):
+        features.bind(model, entity.canonical)
 
 
 @pytest.mark.parametrize("width", [32, 33])
 def test_both_widths_of_object_tokens(width):
-    entity = thing(SplineMotionFeatures(width=width))
+    entity = thing(SplineMotionFeatures(SplineMotionConfig(width=width)))
     assert entity.features.mlp[0].in_features == 33  # 3 + 29 + 1
     assert entity.tokens(Moment(0.3)).features.shape == (12, width)
 
 
 @pytest.mark.parametrize("kind", ["per-gaussian", "shared", "low-rank"])
 def test_rows_of_the_embedding_follow(kind):
-    entity = thing(SplineMotionFeatures(embedding=kind))
+    entity = thing(SplineMotionFeatures(SplineMotionConfig(embedding=kind)))
     before = entity.tokens(Moment(0.4)).features.detach()
     source = torch.tensor([4, 4, 0])
     change = TopologyChange(source, torch.zeros(3, dtype=torch.bool), torch.zeros(3, 3))
-    entity.apply_topology(change, entity.rest.detach()[source])
+    entity.apply_topology(change, entity.canonical.detach()[source])
     torch.testing.assert_close(entity.tokens(Moment(0.4)).features, before[source])
 
 
@@ -157,13 +167,15 @@ def test_spline_motion_needs_keyframes():
     class Drifting(Static):
         provides = frozenset({"velocity"})
 
-        def velocity(self, rest, moment):
-            return torch.ones_like(rest.means)
+        def velocity(self, canonical, moment):
+            return torch.ones_like(canonical.means)
 
     points = Gaussians.from_points(torch.randn(4, 3))
     with pytest.raises(ValueError, match="Drifting has no keyframes"):
         Entity(points, Drifting(), SplineMotionFeatures())
-    entity = Entity(points, Drifting(), SplineMotionFeatures(keyframes=3, width=7))
+    entity = Entity(
+        points, Drifting(), SplineMotionFeatures(SplineMotionConfig(keyframes=3, width=7))
+    )
     assert entity.tokens(Moment(0.5)).features.shape == (4, 7)
 
 
@@ -182,16 +194,22 @@ def test_embedding_of_a_human_stands_at_its_parts(toy_body, toy_pose):
 
 def test_embedding_of_an_object_is_one_a_gaussian():
     entity = Entity(
-        Gaussians.from_points(torch.randn(9, 3)), MlpDeformation(8, 2), EmbeddingFeatures()
+        Gaussians.from_points(torch.randn(9, 3)),
+        MlpDeformation(MlpDeformation.Config(width=8, depth=2)),
+        EmbeddingFeatures(),
     )
     tokens = entity.tokens(Moment(0.2))
     assert tokens.features.shape == (9, 96)
     torch.testing.assert_close(tokens.positions, entity.means.detach())
     entity.apply_topology(
-        TopologyChange.keep(torch.arange(9) < 4), entity.rest.detach()[torch.arange(4)]
+        TopologyChange.keep(torch.arange(9) < 4), entity.canonical.detach()[torch.arange(4)]
     )
     torch.testing.assert_close(entity.tokens(Moment(0.2)).features, tokens.features[:4])
-    few = Entity(Gaussians.from_points(torch.randn(9, 3)), Static(), EmbeddingFeatures(3, 5))
+    few = Entity(
+        Gaussians.from_points(torch.randn(9, 3)),
+        Static(),
+        EmbeddingFeatures(EmbeddingConfig(tokens=3, width=5)),
+    )
     tokens = few.tokens(Moment(0.0))
     assert tokens.features.shape == (3, 5)
     torch.testing.assert_close(tokens.positions, few.means.mean(0).expand(3, 3))
@@ -217,11 +235,13 @@ def test_tokens_without_an_embedding_know_velocity_and_time():
     entity = thing(features)
     moment = Moment(0.4)
     tokens = entity.tokens(moment)
-    velocity = entity.deformation.velocity(entity.rest, moment)
+    velocity = entity.deformation.velocity(entity.canonical, moment)
     clock = torch.full((12, 1), 0.4)
     expected = features.mlp(torch.cat((velocity, clock), -1))
     torch.testing.assert_close(tokens.features, expected)
     assert {n.partition(".")[0] for n, _ in features.named_parameters()} == {"mlp"}
-    still = Entity(entity.rest, Static(), None)
+    still = Entity(entity.canonical, Static(), None)
     with pytest.raises(ValueError, match="velocity"):
-        Entity(still.rest, Static(), SplineMotionFeatures(embedding="none"))
+        Entity(
+            still.canonical, Static(), SplineMotionFeatures(SplineMotionConfig(embedding="none"))
+        )

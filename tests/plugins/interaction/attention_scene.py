@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from hoigs.core.body import PART_NAMES
-from hoigs.core.context import BuildContext
-from hoigs.core.features import Tokens
-from hoigs.core.interaction import Role
+from hoigs.core.interfaces.body import PART_NAMES
+from hoigs.core.values.tokens import Role, Tokens
 from hoigs.plugins.interaction.cross_attention import CrossAttention, CrossAttentionConfig
 
 ARM = 0.7
@@ -15,7 +13,7 @@ ARM = 0.7
 
 def module(perturbed: bool = True, widths=None, **settings) -> CrossAttention:
     torch.manual_seed(0)
-    made = CrossAttention.from_config(CrossAttentionConfig(**settings), BuildContext())
+    made = CrossAttention(CrossAttentionConfig(**settings))
     kinds = {"human": "human", "friend": "human", "ball": "object", "box": "object"}
     made.bind(
         widths or {"human": 96, "friend": 96, "ball": 32, "box": 32}, kinds | {"scene": "scene"}
@@ -50,7 +48,7 @@ def run(made: CrossAttention, ball: Tokens, **others):
 
 
 def part_of_joint() -> list[int]:
-    """By name: SMPL-X's joints 1..21, then 15 of each hand (methods C.9)."""
+    """By name: SMPL-X's joints 1..21, then 15 of each hand."""
     names = (
         "left thigh", "right thigh", "belly", "left shin", "right shin", "belly", "left foot",
         "right foot", "chest", "left foot", "right foot", "head", "chest", "chest", "head",

@@ -8,10 +8,9 @@ import pytest
 import torch
 from attention_scene import ARM, module, part_of_joint, person, run, thing
 
-from hoigs.core.body import PART_NAMES
-from hoigs.core.features import Tokens
-from hoigs.core.interaction import Role
-from hoigs.plugins.interaction.gates import DistanceGate
+from hoigs.core.interfaces.body import PART_NAMES
+from hoigs.core.values.tokens import Role, Tokens
+from hoigs.plugins.interaction.gates import DistanceGateConfig, log_gate
 
 
 @pytest.mark.parametrize("gate", ["hard", "soft"])
@@ -110,8 +109,18 @@ def test_gate_equals_its_formula(granularity, reach_from):
     anchors, center = role.anchors.double(), ball.positions.double().mean(0)
     for reach in (1.0, 0.75):
         gates = {
-            kind: DistanceGate(kind, granularity, reach_from, 0.1, reach).log(
-                "human", role, tokens, ball
+            kind: log_gate(
+                DistanceGateConfig(
+                    gate=kind,
+                    granularity=granularity,
+                    reach_from=reach_from,
+                    softness=0.1,
+                    reach=reach,
+                ),
+                "human",
+                role,
+                tokens,
+                ball,
             )
             for kind in ("hard", "soft")
         }

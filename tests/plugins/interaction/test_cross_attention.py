@@ -8,14 +8,13 @@ import pytest
 import torch
 from attention_scene import ARM, module, part_of_joint, person, run, thing
 
-from hoigs.core.body import PART_NAMES
-from hoigs.core.entity import Entity
-from hoigs.core.features import Tokens
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.interaction import Role
-from hoigs.core.moment import BodyPose, Moment
-from hoigs.plugins.deformation.chs import CubicHermite
-from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
+from hoigs.core.interfaces.body import PART_NAMES
+from hoigs.core.model.entity import Entity
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import BodyPose, Moment
+from hoigs.core.values.tokens import Role, Tokens
+from hoigs.plugins.deformation.avatars.hexplane_skinning import HexPlaneSkinning
+from hoigs.plugins.deformation.splines.chs import CubicHermite
 from hoigs.plugins.features.body_parts import BodyPartFeatures
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.plugins.interaction.cross_attention import CrossAttention
@@ -213,16 +212,21 @@ def test_errors_speak():
 
 def test_whole_forward_pass_of_a_scene(toy_body, toy_pose):
     """Features, interaction and deformations in a SceneModel, gradients end to end."""
-    from hoigs.core.scene import SceneModel
+    from hoigs.core.model.scene import SceneModel
 
     torch.manual_seed(0)
     human = Entity(
-        toy_body.rest(60),
-        HexPlaneSkinning(toy_body, resolution=8, time_resolution=4, field_points=160),
+        toy_body.canonical(60),
+        HexPlaneSkinning(
+            HexPlaneSkinning.Config(
+                resolution=8, time_resolution=4, field_points=160, refine_poses=False
+            ),
+            body=toy_body,
+        ),
         BodyPartFeatures(),
     )
     cloud = Gaussians.from_points(torch.tensor([0.7, 0.4, 0.1]) + 0.05 * torch.randn(20, 3))
-    ball = Entity(cloud, CubicHermite(keyframes=3), SplineMotionFeatures())
+    ball = Entity(cloud, CubicHermite(CubicHermite.Config(keyframes=3)), SplineMotionFeatures())
 
     class Unused:
         def render(self, *args):

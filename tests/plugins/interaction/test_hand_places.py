@@ -6,8 +6,7 @@ import torch
 from attention_scene import module, person, run, thing
 from torch import Tensor
 
-from hoigs.core.features import Tokens
-from hoigs.core.interaction import Role
+from hoigs.core.values.tokens import Role, Tokens
 
 
 def test_adds_a_linear_map_of_hands_from_the_centre():

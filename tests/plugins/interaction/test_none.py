@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from hoigs.core.deformation import DeformationModel
-from hoigs.core.entity import Entity
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.interaction import InteractionModule
-from hoigs.core.moment import Moment
-from hoigs.core.scene import SceneModel
+from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.interfaces.interaction import InteractionModule
+from hoigs.core.model.entity import Entity
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
 from hoigs.plugins.interaction.none import NoInteraction
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 
@@ -25,9 +25,9 @@ class Walker(DeformationModel):
     provides = frozenset({"skeleton"})
     entity = "human"
 
-    def forward(self, rest, moment, residual=None):
+    def forward(self, canonical, moment, residual=None):
         assert residual is None
-        return rest
+        return canonical
 
     def asked(self, *args):
         raise Asked
@@ -41,10 +41,10 @@ class Curious(InteractionModule):
 
 
 def test_roles_are_asked_for_only_where_they_are_read():
-    rest = Gaussians.from_points(torch.rand(4, 3))
+    canonical = Gaussians.from_points(torch.rand(4, 3))
 
     def scene(interaction: InteractionModule | None) -> SceneModel:
-        human = Entity(rest, Walker(), kind="human")
+        human = Entity(canonical, Walker(), kind="human")
         return SceneModel({"human": human}, interaction=interaction, rasterizer=TorchRasterizer())
 
     for interaction in (None, NoInteraction()):

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from hoigs.core.clip import Clip
+from hoigs.core.values.clip import Clip
 
 
 @pytest.fixture(scope="session")
@@ -26,7 +26,7 @@ def tiny_clip(cache: Path, **changes: Any) -> Clip:
     """The built-in clip at its smallest, made in a cache of its own."""
     from hoigs.plugins.bodies.anny import AnnyBody
     from hoigs.plugins.readers.clip import ClipFolderReader
-    from hoigs.synthesis import SceneKnobs, builtin_clip
+    from hoigs.synthesis import SceneConfig, builtin_clip
 
     small: dict[str, Any] = {
         "frames": 8, "width": 32, "height": 32, "fps": 2.0, "held_out_views": 0, "test_frames": 2,
@@ -34,5 +34,5 @@ def tiny_clip(cache: Path, **changes: Any) -> Clip:
     }  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOIGS_CACHE", str(cache))
-        folder = builtin_clip(AnnyBody(), SceneKnobs.tiny(**small, **changes))
+        folder = builtin_clip(AnnyBody(), SceneConfig.tiny(**small, **changes))
     return ClipFolderReader().read(folder)

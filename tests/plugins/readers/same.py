@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import torch
 
-from hoigs.core.camera import Camera
-from hoigs.core.moment import BodyPose
-from hoigs.core.rotation import axis_angle_to_matrices
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.moment import BodyPose
 
 
 def same_cameras(got: Sequence[Camera], want: Sequence[Camera], tolerance: float = 1e-6) -> None:

@@ -13,11 +13,11 @@ from layouts import arctic
 from layouts.anny_models import write_model
 from same import same_cameras, same_poses
 
-from hoigs.core.clip import Clip
-from hoigs.core.clip_folder import write_clip
-from hoigs.core.context import BuildContext
+from hoigs.core.clip_folder.write import write_clip
 from hoigs.core.errors import ClipError, HoigsError
-from hoigs.core.rotation import axis_angle_to_matrices
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.smplx import SmplxBody, SmplxConfig
 from hoigs.plugins.readers.arctic import ArcticReader
 from hoigs.plugins.readers.clip import ClipFolderReader
@@ -33,7 +33,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def template(models: Path) -> np.ndarray:
-    mean = SmplxBody(models / "SMPLX_FEMALE.npz").template.double().numpy()
+    mean = SmplxBody(SmplxBody.Config(path=models / "SMPLX_FEMALE.npz")).template.double().numpy()
     return mean + np.array([0.0, 0.02, 0.0])
 
 
@@ -78,7 +78,7 @@ def test_the_sequence_folder_serves_too(still: Clip, template: np.ndarray, tmp_p
     folder = arctic.write(shapeless(still), tmp_path, template, view=3).parent
     with pytest.raises(ClipError, match=r"images/s05/box_grab_01/1/ is absent"):
         ArcticReader().read(folder)
-    clip = ArcticReader(view=3).read(folder)
+    clip = ArcticReader(ArcticReader.Config(view=3)).read(folder)
     assert clip.name == "s05_box_grab_01_3"
 
 
@@ -87,7 +87,7 @@ def test_gender_and_template_are_required(
 ) -> None:
     """A neutral mean body in their place is visibly shifted (arctic#52)."""
     folder = arctic.write(shapeless(still), tmp_path, template)
-    clip = ArcticReader(points=100).read(folder)
+    clip = ArcticReader(ArcticReader.Config(points=100)).read(folder)
     context = BuildContext(body_track=clip.bodies["human"])
     body = SmplxBody.from_config(SmplxConfig(path=models / "SMPLX_FEMALE.npz"), context)
     torch.testing.assert_close(
@@ -108,7 +108,7 @@ def test_gender_and_template_are_required(
 def test_images_are_offset(still: Clip, template: np.ndarray, tmp_path: Path) -> None:
     folder = arctic.write(shapeless(still), tmp_path, template)
     assert (folder / f"{arctic.OFFSET:05d}.jpg").is_file()
-    clip = ArcticReader(start=2, count=4).read(folder)
+    clip = ArcticReader(ArcticReader.Config(start=2, count=4)).read(folder)
     assert len(clip) == 4 and clip[0].image.equal(still[2].image)
     same_poses(clip.bodies["human"].poses.frame(1), still.bodies["human"].poses.frame(3).replace(
         betas=torch.zeros(10)))  # fmt: skip
@@ -119,7 +119,7 @@ def test_images_are_offset(still: Clip, template: np.ndarray, tmp_path: Path) ->
     with pytest.raises(ClipError, match=r"1/00041\.jpg is absent: .*zc-alexfan/arctic"):
         ArcticReader().read(folder)
     with pytest.raises(ClipError, match=r"no image of frames 7 .*00044 to 00044 \(ioi_offset 37\)"):
-        ArcticReader(start=7).read(folder)
+        ArcticReader(ArcticReader.Config(start=7)).read(folder)
 
 
 def test_the_top_turns_about_its_hinge(still: Clip, template: np.ndarray, tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_masks_come_from_a_segmenter(still: Clip, template: np.ndarray, tmp_path
     told = str(caught.value)
     assert "masks/s05/box_grab_01/1/human/{00037-00044}.png (8 files)" in told
     assert "masks/s05/box_grab_01/1/object/" in told and "your segmenter" in told
-    clip = ArcticReader(masks=False).read(folder)
+    clip = ArcticReader(ArcticReader.Config(masks=False)).read(folder)
     assert clip.kinds == {} and clip.bodies == {} and clip.objects == {}
 
 

@@ -13,16 +13,20 @@ from layouts.anny_models import write_model
 from same import same_cameras, same_poses
 from torch import Tensor
 
-from hoigs.core.clip import Clip
 from hoigs.core.errors import ClipError
+from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.smplh import SmplhBody
-from hoigs.plugins.readers.behave import BehaveReader
-from hoigs.plugins.readers.pickles import load_pickle
+from hoigs.plugins.readers.behave.reader import BehaveReader
+from hoigs.plugins.readers.common.pickles import load_pickle
 
 
 @pytest.fixture(scope="module")
 def body(tmp_path_factory: pytest.TempPathFactory) -> SmplhBody:
-    return SmplhBody(write_model(tmp_path_factory.mktemp("m") / "male" / "model.npz", "smplh"))
+    return SmplhBody(
+        SmplhBody.Config(
+            path=write_model(tmp_path_factory.mktemp("m") / "male" / "model.npz", "smplh")
+        )
+    )
 
 
 @pytest.fixture(scope="module")
@@ -86,8 +90,8 @@ def test_the_other_kinects_are_held_out(still: Clip, pelvis: Tensor, tmp_path: P
     torch.testing.assert_close(camera.world_to_camera[:3, 3], turn.mT @ expected)
     torch.testing.assert_close(camera.center, -expected)
     assert clip.held_out[5].image.equal(want[5].image)
-    assert BehaveReader(held_out=False).read(folder).held_out is None
-    second = BehaveReader(kinect=2).read(folder)
+    assert BehaveReader(BehaveReader.Config(held_out=False)).read(folder).held_out is None
+    second = BehaveReader(BehaveReader.Config(kinect=2)).read(folder)
     torch.testing.assert_close(second.cameras[0].center, -expected)
 
 
@@ -104,7 +108,7 @@ def test_frame_times_not_indices(still: Clip, pelvis: Tensor, tmp_path: Path) ->
     with np.load(folder / "smpl_fit_all.npz") as file:
         later = {**file, "frame_times": np.array([f"t{60 + i:08.3f}" for i in range(len(kept))])}
     np.savez(folder / "smpl_fit_all.npz", **later)
-    with pytest.raises(ClipError, match="are they of this sequence"):
+    with pytest.raises(ClipError, match="are the fits of this sequence"):
         BehaveReader().read(folder)
 
 
@@ -156,7 +160,7 @@ def test_frames_without_masks_are_scene_only(still: Clip, pelvis: Tensor, tmp_pa
     folder, _ = behave.write(still, tmp_path, pelvis, masks=False)
     with pytest.raises(ClipError, match=r"person_mask\.png.* absent: .*--reader-set masks=false"):
         BehaveReader().read(folder)
-    clip = BehaveReader(masks=False).read(folder)
+    clip = BehaveReader(BehaveReader.Config(masks=False)).read(folder)
     assert clip.kinds == {} and clip.bodies == {} and len(clip.points) > 0
 
 

@@ -10,11 +10,11 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import ObjectTrack
-from hoigs.core.clip_folder import ClipWriter
-from hoigs.core.context import BuildContext
+from hoigs.core.clip_folder.write import ClipWriter
 from hoigs.core.errors import ClipError
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import ObjectTrack
 from hoigs.plugins.readers.clip import ClipFolderReader, ClipFolderReaderConfig, FolderStore
 
 FRAMES, SIZE = 5, 16
@@ -38,7 +38,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_config_and_matches(folder: Path) -> None:
     reader = ClipFolderReader.from_config(ClipFolderReaderConfig(cache_mb=3), BuildContext())
-    assert reader.cache_mb == 3
+    assert reader.config.cache_mb == 3
     assert reader.matches(folder) and not reader.matches(folder.parent)
     with pytest.raises(ValidationError):
         ClipFolderReaderConfig(cache_gb=1)  # type: ignore[call-arg]
@@ -46,33 +46,33 @@ def test_config_and_matches(folder: Path) -> None:
 
 def test_nothing_is_decoded_before_it_is_asked_for(folder: Path) -> None:
     clip = ClipFolderReader().read(folder)
-    assert isinstance(clip.store, FolderStore) and clip.store.cached_bytes == 0
+    assert isinstance(clip.store, FolderStore) and clip.store.cache.cached_bytes == 0
     frame = clip[3]
     assert frame.image.dtype == torch.uint8 and int(frame.image.max()) == 30
     assert frame.depth is None and not frame.masks["box"].any()
-    assert clip.store.cached_bytes == SIZE * SIZE * (3 + 1)
+    assert clip.store.cache.cached_bytes == SIZE * SIZE * (3 + 1)
 
 
 def test_cache_is_bounded_and_least_recently_used(folder: Path) -> None:
     store = FolderStore(folder, has_depth=False, cache_mb=0)
     assert store.image(0) is not store.image(0)
-    store.budget = 2 * SIZE * SIZE * 3
+    store.cache.budget = 2 * SIZE * SIZE * 3
     first = store.image(0)
     store.image(1)
     assert store.image(0) is first
     store.image(2)
-    assert store.cached_bytes == store.budget
+    assert store.cache.cached_bytes == store.cache.budget
     assert store.image(0) is first, "it was used last"
-    assert store.image(1) is not None and store.cached_bytes == store.budget
+    assert store.image(1) is not None and store.cache.cached_bytes == store.cache.budget
 
 
 def test_threads_may_read_together(folder: Path) -> None:
     store = FolderStore(folder, has_depth=False)
-    store.budget = 3 * SIZE * SIZE * 3
+    store.cache.budget = 3 * SIZE * SIZE * 3
     with ThreadPoolExecutor(4) as pool:
         images = list(pool.map(lambda i: store.image(i % FRAMES), range(100)))
     assert all(int(image.max()) == 10 * (i % FRAMES) for i, image in enumerate(images))
-    assert store.cached_bytes == 3 * SIZE * SIZE * 3
+    assert store.cache.cached_bytes == 3 * SIZE * SIZE * 3
 
 
 def test_a_damaged_image_is_named(folder: Path) -> None:

@@ -12,9 +12,9 @@ from layouts import colmap
 from PIL import Image
 from same import same_cameras
 
-from hoigs.core.clip import Clip
 from hoigs.core.errors import ClipError
-from hoigs.core.lens import Lens
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.lens import Lens
 from hoigs.plugins.readers.colmap import ColmapConfig, ColmapReader
 
 
@@ -60,12 +60,12 @@ def test_smaller_images_shrink_the_intrinsics(builtin: Clip, tmp_path: Path) -> 
     for path in (tmp_path / "images").iterdir():
         with Image.open(path) as image:
             image.resize((16, 16)).save(tmp_path / "images_2" / path.name)
-    clip = ColmapReader(factor=2).read(tmp_path)
+    clip = ColmapReader(ColmapReader.Config(factor=2)).read(tmp_path)
     assert clip[0].image.shape == (16, 16, 3)
     want = builtin.cameras[0].K * torch.tensor([[0.5], [0.5], [1.0]])
     assert torch.allclose(clip.cameras[0].K, want)
     with pytest.raises(ClipError, match=r"images_4/ is absent: images at 1/4 size"):
-        ColmapReader(factor=4).read(tmp_path)
+        ColmapReader(ColmapReader.Config(factor=4)).read(tmp_path)
 
 
 def test_frames_are_in_the_order_of_their_names(builtin: Clip, tmp_path: Path) -> None:
@@ -141,11 +141,13 @@ def test_a_damaged_model_is_named(builtin: Clip, tmp_path: Path) -> None:
 def test_images_of_another_shape_are_refused(builtin: Clip, tmp_path: Path) -> None:
     colmap.write(builtin, tmp_path, masks=False)
     Image.fromarray(np.zeros((32, 40, 3), np.uint8)).save(tmp_path / "images/frame_4.png")
-    with pytest.raises(ClipError, match=r"frame_4\.png is 40x32, its camera 32x32: another shape"):
+    with pytest.raises(
+        ClipError, match=r"frame_4\.png is 40x32, its camera 32x32: different aspect"
+    ):
         ColmapReader().read(tmp_path)
 
 
 def test_every_eighth_as_3dgs_splits(builtin: Clip, tmp_path: Path) -> None:
     colmap.write(builtin, tmp_path, masks=False)
-    reader = ColmapReader(**ColmapConfig(test_every=3).model_dump())
+    reader = ColmapReader(ColmapReader.Config(**ColmapConfig(test_every=3).model_dump()))
     assert reader.read(tmp_path).split == {"train": [1, 2, 4, 5, 7], "test": [0, 3, 6]}

@@ -9,8 +9,8 @@ import torch
 from layouts import davis
 from PIL import Image
 
-from hoigs.core.clip import Clip
 from hoigs.core.errors import ClipError
+from hoigs.core.values.clip import Clip
 from hoigs.plugins.readers.davis import DavisReader
 
 
@@ -19,7 +19,7 @@ def test_round_trip(builtin: Clip, tmp_path: Path, folders: bool) -> None:
     """Pictures and masks. The layout cannot hold cameras, poses, tracks, depth or points: one
     camera stands at the origin."""
     folder = davis.write(builtin, tmp_path, folders=folders)
-    reader = DavisReader(people=[1], points=300)
+    reader = DavisReader(DavisReader.Config(people=[1], points=300))
     assert reader.matches(folder) and not reader.matches(tmp_path)
     clip = reader.read(folder)
     assert clip.kinds == {"human_1": "human", "object_2": "object"}
@@ -35,10 +35,10 @@ def test_round_trip(builtin: Clip, tmp_path: Path, folders: bool) -> None:
     assert clip.bodies == {} and clip.objects == {} and len(clip.points) == 304
     assert float(clip.cameras[0].K[0, 0]) == pytest.approx(1.2 * 32)
     assert "assumed" in clip.provenance["cameras"]
-    assert float(DavisReader(focal=50.0).read(folder).cameras[0].K[1, 1]) == 50
+    assert float(DavisReader(DavisReader.Config(focal=50.0)).read(folder).cameras[0].K[1, 1]) == 50
     assert DavisReader().read(folder).kinds == {"object_1": "object", "object_2": "object"}
     with pytest.raises(ClipError, match=r"people=\[3\]: annotated objects are \[1, 2\]"):
-        DavisReader(people=[1, 3]).read(folder)
+        DavisReader(DavisReader.Config(people=[1, 3])).read(folder)
 
 
 def test_an_object_may_enter_late(builtin: Clip, tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ from layouts import dnerf
 from layouts.common import save_ply
 from same import same_cameras
 
-from hoigs.core.clip import Clip
 from hoigs.core.errors import ClipError
+from hoigs.core.values.clip import Clip
 from hoigs.plugins.readers.dnerf import DnerfReader
 
 
@@ -62,7 +62,7 @@ def test_transparency(builtin: Clip, tmp_path: Path) -> None:
     shown = torch.stack(list(builtin[builtin.split["train"][2]].masks.values())).any(0)
     assert shown.any() and not shown.all()
     black, white = (
-        DnerfReader(background=b).read(tmp_path)[2].image  # type: ignore[arg-type]
+        DnerfReader(DnerfReader.Config(background=b)).read(tmp_path)[2].image  # type: ignore[arg-type]
         for b in ("black", "white")
     )
     assert not black[~shown].any() and (white[~shown] == 255).all()
@@ -92,9 +92,9 @@ def test_images_keep_their_size(builtin: Clip, tmp_path: Path) -> None:
 
 def test_points_of_a_file_or_at_random(builtin: Clip, tmp_path: Path) -> None:
     dnerf.write(builtin, tmp_path)
-    clip = DnerfReader(points=300).read(tmp_path)
+    clip = DnerfReader(DnerfReader.Config(points=300)).read(tmp_path)
     assert clip.points.shape == (300, 3) and 1.2 < float(clip.points.abs().max()) <= 1.3
-    assert clip.points.equal(DnerfReader(points=300).read(tmp_path).points)
+    assert clip.points.equal(DnerfReader(DnerfReader.Config(points=300)).read(tmp_path).points)
     assert "at random" in clip.provenance["points"]
     save_ply(tmp_path / "fused.ply", builtin.points, builtin.point_colors, floats=True)
     clip = DnerfReader().read(tmp_path)

@@ -13,10 +13,10 @@ from layouts import exavatar
 from layouts.anny_models import write_model
 from same import same_cameras, same_poses
 
-from hoigs.core.clip import Clip
 from hoigs.core.errors import ClipError, HoigsError
+from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.plugins.readers.exavatar import ExavatarReader
+from hoigs.plugins.readers.exavatar.reader import ExavatarReader
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,9 @@ def smplx(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def reader_of(smplx: Path) -> ExavatarReader:
-    return ExavatarReader(smplx, num_betas=10)  # as many as the built-in body has
+    return ExavatarReader(
+        ExavatarReader.Config(smplx=smplx, num_betas=10)
+    )  # as many as the built-in body has
 
 
 @pytest.mark.parametrize("form", [{}, {"virtual": True}, {"neuman": True}, {"points": False}])
@@ -69,7 +71,7 @@ def test_poses_need_a_model_unless_the_camera_is_the_world(
         camera = json.loads(path.read_text())
         camera |= {"R": torch.eye(3).tolist(), "t": [0.0, 0.0, 0.0]}
         path.write_text(json.dumps(camera))
-    still = ExavatarReader(num_betas=10).read(tmp_path / "still")
+    still = ExavatarReader(ExavatarReader.Config(num_betas=10)).read(tmp_path / "still")
     written = json.loads(
         (tmp_path / "still/smplx_optimized/smplx_params_smoothed/3.json").read_text()
     )
@@ -93,8 +95,8 @@ def test_the_shape_has_as_many_coefficients_as_the_model(
     builtin: Clip, body: AnnyBody, smplx: Path, tmp_path: Path
 ) -> None:
     exavatar.write(builtin, tmp_path, body)
-    with pytest.raises(HoigsError, match="has 10 shape directions, num_betas asks for 100"):
-        ExavatarReader(smplx).read(tmp_path)
+    with pytest.raises(HoigsError, match="has 10 shape directions, num_betas is 100"):
+        ExavatarReader(ExavatarReader.Config(smplx=smplx)).read(tmp_path)
 
 
 def test_a_partial_folder_is_told_in_one_message(
@@ -111,7 +113,7 @@ def test_a_partial_folder_is_told_in_one_message(
     for part in (
         "smplx_optimized/smplx_params_smoothed/ is absent: ExAvatar's fitting makes it",
         "masks/ is absent",
-        "frame_list_test.txt is absent: you write it: one frame number a line",
+        "frame_list_test.txt is absent: you write it: one frame number on each line",
         "sparse/points3D.txt or sparse/points3D.bin or bkg_point_cloud.txt is absent: COLMAP",
     ):
         assert part in message
@@ -154,7 +156,7 @@ def test_broken_files_are_named(builtin: Clip, body: AnnyBody, smplx: Path, tmp_
     with pytest.raises(ClipError, match=r"4\.json: body_pose has 60 numbers, others have 63"):
         reader_of(smplx).read(tmp_path)
     path.write_text(json.dumps({k: v for k, v in content.items() if k != "trans"}))
-    with pytest.raises(ClipError, match=r"4\.json is not as .*\n  trans: Field required"):
+    with pytest.raises(ClipError, match=r"4\.json does not have .*\n  trans: Field required"):
         reader_of(smplx).read(tmp_path)
     (tmp_path / "frame_list_train.txt").write_text("0\nframe7.png\n")
     with pytest.raises(ClipError, match=r'frame_list_train\.txt has the line "frame7\.png"'):

@@ -11,9 +11,9 @@ from layouts import hold
 from layouts.common import save_mask
 from same import same_cameras
 
-from hoigs.core.clip import Clip
 from hoigs.core.errors import ClipError
-from hoigs.core.rotation import axis_angle_to_matrices
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.values.clip import Clip
 from hoigs.plugins.readers.hold import HoldReader, decomposed
 
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0]))

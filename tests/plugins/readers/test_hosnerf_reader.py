@@ -16,11 +16,11 @@ from layouts.anny_models import write_model
 from layouts.changed import picked, without_fingers
 from same import same_cameras, same_poses
 
-from hoigs.core.clip import Clip
 from hoigs.core.errors import ClipError
+from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.smplh import SmplBody
+from hoigs.plugins.readers.common.pickles import load_pickle
 from hoigs.plugins.readers.hosnerf import HosnerfReader, published_split
-from hoigs.plugins.readers.pickles import load_pickle
 
 
 @pytest.fixture(scope="module")
@@ -39,12 +39,12 @@ def test_round_trip(builtin: Clip, smpl: Path, tmp_path: Path, centred: bool) ->
     """Cameras, pictures, masks and poses, in metres from another unit. The layout cannot hold
     fingers (SMPL), which pixels of the foreground are the object's, depth, points, an object's
     track, or how fast the video ran."""
-    body = SmplBody(smpl)
+    body = SmplBody(SmplBody.Config(path=smpl))
     with pytest.raises(ClipError, match="fingers"):
         hosnerf.write(builtin, tmp_path / "bent", body)
     clip = without_fingers(builtin)
     hosnerf.write(clip, tmp_path / "scene", body, centred=centred)
-    reader = HosnerfReader(smpl=smpl, points=500)
+    reader = HosnerfReader(HosnerfReader.Config(smpl=smpl, points=500))
     assert reader.matches(tmp_path / "scene") and not reader.matches(tmp_path)
     back = reader.read(tmp_path / "scene")
     same_cameras(back.cameras, clip.cameras)
@@ -67,8 +67,8 @@ def test_frames_are_matched_by_name(builtin: Clip, smpl: Path, tmp_path: Path) -
     clip = without_fingers(builtin)
     order = list(range(len(clip)))
     random.Random(1).shuffle(order)
-    hosnerf.write(clip, tmp_path, SmplBody(smpl), order=order)
-    back = HosnerfReader(smpl=smpl, points=10).read(tmp_path)
+    hosnerf.write(clip, tmp_path, SmplBody(SmplBody.Config(path=smpl)), order=order)
+    back = HosnerfReader(HosnerfReader.Config(smpl=smpl, points=10)).read(tmp_path)
     same_cameras(back.cameras, clip.cameras)
     same_poses(back.bodies["human"].poses, clip.bodies["human"].poses, 2e-5)
 
@@ -78,22 +78,24 @@ def test_frame_0_is_a_test_frame(builtin: Clip, smpl: Path, tmp_path: Path) -> N
     assert split["test"] == list(range(0, 271, 18)) and split["train"][0] == 1
     assert set(range(271, 300)) <= set(split["train"])
     clip = without_fingers(picked(builtin, [i % 8 for i in range(34)]))
-    hosnerf.write(clip, tmp_path, SmplBody(smpl))
-    assert HosnerfReader(points=10).read(tmp_path).split["test"] == list(range(0, 32, 2))
+    hosnerf.write(clip, tmp_path, SmplBody(SmplBody.Config(path=smpl)))
+    assert HosnerfReader(HosnerfReader.Config(points=10)).read(tmp_path).split["test"] == list(
+        range(0, 32, 2)
+    )
 
 
 def test_without_a_model_there_are_no_poses_but_a_clip(
     builtin: Clip, smpl: Path, tmp_path: Path
 ) -> None:
-    hosnerf.write(without_fingers(builtin), tmp_path, SmplBody(smpl))
-    clip = HosnerfReader(points=10).read(tmp_path)
+    hosnerf.write(without_fingers(builtin), tmp_path, SmplBody(SmplBody.Config(path=smpl)))
+    clip = HosnerfReader(HosnerfReader.Config(points=10)).read(tmp_path)
     assert clip.bodies == {} and "smpl=SMPL_NEUTRAL.npz" in clip.provenance["poses of human"]
     same_cameras(clip.cameras, builtin.cameras)
 
 
-def test_each_frame_may_have_a_shape_of_its_own(builtin: Clip, smpl: Path, tmp_path: Path) -> None:
+def test_each_frame_may_have_another_shape(builtin: Clip, smpl: Path, tmp_path: Path) -> None:
     """As HumanNeRF's preparation leaves it; the person's is their mean."""
-    clip, body = without_fingers(builtin), SmplBody(smpl)
+    clip, body = without_fingers(builtin), SmplBody(SmplBody.Config(path=smpl))
     hosnerf.write(clip, tmp_path, body)
     betas = clip.bodies["human"].poses.betas
     offsets = 0.5 * torch.randn(8, len(betas), generator=torch.Generator().manual_seed(0))
@@ -105,17 +107,19 @@ def test_each_frame_may_have_a_shape_of_its_own(builtin: Clip, smpl: Path, tmp_p
             entry["tpose_joints"] = rest - rest[:1]
 
     edit(tmp_path / "mesh_infos.pkl", own)
-    track = HosnerfReader(smpl=smpl, points=10).read(tmp_path).bodies["human"]
+    track = HosnerfReader(HosnerfReader.Config(smpl=smpl, points=10)).read(tmp_path).bodies["human"]
     torch.testing.assert_close(track.poses.betas, betas, atol=1e-3, rtol=0)
     assert "vary by" in track.provenance
     edit(tmp_path / "mesh_infos.pkl", lambda m: m["000003"]["tpose_joints"].__imul__(1.5))
-    with pytest.raises(ClipError, match="they are of somebody else"):
-        HosnerfReader(smpl=smpl).read(tmp_path)
+    with pytest.raises(ClipError, match="they are not of one person"):
+        HosnerfReader(HosnerfReader.Config(smpl=smpl)).read(tmp_path)
 
 
 def test_masks_of_the_object_may_be_added(builtin: Clip, smpl: Path, tmp_path: Path) -> None:
-    hosnerf.write(without_fingers(builtin), tmp_path, SmplBody(smpl), object_masks=True)
-    clip = HosnerfReader(points=10).read(tmp_path)
+    hosnerf.write(
+        without_fingers(builtin), tmp_path, SmplBody(SmplBody.Config(path=smpl)), object_masks=True
+    )
+    clip = HosnerfReader(HosnerfReader.Config(points=10)).read(tmp_path)
     assert clip.kinds == {"human": "human", "object": "object"}
     for name in clip.kinds:
         assert all(clip[i].masks[name].equal(builtin[i].masks[name]) for i in range(8))
@@ -126,14 +130,16 @@ def test_masks_of_the_object_may_be_added(builtin: Clip, smpl: Path, tmp_path: P
 
 def test_distortion_is_taken_out(builtin: Clip, smpl: Path, tmp_path: Path) -> None:
     bent = (-0.2, 0.05, 0.0, 0.0)
-    hosnerf.write(without_fingers(builtin), tmp_path, SmplBody(smpl), distortions=bent)
-    clip = HosnerfReader(points=10).read(tmp_path)
+    hosnerf.write(
+        without_fingers(builtin), tmp_path, SmplBody(SmplBody.Config(path=smpl)), distortions=bent
+    )
+    clip = HosnerfReader(HosnerfReader.Config(points=10)).read(tmp_path)
     assert not clip[0].image.equal(builtin[0].image)
     same_cameras(clip.cameras, builtin.cameras)
 
 
 def test_a_partial_folder(builtin: Clip, smpl: Path, tmp_path: Path) -> None:
-    hosnerf.write(without_fingers(builtin), tmp_path, SmplBody(smpl))
+    hosnerf.write(without_fingers(builtin), tmp_path, SmplBody(SmplBody.Config(path=smpl)))
     for name in ("cameras.pkl", "poses_bounds.npy", "masks/000002.png", "masks/000003.png"):
         (tmp_path / name).unlink()
     with pytest.raises(ClipError) as caught:
@@ -153,15 +159,15 @@ def test_a_wrong_folder(tmp_path: Path) -> None:
         assert name in str(caught.value)
 
 
-def test_inconsistent_files_are_told(builtin: Clip, smpl: Path, tmp_path: Path) -> None:
+def test_inconsistent_files_are_named(builtin: Clip, smpl: Path, tmp_path: Path) -> None:
     clip = without_fingers(builtin)
 
     def broken(name: str, change: Callable[[Path], object], message: str) -> None:
         folder = tmp_path / name
-        hosnerf.write(clip, folder, SmplBody(smpl))
+        hosnerf.write(clip, folder, SmplBody(SmplBody.Config(path=smpl)))
         change(folder)
         with pytest.raises(ClipError, match=message):
-            HosnerfReader(smpl=smpl).read(folder)
+            HosnerfReader(HosnerfReader.Config(smpl=smpl)).read(folder)
 
     def cameras(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
         edit(folder / "cameras.pkl", change)
@@ -180,7 +186,9 @@ def test_inconsistent_files_are_told(builtin: Clip, smpl: Path, tmp_path: Path) 
 
     broken("rows", turned_rows, "turn differently at .* frames")
     broken(
-        "count", lambda f: np.save(f / "poses_bounds.npy", np.zeros((3, 17))), "one row an image"
+        "count",
+        lambda f: np.save(f / "poses_bounds.npy", np.zeros((3, 17))),
+        "one row for each image",
     )
     broken(
         "shape",

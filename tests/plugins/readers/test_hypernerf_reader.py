@@ -14,8 +14,8 @@ from layouts import hypernerf
 from layouts.common import save_image, save_ply
 from same import same_cameras
 
-from hoigs.core.clip import Clip
 from hoigs.core.errors import ClipError
+from hoigs.core.values.clip import Clip
 from hoigs.plugins.readers.hypernerf import HypernerfReader
 
 
@@ -47,7 +47,7 @@ def test_round_trip(builtin: Clip, tmp_path: Path) -> None:
 def test_half_size_is_the_usual_one(builtin: Clip, tmp_path: Path) -> None:
     hypernerf.write(builtin, tmp_path, factors=(1, 2, 4))
     for factor, size in ((None, 16), (1, 32), (4, 8)):
-        clip = HypernerfReader(factor=factor).read(tmp_path)
+        clip = HypernerfReader(HypernerfReader.Config(factor=factor)).read(tmp_path)
         frame = clip[0]
         assert frame.image.shape == (size, size, 3)
         assert torch.allclose(clip.cameras[0].K[:2] * 32 / size, builtin.cameras[0].K[:2])
@@ -138,7 +138,9 @@ def test_wrong_folders_and_files(builtin: Clip, tmp_path: Path) -> None:
         assert f"{name} is absent" in str(caught.value)
     hypernerf.write(builtin, tmp_path)
     edit(tmp_path / "camera/000001.json", lambda c: c.pop("focal_length"))
-    with pytest.raises(ClipError, match=r"000001\.json is not as .*\n  focal_length: Field req"):
+    with pytest.raises(
+        ClipError, match=r"000001\.json does not have .*\n  focal_length: Field req"
+    ):
         HypernerfReader().read(tmp_path)
     shutil.rmtree(tmp_path / "rgb")
     with pytest.raises(ClipError, match=r"rgb/2x/\{000001-000008\}\.png \(8 files\) are absent"):

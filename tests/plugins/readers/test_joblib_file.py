@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hoigs.core.errors import ClipError
-from hoigs.plugins.readers.joblib_file import load_joblib
+from hoigs.plugins.readers.common.joblib_file import load_joblib
 
 joblib = pytest.importorskip("joblib", reason="pip install joblib: it writes what is read here")
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 from PIL import Image
 
-from hoigs.core.camera import Camera
 from hoigs.core.errors import ClipError
-from hoigs.core.lens import Lens
-from hoigs.plugins.readers.lazy_frames import DepthFiles, LazyFrames, MaskFiles, dark
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.lens import Lens
+from hoigs.plugins.readers.common.lazy_frames import DepthFiles, LazyFrames, MaskFiles, dark
 
 W, H = 24, 16
 CAMERA = Camera(torch.tensor([[20.0, 0, 13], [0, 20.0, 7], [0, 0, 1]]), torch.eye(4), W, H)
@@ -112,5 +112,5 @@ def test_one_map_bends_images_masks_and_depth(tmp_path: Path) -> None:
 
 
 def test_lists_of_unlike_length_are_refused(tmp_path: Path, image: Path) -> None:
-    with pytest.raises(ValueError, match="unlike length"):
+    with pytest.raises(ValueError, match="different lengths"):
         LazyFrames(tmp_path, [image] * 2, [CAMERA])

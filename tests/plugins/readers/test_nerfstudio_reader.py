@@ -13,9 +13,9 @@ from layouts import nerfstudio
 from PIL import Image
 from same import same_cameras
 
-from hoigs.core.clip import Clip
 from hoigs.core.errors import ClipError
-from hoigs.core.lens import Lens
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.lens import Lens
 from hoigs.plugins.readers.nerfstudio import NerfstudioReader
 
 
@@ -48,7 +48,7 @@ def test_round_trip(builtin: Clip, tmp_path: Path, scale: float) -> None:
 
 def test_without_the_optional(builtin: Clip, tmp_path: Path) -> None:
     nerfstudio.write(builtin, tmp_path, extras=False, times=False, lists=False, ply=False)
-    clip = NerfstudioReader(points=100).read(tmp_path)
+    clip = NerfstudioReader(NerfstudioReader.Config(points=100)).read(tmp_path)
     same_cameras(clip.cameras, builtin.cameras)
     assert [m.time for m in clip.moments] == [m.time for m in builtin.moments]
     assert clip[0].ignored is None and clip[0].depth is None and clip.depth_kind == "none"
@@ -101,7 +101,7 @@ def test_smaller_images(builtin: Clip, tmp_path: Path) -> None:
     for path in (tmp_path / "images").iterdir():
         with Image.open(path) as image:
             image.resize((16, 16)).save(tmp_path / "images_2" / path.name)
-    clip = NerfstudioReader(factor=2).read(tmp_path)
+    clip = NerfstudioReader(NerfstudioReader.Config(factor=2)).read(tmp_path)
     want = builtin.cameras[0].K * torch.tensor([[0.5], [0.5], [1.0]])
     assert torch.allclose(clip.cameras[0].K, want)
     frame = clip[0]

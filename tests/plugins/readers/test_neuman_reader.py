@@ -15,9 +15,9 @@ from layouts.changed import without_fingers
 from layouts.common import save_image
 from same import same_cameras, same_poses
 
-from hoigs.core.clip import Clip
 from hoigs.core.errors import ClipError
-from hoigs.core.registry import default_registry
+from hoigs.core.registry.registry import default_registry
+from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.neuman import NeumanReader
 
@@ -50,7 +50,7 @@ def test_round_trip(source: Clip, body: AnnyBody, smpl: Path, tmp_path: Path) ->
     """Metres come back from COLMAP's unit, SMPL poses from spaces of their own; the layout has no
     fingers, no objects and no masks of them."""
     neuman.write(source, tmp_path, body)
-    reader = NeumanReader(smpl)
+    reader = NeumanReader(NeumanReader.Config(smpl=smpl))
     assert reader.matches(tmp_path) and not reader.matches(tmp_path / "sparse")
     clip = reader.read(tmp_path)
     same_cameras(clip.cameras, source.cameras)
@@ -75,7 +75,7 @@ def test_a_body_of_another_scale_keeps_its_size_and_look(
 ) -> None:
     """Monocular scales jitter; they cannot be seen from the camera of that frame."""
     neuman.write(source, tmp_path, body, scales=[1, 1, 1, 1, 1, 1.25, 0.8, 1])
-    clip = NeumanReader(smpl).read(tmp_path)
+    clip = NeumanReader(NeumanReader.Config(smpl=smpl)).read(tmp_path)
     same_poses(clip.bodies["human"].poses, source.bodies["human"].poses)
     assert "45.0 %" in clip.provenance["body scale"]
 
@@ -86,7 +86,7 @@ def test_smpl_rows_go_by_the_number_in_the_name(
     """COLMAP lost a frame, and lists the others in another order."""
     neuman.write(source, tmp_path, body, order=(6, 0, 3, 2, 7, 4, 1))
     (tmp_path / "train_split.txt").write_text("00000.png\n00007.png\n")
-    clip = NeumanReader(smpl).read(tmp_path)
+    clip = NeumanReader(NeumanReader.Config(smpl=smpl)).read(tmp_path)
     kept = [0, 1, 2, 3, 4, 6, 7]
     same_cameras(clip.cameras, [source.cameras[i] for i in kept])
     assert [m.index for m in clip.moments] == kept and clip.moments[5].time == 6 / 7
@@ -153,7 +153,7 @@ def test_inconsistent_files(source: Clip, body: AnnyBody, smpl: Path, tmp_path: 
     joblib.dump({1: {"pose": np.zeros((5, 72)), "betas": np.zeros((5, 10))}},
                 tmp_path / "smpl_output_optimized.pkl")  # fmt: skip
     with pytest.raises(ClipError, match=r"pose has shape \[5, 72\]; expected rows up to 7"):
-        NeumanReader(smpl).read(tmp_path)
+        NeumanReader(NeumanReader.Config(smpl=smpl)).read(tmp_path)
     (tmp_path / "train_split.txt").write_text("00099.png\n")
     with pytest.raises(ClipError, match=r"train_split\.txt names 00099\.png: not among"):
         NeumanReader().read(tmp_path)
@@ -174,5 +174,5 @@ def test_both_polarities_of_grey_are_foreground(
 def test_it_is_built_from_the_registry(smpl: Path) -> None:
     registry = default_registry()
     config = registry.config_class("reader:neuman")(smpl=smpl)
-    reader = registry.get("reader:neuman")(**config.model_dump())
-    assert isinstance(reader, NeumanReader) and reader.smpl == smpl
+    reader = registry.get("reader:neuman")(config)
+    assert isinstance(reader, NeumanReader) and reader.config.smpl == smpl

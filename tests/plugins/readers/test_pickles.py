@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from hoigs.core.errors import ClipError
-from hoigs.plugins.readers.pickles import load_pickle, load_pickled_npy
+from hoigs.plugins.readers.common.pickles import load_pickle, load_pickled_npy
 
 VALUE = {
     "a": {"K": np.eye(3), "s": np.float32(2.5), "name": "x", "ids": [1, 2], "raw": b"\x00\xff"},
@@ -66,9 +66,9 @@ def test_code_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.chdir(tmp_path)
     (tmp_path / "x.pkl").write_bytes(pickle.dumps({"a": Evil()}))
     np.save(tmp_path / "x.npy", {"a": Evil()}, allow_pickle=True)
-    with pytest.raises(ClipError, match=r"x\.pkl cannot be read: it asks for builtins\.eval"):
+    with pytest.raises(ClipError, match=r"x\.pkl cannot be read: it contains builtins\.eval"):
         load_pickle(tmp_path / "x.pkl")
-    with pytest.raises(ClipError, match=r"x\.npy cannot be read: it asks for builtins\.eval"):
+    with pytest.raises(ClipError, match=r"x\.npy cannot be read: it contains builtins\.eval"):
         load_pickled_npy(tmp_path / "x.npy")
     assert not (tmp_path / "ran").exists()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from hoigs.core.registry import default_registry
+from hoigs.core.registry.registry import default_registry
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "readers.md"
 

@@ -12,7 +12,7 @@ from layouts.changed import without_fingers
 from typer.testing import CliRunner
 
 from hoigs.cli.main import app
-from hoigs.core.clip import Clip
+from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.smplh import SmplBody, SmplhBody
 
 SMALL = ["--set", "train.steps=1", "--set", "train.preview_every=0", "--rasterizer", "torch",
@@ -22,7 +22,7 @@ SMALL = ["--set", "train.steps=1", "--set", "train.preview_every=0", "--rasteriz
 @pytest.mark.slow
 def test_a_person_and_an_object_of_behave(still: Clip, tmp_path: Path) -> None:
     model = write_model(tmp_path / "male" / "model.npz", "smplh")
-    pelvis = SmplhBody(model).shaped(still.bodies["human"].poses.betas)[1][0]
+    pelvis = SmplhBody(SmplhBody.Config(path=model)).shaped(still.bodies["human"].poses.betas)[1][0]
     folder, _ = behave.write(still, tmp_path / "data", pelvis, kinects=(1,))
     args = ["train", str(folder), "--out", str(tmp_path / "run"), *SMALL]
     bare = CliRunner().invoke(app, args)
@@ -42,7 +42,7 @@ def test_a_person_and_an_object_of_behave(still: Clip, tmp_path: Path) -> None:
 def test_the_scene_alone_of_hosnerf_and_its_settings(builtin: Clip, tmp_path: Path) -> None:
     model = write_model(tmp_path / "SMPL_NEUTRAL.npz", "smpl")
     folder = tmp_path / "scene"
-    hosnerf.write(without_fingers(builtin), folder, SmplBody(model))
+    hosnerf.write(without_fingers(builtin), folder, SmplBody(SmplBody.Config(path=model)))
     run = tmp_path / "run"
     args = ["train", str(folder), "--out", str(run), *SMALL, "--spec", "static"]
     settings = ["--reader", "hosnerf", "--reader-set", f"smpl={model}", "--reader-set", "points=50"]
@@ -52,7 +52,7 @@ def test_the_scene_alone_of_hosnerf_and_its_settings(builtin: Clip, tmp_path: Pa
     assert kept == {
         "use": "reader:hosnerf", "settings": {"points": 50, "smpl": "../SMPL_NEUTRAL.npz"}
     }  # fmt: skip
-    from hoigs.training.session import LoadedRun
+    from hoigs.runs.loaded_run import LoadedRun
 
     assert LoadedRun.open(run).clip.bodies["human"].model == "body:smpl"
 

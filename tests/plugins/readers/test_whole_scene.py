@@ -4,40 +4,22 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from layouts import colmap, dnerf, hypernerf
 
-from hoigs.core.clip import Clip
-
-
-@pytest.fixture
-def train(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable:
-    """`hoigs train ARGS…`: exit code and what went to stderr."""
-    from hoigs.cli.main import main
-
-    def run(*args: object) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["hoigs", "train", *map(str, args)])
-        capsys.readouterr()
-        try:
-            main()
-            code = 0
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        return code, capsys.readouterr().err
-
-    return run
+from hoigs.core.values.clip import Clip
 
 
 @pytest.mark.parametrize("layout", [dnerf, hypernerf])
-def test_4dgs_trains(builtin: Clip, tmp_path: Path, train: Callable, layout: object) -> None:
+def test_4dgs_trains(builtin: Clip, tmp_path: Path, hoigs: Callable, layout: object) -> None:
     layout.write(builtin, tmp_path / "data")  # type: ignore[attr-defined]
     small = ["model.scene.deformation.resolution=16", "model.scene.deformation.time_resolution=8"]
     settings = [part for value in ("train.steps=5", *small) for part in ("--set", value)]
-    code, err = train(
+    result = hoigs(
+        "train",
         tmp_path / "data",
         "--spec",
         "4dgs",
@@ -46,7 +28,7 @@ def test_4dgs_trains(builtin: Clip, tmp_path: Path, train: Callable, layout: obj
         tmp_path / "run",
         "--no-eval",
     )
-    assert code == 0, err
+    assert result.code == 0, result.err
     last = json.loads((tmp_path / "run/metrics.jsonl").read_text().splitlines()[-1])
     assert last["step"] == 5 and math.isfinite(last["psnr"]["test"])
 
@@ -60,10 +42,10 @@ def test_4dgs_trains(builtin: Clip, tmp_path: Path, train: Callable, layout: obj
     ],
 )
 def test_hoigs_wants_people_and_things(
-    builtin: Clip, tmp_path: Path, train: Callable, layout: object, told: str
+    builtin: Clip, tmp_path: Path, hoigs: Callable, layout: object, told: str
 ) -> None:
     layout.write(builtin, tmp_path / "data")  # type: ignore[attr-defined]
-    code, err = train(tmp_path / "data", "--spec", "hoigs", "--out", tmp_path / "run")
-    assert code == 2 and told in err and "--spec 4dgs" in err
-    assert len(err.strip().splitlines()) == 1, "one message"
+    result = hoigs("train", tmp_path / "data", "--spec", "hoigs", "--out", tmp_path / "run")
+    assert result.code == 2 and told in result.err and "--spec 4dgs" in result.err
+    assert len(result.err.strip().splitlines()) == 1, "one message"
     assert not (tmp_path / "run").exists()

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import torch
 
-from hoigs.core.clip import Clip
-from hoigs.core.compose import compose
-from hoigs.core.registry import default_registry
-from hoigs.core.spec import Spec
-from hoigs.studies.needs.halving import Ledger
-from hoigs.studies.needs.judge import Judge
+from hoigs.core.model.compose import compose
+from hoigs.core.registry.registry import default_registry
+from hoigs.core.spec.schema import Spec
+from hoigs.core.values.clip import Clip
+from hoigs.studies.needs.successive_halving import StepBudget
 from hoigs.studies.needs.trained import Trained
+from hoigs.studies.needs.validator import Validator
 
 NAME = (
     "builtin:lift-and-swing?frames=14&width=32&fps=4&samples=1&edge_samples=1&held_out_views=0"
@@ -33,8 +33,8 @@ def as_composed(clip: Clip, *changes: str) -> Trained:
     return Trained(spec, model, clip, registry)
 
 
-def judge_of(clip: Clip) -> Judge:
-    return Judge(clip, clip.split["train"][2:8:3], Ledger(1e6))
+def validator_of(clip: Clip) -> Validator:
+    return Validator(clip, clip.split["train"][2:8:3], StepBudget(1e6))
 
 
 def drawn(trained: Trained, position: int) -> torch.Tensor:

@@ -9,23 +9,24 @@ import pytest
 import torch
 from small_models import NAME, as_composed
 
-from hoigs.core.clip import Clip
-from hoigs.core.entity import Entity
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.moment import Moment
-from hoigs.core.scene import SceneModel
-from hoigs.plugins.deformation.knot_schedule import KnotTrial
-from hoigs.plugins.deformation.knots import Knots
-from hoigs.plugins.deformation.rigid_spline import RigidSpline
+from hoigs.core.interfaces.deformation import has_knots
+from hoigs.core.maths.knots import Knots
+from hoigs.core.model.entity import Entity
+from hoigs.core.model.knot_refit import KnotTrial, as_movable, screen_of
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.plugins.deformation.rigid.rigid_spline import RigidSpline
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.rasterizers.oracle import OracleRasterizer
-from hoigs.studies.needs.judge import Look
-from hoigs.studies.needs.prune import Pruning
-from hoigs.studies.needs.prune_knots import as_movable, fewer_uniform, is_knotted, measure, slowed
+from hoigs.runs.clip_source import read_clip
+from hoigs.studies.needs.pruning.knots import fewer_uniform
+from hoigs.studies.needs.pruning.prune import Pruning
 from hoigs.studies.needs.refit import cheapest_refit
-from hoigs.studies.needs.rungs import Rung
-from hoigs.training.session import read_clip
+from hoigs.studies.needs.search_space import Candidate
+from hoigs.studies.needs.validator import Scores
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +40,9 @@ def moving(clip: Clip, knots: int, path) -> Entity:
     """A box of points on a path (time -> metres), with an uneven `SplineMotionFeatures`."""
     torch.manual_seed(4)
     points = torch.rand(40, 3) * 0.3 + torch.tensor([0.0, 0.9, 0.3])
-    features = SplineMotionFeatures(embedding="shared")
-    entity = Entity(Gaussians.from_points(points, scales=0.02), RigidSpline(knots), features)
+    features = SplineMotionFeatures(SplineMotionFeatures.Config(embedding="shared"))
+    motion = RigidSpline(RigidSpline.Config(keyframes=knots))
+    entity = Entity(Gaussians.from_points(points, scales=0.02), motion, features)
     times = [k / (knots - 1) for k in range(knots)]
     with torch.no_grad():
         places = torch.stack([path(t) for t in times])
@@ -52,10 +54,10 @@ def moving(clip: Clip, knots: int, path) -> Entity:
 
 
 def test_an_even_motion_needs_two_knots_and_an_eight_more(clip):
-    schedule = measure(clip, 1.0)
+    screen = screen_of(clip)
     even = moving(clip, 9, lambda t: torch.tensor([0.4 * t, 0.1 * t, 0.0]))
-    assert is_knotted(even.deformation) and not is_knotted(Static())
-    count, values = fewer_uniform(even.deformation, even.rest.detach(), schedule)
+    assert has_knots(even.deformation) and not has_knots(Static())
+    count, values = fewer_uniform(even.deformation, even.canonical.detach(), screen, 1.0)
     assert count == 2 and values["keyframe_translations"].shape == (2, 3)
 
     def eight(t: float) -> torch.Tensor:
@@ -64,17 +66,16 @@ def test_an_even_motion_needs_two_knots_and_an_eight_more(clip):
 
     looped = moving(clip, 13, eight)
     kept = looped.deformation.keyframe_translations.detach().clone()
-    schedule = measure(clip, 0.2)
-    count, values = fewer_uniform(looped.deformation, looped.rest.detach(), schedule)
+    count, values = fewer_uniform(looped.deformation, looped.canonical.detach(), screen, 0.2)
     assert 4 <= count < 13
     assert len(looped.deformation.knots) == 13 and not looped.deformation.knots.movable
     assert torch.equal(looped.deformation.keyframe_translations, kept)  # only asked, not changed
-    finer, _ = fewer_uniform(looped.deformation, looped.rest.detach(), measure(clip, 0.02))
+    finer, _ = fewer_uniform(looped.deformation, looped.canonical.detach(), screen, 0.02)
     assert finer > count
 
 
 class Seen:
-    """A judge to whom what is drawn says how far an object is from where it was: 1 dB a metre."""
+    """A validator whose score falls with the distance of an object from its first place."""
 
     affordable = True
 
@@ -86,10 +87,10 @@ class Seen:
         with torch.no_grad():
             return torch.stack([self.entity(Moment(t / 13)).means for t in range(14)])
 
-    def look(self, model: object) -> Look:
+    def score(self, model: object) -> Scores:
         del model
         away = (self._means() - self.first).norm(dim=-1).mean()
-        return Look({"human_object": 30.0 - self.dear * float(away)})
+        return Scores({"human_object": 30.0 - self.dear * float(away)})
 
 
 @pytest.mark.parametrize("dear", [0.0, 1e4])
@@ -113,7 +114,7 @@ def test_movable_knots_go_only_where_the_picture_allows(clip, dear):
     assert (cut.before, cut.after) == (9, len(curve.knots))
     assert (len(curve.knots) == 9) == ("dB worse" in cut.why) == (dear > 0)
     if dear:
-        torch.testing.assert_close(pruning.judge._means(), pruning.judge.first)
+        torch.testing.assert_close(pruning.validator._means(), pruning.validator.first)
 
 
 def trials_of(*models: SceneModel) -> dict[str, SimpleNamespace]:
@@ -131,22 +132,22 @@ def test_a_motion_that_fewer_knots_hold_gets_fewer(clip):
         entity = moving(clip, 9, lambda t: path(t) + 1e-3 * torch.randn(3))
         return SceneModel({"object": entity}, rasterizer=OracleRasterizer())
 
-    def rung_of(path) -> int:
-        still = Entity(moving(clip, 9, path).rest, Static(), kind="object")
-        ladder = (
+    def candidate_of(path) -> int:
+        still = Entity(moving(clip, 9, path).canonical, Static(), kind="object")
+        space = (
             SceneModel({"object": still}, rasterizer=OracleRasterizer()),
             *(SceneModel({"object": moving(clip, k, path)}, rasterizer=OracleRasterizer())
               for k in (2, 3)),
             noisy(path),
         )  # fmt: skip
-        trials = trials_of(*ladder)
-        rungs = [Rung(name=name, why="it does") for name in trials]
-        return cheapest_refit(rungs, 3, trials, clip)  # type: ignore[arg-type]
+        trials = trials_of(*space)
+        candidates = [Candidate(name=name, why="it does") for name in trials]
+        return cheapest_refit(candidates, 3, trials, clip)  # type: ignore[arg-type]
 
-    assert rung_of(lambda t: torch.tensor([0.5 * t, 0.1 * t, 0.0])) == 1
-    assert rung_of(lambda t: torch.zeros(3)) == 0
+    assert candidate_of(lambda t: torch.tensor([0.5 * t, 0.1 * t, 0.0])) == 1
+    assert candidate_of(lambda t: torch.zeros(3)) == 0
     eight = lambda t: torch.tensor([math.sin(6.3 * t), 0.7 * math.sin(12.6 * t), 0.0])  # noqa: E731
-    assert rung_of(eight) == 3
+    assert candidate_of(eight) == 3
 
 
 def test_a_refit_of_movable_knots_leaves_their_tangents_what_they_are(clip):
@@ -157,21 +158,24 @@ def test_a_refit_of_movable_knots_leaves_their_tangents_what_they_are(clip):
     with KnotTrial(curve) as trial:
         trial.place([k / 11 for k in range(12)], ())
         trial.keep()
-    before = curve.traced(entity.rest, [0.13, 0.5, 0.77])
-    with as_movable(curve, entity.rest):
-        torch.testing.assert_close(curve.traced(entity.rest, [0.13, 0.5, 0.77]), before)
-        count, _ = fewer_uniform(curve, entity.rest.detach(), measure(clip, 0.3))
+    before = curve.traced(entity.canonical, [0.13, 0.5, 0.77])
+    with as_movable(curve):
+        torch.testing.assert_close(curve.traced(entity.canonical, [0.13, 0.5, 0.77]), before)
+        count, _ = fewer_uniform(curve, entity.canonical.detach(), screen_of(clip), 0.3)
     assert count == 2
 
 
 def test_fewer_knots_move_alike_and_say_the_same(clip):
     """Places within the pixel, velocities in tokens too, though their unit has changed."""
     entity = moving(clip, 9, lambda t: torch.tensor([0.4 * t, 0.3 * t * t, 0.0]))
-    count, values = fewer_uniform(entity.deformation, entity.rest.detach(), measure(clip, 0.2))
+    screen = screen_of(clip)
+    count, values = fewer_uniform(entity.deformation, entity.canonical.detach(), screen, 0.2)
     assert count < 9
     fewer = moving(clip, count, lambda t: torch.zeros(3))
     state = entity.state_dict() | {f"deformation.{n}": v for n, v in values.items()}
-    state["features.mlp.0.weight"] = slowed(entity.features, 9, count)
+    settings, tensors = entity.features.with_fewer_knots(9, count)
+    assert settings == {"keyframes": 9}
+    state |= {f"features.{name}": tensor for name, tensor in tensors.items()}
     state["features.embedding"] = fewer.features.embedding.detach() * 0
     fewer.load_state_dict(state)
     with torch.no_grad():

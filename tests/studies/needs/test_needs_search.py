@@ -8,51 +8,52 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hoigs.core.clip import Clip, FrameStore
 from hoigs.core.errors import HoigsError, SpecError
-from hoigs.core.spec import Spec
+from hoigs.core.spec.schema import Spec
+from hoigs.core.values.clip import Clip, FrameStore
+from hoigs.runs.clip_source import read_clip
 from hoigs.studies.needs import search as search_module
 from hoigs.studies.needs.criterion import Score
-from hoigs.studies.needs.rungs import Ladder, Rung
-from hoigs.studies.needs.search import SETTLE, SETTLES, Needs, Search, told
+from hoigs.studies.needs.report.write import FILES, as_data, page, require_new, row, write_needs
+from hoigs.studies.needs.result import SETTLE, SETTLES, Needs, summary_line
+from hoigs.studies.needs.search import Search
+from hoigs.studies.needs.search_space import Candidate, SearchSpace
 from hoigs.studies.needs.selection import SealedFrameError, selection_view
 from hoigs.studies.needs.trial import Trial, region_of
-from hoigs.studies.needs.write_needs import FILES, as_data, page, require_new, row, write_needs
-from hoigs.training.session import read_clip
 
 NAME = (
     "builtin:lift-and-swing?frames=14&width=32&fps=4&samples=1&edge_samples=1&held_out_views=0"
     "&test_frames=3&scene_points=300&object_points=120"
 )
 GIVEN = ("train.steps=40", "model.human.points=200", "model.human.deformation.resolution=8")
-STATIC = Rung(
+STATIC = Candidate(
     name="static",
     why="it stands still",
     cost=0.5,
     overrides={"model.{object}.deformation": {"use": "deformation:static"}},
 )
-SPLINE = Rung(
+SPLINE = Candidate(
     name="rigid",
     why="it moves as one piece",
     cost=0.5,
     overrides={"model.{object}.deformation": {"use": "deformation:rigid-spline"}},
 )
-BROKEN = Rung(
+BROKEN = Candidate(
     name="hinged",
     why="it has a hinge",
     overrides={
         "model.{object}.deformation": {"use": "deformation:articulated", "axis": [0.0, 0.0, 0.0]}
     },
 )
-OBJECT = Ladder(name="object", kind="object", rungs=(STATIC, SPLINE))
-INTERACTION = Ladder(
+OBJECT = SearchSpace(name="object", kind="object", candidates=(STATIC, SPLINE))
+INTERACTION = SearchSpace(
     name="interaction",
     kind="pair",
     region="contact",
     unless={"object": ("static",)},
     else_cheapest=True,
-    rungs=(
-        Rung(
+    candidates=(
+        Candidate(
             name="off",
             why="each moves by itself",
             overrides={
@@ -61,7 +62,7 @@ INTERACTION = Ladder(
                 "model.{object}.features": None,
             },
         ),
-        Rung(
+        Candidate(
             name="both",
             why="one shows in the other",
             overrides={"interaction": {"use": "interaction:cross-attention"}},
@@ -120,10 +121,10 @@ def test_test_frames_cannot_be_read(clip):
 
 
 def test_what_comes_afterwards_is_in_no_trial(clip, monkeypatch):
-    """A rung is tried as `overrides` has it; the answer has `afterwards` on top."""
+    """A candidate is tried as `overrides` has it; the answer has `afterwards` on top."""
     later = {"model.{object}.deformation.keyframes": 5}
-    rungs = (STATIC, SPLINE.model_copy(update={"afterwards": later}))
-    search = Search(clip, "hoigs", (OBJECT.model_copy(update={"rungs": rungs}),), GIVEN)
+    candidates = (STATIC, SPLINE.model_copy(update={"afterwards": later}))
+    search = Search(clip, "hoigs", (OBJECT.model_copy(update={"candidates": candidates}),), GIVEN)
     tried: dict[str, Trial] = {}
 
     def advance(trial: Trial, until: int) -> Score:
@@ -133,7 +134,7 @@ def test_what_comes_afterwards_is_in_no_trial(clip, monkeypatch):
     scored = Trial.advance
     monkeypatch.setattr(Trial, "advance", advance)
     found = search.run()
-    assert found.answers[0].chosen is rungs[1]
+    assert found.answers[0].chosen is candidates[1]
     assert len(tried["RigidSpline"].model.entity("object").deformation.knots) == 4  # 14 frames
     assert found.spec.model["object"].deformation.settings["keyframes"] == 5
     assert found.overrides["model.object.deformation"]["keyframes"] == 5
@@ -165,22 +166,22 @@ def test_a_box_that_is_swung_moves(needs):
     refused = answer.step(STATIC)
     assert refused.over_chosen is not None and refused.over_chosen.mean < -1
     assert needs.spec.model["object"].deformation.use == "deformation:rigid-spline"
-    assert "because it moves as one piece; static is -" in told(answer)
+    assert "because it moves as one piece; static is -" in summary_line(answer)
 
 
-def test_a_ladder_may_be_content_with_less(clip):
+def test_a_search_space_may_have_its_own_least_gain(clip):
     patient = OBJECT.model_copy(update={"least": 1e3})
     (answer,) = Search(clip, "hoigs", (patient,), GIVEN).run().answers
     assert answer.chosen is STATIC and answer.step(SPLINE).over_chosen.mean > 1
 
 
 def test_the_budget_is_kept(needs):
-    assert needs.ledger.limit == pytest.approx(1.4 * 40)
+    assert needs.budget.limit == pytest.approx(1.4 * 40)
     trained = [step for a in needs.answers for step in a.steps]
     assert all(0 < step.steps <= 40 for step in trained)
-    paid = sum(step.rung.cost * step.steps for step in trained)
-    assert 0.8 * needs.ledger.limit < needs.ledger.spent <= needs.ledger.limit
-    assert paid < needs.ledger.spent
+    paid = sum(step.candidate.cost * step.steps for step in trained)
+    assert 0.8 * needs.budget.limit < needs.budget.spent <= needs.budget.limit
+    assert paid < needs.budget.spent
 
 
 def test_the_answer_on_disk(needs, tmp_path):
@@ -194,50 +195,62 @@ def test_the_answer_on_disk(needs, tmp_path):
     assert json.loads((tmp_path / "out" / "needs.json").read_text()) == json.loads(
         json.dumps(as_data(needs))
     )
-    assert "| rigid |" in page(needs) and "taken" in page(needs)
+    assert "| rigid |" in page(needs) and "chosen" in page(needs)
     assert "or within 0.1 dB. ±" in page(needs)
-    asking = OBJECT.model_copy(update={"least": 0.5, "price": 0.6})
-    answers = tuple(replace(a, ladder=asking) for a in needs.answers if a.ladder == OBJECT)
-    told_of = "0.1 dB; object 0.5 dB; object 0.6 dB for every doubling of parameters. ±"
-    assert told_of in page(replace(needs, answers=answers))
+    asking = OBJECT.model_copy(update={"least": 0.5, "min_gain": 0.6})
+    answers = tuple(replace(a, space=asking) for a in needs.answers if a.space == OBJECT)
+    tolerances = "0.1 dB; object 0.5 dB; object 0.6 dB for every doubling of parameters. ±"
+    assert tolerances in page(replace(needs, answers=answers))
     assert (tmp_path / "out" / "needs.svg").read_text().lstrip().startswith("<?xml")
     with pytest.raises(HoigsError, match=r"has spec\.yaml"):
         require_new(tmp_path / "out", overwrite=False)
+    require_new(tmp_path / "out", overwrite=True)
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    with pytest.raises(HoigsError, match=r"notes\.txt in it did not come from `hoigs needs`"):
+        require_new(tmp_path / "out", overwrite=True)
 
 
-def test_a_rung_that_cannot_be_built_is_told(clip):
-    ladder = Ladder(name="object", kind="object", rungs=(STATIC, BROKEN, SPLINE))
-    answer = Search(clip, "hoigs", (ladder,), GIVEN).run().answers[0]
+def test_an_answer_never_takes_the_place_of_another_spec(tmp_path):
+    (tmp_path / "spec.yaml").write_text("name: mine")
+    with pytest.raises(HoigsError, match=r"not a complete answer .*needs\.md"):
+        require_new(tmp_path, overwrite=True)
+
+
+def test_a_candidate_that_cannot_be_built_has_its_reason(clip):
+    space = SearchSpace(name="object", kind="object", candidates=(STATIC, BROKEN, SPLINE))
+    answer = Search(clip, "hoigs", (space,), GIVEN).run().answers[0]
     assert answer.chosen is SPLINE
     assert "the axis of a joint cannot be" in answer.step(BROKEN).problem
     page_row = row(answer, answer.step(BROKEN))
     assert page_row[0] == "hinged" and page_row[-1].startswith("not tried: ")
 
 
-def test_a_rung_with_a_slip_is_an_error(clip):
+def test_an_invalid_candidate_is_an_error(clip):
     slip = {"model.{object}.deformation": {"use": "deformation:rigid-spline", "keyframe": 3}}
     wrong = SPLINE.model_copy(update={"overrides": slip})
-    ladder = OBJECT.model_copy(update={"rungs": (STATIC, wrong)})
+    space = OBJECT.model_copy(update={"candidates": (STATIC, wrong)})
     with pytest.raises(SpecError, match='did you mean "keyframes"'):
-        Search(clip, "hoigs", (ladder,), GIVEN).run()
+        Search(clip, "hoigs", (space,), GIVEN).run()
 
 
 def test_a_still_object_needs_no_interaction(clip):
-    """A ladder that has nothing to ask takes its cheapest rung, untried."""
-    still = OBJECT.model_copy(update={"rungs": (STATIC, STATIC.model_copy(update={"name": "b"}))})
+    """A skipped search space takes its cheapest candidate, untried."""
+    still = OBJECT.model_copy(
+        update={"candidates": (STATIC, STATIC.model_copy(update={"name": "b"}))}
+    )
     stays = INTERACTION.model_copy(update={"unless": {"object": ("static", "b")}})
     answers = Search(clip, "hoigs", (still, stays), GIVEN).run().answers
-    assert answers[1].chosen is stays.rungs[0] and not answers[1].steps
-    assert told(answers[1]) == "interaction: off, because object is static"
+    assert answers[1].chosen is stays.candidates[0] and not answers[1].steps
+    assert summary_line(answers[1]) == "interaction: off, because object is static"
 
 
-def test_rates_settle_in_trials_and_the_answer_unless_somebody_said_otherwise(clip, monkeypatch):
+def test_rates_settle_in_trials_and_the_answer_unless_they_are_given(clip, monkeypatch):
     tried: list[Spec] = []
 
     class Seen(Trial):
-        def __init__(self, spec: Spec, *rest) -> None:
+        def __init__(self, spec: Spec, *canonical) -> None:
             tried.append(spec)
-            super().__init__(spec, *rest)
+            super().__init__(spec, *canonical)
 
     monkeypatch.setattr(search_module, "Trial", Seen)
     for given, settle in {"": SETTLE, "train.rates.settle=0.5": 0.5, f"{SETTLES}=1": 1}.items():
@@ -249,10 +262,12 @@ def test_rates_settle_in_trials_and_the_answer_unless_somebody_said_otherwise(cl
         assert trials and {spec.train.rates.settle for spec in trials} == {settle}
 
 
-def test_what_cannot_be_paid_is_left_as_it_was_and_told(clip):
+def test_a_search_space_beyond_the_budget_changes_nothing(clip):
     found = Search(clip, "hoigs", (OBJECT,), (*GIVEN, "train.steps=11")).run()
     assert found.answers[0].chosen is None and found.overrides == {SETTLES: SETTLE}
-    assert "unchanged, because 2 rungs need 9 steps at least, but get" in told(found.answers[0])
+    assert "unchanged, because 2 candidates need 9 steps at least, but get" in summary_line(
+        found.answers[0]
+    )
 
 
 def test_regions(clip):

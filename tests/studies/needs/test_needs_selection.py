@@ -1,4 +1,4 @@
-"""Which frames are held back, which are sealed, and which rung a table of scores means."""
+"""Frames held back and sealed, the choice of a candidate, successive halving, search spaces."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import pytest
 
 from hoigs.core.errors import ClipError, HoigsError
 from hoigs.studies.needs.criterion import PATIENCE, Score, bic, choose, gain, near_best, ranked
-from hoigs.studies.needs.halving import (
+from hoigs.studies.needs.search_space import expanded, load_search_spaces, merged
+from hoigs.studies.needs.selection import selection_frames
+from hoigs.studies.needs.successive_halving import (
     FEWEST,
     SCORING,
     BudgetError,
-    Ledger,
-    climb,
+    StepBudget,
     plan,
     rounds,
+    successive_halving,
 )
-from hoigs.studies.needs.rungs import expanded, laid, load_ladders
-from hoigs.studies.needs.selection import selection_frames
 
 
 def score(*psnr: float, parameters: int = 100, pixels: int = 900) -> Score:
@@ -30,7 +30,7 @@ def score(*psnr: float, parameters: int = 100, pixels: int = 900) -> Score:
 
 
 def test_gain_is_paired():
-    """What all rungs share (a hard frame) is not in the error."""
+    """What all candidates share (a hard frame) is not in the error."""
     difference = gain(score(30, 20, 25), score(29, 19.2, 24.4))
     assert difference.mean == pytest.approx(0.8)
     assert difference.error == pytest.approx(0.2 / math.sqrt(3))
@@ -51,18 +51,18 @@ def test_cheapest_within_one_error_of_the_best():
     assert choose(noisy) == 1
 
 
-def test_equal_rungs_give_the_cheapest():
+def test_equal_candidates_give_the_cheapest():
     assert choose([score(20, 21), score(20, 21), score(20, 21)]) == 0
 
 
-def test_a_doubling_of_numbers_has_its_price():
-    """What is four times as large must bring twice the price, and more than its error."""
+def test_a_doubling_of_parameters_must_gain_enough():
+    """Four times the parameters must gain twice `min_gain`, and more than the error."""
     small = score(20, 22, 24, parameters=1000)
     large = score(21.4, 23.5, 25.6, parameters=4000)  # 1.5 dB better
-    assert choose([small, large], price=0.74) == 1
-    assert choose([small, large], price=0.76) == 0
+    assert choose([small, large], min_gain=0.74) == 1
+    assert choose([small, large], min_gain=0.76) == 0
     few = score(21.4, 23.5, 25.6, parameters=10)
-    assert choose([small, few], price=9) == 1  # nothing to pay for
+    assert choose([small, few], min_gain=9) == 1  # fewer parameters: no gain is required
     table = [small, score(20, 22, 24, parameters=2000), large]
     assert ranked(table, "one-se", 0.1, 0.76) == [0, 2, 1]  # 1.5 dB over half of it is worth it
     assert ranked(table, "one-se", 0.1, 2.0) == [0, 2, 1]  # the best stays all the same
@@ -91,7 +91,7 @@ def test_ranking_puts_the_cheap_before_its_equals_and_the_good_before_the_bad():
 
 
 def test_the_best_is_not_crowded_out_by_those_that_few_frames_cannot_tell_from_it():
-    """Three frames that disagree: cheap rungs are within 1.5 standard errors, decibels below."""
+    """Three frames that disagree: cheap ones are within 1.5 standard errors, decibels below."""
     cheap, cheaper = score(10, 10.5, 19), score(10.2, 10, 19)
     table = [cheaper, cheap, score(10, 10.5, 19.5), score(16, 10.5, 19)]
     assert near_best(table, 0.1, errors=PATIENCE) == [True] * 4
@@ -131,8 +131,8 @@ def test_a_plan_goes_no_further_than_a_full_training():
     assert plan([1.0] * 4, 1e6, 3, most=500).steps == 500
 
 
-def test_a_plan_too_poor_says_what_is_needed():
-    with pytest.raises(BudgetError, match=r"4 rungs need \d+ steps at least, but get 20"):
+def test_a_budget_too_small_says_what_is_needed():
+    with pytest.raises(BudgetError, match=r"4 candidates need \d+ steps at least, but get 20"):
         plan([1.0] * 4, 20, 3, most=500)
 
 
@@ -143,35 +143,35 @@ def test_the_least_plan_is_affordable():
 
 
 class Toy:
-    """Rungs whose score is known: plateau minus what training has still to gain."""
+    """Candidates whose score is known: plateau minus what training has still to gain."""
 
     def __init__(self, plateaus):
         self.plateaus, self.calls = plateaus, []
 
-    def __call__(self, rung, until):
-        self.calls.append((rung, until))
-        level = self.plateaus[rung] - 50 / until
+    def __call__(self, candidate, until):
+        self.calls.append((candidate, until))
+        level = self.plateaus[candidate] - 50 / until
         return score(level, level + 0.5, level - 0.3)
 
 
-def test_climb_finds_the_cheapest_that_is_good_enough():
+def test_halving_finds_the_cheapest_that_is_good_enough():
     toy, costs = Toy([15, 22, 30, 30.05, 30.1, 29.0, 30.0]), [1.0] * 7
     shape = plan(costs, 2000, 3, most=10_000)
-    ledger = Ledger(2000)
-    climbed = climb(shape, costs, 3, toy, ledger, least=0.2)
-    assert climbed.chosen == 2
-    trained = [sum(1 for k, _ in toy.calls if k == rung) for rung in range(7)]
+    budget = StepBudget(2000)
+    halving = successive_halving(shape, costs, 3, toy, budget, least=0.2)
+    assert halving.chosen == 2
+    trained = [sum(1 for k, _ in toy.calls if k == candidate) for candidate in range(7)]
     assert trained[2] == 3 and trained[0] == 1 and sorted(trained) == [1, 1, 1, 2, 2, 3, 3]
-    assert ledger.spent == pytest.approx(cost_of(shape, costs, 3))
-    step, own, chosen = climbed.together(0, 2)
+    assert budget.spent == pytest.approx(cost_of(shape, costs, 3))
+    step, own, chosen = halving.last_common(0, 2)
     assert step == shape.until[0] and gain(own, chosen).mean == pytest.approx(-15)
 
 
-def test_the_ledger_stops_work_before_it_is_done():
+def test_the_budget_is_checked_before_each_training():
     toy, costs = Toy([20, 21]), [1.0, 1.0]
     shape = plan(costs, 100, 3, most=1000)
     with pytest.raises(BudgetError, match="left"):
-        climb(shape, costs, 3, toy, Ledger(60), what="object")
+        successive_halving(shape, costs, 3, toy, StepBudget(60), what="object")
     assert len(toy.calls) == 1  # the second would have gone beyond
 
 
@@ -210,37 +210,44 @@ def test_kinds_in_keys_become_blocks():
 
 def test_overrides_are_laid_key_by_key():
     below = {"a.b": {"use": "x", "n": 1}, "a.c": 2}
-    assert laid(below, {"a.b.n": 3}) == {"a.b": {"use": "x", "n": 3}, "a.c": 2}
-    assert laid(below, {"a": None}) == {"a": None}
+    assert merged(below, {"a.b.n": 3}) == {"a.b": {"use": "x", "n": 3}, "a.c": 2}
+    assert merged(below, {"a": None}) == {"a": None}
     with pytest.raises(HoigsError, match="a has been set to None"):
-        laid({"a": None}, {"a.b": 1})
+        merged({"a": None}, {"a.b": 1})
 
 
-def test_the_built_in_ladders_are_sound():
-    ladders = load_ladders()
-    names = [ladder.name for ladder in ladders]
+def test_the_built_in_search_spaces_are_valid():
+    search_spaces = load_search_spaces()
+    names = [space.name for space in search_spaces]
     assert names[:5] == ["scene", "object", "human", "human pose", "interaction"]
-    assert all(rung.why for ladder in ladders for rung in ladder.rungs)
+    assert all(candidate.why for space in search_spaces for candidate in space.candidates)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("ladders: [{name: a, kind: object, rungs: [{name: x, why: y}]}]", "at least 2 items"),
-        ("ladders: [{name: a, kind: objekt, rungs: []}]", "'scene', 'human', 'object' or 'pair'"),
         (
-            "ladders: [{name: a, kind: object, unless: {b: [c]},"
-            " rungs: [{name: x, why: y}, {name: z, why: y}]}]",
-            "no ladder 'b' above it",
+            "search_spaces: [{name: a, kind: object, candidates: [{name: x, why: y}]}]",
+            "at least 2 items",
         ),
         (
-            "ladders: [{name: a, kind: object, rungs: [{name: x, why: y}, {name: x, why: y}]}]",
-            "names of their own",
+            "search_spaces: [{name: a, kind: objekt, candidates: []}]",
+            "'scene', 'human', 'object' or 'pair'",
+        ),
+        (
+            "search_spaces: [{name: a, kind: object, unless: {b: [c]},"
+            " candidates: [{name: x, why: y}, {name: z, why: y}]}]",
+            "no search space 'b' above it",
+        ),
+        (
+            "search_spaces: [{name: a, kind: object,"
+            " candidates: [{name: x, why: y}, {name: x, why: y}]}]",
+            "unique names",
         ),
     ],
 )
-def test_ladders_of_a_file_are_checked(tmp_path, text, message):
+def test_search_spaces_of_a_file_are_checked(tmp_path, text, message):
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(HoigsError, match=message):
-        load_ladders(path)
+        load_search_spaces(path)

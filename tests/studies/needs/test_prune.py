@@ -7,29 +7,31 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_models import GIVEN, NAME, as_composed, drawn, judge_of
+from small_models import GIVEN, NAME, as_composed, drawn, validator_of
 
-from hoigs.core.clip import Clip, FrameStore
-from hoigs.core.entity import Entity
 from hoigs.core.errors import CheckpointError, HoigsError
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.rasterizer import RenderRequest
-from hoigs.core.scene import SceneModel
-from hoigs.core.topology import TopologyChange
-from hoigs.core.train_spec import RatesSpec
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.model.entity import Entity
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.spec.train_schema import RatesSpec
+from hoigs.core.values.clip import Clip, FrameStore
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.topology import TopologyChange
 from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.oracle import OracleRasterizer
-from hoigs.studies.needs import prune
-from hoigs.studies.needs.after import add_to_answer, finish, table
-from hoigs.studies.needs.compact_run import compact_run
-from hoigs.studies.needs.halving import Ledger
-from hoigs.studies.needs.judge import Judge
-from hoigs.studies.needs.prune import Cut, Pruning
-from hoigs.studies.needs.prune_planes import as_one, from_one, time_planes
-from hoigs.studies.needs.prune_splats import rows_to_lose, sensitivities, take_out
+from hoigs.runs.checkpoint import latest_checkpoint, load_checkpoint
+from hoigs.runs.clip_source import read_clip
+from hoigs.runs.loaded_run import LoadedRun
+from hoigs.studies.needs.after_training import add_to_answer, finish, table
+from hoigs.studies.needs.pruning import prune
+from hoigs.studies.needs.pruning.compact_run import compress
+from hoigs.studies.needs.pruning.planes import as_one, from_one, time_planes
+from hoigs.studies.needs.pruning.prune import Cut, Pruning
+from hoigs.studies.needs.pruning.splats import removable_rows, remove_rows, sensitivities
 from hoigs.studies.needs.selection import SealedFrameError, sealed_view
-from hoigs.training.checkpoint import latest_checkpoint, load_checkpoint
-from hoigs.training.session import LoadedRun, Session, read_clip
+from hoigs.studies.needs.successive_halving import StepBudget
+from hoigs.studies.needs.validator import Validator
+from hoigs.training.session import Session
 from hoigs.training.trainer import Trainer
 
 
@@ -51,10 +53,10 @@ def scattered(clip: Clip, count: int = 12) -> SceneModel:
     local = torch.rand(count, 3, generator=generator) * torch.tensor([1.2, 1.2, 1.0])
     local += torch.tensor([-0.6, -0.6, 2.5])
     points = local @ ahead[:3, :3].T + ahead[:3, 3]
-    rest = Gaussians.from_points(
+    canonical = Gaussians.from_points(
         points, torch.rand(count, 3, generator=generator), scales=0.25, opacity=0.5
     )
-    return SceneModel({"scene": Entity(rest, Static())}, rasterizer=OracleRasterizer())
+    return SceneModel({"scene": Entity(canonical, Static())}, rasterizer=OracleRasterizer())
 
 
 def test_sensitivity_is_the_squared_change_of_the_picture(clip):
@@ -85,17 +87,17 @@ def test_gaussians_that_show_nowhere_go_and_others_stay(clip):
     model, scene = trained.model, trained.model.entity("scene")
     with torch.no_grad():
         scene.opacity_logits[50:] = -12.0
-    judge = judge_of(clip)
-    before = judge.look(model)
+    validator = validator_of(clip)
+    before = validator.score(model)
     scores = sensitivities(model, clip, clip.split["train"][:6])["scene"]
-    rows, cost = rows_to_lose(judge, model, "scene", scores, before, 0.01)
+    rows, cost = removable_rows(validator, model, "scene", scores, before, 0.01)
     assert cost <= 0.01 and len(rows) >= 0.8 * (len(scene) - 50)
     drawn_before = drawn(trained, clip.split["train"][3])
     kept = torch.ones(len(scene), dtype=torch.bool)
     kept[rows] = False
-    opacities = scene.opacities if hasattr(scene, "opacities") else scene.rest.opacities
+    opacities = scene.opacities if hasattr(scene, "opacities") else scene.canonical.opacities
     assert opacities[~kept].max() <= opacities.median()
-    take_out(model, "scene", rows)
+    remove_rows(model, "scene", rows)
     assert len(model.entity("scene")) == int(kept.sum())
     change = (drawn(trained, clip.split["train"][3]) - drawn_before).square().mean()
     assert change < 1e-3
@@ -109,7 +111,7 @@ def test_time_planes_that_are_one_go_without_a_trace(clip):
                           "model.object.features=null")  # fmt: skip
     planes = time_planes(trained.model.entity("human").deformation)
     assert planes and from_one(planes) == 0
-    pruning = Pruning(trained, judge_of(clip))
+    pruning = Pruning(trained, validator_of(clip))
     pruning.planes()
     after = pruning.trained
     assert after.spec.model["human"].deformation.settings["time_resolution"] == 0
@@ -155,8 +157,8 @@ def test_interaction_that_does_nothing_goes_and_one_that_does_stays(clip, strong
                 if name.endswith("bias"):
                     parameter += 3.0
     images = {p: (255 * drawn(trained, p)).round().clamp(0, 255).byte() for p in range(len(clip))}
-    judge = judge_of(replace(clip, store=Redrawn(clip.store, images)))
-    pruning = Pruning(trained, judge)
+    validator = validator_of(replace(clip, store=Redrawn(clip.store, images)))
+    pruning = Pruning(trained, validator)
     pruning.tokens()
     gone = pruning.trained.spec.interaction.use == "interaction:none"
     assert gone is not strong
@@ -177,7 +179,7 @@ def test_tuning_settles_and_leaves_the_spec_as_it_was(clip, monkeypatch, settle)
             super().train(*args, **kwargs)
 
     monkeypatch.setattr(prune, "Trainer", Watched)
-    pruning = Pruning(trained, judge_of(clip))
+    pruning = Pruning(trained, validator_of(clip))
     pruning.tune()
     assert not seen  # nothing was pruned
     pruning.cuts = [Cut("splats", "Gaussians", 2, 1, 0.0, "")]
@@ -191,8 +193,8 @@ def test_no_test_frame_is_looked_at(clip):
     view = sealed_view(clip)
     model = as_composed(clip).model
     with pytest.raises(SealedFrameError, match=f"frame {clip.split['test'][0]} is a test frame"):
-        Judge(view, clip.split["test"][:1], Ledger(1e6)).look(model)
-    assert Judge(view, clip.split["train"][:1], Ledger(1e6)).look(model).psnr
+        Validator(view, clip.split["test"][:1], StepBudget(1e6)).score(model)
+    assert Validator(view, clip.split["train"][:1], StepBudget(1e6)).score(model).psnr
     assert list(view.split) == ["train"] and view.held_out is None
 
 
@@ -210,7 +212,7 @@ def run(tmp_path_factory, clip):
 
 
 def test_a_compact_run_reads_back(run, tmp_path):
-    done = compact_run(run, tmp_path / "small")
+    done = compress(run, out=tmp_path / "small")
     assert done.bytes_after < 0.5 * done.bytes_before and abs(done.drop) < 0.1
     whole, small = LoadedRun.open(run), LoadedRun.open(tmp_path / "small")
     assert whole.spec == small.spec and whole.step == small.step
@@ -221,13 +223,13 @@ def test_a_compact_run_reads_back(run, tmp_path):
     size = sum(f.stat().st_size for f in (tmp_path / "small" / "checkpoints").iterdir())
     assert size == done.bytes_after
     with pytest.raises(HoigsError, match="already exists"):
-        compact_run(run, tmp_path / "small")
+        compress(run, out=tmp_path / "small")
     with pytest.raises(CheckpointError, match="pruned or compressed"):
         Session.open(NAME, whole.spec, out=tmp_path / "small", resume=True)
 
 
 def test_a_damaged_compact_run_is_told(run, tmp_path):
-    compact_run(run, tmp_path / "small")
+    compress(run, out=tmp_path / "small")
     weights = next((tmp_path / "small" / "checkpoints").glob("*.safetensors"))
     data = bytearray(weights.read_bytes())
     data[-500] ^= 0x10
@@ -277,7 +279,7 @@ def test_keeping_rows_is_what_pruning_does_to_every_entity(clip):
     for name in trained.model.entities:
         entity = trained.model.entity(name)
         mask = torch.arange(len(entity)) % 3 != 0
-        entity.apply_topology(TopologyChange.keep(mask), entity.rest[mask])
-    less = trained.asking_less({"train.seed": 1})
+        entity.apply_topology(TopologyChange.keep(mask), entity.canonical[mask])
+    less = trained.recomposed({"train.seed": 1})
     assert less.model.count() == trained.model.count()
     torch.testing.assert_close(drawn(less, 2), drawn(trained, 2))

@@ -7,8 +7,8 @@ import random
 from hoigs.evaluation.protocol import NotComputed, Value
 from hoigs.studies.stress.case import Case, all_cases
 from hoigs.studies.stress.measures import MEASURES
-from hoigs.studies.stress.table import Table, make_table
-from hoigs.studies.stress.verdict import Seed, Verdict, judge, verdict_of
+from hoigs.studies.stress.report.table import Table, make_table
+from hoigs.studies.stress.verdict import Seed, Verdict, level_of, verdict_of
 
 MACHINE = "Xeon A, 2 cores; torch 2.13.0, warp 1.19.0"
 PROTOCOL = ("6 frames of split 'test' from training cameras.", "96x96, float pixels.")
@@ -28,13 +28,15 @@ def values(level: int, strength: float, noise: float) -> dict[str, Value]:
 
 def knob_verdict(case: Case, spec: str, seeds: int, strength: float) -> Verdict:
     """A chain of made-up levels, each seed until it breaks."""
-    assert case.knob is not None
+    assert case.sweep is not None
     noise, found = random.Random(f"{case.id} {spec}"), []
     for seed in range(seeds):
         first, levels = values(0, strength, 0.0), []
-        for i, value in enumerate(case.knob.values):
+        for i, value in enumerate(case.sweep.values):
             now = values(i, strength, noise.gauss(0, 0.1) if i else 0.0)
-            levels.append(judge(case.knob, value, now, first, f"runs/{case.id}/{spec}-{seed}-{i}"))
+            levels.append(
+                level_of(case.sweep, value, now, first, f"runs/{case.id}/{spec}-{seed}-{i}")
+            )
             if not levels[-1].stands:
                 break
         found.append(Seed(seed, tuple(levels)))
@@ -49,7 +51,7 @@ def table(seeds: int = 3, cases: tuple[Case, ...] | None = None) -> Table:
         for j, spec in enumerate(SPECS):
             if (i + j) % 7 == 6:
                 found.append(Verdict(case.id, spec, "not applicable", "has not: a body"))
-            elif case.knob is not None:
+            elif case.sweep is not None:
                 found.append(knob_verdict(case, spec, seeds, (4.0, 2.0, 1.0, 0.5, 8.0)[j]))
             else:
                 status = "nature" if (i + j) % 11 == 3 else "pass"

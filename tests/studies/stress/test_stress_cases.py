@@ -1,18 +1,18 @@
-"""Every one of the 56 has a line, and all that is ours to pass passes."""
+"""The 56 cases are complete and valid, and every check of hoigs' own code passes."""
 
 from __future__ import annotations
 
 import pytest
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.rotation import normalize_quats
+from hoigs.core.maths.rotations import normalize_quats
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.studies.stress.case import COUNT, Case, Criterion, Knob, all_cases, choose_cases
+from hoigs.studies.stress.case import COUNT, Case, Criterion, Sweep, all_cases, choose_cases
 from hoigs.studies.stress.checks import CHECKS, PER_SPEC, check, density, motion
 from hoigs.studies.stress.plan import BASE, clip_names
-from hoigs.synthesis.named import clip_knobs
-from hoigs.synthesis.objects import MOTIONS
-from hoigs.synthesis.person import Choreographer
+from hoigs.synthesis.motion.object_motions import MOTIONS
+from hoigs.synthesis.named import clip_config
+from hoigs.synthesis.person.choreography import Choreographer
 
 CASES = all_cases()
 
@@ -25,15 +25,15 @@ def test_none_of_the_56_is_missing():
 
 
 def test_every_check_belongs_to_a_case_and_every_case_to_a_check():
-    asked = {case.check for case in CASES} | {case.per_spec for case in CASES}
-    assert asked - {None} == set(CHECKS) | set(PER_SPEC)
+    named = {case.check for case in CASES} | {case.per_spec for case in CASES}
+    assert named - {None} == set(CHECKS) | set(PER_SPEC)
 
 
 @pytest.mark.parametrize("name", CHECKS)
-def test_what_is_ours_to_pass_passes(name):
-    finding = check(name)()
-    assert finding.passed, finding.measured
-    assert finding.measured
+def test_checks_of_our_own_code_pass(name):
+    result = check(name)()
+    assert result.passed, result.measured
+    assert result.measured
 
 
 def test_a_slerp_that_ignores_signs_is_found(monkeypatch):
@@ -46,37 +46,37 @@ def test_a_slerp_that_ignores_signs_is_found(monkeypatch):
 
 def test_a_late_reset_is_found(monkeypatch):
     monkeypatch.setattr("hoigs.plugins.density.adc.LATEST_RESET", 1.0)
-    finding = density.late_reset_refused()
-    assert not finding.passed and "1000" in finding.measured
+    result = density.late_reset_refused()
+    assert not result.passed and "1000" in result.measured
 
 
 def test_a_cap_that_does_not_hold_is_found(monkeypatch):
     monkeypatch.setattr(density, "CAP", 301)
-    controls = density.AdaptiveDensity
-    monkeypatch.setattr(density, "AdaptiveDensity", lambda cap, **more: controls(cap=400, **more))
+    build = density.component
+    monkeypatch.setattr(density, "component", lambda key, **own: build(key, **own | {"cap": 400}))
     assert not density.explosion_capped().passed
 
 
-def test_every_value_of_a_knob_is_a_clip():
+def test_every_value_of_a_sweep_is_a_clip():
     for case in CASES:
-        if case.knob is not None:
-            knobs = [clip_knobs(name) for name in clip_names(case.knob, BASE)]
-            assert all(k.width == 96 and k.frames == 24 for k in knobs), case.id
-            turned = len({k.digest() for k in knobs})
-            assert turned == (len(knobs) if case.knob.sets else 1), case.id
+        if case.sweep is not None:
+            clips = [clip_config(name) for name in clip_names(case.sweep, BASE)]
+            assert all(k.width == 96 and k.frames == 24 for k in clips), case.id
+            different = len({k.digest() for k in clips})
+            assert different == (len(clips) if case.sweep.sets else 1), case.id
 
 
-def test_the_person_reaches_what_every_clip_asks_for():
+def test_the_person_reaches_the_object_in_every_clip():
     body = AnnyBody()
-    knobs = {
-        clip_knobs(name).digest(): clip_knobs(name)
+    configs = {
+        clip_config(name).digest(): clip_config(name)
         for case in CASES
-        if case.knob is not None
-        for name in clip_names(case.knob, BASE)
+        if case.sweep is not None
+        for name in clip_names(case.sweep, BASE)
     }
-    for own in knobs.values():
+    for own in configs.values():
         script = MOTIONS[own.object.motion](own).script()
-        poses = Choreographer(body, own).perform(script, own)
+        poses = Choreographer(body, own).perform(script)
         assert poses.body.isfinite().all(), own
 
 
@@ -100,33 +100,33 @@ def test_criteria_hold_or_not():
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"why_not": "no"}, "or why_not"),
         ({"check": None}, "or why_not"),
         ({"concerns": ("wings",)}, "concerns"),
     ],
 )
-def test_a_case_that_says_nothing_is_refused(change, told):
+def test_an_invalid_case_is_refused(change, message):
     data = {"id": "F01", "title": "a", "trigger": "b", "criterion": "c", "check": "motion:x"}
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         Case.model_validate(data | change)
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
-        ({"asked": 1.0}, "none of"),
-        ({"asked": 2.5}, "none of"),
-        ({"sets": ()}, "sets something"),
+        ({"required": 1.0}, "none of"),
+        ({"required": 2.5}, "none of"),
+        ({"sets": ()}, "varies a setting"),
         ({"draws": "psnr_ful"}, 'did you mean "psnr_full"'),
         ({"criteria": [{"measure": "psnr_full"}]}, "give one of"),
         ({"criteria": [{"measure": "psnr_fll", "loses": 1}]}, 'did you mean "psnr_full"'),
     ],
 )
-def test_a_knob_that_cannot_be_is_refused(change, told):
+def test_an_invalid_sweep_is_refused(change, message):
     data = {"clip": "carry", "sets": ["fps={}"], "values": [1, 2, 3], "unit": "frames a second",
             "criteria": [{"measure": "psnr_full", "loses": 1}]}  # fmt: skip
-    assert Knob.model_validate(data).must_stand == 3
-    with pytest.raises(ValueError, match=told):
-        Knob.model_validate(data | change)
+    assert Sweep.model_validate(data).required_value == 3
+    with pytest.raises(ValueError, match=message):
+        Sweep.model_validate(data | change)

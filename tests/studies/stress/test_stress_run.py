@@ -1,4 +1,4 @@
-"""A study of two specs, end to end, twice; and what composed models owe."""
+"""A study run twice, end to end; and the checks that composed models are expected to pass."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.spec import Spec
-from hoigs.studies.chart_plan import parse_variants
-from hoigs.studies.job import Job
+from hoigs.core.spec.schema import Spec
+from hoigs.studies.jobs.job import Job
+from hoigs.studies.jobs.variants import parse_variants
 from hoigs.studies.stress.bench import Bench
 from hoigs.studies.stress.case import Case, choose_cases
 from hoigs.studies.stress.checks import PER_SPEC, per_spec
-from hoigs.studies.stress.plan import StressStudy, plan_chains, turned_blocks
+from hoigs.studies.stress.plan import StressStudy, block_settings, plan_chains
 from hoigs.studies.stress.run import run_stress
 from hoigs.studies.stress.sizes import small_settings
 
@@ -24,21 +24,15 @@ BASE = (
 )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HOIGS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        patch.delenv("HOIGS_LPIPS_WEIGHTS", raising=False)
-        patch.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch")))
-        yield
+pytestmark = pytest.mark.usefixtures("own_caches")
 
 
 def short(case: Case) -> Case:
-    """With the ends of its knob alone."""
-    if case.knob is None:
+    """With the ends of its sweep alone."""
+    if case.sweep is None:
         return case
-    ends = {"values": (case.knob.values[0], case.knob.values[-1]), "asked": None}
-    return case.model_copy(update={"knob": case.knob.model_copy(update=ends)})
+    ends = {"values": (case.sweep.values[0], case.sweep.values[-1]), "required": None}
+    return case.model_copy(update={"sweep": case.sweep.model_copy(update=ends)})
 
 
 def study(out: Path, cases: str, specs: str = "static", **more: object) -> StressStudy:
@@ -49,21 +43,21 @@ def study(out: Path, cases: str, specs: str = "static", **more: object) -> Stres
 
 @pytest.mark.slow
 def test_a_study_is_run_once_and_goes_on(tmp_path: Path) -> None:
-    told: list[str] = []
+    words: list[str] = []
     wanted = study(tmp_path, "F04,F20,F49,F47,F56")
 
     def report(job: Job, word: str) -> None:
-        told.append(word)
+        words.append(word)
 
     stopped = run_stress(wanted, workers=1, limit_s=0.0, report=report)
     by_case = {v.case: v for v in stopped}
-    assert by_case["F49"].status == "not run" and not any(t == "done" for t in told)
+    assert by_case["F49"].status == "not run" and not any(t == "done" for t in words)
     assert by_case["F20"].status == "pass" and by_case["F20"].ours
     assert by_case["F56"].status == "pass" and not by_case["F56"].ours
     assert by_case["F04"].status == by_case["F47"].status == "not applicable"
     assert "rotations at keyframes" in by_case["F04"].measured
 
-    told.clear()
+    words.clear()
     (verdict,) = run_stress(study(tmp_path, "F49"), workers=2, report=report)
     assert verdict.status in ("pass", "nature") and len(verdict.seeds) == 2
     assert verdict.machines and "2 frames of split 'test'" in verdict.protocol[0]
@@ -74,20 +68,20 @@ def test_a_study_is_run_once_and_goes_on(tmp_path: Path) -> None:
     (full,) = [s for s in scores["scores"] if (s["view"], s["region"], s["metric"]) ==
                ("test frames", "full", "psnr")]  # fmt: skip
     assert level.values["psnr_full"] == full["value"]
-    assert told.count("done") == sum(len(s.levels) for s in verdict.seeds)
+    assert words.count("done") == sum(len(s.levels) for s in verdict.seeds)
 
-    told.clear()
+    words.clear()
     (again,) = run_stress(study(tmp_path, "F49"), workers=2, report=report)
-    assert again == verdict and set(told) == {"done before"}
+    assert again == verdict and set(words) == {"done before"}
 
 
 @pytest.mark.slow
-def test_composed_models_owe_what_they_owe() -> None:
+def test_composed_models_pass_the_expected_checks() -> None:
     bench = Bench.compose("hoigs")
     assert {"body", "object", "interaction", "free knots", "time planes"} <= bench.capabilities
     of_keyframes = "composed:motion_rate"  # those of hoigs learn at the rate of poses
-    owed = [name for name in PER_SPEC if name != of_keyframes]
-    failed = {n: f.measured for n in owed if not (f := per_spec(n)(bench)).passed}
+    expected = [name for name in PER_SPEC if name != of_keyframes]
+    failed = {n: f.measured for n in expected if not (f := per_spec(n)(bench)).passed}
     assert not failed and "keyframe rate" not in bench.capabilities
     paper = Bench.compose("hoigs-paper")
     assert "keyframe rate" in paper.capabilities and per_spec(of_keyframes)(paper).passed
@@ -110,13 +104,13 @@ def test_a_spec_is_made_small_by_what_it_has() -> None:
     assert "model.human.density.cap" not in parts
 
 
-def test_knobs_of_a_spec_are_set_where_it_has_them() -> None:
+def test_sweeps_of_a_spec_are_set_where_it_has_them() -> None:
     (case,) = choose_cases("F03")
-    assert case.knob is not None
-    assert turned_blocks(Spec.load("hoigs"), case.knob, 2) == [
+    assert case.sweep is not None
+    assert block_settings(Spec.load("hoigs"), case.sweep, 2) == [
         "model.object.deformation.keyframe_step=2"
     ]
-    assert turned_blocks(Spec.load("ex4dgs"), case.knob, 1) == [
+    assert block_settings(Spec.load("ex4dgs"), case.sweep, 1) == [
         "model.scene.deformation.interval=1"
     ]
 

@@ -6,10 +6,10 @@ import pytest
 
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.studies.stress.case import choose_cases
-from hoigs.studies.stress.verdict import Level, Seed, breaking, judge, verdict_of
+from hoigs.studies.stress.verdict import Level, Seed, breaking, level_of, verdict_of
 
-(CASE,) = choose_cases("F01")  # 1, 2, 3, 4, 6 eights; asked for: 4; loses at most 1 dB
-VALUES = CASE.knob.values
+(CASE,) = choose_cases("F01")  # 1, 2, 3, 4, 6 eights; required: 4; loses at most 1 dB
+VALUES = CASE.sweep.values
 
 
 def seed(number: int, *stands: bool) -> Seed:
@@ -47,19 +47,19 @@ def test_most_seeds_decide(stood, nature, status, rate, breaks_at):
 def test_what_is_not_known_is_no_verdict():
     seeds = [seed(0, True, True, True, True, True), seed(1, True)]
     verdict = verdict_of(CASE, "hoigs", False, seeds)
-    assert verdict.status == "not run" and breaking(CASE.knob, seeds) is None
+    assert verdict.status == "not run" and breaking(CASE.sweep, seeds) is None
     assert verdict_of(CASE, "hoigs", False, []).status == "not run"
 
 
 def test_numbers_are_held_against_the_first():
     first = {"psnr_object": 20.0}
-    assert judge(CASE.knob, 2, {"psnr_object": 19.2}, first, "r").stands
-    level = judge(CASE.knob, 2, {"psnr_object": 18.5}, first, "r")
+    assert level_of(CASE.sweep, 2, {"psnr_object": 19.2}, first, "r").stands
+    level = level_of(CASE.sweep, 2, {"psnr_object": 18.5}, first, "r")
     assert not level.stands and level.why.endswith("at most 1 dB: 18.5 of 20")
-    low = judge(CASE.knob, 1, {"psnr_object": 12.0}, {"psnr_object": 12.0}, "r")
+    low = level_of(CASE.sweep, 1, {"psnr_object": 12.0}, {"psnr_object": 12.0}, "r")
     assert not low.stands, "what was never learned cannot be said to stand"
-    absent = judge(CASE.knob, 2, {"psnr_object": NotComputed("no object")}, first, "r")
+    absent = level_of(CASE.sweep, 2, {"psnr_object": NotComputed("no object")}, first, "r")
     assert not absent.stands and "no object" in absent.why
     both = [Seed(i, (level,)) for i in (0, 1)]
-    told = verdict_of(CASE, "hoigs", False, both).measured
-    assert told.count("loses at most") == 1 and "(seed 1, 2)" in told
+    measured = verdict_of(CASE, "hoigs", False, both).measured
+    assert measured.count("loses at most") == 1 and "(seed 1, 2)" in measured

@@ -11,8 +11,8 @@ from made_up import MACHINE, PROTOCOL, SPECS, table
 from PIL import Image
 
 from hoigs.studies.stress.case import COUNT, choose_cases
-from hoigs.studies.stress.table import in_short, rate_of
-from hoigs.studies.stress.write import as_csv, as_json, as_markdown, write_stress
+from hoigs.studies.stress.report.table import in_short, rate_of
+from hoigs.studies.stress.report.write import as_csv, as_json, as_markdown, write_stress
 
 
 def test_all_files_are_written_whole(tmp_path: Path) -> None:

@@ -16,18 +16,18 @@ INT32 = 2**31 - 1
 OTHERWISE = 'use backend="torch" (train.loss.ssim: torch)'
 
 
-class Path(Protocol):
-    """How a device computes the SSIM of images [B, H, W, C], contiguous."""
+class Kernels(Protocol):
+    """Computes the SSIM of contiguous images [B, H, W, C] on a device."""
 
     max_channels: int | None
 
     def mean(
         self, image: Tensor, target: Tensor, with_gradient: bool
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """The mean, and what `gradient` needs later."""
+        """The mean, and the tensors that `gradient` needs."""
 
     def gradient(self, kept: tuple[Tensor, ...], upstream: Tensor) -> Tensor:
-        """Of upstream * mean to the image."""
+        """Gradient of upstream * mean by the image."""
 
     def map(self, image: Tensor, target: Tensor) -> Tensor:
         """SSIM of each pixel and channel."""
@@ -36,11 +36,11 @@ class Path(Protocol):
 def mean_ssim(
     image: Float[Tensor, "*batch H W C"], target: Float[Tensor, "*batch H W C"]
 ) -> Float[Tensor, ""]:
-    """Mean SSIM (Wang et al. 2004; methods D.5) of float32 images in [0, 1].
+    """Mean SSIM (Wang et al. 2004) of float32 images in [0, 1].
 
-    Window 11x11, Gaussian of sigma 1.5, zero padding. Twice run it gives the same bits, whatever
-    the number of cores. Differentiable once, and in `image` only. Where the fast CPU kernel does
-    not compile, slower ones take its place with a warning.
+    Window 11x11, Gaussian of sigma 1.5, zero padding. Two runs agree bit for bit, whatever the
+    number of cores. Differentiable once, and in `image` only. Where the CPU kernel does not
+    compile, the slower ones of CUDA are used as scalar code, with a warning.
 
     Raises:
         ValueError: unequal shapes, no pixels, no float32, a device without kernels, or a target
@@ -48,9 +48,9 @@ def mean_ssim(
         RenderError: Warp is not installed.
     """
     _check(image, target)
-    path = _path(image.device.type)
+    kernels = _kernels(image.device.type)
     tracked = torch.is_grad_enabled() and image.requires_grad
-    value: Tensor = _Mean.apply(_planes(image, path), _planes(target, path), path, tracked)
+    value: Tensor = _Mean.apply(_planes(image, kernels), _planes(target, kernels), kernels, tracked)
     return value
 
 
@@ -69,10 +69,10 @@ def ssim_map(
             "the Warp kernels differentiate the mean of SSIM, not its map: draw the map under "
             f"torch.no_grad(), or {OTHERWISE}"
         )
-    path = _path(image.device.type)
-    planes = _planes(image, path)
+    kernels = _kernels(image.device.type)
+    planes = _planes(image, kernels)
     with torch.cuda.device_of(image):
-        result = path.map(planes, _planes(target, path))
+        result = kernels.map(planes, _planes(target, kernels))
     if planes.shape[-1] == image.shape[-1]:
         return result.reshape(image.shape)
     return result.reshape(image.movedim(-1, -3).shape).movedim(-3, -1)
@@ -80,10 +80,10 @@ def ssim_map(
 
 class _Mean(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, path: Path, tracked: bool) -> Tensor:
+    def forward(ctx: Any, image: Tensor, target: Tensor, kernels: Kernels, tracked: bool) -> Tensor:
         with torch.cuda.device_of(image):
-            value, kept = path.mean(image, target, tracked)
-        ctx.path = path
+            value, kept = kernels.mean(image, target, tracked)
+        ctx.kernels = kernels
         ctx.save_for_backward(*kept)
         return value
 
@@ -91,11 +91,11 @@ class _Mean(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         with torch.cuda.device_of(upstream[0]):
-            return ctx.path.gradient(ctx.saved_tensors, upstream[0]), None, None, None
+            return ctx.kernels.gradient(ctx.saved_tensors, upstream[0]), None, None, None
 
 
 @functools.cache
-def _path(device: str) -> Path:
+def _kernels(device: str) -> Kernels:
     try:
         import warp  # noqa: F401
     except ImportError as error:
@@ -104,35 +104,35 @@ def _path(device: str) -> Path:
             f"{OTHERWISE}"
         ) from error
     if device == "cuda":
-        from hoigs.rasterizers.warp.ssim.tiles import TilePath
+        from hoigs.rasterizers.warp.ssim.tiles import TileKernels
 
-        return TilePath()
-    return _cpu_path()
+        return TileKernels()
+    return _cpu_kernels()
 
 
-def _cpu_path() -> Path:
-    """The fast kernel where it compiles; else those of CUDA as scalar code, and a warning."""
-    from hoigs.rasterizers.warp.ssim.strips import StripPath
+def _cpu_kernels() -> Kernels:
+    """The CPU kernel where it compiles; else those of CUDA as scalar code, and a warning."""
+    from hoigs.rasterizers.warp.ssim.strips import StripKernels
 
-    path, trial = StripPath(), torch.ones(1, 1, 1, 1)
+    kernels, trial = StripKernels(), torch.ones(1, 1, 1, 1)
     try:
-        path.map(trial, trial)
+        kernels.map(trial, trial)
     except Exception as error:  # Warp raises nothing narrower when a build fails
-        from hoigs.rasterizers.warp.ssim.tiles import TilePath
+        from hoigs.rasterizers.warp.ssim.tiles import TileKernels
 
         warnings.warn(
-            f"the CPU kernel of SSIM does not run here: {error}; scalar kernels, slower, take its "
-            f"place. Or {OTHERWISE}",
+            f"the CPU kernel of SSIM does not run here: {error}; slower scalar kernels are used "
+            f"instead; or {OTHERWISE}",
             stacklevel=2,
         )
-        return TilePath()
-    return path
+        return TileKernels()
+    return kernels
 
 
-def _planes(images: Tensor, path: Path) -> Tensor:
+def _planes(images: Tensor, kernels: Kernels) -> Tensor:
     """[B, H, W, C], contiguous; with more channels than the kernels take, [B C, H, W, 1]."""
     channels = images.shape[-1]
-    if path.max_channels is not None and channels > path.max_channels:
+    if kernels.max_channels is not None and channels > kernels.max_channels:
         images, channels = images.movedim(-1, -3).unsqueeze(-1), 1
     return images.reshape(-1, *images.shape[-3:-1], channels).contiguous()
 
@@ -145,13 +145,13 @@ def _check(image: Tensor, target: Tensor) -> None:
         )
     if image.dtype != torch.float32 or target.dtype != torch.float32:
         raise ValueError(
-            f"image is {image.dtype}, target {target.dtype}; the Warp kernels of SSIM take "
+            f"image is {image.dtype}, target {target.dtype}; the Warp kernels of SSIM expect "
             f"torch.float32: {OTHERWISE}"
         )
     if image.device != target.device or image.device.type not in ("cpu", "cuda"):
         raise ValueError(
-            f"image is on {image.device}, target on {target.device}; the Warp kernels of SSIM want "
-            f"both on the CPU or on one CUDA device: move one, or {OTHERWISE}"
+            f"image is on {image.device}, target on {target.device}; the Warp kernels of SSIM "
+            f"expect both on the CPU or on one CUDA device: move one, or {OTHERWISE}"
         )
     if torch.is_grad_enabled() and target.requires_grad:
         raise ValueError(

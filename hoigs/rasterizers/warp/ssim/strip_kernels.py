@@ -2,8 +2,8 @@
 # (Warp's arrays annotate as values)
 """The CPU kernel of SSIM; its loops stand in `strip_source`."""
 
-from hoigs.rasterizers.warp.records import F32, I32
-from hoigs.rasterizers.warp.runtime import CPU_FLAGS, wp
+from hoigs.rasterizers.warp.common.records import F32, I32
+from hoigs.rasterizers.warp.common.runtime import CPU_FLAGS, wp
 from hoigs.rasterizers.warp.ssim import strip_source
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})
@@ -19,7 +19,7 @@ def similarity_native(
 
 @wp.kernel
 def similarity_strips(
-    counters: I32,  # [1], zero: workers that make this same call draw pieces of work from it
+    counters: I32,  # [1], zero: the next work item, for workers that make this same call
     batch: int,
     height: int,
     width: int,

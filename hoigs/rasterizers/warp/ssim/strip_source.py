@@ -2,7 +2,7 @@
 
 An image [H, W, C] is taken as H lines of W C floats, so that a neighbour of a pixel lies C floats
 away and nothing need be sorted by channel. A strip is at most STRIP floats wide; a band of it is
-one piece of work. Line after line, R at a time,
+one work item. Line after line, R at a time,
 
 1. p and d of a line of the images are blurred along it, and kept in a ring of 16 lines (`means`);
 2. the ring blurred down gives SSIM and the images of `definition.FORMULA` at the line 5 above,
@@ -13,8 +13,8 @@ So nothing as large as the image is stored but the gradient. Strips see SIDE flo
 edges at each blur, bands 10 lines: those are computed twice. Every value is made by the same
 operations whatever the bands, so results do not depend on the number of cores.
 
-LLVM vectorises none of this by itself: vectors are spelled out as in `cpu_source`. `float(x)` and
-`int(x)` are macros of Warp here: casts are written (float)(x). Names of arguments stand in
+LLVM vectorises none of this by itself: vectors are written out as in `cpu.vector_source`, and casts
+as (float)(x), since `float(x)` and `int(x)` are macros of Warp. The arguments are described in
 `strip_kernels`.
 """
 

@@ -5,21 +5,20 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hoigs.rasterizers.warp.calls import flat, record
+from hoigs.rasterizers.warp.common.cpu_launch import prepared
+from hoigs.rasterizers.warp.cpu.workers import SerialWorkers, ThreadWorkers
 from hoigs.rasterizers.warp.ssim.strip_kernels import similarity_strips
 from hoigs.rasterizers.warp.ssim.strip_source import MAX_CHANNELS, STRIP
-from hoigs.rasterizers.warp.workers import SerialWorkers, ThreadWorkers
 
-WORTHWHILE = 2**15  # floats of an image that are worth another core
+WORTHWHILE = 2**15  # an image with so many floats takes as long as waking another core
 LEAST_LINES = 64  # of a band: it computes 10 lines beyond each end again
 
 
-class StripPath:
-    """Everything in one pass: the gradient of the mean is made beside it, and only scaled later.
+class StripKernels:
+    """Value and gradient in one pass; backward only scales the gradient by the upstream one.
 
-    It differs from the upstream gradient by a factor, which is not known before backward; keeping
-    the three images that it is blurred from, as a CUDA kernel does, would move three times as much
-    memory.
+    Keeping the three images from which the gradient is blurred, as the CUDA kernels do, would move
+    three times as much memory.
     """
 
     max_channels: int | None = MAX_CHANNELS
@@ -48,15 +47,14 @@ def _run(image: Tensor, target: Tensor, result: Tensor, gradient: Tensor) -> Ten
     strips = -(-length // STRIP)
     strip_width = 16 * -(-length // (16 * strips))
     cores = max(1, min(torch.get_num_threads(), image.numel() // WORTHWHILE))
-    wanted = 2 * cores if cores > 1 else 1  # pieces of work: cores may be of unequal speed
+    wanted = 2 * cores if cores > 1 else 1  # work items: cores may be of unequal speed
     bands = max(1, min(-(-wanted // (batch * strips)), height // LEAST_LINES))
     sums = image.new_empty(batch, height, strips)
     arguments = [
-        flat(torch.zeros(1, dtype=torch.int32)), batch, height, width, channels, strips,
-        strip_width, bands, -(-height // bands), flat(image), flat(target), 1.0 / image.numel(),
-        int(result.numel() > 0), int(gradient.numel() > 0), flat(sums), flat(result),
-        flat(gradient),
+        torch.zeros(1, dtype=torch.int32), batch, height, width, channels, strips, strip_width,
+        bands, -(-height // bands), image, target, 1.0 / image.numel(), int(result.numel() > 0),
+        int(gradient.numel() > 0), sums, result, gradient,
     ]  # fmt: skip
-    launches = [record(similarity_strips, 1, arguments)] * cores
+    launches = [prepared(similarity_strips, 1, arguments)] * cores
     (SerialWorkers() if cores == 1 else ThreadWorkers()).run(launches)
     return sums

@@ -7,7 +7,7 @@ once for four. `forward` keeps the three images of `definition.FORMULA`, `backwa
 the gradient (as fused-ssim does; Mallick et al. 2024, Taming 3DGS). There are no atomics: sums have
 the same order in every run.
 
-On a CPU one thread does the work of a block. Names of arguments stand in `tile_kernels`.
+On a CPU one thread does the work of a block. The arguments are described in `tile_kernels`.
 """
 
 from hoigs.rasterizers.warp.ssim.definition import FORMULA, WEIGHTS
@@ -29,11 +29,11 @@ _HEAD = r"""
 #endif
     constexpr int SIDE = %(SIDE)d, WIDE = SIDE + 10, R = 4;
     const float w[6] = %(WEIGHTS)s;
-    const int across = (width + SIDE - 1) / SIDE, down = (height + SIDE - 1) / SIDE;
+    const int tiles_x = (width + SIDE - 1) / SIDE, tiles_y = (height + SIDE - 1) / SIDE;
     // channel by channel, so that neighbours in time read the same lines of memory
     const int channel = block %% channels, tile = block / channels;
-    const int X = tile %% across * SIDE, Y = tile / across %% down * SIDE;
-    const int picture = tile / across / down;
+    const int X = tile %% tiles_x * SIDE, Y = tile / tiles_x %% tiles_y * SIDE;
+    const int picture = tile / tiles_x / tiles_y;
     const long long first = (long long)picture * height * width;
     const long long plane = first * channels + (long long)channel * height * width;
     const float* image_ = (const float*)image.data;

@@ -7,19 +7,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.rasterizers.warp.calls import flat
-from hoigs.rasterizers.warp.runtime import wp
+from hoigs.rasterizers.warp.common.cpu_launch import prepared
+from hoigs.rasterizers.warp.cuda.launch import CudaStreams
 from hoigs.rasterizers.warp.ssim.tile_kernels import backward_tiles, forward_tiles
 from hoigs.rasterizers.warp.ssim.tile_source import SIDE, THREADS
 
 
-class TilePath:
+class TileKernels:
     """Two kernels, on torch's current stream; nothing waits for the device."""
 
     max_channels: int | None = None
 
     def __init__(self) -> None:
-        self._streams: dict[tuple[int, int], Any] = {}
+        self._streams = CudaStreams()
 
     def mean(
         self, image: Tensor, target: Tensor, with_gradient: bool
@@ -32,8 +32,7 @@ class TilePath:
     def gradient(self, kept: tuple[Tensor, ...], upstream: Tensor) -> Tensor:
         image, target, planes = kept
         result = torch.empty_like(image)
-        arguments = [*_sizes(image), flat(image), flat(target), flat(planes)]
-        self._launch(backward_tiles, image, [*arguments, flat(upstream), flat(result)])
+        self._launch(backward_tiles, image, [image, target, planes, upstream, result])
         return result
 
     def map(self, image: Tensor, target: Tensor) -> Tensor:
@@ -43,30 +42,16 @@ class TilePath:
 
     def _forward(self, image: Tensor, target: Tensor, result: Tensor, kept: Tensor) -> Tensor:
         sums = image.new_empty(_tiles(image))
-        arguments = [*_sizes(image), flat(image), flat(target), int(result.numel() > 0)]
-        arguments += [int(kept.numel() > 0), flat(sums), flat(result), flat(kept)]
-        self._launch(forward_tiles, image, arguments)
+        flags = [int(result.numel() > 0), int(kept.numel() > 0)]
+        self._launch(forward_tiles, image, [image, target, *flags, sums, result, kept])
         return sums
 
     def _launch(self, kernel: Any, image: Tensor, arguments: list[Any]) -> None:
-        if not image.is_cuda:
-            wp.launch(kernel, dim=_tiles(image), inputs=arguments, device="cpu")
-            return
-        current = torch.cuda.current_stream(image.device)
-        key = (current.device_index, current.cuda_stream)
-        if key not in self._streams:
-            self._streams[key] = wp.stream_from_torch(current)
-        wp.launch(
-            kernel,
-            dim=_tiles(image) * THREADS,
-            inputs=arguments,
-            stream=self._streams[key],
-            block_dim=THREADS,
-        )
-
-
-def _sizes(image: Tensor) -> list[int]:
-    return list(image.shape)
+        arguments = [*image.shape, *arguments]
+        if image.is_cuda:
+            self._streams.current().blocks(kernel, _tiles(image), THREADS, arguments)
+        else:
+            prepared(kernel, _tiles(image), arguments).launch()
 
 
 def _tiles(image: Tensor) -> int:

@@ -1,4 +1,4 @@
-"""Direct checks: functions without arguments of our own code, and of one composed model."""
+"""Direct checks by name: `check` of hoigs' own code, `per_spec` of one composed model."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from hoigs.core.errors import HoigsError, did_you_mean
-from hoigs.studies.stress.finding import Finding
+from hoigs.studies.stress.check_result import CheckResult
 
 if TYPE_CHECKING:
     from hoigs.studies.stress.bench import Bench
@@ -21,8 +21,8 @@ CHECKS = {
         "camera": ("extent_of_a_static_camera", "depth_factor_found", "scale_about_the_camera",
                    "front_of_a_ball", "cut_masks", "near_plane", "principal_point",
                    "lens_removed"),
-        "human": ("twisted_covariances", "hand_convention_told", "gender_refused",
-                  "fitted_poses_are_told"),
+        "human": ("twisted_covariances", "hand_convention_found", "gender_refused",
+                  "fitted_poses_are_declared"),
         "interaction": ("bounded_pose", "all_masked", "soft_gate", "held_object", "shapes",
                         "shuffled", "near_and_far"),
         "density": ("explosion_capped", "late_reset_refused", "not_all_pruned"),
@@ -40,23 +40,23 @@ PER_SPEC = {
 }  # fmt: skip
 
 
-def check(name: str) -> Callable[[], Finding]:
-    """A check of our own code by its name in a case."""
-    found: Callable[[], Finding] = _load(name, CHECKS)
+def check(name: str) -> Callable[[], CheckResult]:
+    """A check of hoigs' own code by its name in a case."""
+    found: Callable[[], CheckResult] = _load(name, CHECKS)
     return found
 
 
-def per_spec(name: str) -> Callable[[Bench], Finding]:
+def per_spec(name: str) -> Callable[[Bench], CheckResult]:
     """A check of a composed model by its name in a case."""
-    found: Callable[[Bench], Finding] = _load(name, PER_SPEC)
+    found: Callable[[Bench], CheckResult] = _load(name, PER_SPEC)
     return found
 
 
-def _load(name: str, known: dict[str, tuple[str, str]]) -> Callable[..., Finding]:
+def _load(name: str, known: dict[str, tuple[str, str]]) -> Callable[..., CheckResult]:
     if name not in known:
         raise HoigsError(f"no check {name!r}{did_you_mean(name, known)}")
     module, function = known[name]
-    loaded: Callable[..., Finding] = getattr(
+    loaded: Callable[..., CheckResult] = getattr(
         importlib.import_module(f"{__name__}.{module}"), function
     )
     return loaded

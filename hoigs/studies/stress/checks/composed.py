@@ -1,4 +1,4 @@
-"""F08 to F10, F13, F14, F29, F48, F54, F56: what any composed model owes, after a few steps."""
+"""F08 to F10, F13, F14, F29, F48, F54, F56: checks of a composed model, after a few steps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hoigs.studies.stress.bench import Bench, tiny_clip
 from hoigs.studies.stress.capability import rate_of
-from hoigs.studies.stress.finding import Finding
+from hoigs.studies.stress.check_result import CheckResult
 from hoigs.training.objective import JointObjective
 from hoigs.training.trainer import Trainer
 
@@ -25,14 +25,14 @@ def _means(bench: Bench, time: float) -> Float[Tensor, "N 3"]:
 
 
 def _step(bench: Bench, a: float, b: float) -> float:
-    """Mean way of the Gaussians that move, metres."""
+    """Mean displacement of the Gaussians that move, metres."""
     way = (_means(bench, a) - _means(bench, b)).norm(dim=-1)
     moving = way > 1e-9
     return float(way[moving].mean()) if moving.any() else 0.0
 
 
-def before_the_first_frame(bench: Bench) -> Finding:
-    """Frame 0 is for tests: the way from it to the first frame of training."""
+def before_the_first_frame(bench: Bench) -> CheckResult:
+    """Frame 0 is a test frame: the displacement from it to the first training frame."""
     clip = bench.clip
     split = {"train": list(range(1, len(clip))), "test": [0]}
     bench = bench.anew(replace(clip, split=split))
@@ -41,14 +41,14 @@ def before_the_first_frame(bench: Bench) -> Finding:
     steps = sorted(_step(bench, a, b) for a, b in pairwise(times[1:]))
     first, typical = _step(bench, times[0], times[1]), steps[len(steps) // 2]
     finite = bool(torch.isfinite(_means(bench, 0.0)).all())
-    return Finding(
+    return CheckResult(
         finite and first <= 2 * typical + 1e-3,
         f"{1000 * first:.1f} mm to the frame before, {1000 * typical:.1f} mm typically",
     )
 
 
-def beyond_the_last_frame(bench: Bench) -> Finding:
-    """Times of 1.2 and -0.2: finite, and what the method does there."""
+def beyond_the_last_frame(bench: Bench) -> CheckResult:
+    """Times of 1.2 and -0.2: finite values; reports how the model extrapolates."""
     bench.trained()
     words, finite = [], True
     for end, beyond in ((1.0, 1.2), (0.0, -0.2)):
@@ -58,14 +58,14 @@ def beyond_the_last_frame(bench: Bench) -> Finding:
         word = (
             "held"
             if way < 0.01 * step + 1e-6
-            else f"goes on by {way / max(step, 1e-9):.1f} usual ways"
+            else f"moves on by {way / max(step, 1e-9):.1f} usual steps"
         )
         words.append(f"at {beyond:g} {word}")
-    return Finding(finite, f"{', '.join(words)}; finite: {finite}")
+    return CheckResult(finite, f"{', '.join(words)}; finite: {finite}")
 
 
-def unused_rows(bench: Bench) -> Finding:
-    """Rows of planes over time that no time of the clip reads."""
+def unused_rows(bench: Bench) -> CheckResult:
+    """Rows of time planes that no time of the clip reads."""
     model = bench.anew().shaken()
     planes = {}
     for name in model.entities:
@@ -84,11 +84,11 @@ def unused_rows(bench: Bench) -> Finding:
                 touched[name] |= parameter.grad.abs().sum((0, 2, 3)) > 0
     unused = {name: int((~read).sum()) for name, read in touched.items()}
     words = ", ".join(f"{unused[n]} of {len(touched[n])} rows of {n}" for n in planes)
-    return Finding(not any(unused.values()), f"never read: {words}")
+    return CheckResult(not any(unused.values()), f"never read: {words}")
 
 
-def static_camera(bench: Bench) -> Finding:
-    """A camera that stands still: rates, values and counts after a few steps."""
+def static_camera(bench: Bench) -> CheckResult:
+    """A static camera: learning rates, values and counts after a few steps."""
     bench = bench.anew(tiny_clip("camera.path=static"))
     trainer = bench.trained()
     rates = {name: trainer.optimizer.position_rate(name) for name in bench.model.entities}
@@ -98,7 +98,7 @@ def static_camera(bench: Bench) -> Finding:
     bounded = all(cap is None or counts[n] <= cap for n, cap in caps.items())
     extent = bench.clip.extent()
     passed = finite and bounded and extent > 0 and all(r > 0 for r in trained.values())
-    return Finding(
+    return CheckResult(
         passed and not trainer.guard.skipped,
         f"extent {extent:.2f} m, position rates "
         f"{', '.join(f'{n} {r:.1g}' for n, r in trained.items()) or 'none'}, counts {counts}; "
@@ -106,8 +106,8 @@ def static_camera(bench: Bench) -> Finding:
     )
 
 
-def large_first_splats(bench: Bench) -> Finding:
-    """All scales a hundredfold at the start: memory stays bounded, and values finite."""
+def large_first_splats(bench: Bench) -> CheckResult:
+    """All initial scales times 100: bounded memory, finite values."""
     bench = bench.anew()
     with torch.no_grad():
         for name in bench.model.entities:
@@ -116,13 +116,13 @@ def large_first_splats(bench: Bench) -> Finding:
     trainer = bench.trained()
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     finite = all(bool(torch.isfinite(p).all()) for p in bench.model.parameters())
-    return Finding(
+    return CheckResult(
         finite and grown < GROWTH_MB and not trainer.guard.skipped,
         f"peak memory grew by {grown:.0f} MB in {trainer.step} steps; finite: {finite}",
     )
 
 
-def empty_and_full_masks(bench: Bench) -> Finding:
+def empty_and_full_masks(bench: Bench) -> CheckResult:
     """A frame whose masks are all empty, and one where all are full."""
     bench = bench.anew()
     trainer = Trainer(bench.model, bench.clip, bench.spec.train, density=bench.density)
@@ -139,11 +139,11 @@ def empty_and_full_masks(bench: Bench) -> Finding:
         )
         passed &= finite and (bool(own) == fill)
         words.append(f"{name}: {len(own)} masked terms, finite: {finite}")
-    return Finding(passed, "; ".join(words))
+    return CheckResult(passed, "; ".join(words))
 
 
-def motion_rate(bench: Bench) -> Finding:
-    """The learning rate of keyframes over the run."""
+def motion_rate(bench: Bench) -> CheckResult:
+    """The schedule of the learning rate of keyframes."""
     bench = bench.anew()
     optimizer = Trainer(bench.model, bench.clip, bench.spec.train, density=bench.density).optimizer
     rates = {
@@ -153,11 +153,11 @@ def motion_rate(bench: Bench) -> Finding:
     }
     decays = all(late < early for early, late in rates)
     shown = ", ".join(f"{early:.2g} to {late:.2g}" for early, late in sorted(rates))
-    return Finding(decays and bool(rates), f"from a third of the run to its end: {shown}")
+    return CheckResult(decays and bool(rates), f"from a third of the run to its end: {shown}")
 
 
-def two_forwards(bench: Bench) -> Finding:
-    """The same moment twice, with another one between."""
+def two_forwards(bench: Bench) -> CheckResult:
+    """The same moment evaluated twice, with another one between."""
     model = bench.anew().shaken().eval()
     moment = bench.at(0.3)
     with torch.no_grad():
@@ -166,4 +166,4 @@ def two_forwards(bench: Bench) -> Finding:
         second = model(moment).joined()
     pairs = zip(vars(first).values(), vars(second).values(), strict=True)
     off = max(float((a - b).abs().max()) for a, b in pairs)
-    return Finding(off == 0 and moment.time == 0.3, f"off by {off:g}; time {moment.time:g}")
+    return CheckResult(off == 0 and moment.time == 0.3, f"off by {off:g}; time {moment.time:g}")

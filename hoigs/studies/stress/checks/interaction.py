@@ -1,16 +1,16 @@
-"""F30, F32 to F36, F39: the interaction module with tokens that are made up."""
+"""F30, F32 to F36, F39: direct checks of the interaction module with random tokens."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.context import BuildContext
-from hoigs.core.features import Tokens
-from hoigs.core.interaction import Residual, Role
-from hoigs.plugins.interaction.cross_attention import CrossAttention, CrossAttentionConfig
-from hoigs.studies.stress.finding import Finding
+from hoigs.core.values.tokens import Residual, Role, Tokens
+from hoigs.studies.stress.check_result import CheckResult
+from hoigs.studies.stress.checks.toy import component
 
 ARM = 0.7  # metres
 WIDTHS = {"human": 96, "ball": 32, "box": 32}
@@ -18,13 +18,12 @@ KINDS = {"human": "human", "ball": "object", "box": "object"}
 HANDS = [[0.0, 0, 0], [0.7, 0.45, 0], [-0.7, 0.45, 0], [0.1, -0.95, 0], [-0.1, -0.95, 0]]
 
 
-def _module(**settings: object) -> CrossAttention:
-    """With every parameter off its start, so that there are residuals to look at."""
+def _module(**settings: object) -> Any:
+    """Cross-attention with random parameters, so that residuals are not zero."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        config = CrossAttentionConfig.model_validate(settings)
-        made = CrossAttention.from_config(config, BuildContext())
-        made.bind(WIDTHS, KINDS)  # type: ignore[arg-type]
+        made = component("interaction:cross-attention", **settings)
+        made.bind(WIDTHS, KINDS)
         with torch.no_grad():
             for parameter in made.parameters():
                 parameter.add_(0.1 * torch.randn_like(parameter))
@@ -47,7 +46,7 @@ def _thing(count: int = 20, seed: int = 1, place: tuple[float, ...] = (0.8, 0.5,
 
 
 def _run(
-    made: CrossAttention, ball: Tokens, box: Tokens | None = None, role: Role | None = None
+    made: Any, ball: Tokens, box: Tokens | None = None, role: Role | None = None
 ) -> dict[str, Residual]:
     tokens, usual = _person()
     roles = {"human": role or usual, "ball": Role("object"), "box": Role("object")}
@@ -71,22 +70,23 @@ def _largest(values: Tensor) -> float:
     return float(values.detach().abs().max())
 
 
-def bounded_pose() -> Finding:
-    """Heads driven to their ends: no correction is beyond its bound."""
+def bounded_pose() -> CheckResult:
+    """Saturated heads: no correction exceeds its bound."""
     made = _module()
     with torch.no_grad():
         for parameter in made.parameters():
             parameter.mul_(1e3)
     out = _run(made, _thing(500))
     pose, means = _largest(_pose(out)), _largest(_means(out))
-    passed = 0.29 < pose <= made.pose_bound and 0.09 < means <= made.means_bound
-    return Finding(
+    limits = made.config
+    passed = 0.29 < pose <= limits.pose_bound and 0.09 < means <= limits.means_bound
+    return CheckResult(
         passed,
-        f"at most {pose:.2f} rad of {made.pose_bound:g}, {means:.2f} m of {made.means_bound:g}",
+        f"at most {pose:.2f} rad of {limits.pose_bound:g}, {means:.2f} m of {limits.means_bound:g}",
     )
 
 
-def all_masked() -> Finding:
+def all_masked() -> CheckResult:
     """An object 50 m away: no residual, finite gradients, by every gate."""
     worst, finite = 0.0, True
     for gate in ("hard", "soft"):
@@ -100,19 +100,19 @@ def all_masked() -> Finding:
             (pose.sum() + means.sum()).backward()
             grads = [leaf.grad, *(p.grad for p in made.parameters())]
             finite &= all(g is None or bool(torch.isfinite(g).all()) for g in grads)
-    return Finding(finite and worst < 1e-12, f"largest residual {worst:.1g}; gradients finite: "
+    return CheckResult(finite and worst < 1e-12, f"largest residual {worst:.1g}; gradients finite: "
                                              f"{finite}")  # fmt: skip
 
 
-def soft_gate() -> Finding:
-    """A ball that crosses the reach: how the pose residual changes from frame to frame."""
+def soft_gate() -> CheckResult:
+    """A ball that leaves the reach: the change of the pose residual from frame to frame."""
     change = {gate: _fly_by(gate) for gate in ("soft", "hard")}
     soft = change["soft"]
     moving = soft[soft > 0.3 * soft.max()]
     ratio = float(soft.max() / moving.median())
     words = f"largest step {ratio:.2f} times the median one ({len(moving)} frames); the hard gate "
     jumps = int((change["hard"] > 1e-4).sum())
-    return Finding(len(moving) > 8 and ratio < 2, words + f"does all of it in {jumps}")
+    return CheckResult(len(moving) > 8 and ratio < 2, words + f"does all of it in {jumps}")
 
 
 def _fly_by(gate: str) -> Float[Tensor, " F"]:
@@ -123,10 +123,10 @@ def _fly_by(gate: str) -> Float[Tensor, " F"]:
     return (poses[1:] - poses[:-1]).norm(dim=(1, 2)).detach()
 
 
-def held_object() -> Finding:
-    """An object in an outstretched hand that goes from low to overhead."""
+def held_object() -> CheckResult:
+    """An object in an outstretched hand that is raised overhead."""
     share = {reach: _opened(reach) for reach in ("nearest", "pelvis")}
-    return Finding(
+    return CheckResult(
         share["nearest"] >= 0.95,
         f"open in {100 * share['nearest']:.0f} % of frames measured from the nearest joint, in "
         f"{100 * share['pelvis']:.0f} % from the pelvis as printed",
@@ -145,7 +145,7 @@ def _opened(reach_from: str) -> float:
     return count / 40
 
 
-def shapes() -> Finding:
+def shapes() -> CheckResult:
     """Any number of object tokens."""
     wrong = []
     for count in (1, 16, 17, 500):
@@ -154,10 +154,10 @@ def shapes() -> Finding:
             finite = all(bool(torch.isfinite(x).all()) for x in (_pose(out), _means(out)))
             if _pose(out).shape != (51, 3) or _means(out).shape != (count, 3) or not finite:
                 wrong.append(f"{count} tokens, {values}")
-    return Finding(not wrong, f"wrong: {', '.join(wrong) or 'none'} of 8")
+    return CheckResult(not wrong, f"wrong: {', '.join(wrong) or 'none'} of 8")
 
 
-def shuffled() -> Finding:
+def shuffled() -> CheckResult:
     """Object tokens in another order: the human's output stays, the object's follows."""
     off = 0.0
     for granularity in ("object", "gaussian", "part"):
@@ -167,13 +167,13 @@ def shuffled() -> Finding:
         other = _run(made, Tokens(ball.features[order], ball.positions[order]))
         off = max(off, _largest(_pose(other) - _pose(plain)))
         off = max(off, _largest(_means(other) - _means(plain)[order]))
-    return Finding(off < 1e-5, f"off by {off:.1g}")
+    return CheckResult(off < 1e-5, f"off by {off:.1g}")
 
 
-def near_and_far() -> Finding:
+def near_and_far() -> CheckResult:
     """Two objects, one of them 9 m away."""
     made = _module()
     far = _thing(25, seed=4, place=(9.0, 0.0, 0.0))
     both = _run(made, _thing(10), far)
     near, away = _largest(_means(both)), _largest(_means(both, "box"))
-    return Finding(near > 1e-3 and away < 1e-12, f"near {near:.2g} m, far {away:.1g} m")
+    return CheckResult(near > 1e-3 and away < 1e-12, f"near {near:.2g} m, far {away:.1g} m")

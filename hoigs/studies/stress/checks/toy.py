@@ -1,25 +1,34 @@
-"""A clip of a few small pictures drawn from known Gaussians: a speckled wall, and its depth."""
+"""What checks share: components by key, and a small clip of a speckled wall with its depth."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from hoigs.core.camera import Camera
-from hoigs.core.clip import Clip, FrameStore
-from hoigs.core.gaussians import Gaussians
-from hoigs.core.moment import Moment
-from hoigs.rasterizers.torch_tiles import TorchRasterizer
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.registry.registry import default_registry
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip, FrameStore
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
 
 SIZE = 48
 AWAY = 4.0  # metres from the camera to the wall
 
 
+def component(key: str, **settings: Any) -> Any:
+    """A component of hoigs by its key, with these settings and no clip."""
+    registry = default_registry()
+    config = registry.config_class(key).model_validate(settings)
+    return registry.get(key).from_config(config, BuildContext())
+
+
 class Pictures(FrameStore):
-    """Frames in memory. depths may hold anything, NaN too."""
+    """Frames in memory, without masks."""
 
     def __init__(self, images: list[Tensor], depths: list[Tensor]) -> None:
         self.images, self.depths = images, depths
@@ -35,7 +44,7 @@ class Pictures(FrameStore):
 
 
 def wall(count: int = 300) -> Gaussians:
-    """Coloured spots on the plane z = 0."""
+    """Gaussians of random colours on the plane z = 0."""
     generator = torch.Generator().manual_seed(1)
     points = 3.2 * (torch.rand(count, 3, generator=generator) - 0.5)
     points[:, 2] = 0.0
@@ -44,7 +53,7 @@ def wall(count: int = 300) -> Gaussians:
 
 
 def cameras(frames: int, arc: float) -> list[Camera]:
-    """On an arc of so many radians about the wall's middle; 0 stands still."""
+    """Cameras on an arc of `arc` radians about the middle of the wall; 0 is a static camera."""
     found = []
     for i in range(frames):
         angle = arc * (i / max(1, frames - 1) - 0.5)
@@ -55,11 +64,11 @@ def cameras(frames: int, arc: float) -> list[Camera]:
 
 @torch.no_grad()
 def toy_clip(frames: int = 4, arc: float = 0.4, depth_scale: float = 1.0) -> Clip:
-    """All frames are for training; the depth is the wall's times `depth_scale`."""
+    """A clip of training frames only, whose depth is the true depth times `depth_scale`."""
     scene, views = wall(), cameras(frames, arc)
     images, depths = [], []
     for camera in views:
-        color = TorchRasterizer().render(scene, camera).color
+        color = component("rasterizer:torch").render(scene, camera).color
         images.append((255 * color.clamp(0, 1)).round().to(torch.uint8))
         grid = camera.pixel_grid()
         ones = torch.ones(grid.shape[:2])

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from layouts.common import save_image, save_json, save_mask
 
-from hoigs.core.clip import Clip
-from hoigs.core.rotation import matrices_to_axis_angle
+from hoigs.core.maths.rotations import matrices_to_axis_angle
+from hoigs.core.values.clip import Clip
 
 SUBJECT, SEQUENCE, OFFSET = "s05", "box_grab_01", 37
 ORIGIN = np.array([0.03, -0.02, 0.05])  # of ARCTIC's canonical space, from the object's middle

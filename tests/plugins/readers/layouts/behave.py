@@ -13,9 +13,9 @@ import torch
 from layouts.changed import in_camera_world
 from layouts.common import save_image, save_json, save_mask
 
-from hoigs.core.body_params import smplh_from_pose
-from hoigs.core.clip import Clip
-from hoigs.core.rotation import matrices_to_axis_angle
+from hoigs.core.maths.rotations import matrices_to_axis_angle
+from hoigs.core.model.smpl_params import smplh_from_pose
+from hoigs.core.values.clip import Clip
 
 NAME = "Date03_Sub04_boxmedium"
 OFFSET = np.array([0.4, -0.2, 1.3])  # scans stand anywhere

@@ -8,10 +8,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from hoigs.core.body_params import moved_pose
-from hoigs.core.camera import Camera
-from hoigs.core.clip import BodyTrack, Clip, FrameStore, ObjectTrack
-from hoigs.core.moment import BodyPose, Moment
+from hoigs.core.model.smpl_params import moved_pose
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
+from hoigs.core.values.moment import BodyPose, Moment
 
 
 def without_fingers(clip: Clip) -> Clip:

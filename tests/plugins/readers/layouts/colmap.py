@@ -8,7 +8,7 @@ from typing import Any
 from layouts.colmap_text import write_model
 from layouts.common import save_image, save_mask
 
-from hoigs.core.clip import Clip
+from hoigs.core.values.clip import Clip
 
 
 def write(clip: Clip, folder: Path, *, binary: bool = False, place: str = "sparse/0",

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hoigs.core.camera import Camera
-from hoigs.core.rotation import matrices_to_quats
+from hoigs.core.maths.rotations import matrices_to_quats
+from hoigs.core.values.camera import Camera
 
 
 def write_model(

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from hoigs.core.camera import Camera
+from hoigs.core.values.camera import Camera
 
 
 def save_image(path: Path, pixels: Any) -> None:

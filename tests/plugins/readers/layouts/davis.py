@@ -8,7 +8,7 @@ import numpy as np
 from layouts.common import save_image, save_mask
 from PIL import Image
 
-from hoigs.core.clip import Clip
+from hoigs.core.values.clip import Clip
 
 IDS = {"human": 1, "object": 2}
 

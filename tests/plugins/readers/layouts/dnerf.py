@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from layouts.common import opengl_pose, save_image, save_json
 
-from hoigs.core.clip import Clip
+from hoigs.core.values.clip import Clip
 
 
 def write(clip: Clip, folder: Path, *, val: bool = True, alpha: bool = False,

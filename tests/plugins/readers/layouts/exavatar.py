@@ -10,9 +10,9 @@ import torch
 from layouts.colmap_text import write_model
 from layouts.common import save_image, save_json, save_mask
 
-from hoigs.core.body import BodyModel
-from hoigs.core.body_params import moved_pose
-from hoigs.core.clip import Clip
+from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.model.smpl_params import moved_pose
+from hoigs.core.values.clip import Clip
 
 
 def write(

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from layouts.common import save_image
 
-from hoigs.core.clip import Clip
-from hoigs.core.rotation import matrices_to_axis_angle
+from hoigs.core.maths.rotations import matrices_to_axis_angle
+from hoigs.core.values.clip import Clip
 
 SCALE = 2.5  # of the normalised points
 NORM = np.diag([4.0, 4.0, 4.0, 1.0])  # centres and scales COLMAP's points

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from layouts.common import save_image, save_json
 
-from hoigs.core.clip import Clip
+from hoigs.core.values.clip import Clip
 
 SCALE, CENTER = 0.25, (0.4, -0.2, 1.5)
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from layouts.common import opengl_pose, save_image, save_json, save_mask, save_ply
 
-from hoigs.core.clip import Clip
+from hoigs.core.values.clip import Clip
 
 
 def write(clip: Clip, folder: Path, *, scale: float = 1.0, extras: bool = True,

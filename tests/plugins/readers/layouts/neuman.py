@@ -11,10 +11,10 @@ import torch
 from layouts.colmap_text import write_model
 from layouts.common import save_image, save_mask
 
-from hoigs.core.body import BodyModel
-from hoigs.core.body_params import smpl_from_pose
-from hoigs.core.clip import Clip
-from hoigs.core.rotation import axis_angle_to_matrices, matrices_to_axis_angle
+from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
+from hoigs.core.model.smpl_params import smpl_from_pose
+from hoigs.core.values.clip import Clip
 
 
 def write(

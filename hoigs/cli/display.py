@@ -1,0 +1,93 @@
+"""Display of long commands: lines on stdout, and one progress bar at a time on stderr."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+import typer
+
+from hoigs.cli.common import Bar, print_table, progress_bar
+
+if TYPE_CHECKING:
+    from hoigs.training.session import Session
+    from hoigs.training.trainer import StepReport
+    from hoigs.workflows.evaluate_run import EvaluatedRun
+
+
+class Display:
+    """Callbacks of the public functions, as methods; leaving the context ends the bar."""
+
+    def __init__(self) -> None:
+        self._bars = ExitStack()
+        self._bar: Bar | None = None
+        self._steps = 0
+        self._psnr: dict[str, float] = {}
+
+    def __enter__(self) -> Display:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._end_bar()
+
+    def line(self, text: str) -> None:
+        """`report`: a line on stdout."""
+        self._end_bar()
+        typer.echo(text)
+
+    def started(self, session: Session) -> None:
+        """`on_start`: print the training and the faults of the clip, and start a bar."""
+        self._end_bar()
+        self._steps, width = session.spec.train.steps, session.spec.train.width
+        camera = session.clip.cameras[0]
+        if width is not None and camera.width < width:
+            typer.echo(
+                f"train.width={width} is wider than the clip: its {camera.width} pixels are kept"
+            )
+        typer.echo(
+            f"training {session.spec.name} on {session.clip.name} ({session.reader}): "
+            f"{self._steps} steps, {len(session.clip.split['train'])} frames of "
+            f"{camera.width}x{camera.height}"
+        )
+        for change in session.changes:
+            typer.echo(f"changed on resuming: {change}")
+        for fault in session.faults:
+            typer.echo(f"warning: {fault}", err=True)
+        self._psnr = {}
+        self._bar = self._bars.enter_context(progress_bar("training", self._steps))
+
+    def step(self, report: StepReport) -> None:
+        """`on_step`: update the bar, and print a line when test frames were scored."""
+        assert self._bar is not None
+        self._psnr.update(report.psnr)
+        score = f" test {self._psnr['test']:.2f} dB" if "test" in self._psnr else ""
+        splats = sum(report.counts.values())
+        self._bar.update(report.step, f"loss {report.loss:.4f}{score} {splats} splats")
+        if report.psnr:
+            rest = (self._steps - report.step) * report.time_s / report.step
+            typer.echo(
+                f"step {report.step:>6}  {report.time_s:7.1f} s  ETA {rest:6.0f} s  "
+                f"loss {report.loss:.4f} {score}  {splats} splats"
+            )
+
+    def fraction(self, done: float, text: str) -> None:
+        """`progress`: a bar over a job that reports fractions."""
+        if self._bar is None:
+            self._bar = self._bars.enter_context(progress_bar("working", 1.0))
+        self._bar.update(done, text)
+
+    def _end_bar(self) -> None:
+        self._bars.close()
+        self._bar = None
+
+
+def print_scores(evaluated: EvaluatedRun) -> None:
+    """The tables of an evaluated run."""
+    for table in evaluated.evaluation.tables():
+        print_table(table.title, table.columns, table.rows, table.notes)

@@ -1,0 +1,70 @@
+"""FeatureExtractor: tokens that describe an entity at a moment."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+from torch import Tensor, nn
+
+from hoigs.core.interfaces.configurable import Configurable
+from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import Tokens
+from hoigs.core.values.topology import TopologyChange, reindex
+
+
+class FeatureExtractor(Configurable, nn.Module, ABC):
+    """Describes one entity by M tokens for the interaction module, M of its own choice.
+
+    The Entity calls `bind` once, then `forward` before the interaction module at every step.
+
+    Attributes:
+        requires: capabilities that the deformation must have (`DeformationModel.provides`).
+        per_gaussian: names of this module's parameters whose first axis is the Gaussian.
+        rates: as DeformationModel.rates.
+        width: D, the width of the tokens; known after `bind`.
+        cuda_graph_safe: as DeformationModel.cuda_graph_safe.
+    """
+
+    requires: frozenset[str] = frozenset()
+    per_gaussian: tuple[str, ...] = ()
+    rates: ClassVar[Mapping[str, str]] = {}
+    cuda_graph_safe: bool = False
+    width: int
+
+    def bind(self, deformation: DeformationModel, canonical: Gaussians) -> None:
+        """Allocate what depends on the deformation or on the number of Gaussians."""
+        del deformation, canonical
+
+    @abstractmethod
+    def forward(
+        self, deformation: DeformationModel, canonical: Gaussians, moment: Moment
+    ) -> Tokens:
+        """Tokens of the entity at `moment`: features [M, D] and world positions [M, 3], metres.
+
+        Args:
+            canonical: raw Gaussians in the deformation's `input_space`.
+        """
+
+    def on_topology(self, change: TopologyChange) -> None:
+        """As `DeformationModel.on_topology`."""
+        reindex((self.get_parameter(name) for name in self.per_gaussian), change)
+
+
+@runtime_checkable
+class ReadsKnots(Protocol):
+    """Extractors whose tokens depend on the knots of the deformation (`HasKnots`)."""
+
+    def with_fewer_knots(
+        self, before: int, after: int
+    ) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
+        """What keeps the tokens unchanged when the deformation has fewer uniform knots.
+
+        Returns:
+            settings that change, and tensors that change, by their name in `state_dict`; None
+            where tokens cannot stay unchanged.
+        """
+        ...

@@ -1,0 +1,281 @@
+"""compose: from a spec and a clip to a SceneModel and its density controls."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hoigs.core.errors import HoigsError, PluginError, SpecError, did_you_mean
+from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.interfaces.density import DensityControl, check_rasterizer
+from hoigs.core.interfaces.initializer import ObjectInitializer, check_track
+from hoigs.core.interfaces.rasterizer import Rasterizer
+from hoigs.core.model.entity import Entity
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.registry.registry import Registry, default_registry
+from hoigs.core.spec.schema import ComponentSpec, EntitySpec, Spec
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.tokens import EntityKind
+
+SCENE = "scene"
+
+
+def compose(spec: Spec, clip: Clip, registry: Registry | None = None) -> SceneModel:
+    """The model that `spec` describes, initialised from `clip`, on the CPU.
+
+    The same spec and clip give the same parameters; torch's global random state does not change.
+
+    Raises:
+        SpecError: an entity has no block, or a component cannot be built; with the spec's line.
+        PluginError: a component that cannot be loaded.
+    """
+    builder = _Builder(spec, clip, registry or default_registry())
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(spec.train.seed)
+        context = BuildContext(clip=clip, seed=spec.train.seed)
+        rasterizer = builder.part(("rasterizer",), spec.rasterizer, context)
+        bodies = builder.bodies()
+        entities = {
+            name: builder.entity(name, kind, place, block, rasterizer, bodies)
+            for name, kind, place, block in builder.chosen()
+        }
+        interaction = builder.part(("interaction",), spec.interaction, context)
+        with _errors_at(spec, "interaction"):
+            return SceneModel(entities, interaction=interaction, rasterizer=rasterizer)
+
+
+def compose_density(
+    spec: Spec, clip: Clip, registry: Registry | None = None
+) -> dict[str, DensityControl]:
+    """The density control of each entity that `compose` builds, by name.
+
+    Raises:
+        SpecError, PluginError: as `compose`.
+    """
+    builder = _Builder(spec, clip, registry or default_registry())
+    controls = {}
+    for name, _, place, block in builder.chosen():
+        where = ("model", place, "density")
+        context = BuildContext(entity=name, clip=clip, seed=spec.train.seed)
+        controls[name] = builder.part(where, block.density, context)
+        with _errors_at(spec, *where):
+            check_rasterizer(controls[name], builder.registry.get(spec.rasterizer.use))
+    return controls
+
+
+@dataclass(frozen=True)
+class _Builder:
+    """Builds the components of one spec and clip."""
+
+    spec: Spec
+    clip: Clip
+    registry: Registry
+
+    def chosen(self) -> list[tuple[str, EntityKind, str, EntitySpec]]:
+        """Every entity to be modelled: its name, its kind, its block's key and its block."""
+        kinds: dict[str, EntityKind] = {SCENE: "scene", **self.clip.kinds}
+        dynamic = [name for name in self.spec.model if name != SCENE]
+        if not self.clip.kinds and self.spec.entities is None and dynamic:
+            raise SpecError(
+                f"{self.spec.at('model')}: {self.spec.name} models {' and '.join(dynamic)}, and "
+                f"clip {self.clip.name} has no entity but the scene; take a spec for the whole "
+                "picture (--spec 4dgs, d3dgs), or model the scene alone (--set entities=[scene])"
+            )
+        found = []
+        for name, kind in kinds.items():
+            if not self.spec.selects(name, kind):
+                continue
+            block = self.spec.block(name, kind)
+            if block is None:
+                raise SpecError(
+                    f"{self.spec.at('model')}: no block for the clip's {kind} "
+                    f'"{name}"{did_you_mean(name, self.spec.model)}; add model.{kind}, or leave '
+                    "it out with `entities`"
+                )
+            found.append((name, kind, *block))
+        if not found:
+            raise SpecError(
+                f"{self.spec.at('entities')}: none of {list(self.spec.entities or ())} is in the "
+                f"clip, which has {', '.join(f'{n} ({k})' for n, k in kinds.items())}"
+            )
+        return found
+
+    def part(self, place: tuple[str, ...], part: ComponentSpec, context: BuildContext) -> Any:
+        """One component, built from its settings."""
+        config = self.registry.config_class(part.use).model_validate(part.settings)
+        component = self.registry.get(part.use)
+        with _errors_at(self.spec, *place) if place else nullcontext():
+            return component.from_config(config, context)
+
+    def entity(
+        self,
+        name: str,
+        kind: EntityKind,
+        place: str,
+        block: EntitySpec,
+        rasterizer: Rasterizer,
+        bodies: Mapping[str, BodyModel],
+    ) -> Entity:
+        context = BuildContext(entity=name, clip=self.clip, seed=self.spec.train.seed)
+        if kind == "human":
+            context = replace(context, body_track=self.clip.bodies[name], body=bodies[name])
+        elif kind == "object":
+            track = self.clip.objects.get(name)
+            context = replace(context, object_track=track, bodies=bodies)
+        if kind == "object" and context.object_track is None and block.initializer is None:
+            raise SpecError(
+                f"{self.spec.at('model', place)}: the clip has no track of {name}; give an "
+                "`initializer`"
+            )
+        if block.initializer is not None:
+            context = self._with_initializer(context, kind, place, block.initializer, rasterizer)
+        deformation = self.part(("model", place, "deformation"), block.deformation, context)
+        features = None
+        if block.features is not None:
+            features = self.part(("model", place, "features"), block.features, context)
+        with _errors_at(self.spec, "model", place):
+            canonical = initial_gaussians(kind, deformation, block, context)
+            return Entity(canonical, deformation, features, kind=kind)
+
+    def bodies(self) -> dict[str, BodyModel]:
+        """The body model of every human, by entity."""
+        return {
+            name: self._body(name, place, block)
+            for name, kind, place, block in self.chosen()
+            if kind == "human"
+        }
+
+    def _body(self, name: str, place: str, block: EntitySpec) -> BodyModel:
+        """The body model that the clip's poses of a human were fitted with."""
+        track = self.clip.bodies.get(name)
+        if track is None:
+            why = self.clip.provenance.get(f"poses of {name}", "its reader gives none")
+            raise SpecError(
+                f"{self.spec.at('model', place)}: clip {self.clip.name} has no body poses of "
+                f"{name}: {why}; or take a spec for the whole picture (--spec 4dgs, d3dgs)"
+            )
+        context = BuildContext(
+            entity=name, clip=self.clip, seed=self.spec.train.seed, body_track=track
+        )
+        if block.body is None:
+            why = f"the clip's {name} is a {track.model}: "
+            with _errors_at(self.spec, "model", place, why=why):
+                return self._built(self._default_body(track.model), context)
+        if block.body.use.partition("@")[0] != track.model.partition("@")[0]:
+            raise SpecError(
+                f"{self.spec.at('model', place, 'body')}: the clip's {name} was fitted with "
+                f"{track.model}; its shape coefficients do not fit {block.body.use}"
+            )
+        return self._built(block.body, context, "model", place, "body")
+
+    def _built(self, part: ComponentSpec, context: BuildContext, *place: str) -> BodyModel:
+        body = self.part(place, part, context)
+        assert isinstance(body, BodyModel)
+        return body
+
+    def _with_initializer(
+        self,
+        context: BuildContext,
+        kind: EntityKind,
+        place: str,
+        part: ComponentSpec,
+        rasterizer: Rasterizer,
+    ) -> BuildContext:
+        """`context` with the track that an initializer makes, in place of the clip's."""
+        where, name = ("model", place, "initializer"), context.entity
+        if kind != "object":
+            raise SpecError(
+                f"{self.spec.at(*where)}: initializers make objects; {name} is a {kind}"
+            )
+        initializer = self.part(where, part, replace(context, rasterizer=rasterizer))
+        assert isinstance(initializer, ObjectInitializer)
+        with _errors_at(self.spec, *where, why=f"{name}: "):
+            track = check_track(initializer.initialize(self.clip, name), len(self.clip))
+        return replace(context, object_track=track)
+
+    def _default_body(self, key: str) -> ComponentSpec:
+        """The body with default settings; PluginError if it has required ones."""
+        fields = self.registry.config_class(key).model_fields.items()
+        needed = [name for name, field in fields if field.is_required()]
+        if needed:
+            example = ", ".join(f"{name}: …" for name in needed)
+            raise PluginError(f'add `body: {{use: "{key}", {example}}}` to this block')
+        return ComponentSpec(use=key)
+
+
+def initial_gaussians(
+    kind: EntityKind, deformation: DeformationModel, block: EntitySpec, context: BuildContext
+) -> Gaussians:
+    """Canonical Gaussians of an entity, in the space that its deformation expects.
+
+    The scene starts from the clip's points; a human from points spread evenly over its body; an
+    object from the points of its track (the clip's, or its initializer's). Scales follow the
+    spacing of the points (3DGS's rule).
+    """
+    appearance: dict[str, Any] = {"opacity": block.opacity, "sh_degree": block.sh_degree}
+    clip = context.clip
+    assert clip is not None
+    if kind == "human":
+        return _human(context, deformation, block.points, appearance)
+    if kind == "object":
+        return _object(context, deformation, block.points, appearance)
+    if len(clip.points) == 0:
+        raise ValueError("the clip has no scene points to start from (points.npz is empty)")
+    rows = _subset(len(clip.points), block.points, context.seed)
+    return Gaussians.from_points(clip.points[rows], clip.point_colors[rows], **appearance)
+
+
+def _human(
+    context: BuildContext, deformation: DeformationModel, count: int, appearance: dict[str, Any]
+) -> Gaussians:
+    body, track = context.body, context.body_track
+    assert body is not None and track is not None
+    betas = track.poses.betas
+    betas = betas if betas.dim() == 1 else betas.mean(0)
+    surface = body.surface(count, betas, context.seed)
+    points = surface.points
+    if deformation.input_space == "world":
+        pose = track.poses.frame(len(track.poses.transl) // 2)
+        corners = body(pose).vertices[body.faces[surface.faces]]
+        points = (corners * surface.barycentric[..., None]).sum(1)
+    return Gaussians.from_points(points.detach(), scales=surface.spacing.detach(), **appearance)
+
+
+def _object(
+    context: BuildContext, deformation: DeformationModel, count: int, appearance: dict[str, Any]
+) -> Gaussians:
+    track = context.object_track
+    assert track is not None
+    rows = _subset(len(track.points), count, context.seed)
+    points = track.points[rows]
+    if deformation.input_space == "world":
+        first = int(track.observed.nonzero()[0]) if track.observed.any() else 0
+        points = points @ track.rotations[first].mT + track.translations[first]
+    return Gaussians.from_points(points, track.colors[rows], **appearance)
+
+
+def _subset(available: int, count: int, seed: int) -> Tensor:
+    """`count` random rows in ascending order, or all rows if there are fewer."""
+    if available <= count:
+        return torch.arange(available)
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randperm(available, generator=generator)[:count].sort().values
+
+
+@contextmanager
+def _errors_at(spec: Spec, *place: str, why: str = "") -> Iterator[None]:
+    """Errors raised inside become SpecErrors that name the component's place in the spec."""
+    try:
+        yield
+    except SpecError:
+        raise
+    except (HoigsError, ValueError) as error:
+        raise SpecError(f"{spec.at(*place)}: {why}{error}") from error

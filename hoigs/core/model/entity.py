@@ -1,0 +1,155 @@
+"""Entity: canonical Gaussians, the deformation that moves them and the features that describe
+them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hoigs.core.interfaces.deformation import DeformationModel, ProvidesSkeleton
+from hoigs.core.interfaces.features import FeatureExtractor
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import EntityKind, Residual, Role, Tokens
+from hoigs.core.values.topology import TopologyChange, share_opacity
+
+FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+
+
+class Entity(nn.Module):
+    """One human, one object, or the static scene.
+
+    Its parameters are the raw fields of the canonical Gaussians and those of both components.
+
+    Args:
+        canonical: raw Gaussians in the deformation's `input_space`; all fields are trained but
+            those that the deformation owns.
+        deformation: how they move.
+        features: tokens for the interaction module; None leaves the entity out of it.
+        kind: by default "human" if the deformation provides a skeleton, "object" if there are
+            features or the deformation has parameters, else "scene".
+
+    Raises:
+        ValueError: the features require a capability that the deformation lacks.
+    """
+
+    means: nn.Parameter
+    quats: nn.Parameter
+    log_scales: nn.Parameter
+    opacity_logits: nn.Parameter
+    sh: nn.Parameter
+
+    def __init__(
+        self,
+        canonical: Gaussians,
+        deformation: DeformationModel,
+        features: FeatureExtractor | None = None,
+        *,
+        kind: EntityKind | None = None,
+    ) -> None:
+        super().__init__()
+        self.deformation = deformation
+        self.features = features
+        if features is not None and not features.requires <= deformation.provides:
+            missing = sorted(features.requires - deformation.provides)
+            raise ValueError(
+                f"{type(features).__name__} requires {missing}, but {type(deformation).__name__} "
+                f"provides {sorted(deformation.provides) or 'nothing'}"
+            )
+        self.kind: EntityKind = kind or self._infer_kind()
+        for name in FIELDS:
+            value = getattr(canonical, name).detach().clone()
+            trained = name not in deformation.owns
+            setattr(self, name, nn.Parameter(value, requires_grad=trained))
+        deformation.bind(self.canonical)
+        if features is not None:
+            features.bind(deformation, self.canonical)
+
+    def _infer_kind(self) -> EntityKind:
+        if "skeleton" in self.deformation.provides:
+            return "human"
+        moves = any(True for _ in self.deformation.parameters())
+        return "object" if self.features is not None or moves or self.deformation.owns else "scene"
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def canonical(self) -> Gaussians:
+        """The canonical Gaussians, raw; its tensors are this module's parameters."""
+        return Gaussians(*(getattr(self, name) for name in FIELDS))
+
+    @property
+    def at_peak(self) -> Gaussians:
+        """The canonical Gaussians, raw, each with the largest opacity that it has over time."""
+        canonical = self.canonical
+        return canonical.replace(opacity_logits=self.deformation.peak_opacity_logits(canonical))
+
+    def tokens(self, moment: Moment) -> Tokens | None:
+        """What the interaction module reads of this entity; None without features."""
+        if self.features is None:
+            return None
+        return self.features(self.deformation, self.canonical, moment)
+
+    def role(self, moment: Moment) -> Role:
+        """The entity's kind and, of a human with a skeleton, where its reach begins and ends."""
+        if self.kind == "human" and isinstance(self.deformation, ProvidesSkeleton):
+            return Role("human", self.deformation.anchors(moment), self.deformation.arm_length())
+        return Role(self.kind)
+
+    def forward(self, moment: Moment, residual: Residual | None = None) -> Gaussians:
+        """The entity at `moment`: raw Gaussians in the world."""
+        return self.deformation(self.canonical, moment, residual)
+
+    def per_gaussian(self) -> Iterator[tuple[str, nn.Parameter]]:
+        """Every parameter whose first axis is the Gaussian, with its dotted name."""
+        for name in FIELDS:
+            yield name, self.get_parameter(name)
+        for prefix in ("deformation", "features"):
+            module = getattr(self, prefix)
+            for name in module.per_gaussian if module is not None else ():
+                yield f"{prefix}.{name}", module.get_parameter(name)
+
+    @torch.no_grad()
+    def apply_topology(self, change: TopologyChange, canonical: Gaussians) -> None:
+        """Take M new canonical Gaussians; deformation and features follow by one index map.
+
+        Parameter objects stay and only their data changes, so optimizer groups remain valid.
+        """
+        for name in FIELDS:
+            parameter = self.get_parameter(name)
+            parameter.grad = None
+            parameter.data = getattr(canonical, name).detach().clone()
+        self.deformation.on_topology(change)
+        if change.copies is not None:
+            for name in self.deformation.per_gaussian:
+                if name.rpartition(".")[2] == "opacity_logits":
+                    keyed = self.deformation.get_parameter(name)
+                    keyed.data = share_opacity(keyed.data, change.copies)
+        if self.features is not None:
+            self.features.on_topology(change)
+
+    @torch.no_grad()
+    def displace(self, offsets: Float[Tensor, "N 3"]) -> None:
+        """Add offsets, metres, to the canonical means and to means that the deformation owns."""
+        self.means.data += offsets
+        if "means" in self.deformation.owns:
+            self.deformation.on_topology(TopologyChange.displaced(offsets))
+
+    def resize(self, count: int) -> None:
+        """Allocate `count` Gaussians with arbitrary values, before a checkpoint is loaded."""
+        if count == len(self):
+            return  # keep what the deformation derived from its points when it was bound
+        source = torch.arange(count, device=self.means.device) % max(1, len(self))
+        change = TopologyChange(
+            source,
+            torch.zeros(count, dtype=torch.bool, device=source.device),
+            torch.zeros(count, 3, device=source.device),
+        )
+        self.apply_topology(change, self.canonical[source])
+
+    def regularizers(self) -> dict[str, Tensor]:
+        return self.deformation.regularizers()

@@ -1,0 +1,154 @@
+"""SceneModel: the only place where a forward pass is composed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from hoigs.core.interfaces.interaction import InteractionModule
+from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.model.entity import Entity
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import Residual, Tokens
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """All entities at one moment, by name and in the scene's order.
+
+    Attributes:
+        gaussians: raw, world. residuals, tokens: empty where the interaction did not run.
+        whole: all of `gaussians` in one, if it has been computed already.
+    """
+
+    gaussians: Mapping[str, Gaussians]
+    residuals: Mapping[str, Residual]
+    tokens: Mapping[str, Tokens]
+    whole: Gaussians | None = None
+
+    def joined(self, only: Iterable[str] | None = None) -> Gaussians:
+        """The Gaussians of all entities, or of those in `only`, in the scene's order."""
+        names = set(self.gaussians if only is None else only)
+        if self.whole is not None and names >= set(self.gaussians):
+            return self.whole
+        return Gaussians.cat([g for name, g in self.gaussians.items() if name in names])
+
+    def slices(self, only: Iterable[str] | None = None) -> dict[str, slice]:
+        """Rows of each entity in `joined(only)`."""
+        names = set(self.gaussians if only is None else only)
+        rows, start = {}, 0
+        for name, gaussians in self.gaussians.items():
+            if name in names:
+                rows[name] = slice(start, start + len(gaussians))
+                start += len(gaussians)
+        return rows
+
+
+class SceneModel(nn.Module):
+    """Entities, the interaction between them, and the rasterizer that draws them.
+
+    moment -> features -> interaction -> deformation -> Gaussians(t) -> rasterizer -> image
+
+    Args:
+        entities: by name; their order decides that of the joined Gaussians.
+        interaction: couples the entities that have features; None couples nothing.
+        rasterizer: any backend; `model.rasterizer` may be replaced at any time.
+
+    Attributes:
+        interaction_enabled: False during the warm-up of the interaction.
+
+    Raises:
+        ValueError: there are no entities.
+    """
+
+    def __init__(
+        self,
+        entities: Mapping[str, Entity],
+        *,
+        interaction: InteractionModule | None = None,
+        rasterizer: Rasterizer,
+    ) -> None:
+        super().__init__()
+        if not entities:
+            raise ValueError("SceneModel needs at least one entity")
+        self.entities = nn.ModuleDict(entities)
+        self.interaction = interaction
+        self.interaction_enabled = True
+        self.rasterizer = rasterizer
+        if interaction is not None:
+            described = {n: e for n, e in entities.items() if e.features is not None}
+            interaction.bind(
+                {n: e.features.width for n, e in described.items() if e.features is not None},
+                {n: e.kind for n, e in entities.items()},
+            )
+
+    def entity(self, name: str) -> Entity:
+        entity = self.entities[name]
+        assert isinstance(entity, Entity)
+        return entity
+
+    def names(self, kind: str | None = None) -> list[str]:
+        """Names of all entities, or of those of a kind: "scene", "human" or "object"."""
+        return [n for n in self.entities if kind is None or self.entity(n).kind == kind]
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.parameters()).device
+
+    def forward(self, moment: Moment, only: Iterable[str] | None = None) -> SceneState:
+        """Every entity, or those in `only`, at `moment`.
+
+        The interaction reads all entities, also those that are not in `only`.
+
+        Args:
+            moment: on the model's device.
+        """
+        names = list(self.entities if only is None else only)
+        tokens: dict[str, Tokens] = {}
+        residuals: Mapping[str, Residual] = {}
+        module = self.interaction
+        if module is not None and module.reads and self.interaction_enabled:
+            for name in self.entities:
+                described = self.entity(name).tokens(moment)
+                if described is not None:
+                    tokens[name] = described
+            roles = {name: self.entity(name).role(moment) for name in self.entities}
+            residuals = module(tokens, roles)
+        gaussians = {n: self.entity(n)(moment, residuals.get(n)) for n in names}
+        return SceneState(gaussians, residuals, tokens)
+
+    def render(
+        self,
+        moment: Moment,
+        camera: Camera,
+        *,
+        only: Iterable[str] | None = None,
+        background: Tensor | None = None,
+        request: RenderRequest | None = None,
+    ) -> RenderOutput:
+        """Draw all entities, or those in `only`, at any moment from any camera.
+
+        Args:
+            moment, camera: on the model's device.
+            background: RGB in [0, 1], [3]; in place of `request.background`.
+            request: everything else that a rasterizer can be requested to do.
+        """
+        state = self(moment, only)
+        request = request or RenderRequest()
+        if background is not None:
+            request = request.replace(background=background)
+        return self.rasterizer.render(state.joined(), camera, request)
+
+    def set_progress(self, progress: float) -> None:
+        """Pass the done share of the training run, in [0, 1], to every deformation."""
+        for name in self.entities:
+            self.entity(name).deformation.set_progress(progress)
+
+    def count(self) -> dict[str, int]:
+        """The number of Gaussians of each entity."""
+        return {name: len(self.entity(name)) for name in self.entities}

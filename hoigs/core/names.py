@@ -1,0 +1,13 @@
+"""Names that are used as names of files and folders: of entities and of specs."""
+
+from __future__ import annotations
+
+import re
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+RULE = "use letters, digits, _, - and . , a letter or digit first"
+
+
+def name_from(text: str, otherwise: str) -> str:
+    """`text` with "-" for each run of characters that no name has; `otherwise` if none is left."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("_.-") or otherwise

@@ -1,0 +1,261 @@
+"""Spec: a method as a file that names its components and their settings. It needs no torch.
+
+A file is YAML or TOML. Each component is a block of `use: "kind:name"` beside that component's own
+settings, which its own config class checks. `extends: NAME_OR_FILE` starts from another spec.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    field_validator,
+)
+
+from hoigs.core.errors import PluginError, SpecError
+from hoigs.core.names import NAME, RULE
+from hoigs.core.registry.registry import Registry, default_registry
+from hoigs.core.spec.errors import explain
+from hoigs.core.spec.files import (
+    BUILTIN_SPECS,
+    builtin_specs,
+    builtin_summary,
+    extended,
+    read_spec,
+    spec_profiles,
+)
+from hoigs.core.spec.loader import Document, Place, dump_yaml, load_overrides, load_yaml
+from hoigs.core.spec.older import with_present_names
+from hoigs.core.spec.train_schema import EvaluationSpec, TrainSpec
+
+__all__ = [
+    "BUILTIN_SPECS",
+    "ComponentSpec",
+    "EntitySpec",
+    "Spec",
+    "builtin_specs",
+    "builtin_summary",
+    "spec_profiles",
+]
+
+# sections that decide which tensors a model has; a checkpoint belongs to these
+MODEL_SECTIONS = ("interaction", "entities", "model")
+# settings of an entity that decide no tensor's existence: how training changes the count, and where
+# opacities start. `points` is not among them: penalties between neighbours depend on first points.
+TRAINING_ONLY = ("density", "opacity")
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class ComponentSpec(BaseModel):
+    """One component: `use`, and its settings beside it; a resolved spec has all of them."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, use_attribute_docstrings=True)
+
+    use: str
+    """"kind:name", or "kind:name@distribution"."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return dict(self.model_extra or {})
+
+
+class EntitySpec(_Strict):
+    """How one entity, or every entity of a kind, is modelled."""
+
+    deformation: ComponentSpec
+    """The deformation: how it moves."""
+    features: ComponentSpec | None = None
+    """Its feature extractor: tokens for the interaction; None leaves it out of the interaction."""
+    density: ComponentSpec = ComponentSpec(use="density:none")
+    """Density control: when it gains and loses Gaussians."""
+    body: ComponentSpec | None = None
+    """Settings of a human's body model; by default those of the one that the clip names."""
+    initializer: ComponentSpec | None = None
+    """Where an object's first points and its track come from; None takes the clip's own."""
+    sh_degree: int = Field(default=0, ge=0, le=3)
+    """Spherical-harmonics degree of its colours."""
+    points: int = Field(default=10_000, ge=1)
+    """Gaussians at the start; scene and objects have fewer where the clip has fewer points for
+    them."""
+    opacity: float = Field(default=0.1, gt=0, lt=1)
+    """Opacity of every Gaussian at the start."""
+
+
+class Spec(_Strict):
+    """A complete method."""
+
+    name: str
+    """For listings, reports and the folders of runs; letters, digits, `_`, `-` and `.`, with
+    `@PROFILE` after it where a profile was taken."""
+    summary: str = ""
+    """For listings and reports."""
+    rasterizer: ComponentSpec = ComponentSpec(use="rasterizer:warp")
+    """Draws every image."""
+    interaction: ComponentSpec = ComponentSpec(use="interaction:none")
+    """Couples the entities."""
+    entities: tuple[str, ...] | None = None
+    """Names or kinds of the clip's entities to model; None models all. The others are ignored:
+    their pixels count as scene."""
+    model: dict[str, EntitySpec]
+    """By exact entity name or by kind (scene, human, object); the name wins. Blocks that the clip
+    has no entity for are not used."""
+    train: TrainSpec = TrainSpec()
+    """How the model is optimised."""
+    evaluation: EvaluationSpec = EvaluationSpec()
+    """How a run is scored."""
+
+    _document: Document = PrivateAttr(default_factory=lambda: Document("spec"))
+
+    @field_validator("name")
+    @classmethod
+    def _name_is_safe(cls, name: str) -> str:
+        base, at, profile = name.partition("@")
+        if not all(NAME.fullmatch(part) for part in ([base, profile] if at else [base])):
+            raise ValueError(RULE)
+        return name
+
+    @staticmethod
+    def load(
+        source: str | Path,
+        *,
+        overrides: Sequence[str] = (),
+        registry: Registry | None = None,
+    ) -> Spec:
+        """Read, check and resolve a spec.
+
+        Args:
+            source: a built-in spec's name, or a .yaml, .yml or .toml file; "@PROFILE" after it
+                selects one of its profiles ("4dgs@matched").
+            overrides: "a.b=value", laid over the file.
+            registry: where components are looked up; by default what is installed.
+
+        Raises:
+            SpecError: everything that is wrong, a line each, with its position.
+        """
+        document = read_spec(source)
+        if overrides:
+            document = document.merged(load_overrides(list(overrides)))
+        return _resolve(document, registry or default_registry())
+
+    @staticmethod
+    def parse(text: str, *, source: str = "spec", registry: Registry | None = None) -> Spec:
+        """A spec from YAML text; `extends` may name built-in specs only.
+
+        Raises:
+            SpecError: as `load`.
+        """
+        document = extended(load_yaml(text, source))
+        return _resolve(document, registry or default_registry())
+
+    def block(self, name: str, kind: str) -> tuple[str, EntitySpec] | None:
+        """The model block for an entity, and its key."""
+        for key in (name, kind):
+            if key in self.model:
+                return key, self.model[key]
+        return None
+
+    def selects(self, name: str, kind: str) -> bool:
+        """Whether an entity of the clip is to be modelled."""
+        return self.entities is None or name in self.entities or kind in self.entities
+
+    def component_specs(self) -> Iterator[tuple[Place, ComponentSpec]]:
+        """Every component with its place in the tree."""
+        yield ("rasterizer",), self.rasterizer
+        yield ("interaction",), self.interaction
+        for name, block in self.model.items():
+            for field in ("deformation", "features", "density", "body", "initializer"):
+                part = getattr(block, field)
+                if part is not None:
+                    yield ("model", name, field), part
+
+    def components(self) -> dict[str, str]:
+        """The key of every component by its dotted place."""
+        return {".".join(map(str, place)): part.use for place, part in self.component_specs()}
+
+    def at(self, *place: str) -> str:
+        """`file:line:column dotted.place`, for messages about a part of this spec."""
+        return f"{self._document.where(place)} {'.'.join(place)}"
+
+    def dump(self) -> str:
+        """Canonical YAML, every default filled in; it is itself a spec and equal to this one."""
+        return dump_yaml(self.model_dump(mode="json"))
+
+    def hash(self) -> str:
+        """SHA-256 of what a result depends on: not names and summary, nor how it is computed."""
+        sections = [f for f in type(self).model_fields if f not in ("name", "summary")]
+        return self._digest(sections, {"train": {"graphs"}})
+
+    def model_hash(self) -> str:
+        """SHA-256 of what decides which tensors the model has; checkpoints carry it.
+
+        Density control and first opacities are left out, as a run may continue with another cap.
+        """
+        without = {"model": {name: set(TRAINING_ONLY) for name in self.model}}
+        return self._digest(MODEL_SECTIONS, without)
+
+    def _digest(self, sections: Sequence[str], without: dict[str, Any] | None = None) -> str:
+        data = self.model_dump(mode="json", include=set(sections), exclude=without)
+        return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Spec) and self.model_dump() == other.model_dump()
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.hash()))
+
+
+def _resolve(document: Document, registry: Registry) -> Spec:
+    """Check the tree, then each component's settings with its own config class."""
+    document = with_present_names(document)
+    try:
+        spec = Spec.model_validate(document.data)
+    except ValidationError as error:
+        raise SpecError("\n".join(explain(error, Spec, document, ()))) from error
+    problems: list[str] = []
+    data = spec.model_dump()
+    for place, part in spec.component_specs():
+        settings, trouble = _settings(part, place, document, registry)
+        problems += trouble
+        node: Any = data
+        for step in place[:-1]:
+            node = node[step]
+        node[place[-1]] = {"use": part.use, **settings}
+    if problems:
+        raise SpecError("\n".join(problems))
+    resolved = Spec.model_validate(data)
+    resolved._document = document
+    return resolved
+
+
+def _settings(
+    part: ComponentSpec, place: Place, document: Document, registry: Registry
+) -> tuple[dict[str, Any], list[str]]:
+    """Complete settings of one component, and what is wrong with it."""
+    path = ".".join(map(str, place))
+    at = document.where((*place, "use"))
+    kind = str(place[-1])
+    try:
+        found = registry.component(part.use)
+        if found.kind != kind:
+            known = ", ".join(registry.keys(kind))
+            return {}, [f'{at} {path}.use: "{part.use}" is no {kind} (known: {known})']
+        config_class = registry.config_class(part.use)
+        registry.get(part.use)
+    except PluginError as error:
+        return {}, [f"{at} {path}.use: {error}"]
+    try:
+        return config_class.model_validate(part.settings).model_dump(mode="json"), []
+    except ValidationError as error:
+        return {}, explain(error, config_class, document, place)

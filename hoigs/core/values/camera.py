@@ -1,0 +1,171 @@
+"""Pinhole camera with OpenCV axes: x right, y down, z forward; pixel centres at +0.5."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hoigs.core.maths.rotations import exp_se3, quats_to_matrices
+
+
+def pinhole_pixels(
+    K: Float[Tensor, "*#batch 3 3"], points: Float[Tensor, "*#batch 3"], near: float | None = None
+) -> Float[Tensor, "*batch 2"]:
+    """Pixels (x, y) of points in camera coordinates; differentiable.
+
+    Args:
+        K: intrinsics, of one camera or of one for each point. points: metres, or any one unit.
+        near: a depth in front of the camera; nearer points are divided by it in place of their
+            own depth. None divides by every depth, also behind the camera, but not by zero.
+    """
+    depth = points[..., 2:]
+    if near is None:
+        depth = torch.where(depth.abs() < 1e-8, torch.full_like(depth, 1e-8), depth)
+    else:
+        depth = depth.clamp_min(near)
+    focal = torch.stack((K[..., 0, 0], K[..., 1, 1]), -1)
+    return points[..., :2] / depth * focal + K[..., :2, 2]
+
+
+def pinhole_rays(
+    K: Float[Tensor, "*#batch 3 3"], pixels: Float[Tensor, "*#batch 2"]
+) -> Float[Tensor, "*batch 2"]:
+    """x and y of the points in camera coordinates that pixels show at depth z = 1."""
+    focal = torch.stack((K[..., 0, 0], K[..., 1, 1]), -1)
+    return (pixels - K[..., :2, 2]) / focal
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One pinhole view.
+
+    Attributes:
+        K: intrinsics [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels; the centre of the top-left
+            pixel is at (0.5, 0.5).
+        world_to_camera: rigid transform x_cam = R x_world + t, metres ("viewmat").
+        width, height: image size, pixels.
+    """
+
+    K: Float[Tensor, "3 3"]
+    world_to_camera: Float[Tensor, "4 4"]
+    width: int
+    height: int
+
+    @property
+    def center(self) -> Float[Tensor, " 3"]:
+        """Camera centre in the world, metres."""
+        rotation, shift = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return -rotation.mT @ shift
+
+    @property
+    def focal(self) -> Float[Tensor, " 2"]:
+        """Focal lengths fx and fy, pixels."""
+        return torch.stack((self.K[0, 0], self.K[1, 1]))
+
+    def to(self, *args: Any, **kwargs: Any) -> Camera:
+        return replace(
+            self,
+            K=self.K.to(*args, **kwargs),
+            world_to_camera=self.world_to_camera.to(*args, **kwargs),
+        )
+
+    def to_camera(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """World points in camera coordinates, metres."""
+        return points @ self.world_to_camera[:3, :3].mT + self.world_to_camera[:3, 3]
+
+    def to_world(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Points in camera coordinates in the world, metres."""
+        return (points - self.world_to_camera[:3, 3]) @ self.world_to_camera[:3, :3]
+
+    def project(
+        self, points: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
+        """Pixels (x, y) and depth in metres of world points; depth may be negative (behind)."""
+        cam = self.to_camera(points)
+        return pinhole_pixels(self.K, cam), cam[..., 2]
+
+    def shows(
+        self, pixels: Float[Tensor, "*batch 2"], depth: Float[Tensor, "*batch"], near: float = 0.0
+    ) -> Bool[Tensor, "*batch"]:
+        """Which projected points lie within the image and farther than `near`, metres."""
+        size = pixels.new_tensor((self.width, self.height))
+        return (depth > near) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
+
+    def unproject(
+        self, pixels: Float[Tensor, "*batch 2"], depth: Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch 3"]:
+        """World points at pixels (x, y) and depths along z, metres."""
+        xy = pinhole_rays(self.K, pixels) * depth[..., None]
+        return self.to_world(torch.cat((xy, depth[..., None]), -1))
+
+    def pixel_grid(self) -> Float[Tensor, "H W 2"]:
+        """Centres (x, y) of all pixels."""
+        y = torch.arange(self.height, device=self.K.device, dtype=self.K.dtype) + 0.5
+        x = torch.arange(self.width, device=self.K.device, dtype=self.K.dtype) + 0.5
+        return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+
+    def moved(self, turn: Float[Tensor, " 3"], shift: Float[Tensor, " 3"]) -> Camera:
+        """The camera after a rigid motion in its own space: x_cam = Exp(turn, shift) (R x + t).
+
+        A turn alone is about the camera's centre. Differentiable, and smooth at zero.
+
+        Args:
+            turn: axis-angle, radians. shift: metres.
+        """
+        quat, moved = exp_se3(turn, shift)
+        R: Float[Tensor, "3 3"] = quats_to_matrices(quat)
+        given = self.world_to_camera
+        top = torch.cat((R @ given[:3, :3], (R @ given[:3, 3] + moved)[:, None]), 1)
+        return replace(self, world_to_camera=torch.cat((top, given[3:]), 0))
+
+    def scaled(self, scale: float) -> Camera:
+        """The same view of a world made `scale` times larger."""
+        w2c = self.world_to_camera.clone()
+        w2c[:3, 3] *= scale
+        return replace(self, world_to_camera=w2c)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view at another image size."""
+        scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
+        return replace(self, K=self.K * scale, width=width, height=height)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The part of the image that starts at pixel (left, top)."""
+        shift = self.K.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+        return replace(self, K=self.K - shift, width=width, height=height)
+
+    @staticmethod
+    def look_at(
+        eye: Float[Tensor, " 3"],
+        target: Float[Tensor, " 3"],
+        *,
+        width: int,
+        height: int,
+        fov_y: float,
+        up: tuple[float, float, float] = (0.0, 1.0, 0.0),
+    ) -> Camera:
+        """A camera at `eye` that looks at `target`; `fov_y` is the vertical angle in radians.
+
+        Raises:
+            ValueError: it would look along `up`, or at its own place, so that no upright is left.
+        """
+        forward = torch.nn.functional.normalize(target - eye, dim=0)
+        down = -torch.tensor(up, dtype=eye.dtype, device=eye.device)
+        right = torch.linalg.cross(down, forward)
+        if not right.norm() > 1e-6 * down.norm():
+            raise ValueError(
+                f"a camera at {eye.tolist()} that looks at {target.tolist()} has no upright: "
+                f"the view is along up = {up}; give another `up`"
+            )
+        right = torch.nn.functional.normalize(right, dim=0)
+        rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
+        viewmat = torch.eye(4, dtype=eye.dtype, device=eye.device)
+        viewmat[:3, :3] = rotation
+        viewmat[:3, 3] = -rotation @ eye
+        focal = 0.5 * height / float(torch.tan(torch.tensor(fov_y / 2)))
+        K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        return Camera(K.to(viewmat), viewmat, width, height)

@@ -1,0 +1,266 @@
+"""Clip: the frames, cameras, masks, bodies and objects that a reconstruction starts from."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from hoigs.core.diagnostics import Diagnostic
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.moment import BodyPose, Moment
+from hoigs.core.values.tokens import EntityKind
+
+CAMERAS_REFINED = "cameras_refined_in_training"  # a key of Clip.provenance
+
+
+class FrameStore(ABC):
+    """Pixels on demand; implementations decode lazily and may cache. Positions, not names.
+
+    Attributes:
+        root: the folder that the pixels come from, where they come from one.
+    """
+
+    root: Path | None = None
+
+    @abstractmethod
+    def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
+        """RGB."""
+
+    @abstractmethod
+    def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
+        """Visible pixels of an entity; all False where it is not seen."""
+
+    @abstractmethod
+    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
+        """Depth along z, metres; 0 where unknown (NaN and infinity are cleaned by the reader)."""
+
+    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
+        """Pixels that show no scene; None where all do."""
+        return None
+
+    def mask_known(self, entity: str, position: int) -> bool:
+        """Whether there is a mask at all; where there is not, `mask` is empty."""
+        del entity, position
+        return True
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One view of a clip, decoded.
+
+    Attributes:
+        position: its place in the clip's frame list. moment.index is the frame number.
+        masks: by entity, visible pixels. depth: metres, 0 = unknown, or None.
+        ignored: pixels that show no scene (painted over, outside the lens image): they are
+            left out of losses and scores. None without any.
+        unknown: entities that have no mask here; theirs in `masks` is empty and means nothing.
+    """
+
+    position: int
+    moment: Moment
+    camera: Camera
+    image: UInt8[Tensor, "H W 3"]
+    masks: dict[str, Bool[Tensor, "H W"]]
+    depth: Float[Tensor, "H W"] | None
+    ignored: Bool[Tensor, "H W"] | None = None
+    unknown: frozenset[str] = frozenset()
+
+    @property
+    def rgb(self) -> Float[Tensor, "H W 3"]:
+        """RGB in [0, 1]."""
+        return self.image.float() / 255.0
+
+    def to(self, device: torch.device | str) -> Frame:
+        """The same view with its moment, camera and pixels on a device."""
+        depth, ignored = self.depth, self.ignored
+        return replace(
+            self,
+            moment=self.moment.to(device),
+            camera=self.camera.to(device),
+            image=self.image.to(device),
+            masks={name: mask.to(device) for name, mask in self.masks.items()},
+            depth=None if depth is None else depth.to(device),
+            ignored=None if ignored is None else ignored.to(device),
+        )
+
+
+@dataclass(frozen=True)
+class BodyTrack:
+    """A body over the clip: which body model, and a BodyPose batched over the frames.
+
+    Attributes:
+        model: registry key, for example "body:anny".
+        gender: of the model file that the poses were fitted with ("male", "female", "neutral"),
+            where that matters; body models refuse another.
+        template: the person's own zero-pose vertices, metres, in place of the model's mean
+            (ARCTIC); the betas come on top of it.
+    """
+
+    model: str
+    poses: BodyPose
+    provenance: str = "unknown"
+    gender: str | None = None
+    template: Float[Tensor, "V 3"] | None = None
+
+
+@dataclass(frozen=True)
+class ObjectTrack:
+    """What is known of an object before training.
+
+    Attributes:
+        points: canonical points about the object's centre, metres, at world scale.
+        colors: RGB in [0, 1].
+        rotations: object to world, per frame. translations: object centre in the world, metres.
+        observed: frames in which the object was seen; the others are interpolated.
+        provenance: who made the track, for reports.
+        moving: of an object in two parts, the points that belong to the moving one; None if
+            that is not known, or there are no parts.
+    """
+
+    points: Float[Tensor, "P 3"]
+    colors: Float[Tensor, "P 3"]
+    rotations: Float[Tensor, "F 3 3"]
+    translations: Float[Tensor, "F 3"]
+    observed: Bool[Tensor, " F"]
+    provenance: str = "unknown"
+    moving: Bool[Tensor, " P"] | None = None
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Everything that training and evaluation read; frames are lazy and uint8.
+
+    Attributes:
+        name: for reports.
+        store: pixels. cameras, moments: one a frame, in order.
+        kinds: entity name to kind; "scene" is implicit.
+        bodies: by human entity. objects: by object entity.
+        points, point_colors: scene points (COLMAP, or back-projected depth), metres, RGB [0, 1].
+        split: "train" and "test" positions.
+        held_out: the same moments from cameras never trained on, or None.
+        fps: frames a second.
+        depth_kind: "metric", "affine-disparity" or "none".
+        provenance: where each part came from.
+        faults: what is wrong with the clip and was accepted when it was read (`clip_folder.health`
+            finds more).
+    """
+
+    name: str
+    store: FrameStore
+    cameras: Sequence[Camera]
+    moments: Sequence[Moment]
+    kinds: Mapping[str, EntityKind]
+    bodies: Mapping[str, BodyTrack]
+    objects: Mapping[str, ObjectTrack]
+    points: Float[Tensor, "P 3"]
+    point_colors: Float[Tensor, "P 3"]
+    split: Mapping[str, Sequence[int]]
+    held_out: Clip | None = None
+    fps: float = 30.0
+    depth_kind: str = "none"
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    faults: Sequence[Diagnostic] = ()
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __getitem__(self, position: int) -> Frame:
+        if not -len(self) <= position < len(self):
+            raise IndexError(f"frame {position} of a clip with {len(self)} frames")
+        position %= len(self)
+        return Frame(
+            position=position,
+            moment=self.moments[position],
+            camera=self.cameras[position],
+            image=self.store.image(position),
+            masks={name: self.store.mask(name, position) for name in self.kinds},
+            depth=self.store.depth(position),
+            ignored=self.store.ignored(position),
+            unknown=frozenset(n for n in self.kinds if not self.store.mask_known(n, position)),
+        )
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[i] for i in range(len(self)))
+
+    @property
+    def num_frames(self) -> int:
+        """N_f of the paper: frames of the whole video, held-out views not counted."""
+        return max(m.index for m in self.moments) + 1
+
+    def frame(self, position: int) -> Frame:
+        return self[position]
+
+    def resized(self, width: int) -> Clip:
+        """This clip at another width, aspect kept; pixels are resampled on demand."""
+        if width == self.cameras[0].width:
+            return self
+        sizes = [(width, max(1, round(c.height * width / c.width))) for c in self.cameras]
+        return replace(
+            self,
+            store=ResizedStore(self.store, sizes),
+            cameras=[c.resized(*s) for c, s in zip(self.cameras, sizes, strict=True)],
+            held_out=self.held_out.resized(width) if self.held_out else None,
+        )
+
+    def extent(self) -> float:
+        """Scene extent, metres: 1.1 x camera spread (Kerbl et al. 2023, arXiv:2308.04079), but at
+        least half the median depth of the points, so that a static camera does not give zero."""
+        centers = torch.stack([c.center for c in self.cameras])
+        spread = 1.1 * float((centers - centers.mean(0)).norm(dim=-1).max())
+        if len(self.points) == 0:
+            return max(spread, 1.0)
+        depth = self.cameras[0].to_camera(self.points)[:, 2]
+        ahead = depth[depth > 0]
+        return max(spread, 0.5 * float(ahead.median()) if len(ahead) else 1.0)
+
+
+class ResizedStore(FrameStore):
+    """Another store at another size: images by area, masks and depth by nearest pixel."""
+
+    def __init__(self, base: FrameStore, sizes: Sequence[tuple[int, int]]) -> None:
+        self.base, self.sizes = base, sizes
+        self.root = base.root
+        self._images: dict[int, Tensor] = {}
+
+    def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
+        if position not in self._images:
+            width, height = self.sizes[position]
+            image = self.base.image(position).permute(2, 0, 1)[None].float()
+            small = torch.nn.functional.interpolate(image, (height, width), mode="area")
+            self._images[position] = small[0].permute(1, 2, 0).round().to(torch.uint8)
+        return self._images[position]
+
+    def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
+        return self._nearest(self.base.mask(entity, position).float(), position) > 0.5
+
+    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
+        depth = self.base.depth(position)
+        return None if depth is None else self._nearest(depth, position)
+
+    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
+        ignored = self.base.ignored(position)
+        return None if ignored is None else self._nearest(ignored.float(), position) > 0.5
+
+    def mask_known(self, entity: str, position: int) -> bool:
+        return self.base.mask_known(entity, position)
+
+    def _nearest(self, image: Tensor, position: int) -> Tensor:
+        width, height = self.sizes[position]
+        resize = torch.nn.functional.interpolate
+        return resize(image[None, None], (height, width), mode="nearest-exact")[0, 0]
+
+
+def uniform_test_split(count: int, tests: int = 16) -> dict[str, list[int]]:
+    """`tests` uniformly chosen test frames, never the first or last (HOSNeRF's rule: 16)."""
+    tests = min(tests, max(1, count // 4))
+    chosen = sorted({round((i + 0.5) * count / tests) for i in range(tests)})
+    chosen = [min(max(1, c), count - 2) for c in chosen] if count > 2 else []
+    test = sorted(set(chosen))
+    return {"train": [i for i in range(count) if i not in set(test)], "test": test}

@@ -1,0 +1,162 @@
+"""Lens: how a real camera maps rays to pixels, in COLMAP's models, and to a pinhole."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.core.errors import ClipError, did_you_mean
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.undistortion import Undistortion
+
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+NEGLIGIBLE_SHIFT = 0.01  # pixels of distortion below which a lens counts as a pinhole
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics with distortion.
+
+    Attributes:
+        model: COLMAP's name: "PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", …
+        params: in COLMAP's order for that model; the centre of the top-left pixel is (0.5, 0.5).
+        width, height: image size, pixels.
+
+    Raises:
+        ClipError: no such model, or another number of parameters.
+    """
+
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        _ = self._colmap
+
+    @staticmethod
+    def opencv(
+        K: Float[np.ndarray, "3 3"],
+        distortion: Sequence[float],
+        width: int,
+        height: int,
+        *,
+        pixel_center: float = 0.5,
+    ) -> Lens:
+        """A lens with OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6]], as many as there are.
+
+        Args:
+            K: intrinsics, pixels. width, height: of the image.
+            pixel_center: where its maker puts the centre of the top-left pixel: 0.5, or 0 for
+                calibrations by OpenCV itself.
+        """
+        if len(distortion) not in (0, 4, 5, 8):
+            raise ClipError(
+                f"{len(distortion)} distortion coefficients; OpenCV's lenses have 0, 4, 5 or 8: "
+                "k1 k2 p1 p2 [k3 [k4 k5 k6]]"
+            )
+        shift = 0.5 - pixel_center
+        params = [K[0, 0], K[1, 1], K[0, 2] + shift, K[1, 2] + shift, *distortion]
+        if any(distortion[4:]):
+            model, count = "FULL_OPENCV", 12
+        elif any(distortion):
+            model, count = "OPENCV", 8
+        else:
+            model, count = "PINHOLE", 4
+        params = [*params, *[0.0] * count][:count]
+        return Lens(model, tuple(float(p) for p in params), width, height)
+
+    @property
+    def K(self) -> Float[Tensor, "3 3"]:
+        """Intrinsics of the pinhole camera with this focal length and principal point, float64."""
+        lens = self._colmap
+        return torch.tensor(
+            [
+                [lens.focal_length_x, 0, lens.principal_point_x],
+                [0, lens.focal_length_y, lens.principal_point_y],
+                [0, 0, 1],
+            ],
+            dtype=torch.float64,
+        )
+
+    def camera(self, world_to_camera: Float[np.ndarray, "4 4"]) -> Camera:
+        """The pinhole camera that undistorted images belong to, float32."""
+        w2c = torch.from_numpy(np.asarray(world_to_camera, np.float64))
+        return Camera(self.K.float(), w2c.float(), self.width, self.height)
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The same lens behind an image of another size."""
+        if (width, height) == (self.width, self.height):
+            return self
+        scaled = self._colmap  # a fresh one at each call
+        scaled.rescale(width, height)
+        return Lens(self.model, tuple(float(p) for p in scaled.params), width, height)
+
+    def undistortion(self, size: tuple[int, int] | None = None) -> Undistortion:
+        """From this lens's images to those of `camera`; made once for equal lenses.
+
+        Args:
+            size: width and height of the images, if they were resized.
+        """
+        if self.model in PINHOLES:  # captures with a focal length a frame stay cheap
+            return Undistortion()
+        return _undistortion(self, size or (self.width, self.height))
+
+    @property
+    def _colmap(self) -> Any:
+        import pycolmap
+
+        known = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+        if self.model not in known:
+            raise ClipError(
+                f"{self.model} is not a camera model of COLMAP{did_you_mean(self.model, known)}"
+            )
+        camera = pycolmap.Camera(
+            model=self.model, width=self.width, height=self.height, params=list(self.params)
+        )
+        if not camera.verify_params():
+            raise ClipError(
+                f"{self.model} has the parameters {camera.params_info}; got {len(self.params)}"
+            )
+        return camera
+
+
+@functools.lru_cache(maxsize=8)  # rigs have a few lenses; a map of 1280x720 pixels takes 7 MiB
+def _undistortion(lens: Lens, size: tuple[int, int]) -> Undistortion:
+    colmap = lens._colmap
+    scale = np.array(size) / (lens.width, lens.height)
+    focal = np.array([colmap.focal_length_x, colmap.focal_length_y]) * scale
+    center = np.array([colmap.principal_point_x, colmap.principal_point_y]) * scale
+    x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    pinhole = np.stack((x, y), -1)
+    flat = (pinhole.reshape(-1, 2) - center) / focal
+
+    def seen(xy: np.ndarray) -> np.ndarray:
+        rays = np.concatenate((xy, np.ones((len(xy), 1))), -1)
+        return np.asarray(colmap.img_from_cam(rays), np.float64) * scale
+
+    source = seen(flat)
+    # beyond the radius where a polynomial turns back, it shows what it has shown already
+    outward = ((seen(1.001 * flat) - source) / focal * flat).sum(-1)
+    folded = (outward <= 0) & ((flat * flat).sum(-1) > 1e-6)
+    source[folded] = np.nan
+    source = source.reshape(*pinhole.shape)
+
+    def forward(xy: np.ndarray) -> np.ndarray:
+        points = xy.reshape(-1, 2).astype(np.float64)
+        known = np.isfinite(points).all(-1)
+        out = np.full_like(points, np.nan)
+        if known.any():
+            out[known] = np.asarray(colmap.cam_from_img(points[known] / scale))[:, :2]
+            out[known] = out[known] * focal + center
+        return out.reshape(xy.shape).astype(xy.dtype)
+
+    found = Undistortion(source, forward)
+    return found if found.shift >= NEGLIGIBLE_SHIFT else Undistortion()

@@ -1,0 +1,132 @@
+"""Gaussians on the surface of a skinned body: what all avatars share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from hoigs.core.interfaces.body import PELVIS, BodySurface
+from hoigs.core.maths.rotations import multiply_quats
+from hoigs.core.maths.skinning import skin, skin_quats
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.moment import BodyPose, Moment, ResidualRule
+from hoigs.core.values.tokens import Residual
+from hoigs.core.values.topology import TopologyChange
+from hoigs.plugins.deformation.avatars.face_points import HEAD_JOINT, face_points
+from hoigs.plugins.deformation.avatars.skinned_body import SkinnedBody, checked_surface
+
+OPAQUE = 4.6  # logit of 0.99, the largest opacity that rasterizers draw
+
+
+class SurfaceBody(SkinnedBody):
+    """Points of the body's surface with the skinning weights, body part and triangle of each.
+
+    The canonical Gaussians lie on `surface`, or, if none is given, on
+    `body.surface(len(canonical), betas, seed)`: they must have been made by the same call.
+    """
+
+    provides = frozenset({"skeleton", "face"})
+    rates: ClassVar[Mapping[str, str]] = {"refinement": "pose", "refinement.betas": "shape"}
+
+    template_weights: Tensor
+    parts: Tensor
+    faces: Tensor
+    barycentric: Tensor
+    normals: Tensor
+    _change: Tensor | None = None  # `shape_change` while held
+
+    def point_rows(self, surface: BodySurface) -> dict[str, Tensor]:
+        """Buffers with one row for each Gaussian, which follow changes of their number."""
+        return {
+            "template_weights": surface.weights,
+            "parts": surface.parts,
+            "faces": surface.faces,
+            "barycentric": surface.barycentric,
+            "normals": surface.normals,
+        }
+
+    def bind(self, canonical: Gaussians) -> None:
+        made = self._surface or self.body.surface(len(canonical), self.betas, self.seed)
+        rows = self.point_rows(checked_surface(made, canonical))
+        for name, value in rows.items():
+            self.register_buffer(name, value.detach().clone())
+        self._row_names, self._surface = tuple(rows), None
+
+    def on_topology(self, change: TopologyChange) -> None:
+        """A child keeps the rows of its parent: weights, part and triangle."""
+        for name in self._row_names:
+            setattr(self, name, getattr(self, name)[change.source].contiguous())
+
+    @torch.no_grad()
+    def hold(self, canonical: Gaussians, moment: Moment) -> None:
+        """As SkinnedBody, and the change of each canonical point by the shape of `moment`."""
+        super().hold(canonical, moment)
+        self._change = self._changed(self.shaped(self.pose(moment).betas, moment)[0])
+
+    def shaped_pose(
+        self, moment: Moment, residual: Residual | None, rule: ResidualRule = "add"
+    ) -> tuple[BodyPose, Float[Tensor, "V 3"], Float[Tensor, "J 3"]]:
+        """theta_final of HOIGS, Eq. 13, and the vertices and joints of the zero pose, metres."""
+        pose = self.pose(moment)
+        shape = self.shaped(pose.betas, moment)
+        if residual is not None and residual.pose is not None:
+            pose = pose.with_residual(residual.pose, rule)
+        return pose, *shape
+
+    def shape_change(
+        self, pose: BodyPose, vertices: Float[Tensor, "V 3"], moment: Moment
+    ) -> Float[Tensor, "N 3"] | None:
+        """Displacement of each canonical point by the betas of `pose`, metres; None if these are
+        the betas of the canonical Gaussians.
+
+        Args:
+            vertices: of the zero pose, in the shape of `pose`.
+        """
+        if self.held:
+            return self._change
+        return self._changed(vertices) if self.reshaped(pose.betas, moment) else None
+
+    def _changed(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N 3"]:
+        corners = (vertices - self.rest_vertices)[self.body.faces[self.faces]]
+        return (corners * self.barycentric[..., None]).sum(1)
+
+    def posed(
+        self,
+        canonical: Gaussians,
+        weights: Float[Tensor, "N J"],
+        pose: BodyPose,
+        joints: Float[Tensor, "J 3"],
+        moment: Moment,
+        residual: Residual | None,
+    ) -> Gaussians:
+        """alpha LBS(P_c, theta, W) (HOIGS, Eq. 6 and 14), plus the residual of the means.
+
+        Args:
+            canonical: Gaussians of the zero pose. joints: of the zero pose, in the shape of `pose`,
+                metres.
+        """
+        transforms = self.body.skinning_transforms(pose)
+        means = skin(canonical.means, transforms, weights)
+        pelvis = self.posed_joints(joints, transforms, (PELVIS,))[0]
+        means = self.scaled(means, pelvis, moment)
+        if residual is not None and residual.means is not None:
+            means = means + residual.means
+        turns = skin_quats(transforms, weights, self.body.parents, self.ancestors)
+        return replace(
+            canonical,
+            means=means,
+            quats=multiply_quats(turns, canonical.quats),
+            log_scales=canonical.log_scales + self.log_alpha,
+        )
+
+    def point_parts(self) -> Int[Tensor, " N"]:
+        return self.parts
+
+    def face_points(self) -> tuple[Int[Tensor, " F"], Float[Tensor, "F 3"]]:
+        triangles, head = self.body.faces[self.faces], self.rest_joints[HEAD_JOINT]
+        return face_points(self.rest_vertices, head, triangles, self.parts, self.barycentric)

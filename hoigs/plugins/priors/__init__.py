@@ -1,1 +1,0 @@
-"""Object initialisers: first points of an object, and its pose in every frame."""

@@ -1,0 +1,128 @@
+"""A COLMAP model folder: lenses, poses and points, with names as its images have them."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.core.errors import ClipError
+from hoigs.core.values.lens import Lens
+from hoigs.plugins.readers.common.frame_order import natural
+from hoigs.plugins.readers.common.listing import Need
+from hoigs.plugins.readers.common.poses import rigid
+
+MAKER = "COLMAP makes the sparse model (`colmap mapper`; mask out what moves)"
+PARTS = ("cameras", "images", "points3D")
+
+
+@dataclass(frozen=True)
+class View:
+    """One registered image.
+
+    Attributes:
+        name: as in the COLMAP model. world_to_camera: OpenCV axes, COLMAP's own unit.
+    """
+
+    name: str
+    lens: Lens
+    world_to_camera: Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """Views in natural order of their names; points and RGB in [0, 1]."""
+
+    views: list[View]
+    points: Float[Tensor, "P 3"]
+    colors: Float[Tensor, "P 3"]
+    summary: str
+
+
+def model_folder(folder: Path, places: tuple[str, ...] = ("sparse/0", "sparse")) -> str | None:
+    """The first of `places` under `folder` with a model in it, complete or not."""
+    for place in places:
+        if any((folder / place / f"{p}.{s}").is_file() for p in PARTS for s in ("bin", "txt")):
+            return place
+    return None
+
+
+def sparse_needs(
+    folder: Path,
+    places: tuple[str, ...] = ("sparse/0", "sparse"),
+    points: bool = True,
+    maker: str = MAKER,
+) -> list[Need]:
+    """The files of a sparse model, in the form (binary or text) that is there already."""
+    place = model_folder(folder, places) or places[0]
+    parts = PARTS if points else PARTS[:2]
+    form = "txt" if any((folder / place / f"{p}.txt").is_file() for p in PARTS) else "bin"
+    if all((folder / place / f"{p}.bin").is_file() for p in parts):
+        form = "bin"
+    other = "bin" if form == "txt" else "txt"
+    whole = model_folder(folder, places) is None
+    return [
+        Need((f"{place}/{p}.{form}", f"{place}/{p}.{other}") if whole else (f"{place}/{p}.{form}",),
+             maker)
+        for p in parts
+    ]  # fmt: skip
+
+
+def read_sparse(folder: Path) -> SparseModel:
+    """The model in `folder`; one without points3D has no points.
+
+    Raises:
+        ClipError: it is damaged, or registers no image.
+    """
+    import pycolmap
+
+    try:
+        if any((folder / f"points3D.{s}").is_file() for s in ("bin", "txt")):
+            model: Any = pycolmap.Reconstruction(str(folder))
+        else:
+            model = _without_points(folder)
+    except (RuntimeError, ValueError, IndexError) as error:
+        raise ClipError(f"{folder} is not a readable COLMAP model: {error}") from error
+    lenses = {
+        number: Lens(c.model_name, tuple(float(p) for p in c.params), c.width, c.height)
+        for number, c in model.cameras.items()
+    }
+    views = []
+    for image in sorted(model.images.values(), key=lambda i: natural(i.name)):
+        if image.has_pose:
+            pose = np.asarray(image.cam_from_world().matrix(), np.float64)
+            views.append(View(image.name, lenses[image.camera_id], rigid(pose[:, :3], pose[:, 3])))
+    if not views:
+        raise ClipError(
+            f"{folder} registers no image; run COLMAP again, with moving objects masked"
+        )
+    points = list(model.points3D.values())
+    models = ", ".join(sorted({lens.model for lens in lenses.values()}))
+    return SparseModel(
+        views,
+        torch.tensor(np.array([p.xyz for p in points]).reshape(-1, 3)).float(),
+        torch.tensor(np.array([p.color for p in points]).reshape(-1, 3)).float() / 255,
+        f"COLMAP {models}, {len(views)} images, {len(points)} points",
+    )
+
+
+def _without_points(folder: Path) -> Any:
+    """cameras.txt and images.txt alone: pycolmap needs all three files, and tracks that exist."""
+    import pycolmap
+
+    lines = (folder / "images.txt").read_text(encoding="utf-8").split("\n")
+    rows = [line for line in lines if not line.startswith("#")]
+    with tempfile.TemporaryDirectory() as scratch:
+        place = Path(scratch)
+        shutil.copy(folder / "cameras.txt", place)
+        # each image has two lines; the second has its observations and may be empty
+        (place / "images.txt").write_text("".join(f"{row}\n\n" for row in rows[::2] if row.strip()))
+        (place / "points3D.txt").write_text("")
+        return pycolmap.Reconstruction(scratch)

@@ -1,0 +1,127 @@
+"""MediaPipe's 33 landmarks and the points of a body that they should fall on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from hoigs.core.interfaces.body import BodyModel
+
+# landmark -> SMPL-X body joint
+JOINTS = {11: 16, 12: 17, 13: 18, 14: 19, 15: 20, 16: 21, 23: 1, 24: 2, 25: 4, 26: 5, 27: 7, 28: 8}
+# landmark -> joint within the hands' 30: knuckles of index and little finger
+KNUCKLES = {19: 0, 17: 6, 20: 15, 18: 21}
+# bones whose directions are compared in 3D: pairs of landmarks
+BONES = (
+    (11, 13), (13, 15), (12, 14), (14, 16), (23, 25), (25, 27), (24, 26), (26, 28), (11, 12),
+    (23, 24), (11, 23), (12, 24), (27, 31), (28, 32), (15, 19), (16, 20),
+)  # fmt: skip
+TORSO = (11, 12, 23, 24)
+FEET = (29, 30, 31, 32)
+USED = tuple(sorted((*JOINTS, *KNUCKLES, 0, 7, 8, *FEET)))  # landmarks that `points_of` places
+SOLID = (11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)  # in space: torso and limbs start on them
+ENOUGH = 8  # landmarks of USED in the image, with which a frame counts
+
+
+@dataclass(frozen=True)
+class LandmarkTrack:
+    """Landmarks of one person over a clip; NaN where they were not found.
+
+    Attributes:
+        image: x, y in pixels of the frames, and visibility in [0, 1].
+        world: metres about the hips' middle, along the camera's axes (x right, y down, z away);
+            NaN where the estimator sees the image only.
+    """
+
+    image: Float[Tensor, "F 33 3"]
+    world: Float[Tensor, "F 33 3"]
+
+    @staticmethod
+    def from_mediapipe(
+        image_xyzv: Float[np.ndarray, "F 33 4"], world_xyzv: Float[np.ndarray, "F 33 4"]
+    ) -> LandmarkTrack:
+        """From the arrays of `pose_mediapipe.npz`."""
+        image = torch.as_tensor(image_xyzv, dtype=torch.float32)[..., [0, 1, 3]]
+        world = torch.as_tensor(world_xyzv, dtype=torch.float32)[..., :3]
+        return LandmarkTrack(image, world)
+
+    @property
+    def known(self) -> Bool[Tensor, "F 33"]:
+        """Landmarks that were found in the image."""
+        return torch.isfinite(self.image).all(-1)
+
+    @property
+    def found(self) -> Bool[Tensor, " F"]:
+        """Frames in which enough landmarks of the body were found in the image."""
+        return self.known[:, list(USED)].sum(1) >= ENOUGH
+
+    @property
+    def solid(self) -> Bool[Tensor, " F"]:
+        """Frames of `found` whose torso and limbs are known in space, too."""
+        return self.found & torch.isfinite(self.world[:, list(SOLID)]).all(-1).all(-1)
+
+
+@dataclass(frozen=True)
+class LandmarkPoints:
+    """Which joints and vertices of a body stand for which landmarks.
+
+    Attributes:
+        landmarks: numbers of the landmarks that have a counterpart, in the order of `locate`.
+        joints: joint of each of the first landmarks. vertices: vertex of each of the others.
+        pairs: number of each landmark's left-right pair. mirror: factors of x, y, z that take the
+            pair's offset to this side.
+    """
+
+    landmarks: tuple[int, ...]
+    joints: Int[Tensor, " A"]
+    vertices: Int[Tensor, " B"]
+    pairs: Int[Tensor, " L"]
+    mirror: Float[Tensor, "L 3"]
+
+    def index(self, landmark: int) -> int:
+        return self.landmarks.index(landmark)
+
+
+def points_of(body: BodyModel) -> LandmarkPoints:
+    """Joints where a landmark is a joint; extreme vertices for nose, ears, heels and toes."""
+    template, joints = body.shaped(torch.zeros(body.num_betas))
+    first_hand = len(body.parents) - 30
+    by_joint = {**JOINTS, **{mark: first_hand + k for mark, k in KNUCKLES.items()}}
+    head = (body.vertex_parts == 3).nonzero().squeeze(1)
+    head = head[template[head, 1] > joints[15, 1]]  # above the head joint: no collar, no neck
+    nose = head[template[head, 2].argmax()]
+    level = head[(template[head, 1] - template[nose, 1]).abs() < 0.03]
+    by_vertex = {
+        0: nose,
+        7: level[template[level, 0].argmax()],
+        8: level[template[level, 0].argmin()],
+    }
+    for part, heel, toe in ((14, 29, 31), (15, 30, 32)):
+        foot = (body.vertex_parts == part).nonzero().squeeze(1)
+        floor = foot[template[foot, 1] < template[foot, 1].min() + 0.04]
+        by_vertex[heel] = floor[template[floor, 2].argmin()]
+        by_vertex[toe] = floor[template[floor, 2].argmax()]
+    landmarks = (*by_joint, *by_vertex)
+    pairs, mirror = _left_right(landmarks)
+    return LandmarkPoints(
+        landmarks,
+        torch.tensor(list(by_joint.values())),
+        torch.stack(list(by_vertex.values())),
+        pairs,
+        mirror,
+    )
+
+
+def _left_right(landmarks: tuple[int, ...]) -> tuple[Int[Tensor, " L"], Float[Tensor, "L 3"]]:
+    """Pair of each landmark, and the mirror's signs: odd numbers are left, the next is right.
+
+    The nose is its own pair and may not move aside.
+    """
+    left = [mark if mark % 2 or mark == 0 else mark - 1 for mark in landmarks]
+    numbers = sorted(set(left))
+    signs = [(0.0 if m == 0 else 1.0 if m % 2 else -1.0, 1.0, 1.0) for m in landmarks]
+    return torch.tensor([numbers.index(n) for n in left]), torch.tensor(signs)

@@ -1,0 +1,190 @@
+"""Cameras of a video: COLMAP's, with the lens distortion taken out, or one that stands still."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.core.diagnostics import ranges
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.lens import Lens
+from hoigs.core.values.undistortion import Undistortion
+from hoigs.preparation.video.frames import Frames
+from hoigs.preparation.video.source import SourceError, frame_number
+
+ASSUMED_FOCAL = 0.8  # of the longer side: 64 degrees, a phone's main camera
+
+
+@dataclass(frozen=True)
+class CameraTrack:
+    """Pinhole cameras of all frames, and the mapping from the video's pixels to theirs.
+
+    Attributes:
+        cameras: one a frame, at the width of the frames given out.
+        points, colors: scene points in the cameras' own unit, RGB in [0, 1]; none if static.
+        provenance: for the clip and the report.
+        metric: whether the world is in metres already (a static camera has no scale of its own).
+        lens: of the video; None if it is a pinhole's.
+        model: folder of the COLMAP model, or None for a static camera.
+        positions: places, among the frames given in, of those that have a camera.
+        figures: for the report: "registered" and "images", "reprojection_px", "points",
+            "distortion_px", and of a static camera "displacement_px" and those of its focal length.
+    """
+
+    cameras: list[Camera]
+    points: Float[Tensor, "P 3"]
+    colors: Float[Tensor, "P 3"]
+    provenance: str
+    metric: bool
+    lens: Lens | None = None
+    model: Path | None = None
+    positions: tuple[int, ...] = ()
+    figures: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def undistort(self) -> Undistortion:
+        """From images, masks and pixel positions of the video to those of `cameras`."""
+        if self.lens is None:
+            return Undistortion()
+        return self.lens.undistortion((self.cameras[0].width, self.cameras[0].height))
+
+    @property
+    def static(self) -> bool:
+        return self.model is None
+
+
+def static_cameras(video: Frames, focal: float, how: str = "given") -> CameraTrack:
+    """One camera at the origin for all frames: the world is its frame, y down, z forward.
+
+    Args:
+        focal: pixels at the video's own size. how: where it comes from, for the provenance.
+    """
+    f = focal * video.width / video.native_width
+    K = torch.tensor([[f, 0, video.width / 2], [0, f, video.height / 2], [0, 0, 1]])
+    camera = Camera(K, torch.eye(4), video.width, video.height)
+    provenance = f"static camera at the origin, focal {focal:.0f} px ({how})"
+    none = torch.zeros(0, 3)
+    return CameraTrack(
+        [camera] * len(video), none, none, provenance, metric=True,
+        positions=tuple(range(len(video))),
+    )  # fmt: skip
+
+
+def colmap_cameras(video: Frames, model: Path, *, partial: bool = False) -> CameraTrack:
+    """Cameras and points of a COLMAP model, in its own unit, distortion removed.
+
+    Images are matched to frames by the number in their name, which counts video frames from 0
+    (or from 1 if no image is numbered 0).
+
+    Args:
+        partial: leave out frames that the model has no camera for.
+
+    Raises:
+        SourceError: the model is unreadable, lacks frames, or has cameras of several kinds.
+    """
+    import pycolmap
+
+    try:
+        model_read = pycolmap.Reconstruction(str(model))
+    except (RuntimeError, ValueError, IndexError) as error:
+        raise SourceError(f"{model} is not a readable COLMAP model: {error}") from error
+    by_frame = _by_frame(model_read)
+    missing = [i for i in video.indices if i not in by_frame]
+    if missing and (not partial or len(missing) == len(video)):
+        raise SourceError(
+            f"camera count unlike frame count: {model} registers {len(by_frame)} images, the video "
+            f"gives {len(video)} frames, and {len(missing)} of them have no camera "
+            f"({ranges(missing)}); run COLMAP on all frames, or take fewer (every, max_frames)"
+        )
+    positions = tuple(i for i, number in enumerate(video.indices) if number in by_frame)
+    images = [by_frame[video.indices[i]] for i in positions]
+    lens = _one_lens(model, model_read, {image.camera_id for image in images})
+    K = _intrinsics(lens, video.width, video.height)
+    shift = lens.undistortion((video.width, video.height)).shift
+    cameras = [_camera(image, K, video) for image in images]
+    points = [p for p in model_read.points3D.values() if p.track.length() >= 3]
+    if not points:
+        raise SourceError(f"{model} has no points seen by three images or more")
+    off = float(model_read.compute_mean_reprojection_error())
+    provenance = (
+        f"COLMAP {lens.model}, {len(images)} of {len(by_frame)} images, "
+        f"{len(points)} points, reprojection "
+        f"{off:.3f} px, "
+        f"distortion up to {shift:.2f} px removed"
+    )
+    return CameraTrack(
+        cameras,
+        torch.tensor(np.array([p.xyz for p in points]), dtype=torch.float32),
+        torch.tensor(np.array([p.color for p in points]), dtype=torch.float32) / 255,
+        provenance,
+        metric=False,
+        lens=lens,
+        model=model,
+        positions=positions,
+        figures={
+            "registered": len(images),
+            "images": len(video),
+            "reprojection_px": round(off, 4),
+            "points": len(points),
+            "distortion_px": round(shift, 3),
+        },
+    )
+
+
+def _by_frame(model: Any) -> dict[int, Any]:
+    numbered: dict[int, Any] = {}
+    for image in model.images.values():
+        number = frame_number(image.name)
+        if number is None:
+            raise SourceError(f'COLMAP image "{image.name}" has no frame number in its name')
+        if image.has_pose:
+            numbered[number] = image
+    if numbered and 0 not in numbered and 1 in numbered:
+        return {number - 1: image for number, image in numbered.items()}
+    return numbered
+
+
+def _one_lens(path: Path, model: Any, used: set[int]) -> Lens:
+    lenses = [model.cameras[i] for i in sorted(used)]
+    if any(list(lens.params) != list(lenses[0].params) for lens in lenses):
+        raise SourceError(
+            f"{path} has {len(lenses)} different cameras; one video has one lens: run COLMAP with "
+            "--ImageReader.single_camera 1"
+        )
+    first = lenses[0]
+    return Lens(first.model_name, tuple(map(float, first.params)), first.width, first.height)
+
+
+def _intrinsics(lens: Lens, width: int, height: int) -> Float[Tensor, "3 3"]:
+    """Of the pinhole camera at the given size.
+
+    Raises:
+        SourceError: the lens saw images of another shape.
+    """
+    scale = torch.tensor([[width / lens.width], [height / lens.height], [1.0]], dtype=torch.float64)
+    if abs(float(scale[0] / scale[1]) - 1) > 0.02:
+        raise SourceError(
+            f"COLMAP saw {lens.width}x{lens.height} images, the frames are {width}x{height}: "
+            "another shape"
+        )
+    return (lens.K * scale).float()
+
+
+def _camera(image: Any, K: Tensor, video: Frames) -> Camera:
+    pose = image.cam_from_world()
+    w2c = torch.eye(4)
+    w2c[:3] = torch.tensor(np.asarray(pose.matrix()), dtype=torch.float32)
+    return Camera(K, w2c, video.width, video.height)
+
+
+def parallax(cameras: list[Camera], target: Float[Tensor, " 3"]) -> float:
+    """Largest angle, degrees, between two views of a point: 0 for a static camera."""
+    rays = torch.stack([c.center for c in cameras]) - target
+    rays = torch.nn.functional.normalize(rays.double(), dim=-1)
+    return float(torch.rad2deg(torch.acos((rays @ rays.mT).clamp(-1, 1)).max()))

@@ -1,0 +1,168 @@
+"""Cameras from the video itself: COLMAP's structure from motion on what does not move."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from hoigs.preparation.cameras.camera_track import ASSUMED_FOCAL
+from hoigs.preparation.cameras.colmap_log import quiet_colmap
+from hoigs.preparation.cameras.motion import grown
+from hoigs.preparation.masks.entity_masks import GivenMasks
+from hoigs.preparation.video.frames import Frames
+from hoigs.preparation.video.source import SourceError
+
+LENS = "SIMPLE_RADIAL"  # one focal length, one distortion: a video determines no more
+FEATURES = 8192  # of an image
+OVERLAP = 10  # frames that each is matched with, and as many at distances 1, 2, 4, 8, …
+SMALLEST_SHARE = 0.5  # of the frames: with fewer cameras there is no clip
+
+
+def structure_from_motion(
+    video: Frames,
+    masks: GivenMasks,
+    folder: Path,
+    *,
+    focal: float | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Path:
+    """A COLMAP model of the chosen frames, the largest that was found.
+
+    Features on masked pixels are left out; frames are matched with their neighbours in time; one
+    camera with one radial distortion serves all (COLMAP, Schoenberger and Frahm 2016).
+
+    Args:
+        folder: to work in; images, databases and models are left there. Features and matches
+            that an earlier run of the same frames, masks and focal length left are used again.
+        focal: pixels of the frames' size, if known; it is still refined.
+        progress: called with 0..1.
+
+    Returns:
+        folder of the model; its images are named by frame number.
+
+    Raises:
+        SourceError: less than half of the frames were given a camera, and why that may be.
+    """
+    import pycolmap
+
+    report = progress or (lambda _done: None)
+    images, matches = folder / "images", folder / "matches.db"
+    for name in ("images", "masks", "models", "largest"):  # cheap, or half-made
+        shutil.rmtree(folder / name, ignore_errors=True)
+    _write_images(video, masks, folder, lambda done: report(0.1 * done))
+    with quiet_colmap():
+        if not matches.is_file():
+            features = folder / "features.db"
+            if not features.is_file():
+                _extract(pycolmap, features, images, _reader(pycolmap, video, folder, focal))
+            report(0.4)
+            _match(pycolmap, features, matches)
+        report(0.7)
+        (folder / "models").mkdir()
+        models = pycolmap.incremental_mapping(
+            _copy(matches),
+            images,
+            folder / "models",
+            options=_mapping(pycolmap),
+        )
+    best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+    count = best.num_reg_images() if best is not None else 0
+    if best is None or count < SMALLEST_SHARE * len(video):
+        raise SourceError(
+            f"structure from motion gave cameras to {count} of {len(video)} frames. If the camera "
+            "stands still or only turns, use --camera static; else the background may lack "
+            "texture, be blurred or be hidden by the masks: look at the masks, take sharper or "
+            "more frames, or put a COLMAP model of your own beside the video, as sparse/"
+        )
+    kept = folder / "largest"
+    kept.mkdir()
+    best.write(kept)
+    report(1.0)
+    return kept
+
+
+def _write_images(
+    video: Frames, masks: GivenMasks, folder: Path, report: Callable[[float], None]
+) -> None:
+    """images/00017.png by frame number, and masks/00017.png.png, 0 where nothing is to be found."""
+    for name in ("images", "masks"):
+        (folder / name).mkdir(parents=True)
+    for i, (number, image) in enumerate(zip(video.indices, video, strict=True)):
+        name = f"{number:05d}.png"
+        Image.fromarray(image).save(folder / "images" / name, compress_level=1)
+        still = np.where(grown(masks.moving(i)), 0, 255).astype(np.uint8)
+        Image.fromarray(still).save(folder / "masks" / f"{name}.png", compress_level=1)
+        report((i + 1) / len(video))
+
+
+def _extract(pycolmap: Any, features: Path, images: Path, reader: Any) -> None:
+    """A database with the features of all images; it appears under its name when it is whole."""
+    half = _copy(None, features)
+    pycolmap.extract_features(
+        half,
+        images,
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
+        extraction_options=_extraction(pycolmap),
+        device=pycolmap.Device.cpu,
+    )
+    half.replace(features)
+
+
+def _match(pycolmap: Any, features: Path, matches: Path) -> None:
+    """A database with features and matches, likewise."""
+    half = _copy(features, matches)
+    pycolmap.match_sequential(
+        half,
+        matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=_threads()),
+        pairing_options=pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True),
+        device=pycolmap.Device.cpu,
+    )
+    half.replace(matches)
+
+
+def _copy(database: Path | None, name: Path | None = None) -> Path:
+    """A temporary database for `name`, or beside `database`: a copy of it, or none yet.
+
+    What a killed run left of it goes, with SQLite's own files beside it.
+    """
+    target = name or database
+    assert target is not None
+    half = target.with_suffix(".part")
+    for path in target.parent.glob(f"{half.name}*"):
+        path.unlink()
+    if database is not None:
+        shutil.copyfile(database, half)
+    return half
+
+
+def _reader(pycolmap: Any, video: Frames, folder: Path, focal: float | None) -> Any:
+    f = focal or ASSUMED_FOCAL * max(video.width, video.height)
+    options = pycolmap.ImageReaderOptions(mask_path=str(folder / "masks"), camera_model=LENS)
+    options.camera_params = f"{f},{video.width / 2},{video.height / 2},0"
+    return options
+
+
+def _extraction(pycolmap: Any) -> Any:
+    options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=_threads())
+    options.sift.max_num_features = FEATURES
+    return options
+
+
+def _mapping(pycolmap: Any) -> Any:
+    options = pycolmap.IncrementalPipelineOptions(num_threads=_threads(), random_seed=0)
+    # a video adds its frames in order: the whole need not be solved anew after every tenth
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3
+    return options
+
+
+def _threads() -> int:
+    """The number that OMP_NUM_THREADS gives, else one a core."""
+    given = os.environ.get("OMP_NUM_THREADS", "")
+    return int(given) if given.isdigit() and int(given) else os.cpu_count() or 1

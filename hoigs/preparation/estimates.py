@@ -1,0 +1,190 @@
+"""What estimators find in the chosen frames, before their cameras are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from hoigs.core.errors import HoigsError
+from hoigs.core.interfaces.estimator import (
+    EntityRequest,
+    EstimateKind,
+    Estimates,
+    Estimator,
+    Landmarks,
+    PromptPoint,
+    VideoRequest,
+    checked,
+)
+from hoigs.preparation.body.landmarks import LandmarkTrack
+from hoigs.preparation.body.person import RawLandmarks, chosen_landmarks
+from hoigs.preparation.masks.entity_masks import GivenMasks
+from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.objects.ball import BallTrack
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.stages.work_folder import digest
+from hoigs.preparation.video.frames import Frames
+from hoigs.preparation.video.resizing import resized_mask
+from hoigs.preparation.video.source import Source, SourceError
+
+Estimators = Mapping[EstimateKind, Estimator]
+
+
+@dataclass(frozen=True)
+class RawEstimates:
+    """Landmarks and masks of the chosen frames, at their size; distortion still in."""
+
+    landmarks: RawLandmarks
+    masks: GivenMasks
+
+
+@dataclass(frozen=True)
+class UndistortedEstimates:
+    """The same on the cameras' undistorted images, and the object if it is a tracked ball."""
+
+    landmarks: LandmarkTrack
+    masks: GivenMasks
+    ball: BallTrack | None
+
+
+@dataclass(frozen=True)
+class EstimateReader:
+    """Runs the estimator of each kind: a given one, or that of the files beside the video.
+
+    Attributes:
+        work: folder for what estimators keep between runs.
+    """
+
+    source: Source
+    video: Frames
+    options: PrepareOptions
+    estimators: Estimators
+    work: Path
+
+    def landmarks_and_masks(self, progress: Callable[[float], None]) -> RawEstimates:
+        """Landmarks first: they are read fast, and a clip without them cannot be made."""
+        landmarks = self._landmarks(progress)
+        return RawEstimates(
+            landmarks, self._masks((self.options.human, self.options.object), progress)
+        )
+
+    def estimate(self, kind: EstimateKind, progress: Callable[[float], None]) -> Estimates:
+        """The result of the estimator of a kind.
+
+        Raises:
+            SourceError: it does not give what it should.
+        """
+        estimator = self.estimators[kind]
+        if kind not in estimator.provides:
+            raise SourceError(
+                f"estimators.{kind}: {type(estimator).__name__} provides "
+                f"{_listed(estimator.provides)}, not {kind}"
+            )
+        request = self.request(kind)
+        try:
+            return checked(
+                estimator.estimate(request, lambda x, _: progress(x)), request, estimator
+            )
+        except HoigsError:
+            raise
+        except ValueError as error:
+            raise SourceError(f"estimators.{kind}: {error}") from error
+
+    def request(self, kind: EstimateKind) -> VideoRequest:
+        """The video as estimators see it: whole, at its own size."""
+        video, options = self.video, self.options
+        path = self.source.video
+        return VideoRequest(
+            frames=self._total,
+            width=video.native_width,
+            height=video.native_height,
+            read=video.read,
+            folder=self.source.folder,
+            work=self.work / digest([identity(self.estimators[kind]), str(path)])[:16],
+            static_camera=options.camera == "static",
+            entities=self._entities(kind),
+            wanted=tuple(video.indices),
+            video=path if path.is_file() else None,
+            fps=video.list.rate,
+        )
+
+    @cached_property
+    def _total(self) -> int:
+        """Frames of the whole video, which are counted only where the survey stopped early."""
+        return self.video.total if self.options.max_frames is None else self.video.count()
+
+    def _entities(self, kind: EstimateKind) -> tuple[EntityRequest, ...]:
+        options = self.options
+        entities = (
+            _request(options, options.human, "human"),
+            _request(options, options.object, "object"),
+        )
+        if kind == "masks" and kind in self.source.beside:
+            return tuple(entity for entity in entities if entity.name in self.source.masked)
+        return entities
+
+    def _landmarks(self, progress: Callable[[float], None]) -> RawLandmarks:
+        tracks = self.estimate("landmarks", progress).landmarks
+        name = self.options.human
+        who = f"estimators.landmarks: {_name(self.estimators['landmarks'])}"
+        if name not in tracks:
+            raise SourceError(f"{who} gave landmarks of {_listed(tracks)}, not of {name}")
+        track: Landmarks = tracks[name]
+        return chosen_landmarks(
+            track.image_xyzv, track.world_xyzv, self.video, who, track.provenance or "given"
+        )
+
+    def _masks(self, names: tuple[str, str], progress: Callable[[float], None]) -> GivenMasks:
+        found = self.estimate("masks", progress).masks
+        assert found is not None  # `checked` saw to it
+        human, object_mask = (
+            self._stack(found.entities[n]) if n in found.entities else None for n in names
+        )
+        together = None if found.together is None else self._stack(found.together)
+        ball = self.source.ball is not None
+        if not (together or (human and (object_mask or ball))):
+            raise SourceError(
+                f"estimators.masks: {_name(self.estimators['masks'])} gave masks of "
+                f"{_listed(found.entities)}; needed are those of {names[0]} and {names[1]}, or one "
+                "of both together"
+            )
+        if human and object_mask:
+            return GivenMasks(human=human, object=object_mask)
+        return GivenMasks(together=together) if together else GivenMasks(human=human)
+
+    def _stack(self, masks) -> MaskStack:
+        size = (self.video.width, self.video.height)
+        return MaskStack(resized_mask(masks[number], size) for number in self.video.indices)
+
+
+def identity(estimator: Estimator) -> list[str]:
+    """An estimator and its settings, as a key of its results."""
+    settings = sorted((name, repr(value)) for name, value in vars(estimator).items())
+    return [f"{type(estimator).__module__}:{type(estimator).__qualname__}", repr(settings)]
+
+
+def paths_of(estimator: Estimator, folder: Path) -> list[Path]:
+    """Files and folders that an estimator's settings name, which its estimates may come from."""
+    settings = getattr(estimator, "config", None)  # absent where `__init__` is an estimator's own
+    values = [*vars(estimator).values(), *(dict(settings).values() if settings else ())]
+    values += [item for value in values if isinstance(value, dict) for item in value.values()]
+    paths = (folder / v.expanduser() for v in values if isinstance(v, Path))
+    return sorted(path for path in paths if path.exists())
+
+
+def _request(options: PrepareOptions, name: str, kind) -> EntityRequest:
+    prompt = options.prompts.get(name)
+    if prompt is None:
+        return EntityRequest(name, kind)
+    points = tuple(PromptPoint(x, y, bool(inside)) for x, y, inside in prompt.points)
+    return EntityRequest(name, kind, prompt.text, points, prompt.box, prompt.frame)
+
+
+def _name(estimator: Estimator) -> str:
+    return type(estimator).__name__
+
+
+def _listed(names) -> str:
+    return ", ".join(sorted(names)) or "nothing"

@@ -1,0 +1,251 @@
+"""One mask of person and object together, separated by the fitted body and by colour."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+from scipy import ndimage
+
+from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.video.resizing import shrink, shrink_mask
+
+BINS = 24  # a colour channel
+WORK_SIDE = 480  # pixels; masks need no more to be separated, and time grows with area
+GUESSED = 0.2  # weight of a silhouette in a frame whose body was not seen
+CRUMB = 0.05  # of the person's largest part
+STRAY = 0.15  # of the longer side: parts farther than this from the object are not of it
+MARGIN = 0.03  # of the image's longer side: how far clothes reach beyond the body
+Images = Callable[[], Iterable[UInt8[np.ndarray, "H W 3"]]]
+
+
+def separate(
+    images: Images,
+    together: MaskStack,
+    bodies: MaskStack,
+    fitted: Bool[np.ndarray, " F"],
+    rounds: int = 4,
+) -> tuple[MaskStack, MaskStack]:
+    """The person's and the object's masks, which divide `together`.
+
+    Every pixel has a log-odds of being the object: from its distance to the body's silhouette
+    (soft, because clothes reach beyond it and fits are off), from the two colour histograms that
+    the masks of the round before give over all frames, from the object's place in the frames
+    before and after, and from its neighbours (a mean field with a box neighbourhood). It is
+    GrabCut's idea (Rother et al. 2004) with histograms in place of mixtures and a mean field in
+    place of the cut. Large frames are worked on at a longer side of 480 pixels.
+
+    Args:
+        images: gives the frames anew on every call.
+        together: person and object. bodies: silhouettes of the fitted body, unclothed.
+        fitted: frames whose body was fitted to something seen; silhouettes of the others are
+            guesses: they count less, and colours are not learnt from them.
+        rounds: of colours and masks, after the first masks from the silhouettes alone.
+
+    Returns:
+        human, object
+    """
+    size = _work_size(together[0].shape)
+    wholes = [shrink_mask(m, *size) for m in together]
+    pictures = [shrink(image, *size) for image in images()]
+    small_bodies = [shrink_mask(b, *size) for b in bodies]
+    trust = [
+        _trust(b, t) * (1.0 if seen else GUESSED)
+        for b, t, seen in zip(small_bodies, wholes, fitted, strict=True)
+    ]
+    odds = [w * _silhouette_odds(b) for b, w in zip(small_bodies, trust, strict=True)]
+    objects = [t & (o > 0) for t, o in zip(wholes, odds, strict=True)]
+    for turn in range(rounds):
+        colors = _learned(pictures, wholes, objects, odds, trust)
+        places = [_place(objects, i) if turn else 0.0 for i in range(len(objects))]
+        for i, mask in enumerate(wholes):
+            color = colors(pictures[i])
+            objects[i] = _object_parts(_mean_field(odds[i] + color + places[i], mask), color)
+        objects = _without_strays(objects)
+    humans, separated = MaskStack(), MaskStack()
+    for mask, part, whole in zip(together, _adopted(objects, wholes), wholes, strict=True):
+        object_mask = mask & _enlarged(part, whole & ~part, mask.shape)
+        humans.append(mask & ~object_mask)
+        separated.append(object_mask)
+    return humans, separated
+
+
+def _work_size(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Width and height to work at."""
+    factor = min(1.0, WORK_SIDE / max(shape))
+    return max(1, round(shape[1] * factor)), max(1, round(shape[0] * factor))
+
+
+def _enlarged(
+    object_mask: Bool[np.ndarray, "h w"], human: Bool[np.ndarray, "h w"], shape: tuple[int, ...]
+) -> Bool[np.ndarray, "H W"]:
+    """Where, at the full size, the object is nearer than the person."""
+    if object_mask.shape == shape:
+        return object_mask
+    nearer = ndimage.gaussian_filter(object_mask.astype(np.float32) - human, 1.0)
+    large = Image.fromarray(nearer).resize((shape[1], shape[0]), Image.Resampling.BILINEAR)
+    return np.asarray(large) > 0
+
+
+def _learned(
+    pictures: Sequence[np.ndarray],
+    wholes: Sequence[np.ndarray],
+    objects: Sequence[np.ndarray],
+    odds: Sequence[np.ndarray],
+    trust: Sequence[float],
+) -> ColorOdds:
+    """Colours of both, from the frames whose silhouette is to be trusted."""
+    colors = ColorOdds()
+    for image, mask, part, odd, w in zip(pictures, wholes, objects, odds, trust, strict=True):
+        if w > 0.5 * max(trust):
+            # pixels on the silhouette's border are ambiguous
+            sure = mask & (np.abs(odd) > 0.5 * w)
+            colors.learn(image, sure & part, sure & ~part)
+    colors.settle()
+    return colors
+
+
+def _trust(body: Bool[np.ndarray, "H W"], together: Bool[np.ndarray, "H W"]) -> float:
+    """0.2..1: how much of a silhouette lies on the mask that it ought to lie on."""
+    inside = (body & together).sum() / max(1, body.sum())
+    return float(np.clip((inside - 0.6) / 0.3, 0.2, 1.0))
+
+
+def _silhouette_odds(body: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Log-odds of the object from the signed distance to a silhouette: -2 inside, 2 far off."""
+    if not body.any():
+        return np.zeros(body.shape, np.float32)
+    scale = MARGIN * max(body.shape)
+    outside = ndimage.distance_transform_edt(~body)
+    inside = ndimage.distance_transform_edt(body)
+    return (2 * np.tanh((outside - inside - scale) / scale)).astype(np.float32)
+
+
+def _place(objects: list[Bool[np.ndarray, "H W"]], frame: int) -> Float[np.ndarray, "H W"]:
+    """Log-odds -1..1 from where the object is in the two frames before and after."""
+    near = [objects[i] for i in range(frame - 2, frame + 3) if 0 <= i < len(objects) and i != frame]
+    if not near:
+        return np.zeros(objects[frame].shape, np.float32)
+    mean = np.mean(near, axis=0, dtype=np.float32)
+    return 2 * ndimage.uniform_filter(mean, int(MARGIN * max(mean.shape)) | 1) - 1
+
+
+class ColorOdds:
+    """Log-odds of object against person by colour, from histograms over all frames."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros((2, BINS, BINS, BINS))
+        self._odds = np.zeros((BINS, BINS, BINS), np.float32)
+
+    def learn(
+        self,
+        image: UInt8[np.ndarray, "H W 3"],
+        object_mask: Bool[np.ndarray, "H W"],
+        human_mask: Bool[np.ndarray, "H W"],
+    ) -> None:
+        for i, mask in enumerate((object_mask, human_mask)):
+            cells = _bins(image[mask]) @ np.array([BINS * BINS, BINS, 1])
+            self._counts[i] += np.bincount(cells, minlength=BINS**3).reshape(self._counts[i].shape)
+
+    def settle(self) -> None:
+        """Smooths the histograms and takes their ratio; colours never seen have odds of 0."""
+        totals = self._counts.sum((1, 2, 3))
+        if (totals == 0).any():
+            return
+        smooth = np.stack([ndimage.gaussian_filter(c, 1.0) for c in self._counts])
+        likelihood = smooth / totals[:, None, None, None]
+        floor = 0.3 / BINS**3
+        ratio = np.log(likelihood[0] + floor) - np.log(likelihood[1] + floor)
+        self._odds = np.clip(ratio, -4, 4).astype(np.float32)
+
+    def __call__(self, image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
+        index = _bins(image)
+        return self._odds[index[..., 0], index[..., 1], index[..., 2]]
+
+
+def _bins(pixels: UInt8[np.ndarray, "*batch 3"]) -> np.ndarray:
+    return pixels.astype(np.int64) * BINS // 256
+
+
+def _object_parts(
+    mask: Bool[np.ndarray, "H W"], color: Float[np.ndarray, "H W"], smallest: float = 0.1
+) -> Bool[np.ndarray, "H W"]:
+    """The parts whose colours are the object's on average, without crumbs.
+
+    A shoulder that the fitted body misses is as far from the silhouette as a bag, but has the
+    person's colours.
+    """
+    labels, count = ndimage.label(mask)
+    if not count:
+        return mask
+    index = np.arange(1, count + 1)
+    like = ndimage.mean(color, labels, index) > 0
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:] * like
+    keep = like & (sizes >= smallest * sizes.max())
+    return np.concatenate(([False], keep))[labels]
+
+
+def _adopted(
+    objects: list[Bool[np.ndarray, "H W"]], wholes: list[Bool[np.ndarray, "H W"]]
+) -> list[Bool[np.ndarray, "H W"]]:
+    """Objects with the crumbs of the person that touch them and nothing else of the person: a dark
+    edge, a buckle."""
+    adopted = []
+    for object_mask, whole in zip(objects, wholes, strict=True):
+        labels, count = ndimage.label(whole & ~object_mask)
+        sizes = np.bincount(labels.ravel(), minlength=count + 1)
+        sizes[0] = 0
+        touching = np.unique(labels[ndimage.binary_dilation(object_mask)])
+        crumbs = [n for n in touching.tolist() if n and sizes[n] < CRUMB * sizes.max()]
+        adopted.append(object_mask | np.isin(labels, crumbs))
+    return adopted
+
+
+def _without_strays(
+    objects: list[Bool[np.ndarray, "H W"]], reach: int = 6
+) -> list[Bool[np.ndarray, "H W"]]:
+    """Drops parts that are far from where the object is in the frames around.
+
+    Where it is: the median, over `reach` frames before and after, of the largest part's middle.
+    Far: no pixel within STRAY of it.
+    """
+    labelled = [ndimage.label(o) for o in objects]
+    middles = np.full((len(objects), 2), np.nan)
+    for i, (labels, count) in enumerate(labelled):
+        if count:
+            largest = 1 + np.bincount(labels.ravel())[1:].argmax()
+            middles[i] = np.argwhere(labels == largest).mean(0)
+    kept = []
+    for i, (labels, count) in enumerate(labelled):
+        around = middles[max(0, i - reach) : i + reach + 1]
+        around = around[np.isfinite(around[:, 0])]
+        if not count or not len(around):
+            kept.append(objects[i])
+            continue
+        middle = np.median(around, axis=0)
+        rows, columns = np.nonzero(labels)
+        away = np.hypot(rows - middle[0], columns - middle[1])
+        numbers = labels[rows, columns]
+        near = np.unique(numbers[away <= STRAY * max(labels.shape)])
+        kept.append(np.isin(labels, near) & (labels > 0))
+    return kept
+
+
+def _mean_field(
+    odds: Float[np.ndarray, "H W"],
+    mask: Bool[np.ndarray, "H W"],
+    reach: float = 0.02,
+    weight: float = 4.0,
+    steps: int = 8,
+) -> Bool[np.ndarray, "H W"]:
+    """Object pixels of `mask` after neighbours have agreed; reach in parts of the longer side."""
+    size = max(3, int(reach * max(mask.shape)) | 1)
+    inside = mask.astype(np.float32)
+    norm = np.maximum(ndimage.uniform_filter(inside, size), 1e-3)
+    belief = np.tanh(odds / 2) * inside
+    for _ in range(steps):
+        neighbours = ndimage.uniform_filter(belief, size) / norm
+        belief = np.tanh((odds + weight * neighbours) / 2) * inside
+    return mask & (belief > 0)

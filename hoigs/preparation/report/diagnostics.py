@@ -1,0 +1,149 @@
+"""How good the measures of a preparation are, and what to do where they are not good.
+
+The limits between good, fair and bad are our own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from hoigs.core.diagnostics import Diagnostic, Severity
+from hoigs.preparation.report.measures import Measures
+
+BLURRED = 0.5  # of the median sharpness: a frame below it is blurred
+
+
+@dataclass(frozen=True)
+class MeasureDiagnostic(Diagnostic):
+    """One measure, judged: `kind` is its name, `what` its meaning. `do` is "" where it is good."""
+
+    value: str = ""
+
+
+def diagnose(measures: Measures) -> list[MeasureDiagnostic]:
+    """Every measure that can be judged, in the order of the stages."""
+    return [*_cameras(measures), *_frames(measures), *_tracks(measures), *_views(measures)]
+
+
+def _judge(value: float, good: float, fair: float) -> Severity:
+    """By the largest values that are good and fair."""
+    return "good" if value <= good else "fair" if value <= fair else "bad"
+
+
+def _judged(
+    kind: str, value: str, meaning: str, severity: Severity, advice: str
+) -> MeasureDiagnostic:
+    do = "" if severity == "good" else advice
+    return MeasureDiagnostic(kind, meaning, do, severity=severity, value=value)
+
+
+def _cameras(report: Measures) -> Iterator[MeasureDiagnostic]:
+    if report.camera == "static":
+        moved = report.displacement_px
+        yield _judged(
+            "camera",
+            "static",
+            "taken to stand still"
+            + (f": the background moves by {moved:.2f} px at 640" if moved is not None else ""),
+            "fair",
+            "the background has one view and no measured depth: it looks right from near the "
+            "camera only. An estimator of depth (--set estimators.depth.use=…) gives it one; "
+            "--camera moving declares that the camera does move. Give --focal: all depths "
+            "scale with it.",
+        )
+        return
+    if report.registered is not None:
+        yield _judged(
+            "frames with a camera",
+            f"{100 * report.registered:.0f} %",
+            "the others are left out of the clip",
+            _judge(1 - report.registered, 0.02, 0.2),
+            "look at the masks (everything that moves must be masked, the background not), take "
+            "sharper or more frames, or run COLMAP yourself and put its model at sparse/",
+        )
+    if report.reprojection_px is not None:
+        yield _judged(
+            "reprojection error",
+            f"{report.reprojection_px:.2f} px",
+            "of the scene's points in the images",
+            _judge(report.reprojection_px, 1.0, 2.0),
+            "cameras are off by about as much: let training refine them (train.rates.camera), or "
+            "look for movement outside the masks",
+        )
+    yield _judged(
+        "parallax",
+        f"{report.parallax_degrees:.1f}°",
+        "largest angle between two views of the scene's middle",
+        _judge(-report.parallax_degrees, -10, -5),
+        "the scene's depth is weakly known: walk around the person next time, or add an "
+        "estimator of depth",
+    )
+
+
+def _frames(report: Measures) -> Iterator[MeasureDiagnostic]:
+    for name, coverage in report.coverage.items():
+        empty = sum(value == 0 for value in coverage) / max(1, len(coverage))
+        mean = sum(coverage) / max(1, len(coverage))
+        yield _judged(
+            f"mask of {name}",
+            f"{100 * mean:.1f} %",
+            f"of the image; empty in {100 * empty:.0f} % of the frames",
+            _judge(empty, 0.05, 0.25),
+            "if it is in view there, the segmenter lost it: prompt it again in those frames",
+        )
+    if report.sharpness:
+        middle = sorted(report.sharpness)[len(report.sharpness) // 2]
+        blurred = sum(v < BLURRED * middle for v in report.sharpness) / len(report.sharpness)
+        yield _judged(
+            "blurred frames",
+            f"{100 * blurred:.0f} %",
+            "less than half as sharp as the middle one",
+            _judge(blurred, 0.05, 0.2),
+            "take the sharpest of each few frames (--every 2, --fps 15), film in more light or "
+            "move the camera slower",
+        )
+
+
+def _tracks(report: Measures) -> Iterator[MeasureDiagnostic]:
+    longer = max(report.width, report.height)
+    metres = "" if report.body_residual_m is None else f", {100 * report.body_residual_m:.1f} cm"
+    yield _judged(
+        "body on its landmarks",
+        f"{report.body_residual_px:.1f} px{metres}",
+        "median distance of visible landmarks",
+        _judge(report.body_residual_px / longer, 0.01, 0.02),
+        "look at overlay.mp4: if the landmarks jump, use another estimator (estimators.landmarks); "
+        "if all of the body is off, the focal length or the cameras are",
+    )
+    yield _judged(
+        "object's apparent size",
+        f"± {100 * report.object_scale_spread:.1f} %",
+        "over its expected size; its depth is as uncertain",
+        _judge(report.object_scale_spread, 0.05, 0.15),
+        "the object's masks grow and shrink, or it turns: mend the masks, or give its shape as a "
+        "mesh (initializer:mesh)",
+    )
+    if report.depth_residual is not None:
+        yield _judged(
+            "depth",
+            f"{100 * report.depth_residual:.1f} %",
+            f"off {report.depth_against}, after its scale was fitted",
+            _judge(report.depth_residual, 0.05, 0.1),
+            "the depth network misjudges this scene: try another, or leave its loss out "
+            "(--set train.loss.depth=0)",
+        )
+
+
+def _views(report: Measures) -> Iterator[MeasureDiagnostic]:
+    if report.omega is None:
+        return
+    ratio = "" if report.big_omega is None else f", {report.big_omega:.2g} times as fast as it"
+    yield _judged(
+        "effective multi-view factor",
+        f"{report.omega:.1f}°/s",
+        f"the camera goes round the person{ratio} (DyCheck's omega and Omega)",
+        _judge(-report.omega, -40, -10),
+        "each moment is seen from one side: what is hidden is guessed by the body model and the "
+        "object's rigidity. Judge by held-out cameras, not by this camera's own frames.",
+    )

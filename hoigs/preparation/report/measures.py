@@ -1,0 +1,67 @@
+"""What is measured of a preparation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Numbers to judge a prepared clip by.
+
+    Attributes:
+        name, frames, width, height, fps: of the clip. video: the source's file name.
+        camera: "static" or "moving". parallax_degrees: largest angle between two views of the
+            scene's middle; under about 5 the geometry is weakly known.
+        coverage: by entity, part of the image that the mask covers in each frame, 0..1.
+        body_residual_px: median distance of fitted to given landmarks, in frame pixels.
+        body: whatever else the body fit reports.
+        scene_scale: metres a COLMAP unit; 1 for a static camera.
+        object_scale_spread: standard deviation over frames of the object's apparent over its
+            expected size: 0.05 means that its depth is uncertain by about 5 %.
+        object_observed: part of the frames in which the object was seen.
+        scene_points: number of points that start the background.
+        provenance: what each part was made from, and how weak it is.
+        warnings: what to know before training.
+        seconds: time by stage.
+        registered: part of the chosen frames that have a camera; None for a static camera.
+        reprojection_px: of COLMAP's points, mean; None for a static camera.
+        displacement_px: of a static camera's background, at a width of 640; None if not measured.
+        sharpness: of each frame (`sharpness.sharpness`).
+        body_residuals_px: of each frame; None without landmarks.
+        body_residual_m: `body_residual_px` at the person's distance.
+        depth_residual: typical relative error of the depth estimator once it is in metres, against
+            `depth_against`; depth_residuals: of each frame. None without such an estimator.
+        omega, big_omega: effective multi-view factors (`multiview`).
+    """
+
+    name: str
+    video: str
+    frames: int
+    width: int
+    height: int
+    fps: float
+    camera: str
+    parallax_degrees: float
+    coverage: dict[str, list[float]]
+    body_residual_px: float
+    scene_scale: float
+    object_scale_spread: float
+    object_observed: float
+    scene_points: int
+    body: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, str] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+    registered: float | None = None
+    reprojection_px: float | None = None
+    displacement_px: float | None = None
+    sharpness: list[float] = field(default_factory=list)
+    body_residuals_px: list[float | None] = field(default_factory=list)
+    body_residual_m: float | None = None
+    depth_residual: float | None = None
+    depth_residuals: list[float | None] = field(default_factory=list)
+    depth_against: str = ""
+    omega: float | None = None
+    big_omega: float | None = None

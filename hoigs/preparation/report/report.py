@@ -1,0 +1,88 @@
+"""The report of a preparation: what was made, how well, and how far each part may be trusted."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from hoigs.preparation.report.diagnostics import MeasureDiagnostic, diagnose
+from hoigs.preparation.report.measures import Measures
+from hoigs.preparation.report.page import report_page
+
+
+@dataclass(frozen=True)
+class PrepareReport(Measures):
+    """Measures of a prepared clip, as report.json, report.md and report.html beside it."""
+
+    def diagnostics(self) -> list[MeasureDiagnostic]:
+        """Every measure that can be judged, and what to do where it is not good."""
+        return diagnose(self)
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self), indent=2, allow_nan=False)
+
+    def rows(self) -> list[tuple[str, str, str]]:
+        """What, value and note of each measure."""
+        rows = [
+            ("video", self.video, ""),
+            ("frames", f"{self.frames} of {self.width}x{self.height}", f"{self.fps:g} fps"),
+            ("camera", self.camera, f"parallax {self.parallax_degrees:.1f} degrees"),
+            ("body", f"{self.body_residual_px:.1f} px", "median distance from the landmarks"),
+            ("scene scale", f"{self.scene_scale:.4g}", "metres a unit of the source"),
+            ("object seen", f"{100 * self.object_observed:.0f} %", "of the frames"),
+            ("object scale spread", f"{100 * self.object_scale_spread:.1f} %", "so its depth's"),
+            ("scene points", f"{self.scene_points}", ""),
+        ]
+        if self.depth_residual is not None:
+            rows.append(
+                ("depth", f"{100 * self.depth_residual:.1f} %", f"off {self.depth_against}")
+            )
+        if self.omega is not None:
+            rows.append(("multi-view", f"{self.omega:.1f} °/s", "the camera around the person"))
+        rows += [(f"mask of {n}", *_coverage(c)) for n, c in self.coverage.items()]
+        rows.append(("time", f"{sum(self.seconds.values()):.0f} s", _times(self.seconds)))
+        return rows
+
+    def to_markdown(self) -> str:
+        table = "\n".join(f"| {what} | {value} | {note} |" for what, value, note in self.rows())
+        made = "\n".join(f"- **{name}**: {text}" for name, text in self.provenance.items())
+        lines = [f"# {self.name}", "", "| | | |", "|---|---|---|", table]
+        lines += ["", "## Made from", "", made]
+        todo = [
+            f"- **{d.kind}: {d.value}** ({d.severity}), {d}" for d in self.diagnostics() if d.do
+        ]
+        if todo:
+            lines += ["", "## What to do", "", *todo]
+        if self.warnings:
+            lines += ["", "## Beware", "", *(f"- {w}" for w in self.warnings)]
+        return "\n".join(lines) + "\n"
+
+    def save(self, folder: Path) -> None:
+        """report.json, report.md and report.html."""
+        (folder / "report.json").write_text(self.to_json(), encoding="utf-8")
+        (folder / "report.md").write_text(self.to_markdown(), encoding="utf-8")
+        page = report_page(
+            self, self.diagnostics(), self.rows(), overlay=(folder / "overlay.mp4").is_file()
+        )
+        (folder / "report.html").write_text(page, encoding="utf-8")
+
+
+_BARS = "▁▂▃▄▅▆▇█"
+
+
+def _coverage(values: list[float]) -> tuple[str, str]:
+    """Mean part of the image; a sparkline over time, the maximum and the empty frames."""
+    if not values:
+        return "no frames", ""
+    top = max(values) or 1.0
+    chosen = [values[i * len(values) // 32] for i in range(32)] if len(values) > 32 else values
+    line = "".join(_BARS[min(7, int(8 * v / top))] if v else " " for v in chosen)
+    empty = sum(v == 0 for v in values)
+    note = f", empty in {empty} frames" if empty else ""
+    mean = sum(values) / len(values)
+    return f"{100 * mean:.1f} %", f"of the image, {line} up to {100 * top:.1f} %{note}"
+
+
+def _times(seconds: dict[str, float]) -> str:
+    return ", ".join(f"{name} {value:.1f}" for name, value in seconds.items())

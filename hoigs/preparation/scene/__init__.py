@@ -1,0 +1,8 @@
+"""Points and depth of the scene, in metres.
+
+- `scene_points`: `colmap_scene` and `static_scene`, the points that start the background.
+- `dense_points`: more points between those of COLMAP.
+- `background_points`: a floor and a wall for a camera that never moves.
+- `depth`: `fit_depth`, an estimator's depth in metres.
+- `scale`: metres a unit, from the ground at the feet.
+"""

@@ -1,0 +1,8 @@
+"""The stages of a preparation.
+
+- `plan`: their order, and what each depends on.
+- `work_folder`: WorkFolder, which keeps their results.
+- `saved`: results as JSON and arrays, and back.
+- `progress`: their times and one progress number.
+- `cleanup`: removes what a killed run left.
+"""

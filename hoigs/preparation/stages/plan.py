@@ -1,0 +1,55 @@
+"""The stages of a preparation: their order, and the results and options that each reads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from hoigs.core.errors import HoigsError, did_you_mean
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage.
+
+    Attributes:
+        weight: its share of the time, about. reads: the stages whose results it reads.
+        options: fields of PrepareOptions that change its result.
+        slow: its result is kept even if a later stage finds that the source cannot be used.
+    """
+
+    weight: float
+    reads: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()
+    slow: bool = False
+
+
+PLAN = {
+    "frames": Stage(2, (), ("width", "every", "fps", "max_frames", "pick", "folder_fps")),
+    "evidence": Stage(4, ("frames",), ("human", "object", "prompts")),
+    "cameras": Stage(3, ("frames", "evidence"), ("camera", "focal")),
+    "inputs": Stage(6, ("evidence", "cameras")),
+    "body": Stage(40, ("inputs",), ("body", "fit_steps"), slow=True),
+    "masks": Stage(10, ("inputs", "body"), ("keep_black",), slow=True),
+    "object": Stage(4, ("masks",), ("ball_radius", "object_points"), slow=True),
+    "depth": Stage(4, ("masks",), ("prompts",), slow=True),
+    "scene": Stage(6, ("masks", "depth"), ("scene_points", "backdrop"), slow=True),
+    "writing": Stage(40, ("object", "scene")),
+}
+
+
+def check_stage(name: str) -> None:
+    """HoigsError if there is no such stage."""
+    if name not in PLAN:
+        raise HoigsError(
+            f"there is no stage {name!r}{did_you_mean(name, PLAN)}; in order: {', '.join(PLAN)}"
+        )
+
+
+def with_dependents(names: Iterable[str]) -> set[str]:
+    """The named stages and all that read their results, directly or not."""
+    found = set(names)
+    for name, stage in PLAN.items():  # in order, so that one pass suffices
+        if found & set(stage.reads):
+            found.add(name)
+    return found

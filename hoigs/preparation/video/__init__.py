@@ -1,0 +1,7 @@
+"""Reading a source, a video or a folder of frames.
+
+- `source`: `find_source`, where each input lies.
+- `frames`: `open_frames`, the chosen frames, streamed.
+- `pictures`, `resizing`: one frame as RGB or grey, images and masks at another size.
+- `sharpness`, `blank`: how sharp a frame is, and its pixels that hold no picture.
+"""

@@ -1,0 +1,261 @@
+"""Videos, and folders of frames, to RGB: streamed, any number of passes, one frame in memory."""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, Self
+
+import numpy as np
+from jaxtyping import UInt8
+
+from hoigs.preparation.video.pictures import FilePicture, Picture, VideoPicture
+from hoigs.preparation.video.sharpness import sharpness
+from hoigs.preparation.video.source import IMAGE_SUFFIXES, SourceError, numbered_frames
+
+Pick = Literal["sharpest", "first"]
+
+
+@dataclass(frozen=True)
+class FrameList:
+    """What a survey of a source found.
+
+    Attributes:
+        native_width, native_height: of the source as displayed (rotation applied).
+        rate: frames a second of the source. fps: of the chosen ones.
+        total: frames in the source, up to the last one looked at.
+        indices: frame number of each chosen one.
+        sharpness: of each chosen one; see `sharpness.sharpness`.
+    """
+
+    native_width: int
+    native_height: int
+    rate: float
+    fps: float
+    total: int
+    indices: list[int]
+    sharpness: list[float]
+
+
+class Frames(ABC):
+    """The chosen frames of a source, read anew on every iteration.
+
+    Args:
+        path: the source.
+        width: of the frames given out, pixels; None keeps the source's. Height follows.
+        every: one frame of each window of so many. max_frames: stop after so many; None takes all.
+        fps: frames a second to choose, in place of `every`.
+        pick: which frame of a window: its first, or its sharpest.
+        rate: of a source that has none of its own.
+        known: what an earlier survey found; the source is then not looked at again.
+
+    Attributes:
+        native_width, native_height: of the source as displayed (rotation applied).
+        width, height: of the frames given out.
+        fps: of the frames given out, `every` allowed for.
+        indices: the source's frame number of each frame given out.
+        total: frames in the source, up to the last one looked at.
+        sharpness: of each frame given out.
+
+    Raises:
+        SourceError: the source is no video, is empty, or is damaged.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        width: int | None = None,
+        every: int = 1,
+        max_frames: int | None = None,
+        *,
+        fps: float | None = None,
+        pick: Pick = "first",
+        rate: float = 30.0,
+        known: FrameList | None = None,
+    ) -> None:
+        self.path, self._rate = Path(path), rate
+        self.list = known or self._survey(_Windows(every, fps, max_frames, pick))
+        if width and width > self.native_width:
+            raise SourceError(
+                f"width {width} is larger than the video's {self.native_width}; "
+                "frames are not enlarged"
+            )
+        self.width = width or self.native_width
+        self.height = max(1, round(self.native_height * self.width / self.native_width))
+        self._reading: tuple[int, Iterator[Picture]] | None = None
+
+    native_width = property(lambda self: self.list.native_width)
+    native_height = property(lambda self: self.list.native_height)
+    fps = property(lambda self: self.list.fps)
+    total = property(lambda self: self.list.total)
+    indices = property(lambda self: self.list.indices)
+    sharpness = property(lambda self: self.list.sharpness)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __iter__(self) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+        for picture in self._chosen():
+            yield picture.rgb(self.width, self.height)
+
+    def subset(self, positions: Sequence[int]) -> Self:
+        """Only some of the chosen frames, by their place among them."""
+        part = copy.copy(self)
+        part.list = replace(
+            self.list,
+            indices=[self.indices[i] for i in positions],
+            sharpness=[self.sharpness[i] for i in positions],
+        )
+        part._reading = None
+        return part
+
+    def read(self, number: int) -> UInt8[np.ndarray, "H W 3"]:
+        """Frame `number` of the source at its own size; going forwards is the cheap way."""
+        at, stream = self._reading or (-1, None)
+        if stream is None or number <= at:
+            at, stream = -1, self._pictures()
+        for picture in stream:
+            at += 1
+            if at == number:
+                self._reading = at, stream
+                return picture.rgb(self.native_width, self.native_height)
+        raise SourceError(f"{self.path} has {at + 1} frames, none of number {number}")
+
+    def count(self) -> int:
+        """Frames of the whole source, those beyond the last chosen one too."""
+        return sum(1 for _ in self._pictures())
+
+    @abstractmethod
+    def _pictures(self) -> Iterator[Picture]:
+        """All frames of the source in order; sets `_rate` where the source has one."""
+
+    def _chosen(self) -> Iterator[Picture]:
+        wanted, last = set(self.indices), self.indices[-1]
+        for number, picture in enumerate(self._pictures()):
+            if number in wanted:
+                yield picture
+            if number == last:
+                return
+
+    def _survey(self, windows: _Windows) -> FrameList:
+        """Looks at every frame, so that damage shows before any work."""
+        native: tuple[int, int] | None = None
+        count = 0
+        for number, picture in enumerate(self._pictures()):
+            windows.rate = self._rate
+            native = native or picture.size()
+            if picture.size() != native:
+                raise SourceError(
+                    f"{self.path}: frame {number} is {picture.size()[0]}x{picture.size()[1]}, "
+                    f"the first {native[0]}x{native[1]}; a clip has one size"
+                )
+            if windows.beyond(number):
+                break
+            count = number + 1
+            windows.offer(number, picture)
+            if windows.full(number):
+                break
+        if native is None:
+            raise SourceError(f"{self.path} holds no video frame: it is empty or cut off")
+        return FrameList(
+            *native, self._rate, windows.fps(), count, windows.indices, windows.sharpnesses
+        )
+
+
+class _Windows:
+    """Cuts a stream of frames into windows and keeps one frame of each."""
+
+    def __init__(self, every: int, fps: float | None, max_frames: int | None, pick: Pick) -> None:
+        self.every, self.wanted_fps, self.max_frames, self.pick = every, fps, max_frames, pick
+        self.rate = 0.0
+        self.indices: list[int] = []
+        self.sharpnesses: list[float] = []
+
+    def fps(self) -> float:
+        return self.rate / self.every if self.wanted_fps is None else self.wanted_fps
+
+    def of(self, number: int) -> int:
+        if self.wanted_fps is None:
+            return number // self.every
+        if self.wanted_fps > self.rate:
+            raise SourceError(
+                f"fps {self.wanted_fps:g} is more than the video's {self.rate:g}; "
+                "frames are not invented"
+            )
+        return int(number * self.wanted_fps / self.rate + 1e-6)
+
+    def beyond(self, number: int) -> bool:
+        return self.max_frames is not None and self.of(number) >= self.max_frames
+
+    def full(self, number: int) -> bool:
+        """Whether no later frame can be chosen."""
+        return self.beyond(number + 1 if self.pick == "sharpest" else number + self.every)
+
+    def offer(self, number: int, picture: Picture) -> None:
+        new = self.of(number) == len(self.indices)
+        if not new and self.pick == "first":
+            return
+        value = sharpness(picture)
+        if new:
+            self.indices.append(number)
+            self.sharpnesses.append(value)
+        elif value > self.sharpnesses[-1]:
+            self.indices[-1], self.sharpnesses[-1] = number, value
+
+
+class VideoFrames(Frames):
+    """The chosen frames of a video file, decoded anew on every iteration."""
+
+    def _pictures(self) -> Iterator[Picture]:
+        import av
+
+        try:
+            with av.open(str(self.path)) as container:
+                if not container.streams.video:
+                    raise SourceError(f"{self.path} has no video stream")
+                stream = container.streams.video[0]
+                stream.thread_type = "AUTO"
+                self._rate = float(stream.average_rate or stream.guessed_rate or 30)
+                yield from map(VideoPicture, container.decode(stream))
+        except (av.error.FFmpegError, ValueError) as error:
+            size = self.path.stat().st_size if self.path.exists() else 0
+            raise SourceError(
+                f"{self.path} ({size} bytes) is not a readable video: {error}; "
+                "re-encode it, for example with `ffmpeg -i VIDEO -c:v libx264 fixed.mp4`"
+            ) from error
+
+
+class FolderFrames(Frames):
+    """The chosen images of a folder in the order of their names, which end in a number."""
+
+    def _pictures(self) -> Iterator[Picture]:
+        return map(FilePicture, self._paths())
+
+    def _chosen(self) -> Iterator[Picture]:
+        paths = self._paths()
+        return (FilePicture(paths[number]) for number in self.indices)
+
+    def _paths(self) -> list[Path]:
+        paths = numbered_frames(self.path)
+        if not paths:
+            raise SourceError(f"{self.path} holds no images ({', '.join(IMAGE_SUFFIXES)})")
+        return paths
+
+
+def open_frames(
+    path: Path,
+    width: int | None = None,
+    every: int = 1,
+    max_frames: int | None = None,
+    *,
+    fps: float | None = None,
+    pick: Pick = "first",
+    rate: float = 30.0,
+    known: FrameList | None = None,
+) -> Frames:
+    """A video file's or a folder's frames; see `Frames`."""
+    kind = FolderFrames if Path(path).is_dir() else VideoFrames
+    return kind(path, width, every, max_frames, fps=fps, pick=pick, rate=rate, known=known)

@@ -1,0 +1,102 @@
+# mypy: ignore-errors
+# (Warp's arrays annotate as values)
+"""Kernels that blend one tile with a warp of 32 lanes, on CUDA and, to test them, on a CPU.
+
+Their C++ stands in `pixel_source`; threads are numbered 32 tile + lane.
+"""
+
+from hoigs.rasterizers.warp.blend import pixel_source
+from hoigs.rasterizers.warp.common.records import F32, I32
+from hoigs.rasterizers.warp.common.runtime import CPU_FLAGS, wp
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})
+
+BLOCK = wp.constant(32 * pixel_source.WARPS)
+
+
+@wp.func_native(pixel_source.FORWARD)
+def forward_native(
+    thread: int, tiles: int, tiles_x: int, width: int, height: int, max_alpha: float,
+    log2_min_alpha: float, min_transmittance: float, records: F32, indices: I32, offsets: I32,
+    features: F32, channels: int, background: F32, background_stride: int, color: F32,
+    alpha: F32, depth: F32, feature_image: F32,
+): ...  # fmt: skip
+
+
+@wp.kernel(launch_bounds=BLOCK)
+def forward_pixels(
+    tiles: int,
+    tiles_x: int,
+    width: int,
+    height: int,
+    max_alpha: float,
+    log2_min_alpha: float,
+    min_transmittance: float,  # negative: never stop
+    records: F32,
+    indices: I32,
+    offsets: I32,
+    features: F32,  # [N, channels]
+    channels: int,
+    background: F32,  # [3] with stride 0, or [H, W, 3] with stride 3
+    background_stride: int,
+    color: F32,
+    alpha: F32,
+    depth: F32,
+    feature_image: F32,  # [H, W, channels]
+    base: int,
+    count: int,
+):
+    thread = wp.tid() + base
+    if thread < count:
+        forward_native(
+            thread, tiles, tiles_x, width, height, max_alpha, log2_min_alpha, min_transmittance,
+            records, indices, offsets, features, channels, background, background_stride, color,
+            alpha, depth, feature_image,
+        )  # fmt: skip
+
+
+@wp.func_native(pixel_source.BACKWARD)
+def backward_native(
+    thread: int, tiles: int, tiles_x: int, width: int, height: int, max_alpha: float,
+    log2_min_alpha: float, min_transmittance: float, records: F32, indices: I32, offsets: I32,
+    features: F32, channels: int, background: F32, background_stride: int, color: F32,
+    alpha: F32, depth: F32, feature_image: F32, v_color: F32, v_alpha: F32, v_depth: F32,
+    v_feature_image: F32, partials: F32,
+): ...  # fmt: skip
+
+
+@wp.kernel(launch_bounds=BLOCK)
+def backward_pixels(
+    tiles: int,
+    tiles_x: int,
+    width: int,
+    height: int,
+    max_alpha: float,
+    log2_min_alpha: float,
+    min_transmittance: float,
+    records: F32,
+    indices: I32,
+    offsets: I32,
+    features: F32,
+    channels: int,
+    background: F32,
+    background_stride: int,
+    color: F32,
+    alpha: F32,
+    depth: F32,
+    feature_image: F32,
+    v_color: F32,
+    v_alpha: F32,
+    v_depth: F32,
+    v_feature_image: F32,
+    partials: F32,  # [intersections, MOMENTS + channels]; on a CPU zero before
+    base: int,
+    count: int,
+):
+    thread = wp.tid() + base
+    if thread < count:
+        backward_native(
+            thread, tiles, tiles_x, width, height, max_alpha, log2_min_alpha, min_transmittance,
+            records, indices, offsets, features, channels, background, background_stride, color,
+            alpha, depth, feature_image, v_color, v_alpha, v_depth, v_feature_image, partials,
+        )  # fmt: skip

@@ -1,0 +1,356 @@
+"""C++ of the pixel kernels: for CUDA, and the same code for a CPU, so that tests can run it.
+
+A warp of 32 lanes blends a tile, TILE_WIDTH pixels wide and TILE_HEIGHT high; a lane owns PIXELS
+pixels of one column. The warp fetches 32 records at a time into shared memory. The ten sums of a
+splat's gradient over the tile take 12 shuffles: each exchange also halves how many sums a lane
+keeps. There are no barriers beyond the warp and no atomics, and sums have the same order in every
+run.
+
+On CUDA all tiles may share one list of Gaussians instead (see `warp.cuda.intersections`). Of each
+32, the warp then takes those whose box touches its tile, and adds its sums by atomics.
+
+On a CPU the lanes run one after the other, and each adds its own share to the partials.
+The arguments are described in `pixel_kernels`.
+"""
+
+from hoigs.rasterizers.warp.intersect.tile_spans import TILE_WIDTH
+
+LANES = 32
+PIXELS = 4
+TILE_HEIGHT = LANES // TILE_WIDTH * PIXELS
+WARPS = 4  # of a block
+
+_HEAD = r"""
+    constexpr int P = %(PIXELS)d, STEP = 32 / %(TILE_WIDTH)d;  // rows between a lane's pixels
+    const int* offsets_ = (const int*)offsets.data;
+    const int lane = thread & 31;
+#if defined(__CUDA_ARCH__)
+    const int tile = offsets_[tiles + 3 + (thread >> 5)];
+#else
+    const int tile = thread >> 5;
+#endif
+    const int left = tile %% tiles_x * %(TILE_WIDTH)d, top = tile / tiles_x * %(TILE_HEIGHT)d;
+    const int x = left + lane %% %(TILE_WIDTH)d, y = top + lane / %(TILE_WIDTH)d;
+    const float* records_ = (const float*)records.data;
+    const float* features_ = (const float*)features.data;
+    const float* background_ = (const float*)background.data;
+    const int* indices_ = (const int*)indices.data;
+    float* color_ = (float*)color.data;
+    float* alpha_ = (float*)alpha.data;
+    float* depth_ = (float*)depth.data;
+    float* feature_image_ = (float*)feature_image.data;
+    int begin = offsets_[tile], end = offsets_[tile + 1];
+#if defined(__CUDA_ARCH__)
+    const unsigned ALL = 0xffffffffu;
+    __shared__ float4 staged[%(WARPS)d * 32 * 3];
+    float4* stage = staged + (threadIdx.x >> 5) * 32 * 3;
+    const bool shared_list = offsets_[tiles + 1] >= 0;
+    if (shared_list) {
+        begin = 0;
+        end = offsets_[tiles + 1];
+    }
+    auto any = [&](bool here) -> bool { return __any_sync(ALL, here); };
+    auto exp2_of = [](float e) -> float {
+        float power;
+        asm("ex2.approx.ftz.f32 %%0, %%1;" : "=f"(power) : "f"(e));
+        return power;
+    };
+    auto quotient = [](float a, float b) -> float { return __fdividef(a, b); };
+#else
+    auto any = [](bool here) -> bool { return here; };
+    auto exp2_of = [](float e) -> float { return wp::exp(e * 0.693147180559945309f); };
+    auto quotient = [](float a, float b) -> float { return a / b; };
+#endif
+"""
+
+# One pass over the intersections: colour and depth, or four feature channels from `channel` on.
+_STATE = r"""
+        float T[P];
+        bool inside[P];
+        #pragma unroll
+        for (int i = 0; i < P; ++i) {
+            inside[i] = x < width && y + i * STEP < height;
+            T[i] = inside[i] ? 1.0f : -1.0f;  // negative: stopped
+        }
+"""
+
+# The loop over the tile's intersections, as long as some pixel goes on. It opens blocks that DONE
+# closes; `continue` skips a splat. `exponent[i]` is log2 of alpha before the clamp, `on[i]` whether
+# pixel i is hit. `at` is the first intersection not yet read when the loop ends.
+_EACH = r"""
+        int at = begin;
+#if defined(__CUDA_ARCH__)
+        #define DONE } at += 32; }
+        int2 index;
+        float4 first, second, third;
+        auto fetch = [&](int from) {
+            if (from + lane >= end) return;
+            index = ((const int2*)indices_)[from + lane];
+            const float4* record = (const float4*)records_ + 4ll * index.x;
+            first = record[0];
+            second = record[1];
+            third = record[2];
+        };
+        fetch(at);
+        while (at < end) {
+            bool running = false;
+            #pragma unroll
+            for (int i = 0; i < P; ++i) running |= T[i] > 0.0f;
+            if (!any(running)) break;
+            bool mine = at + lane < end;
+            if (shared_list && mine)  // one pixel more than the box: rounding loses nothing
+                mine = first.x + third.z > (float)left - 1.0f
+                    && first.x - third.z < (float)(left + %(TILE_WIDTH)d) + 1.0f
+                    && first.y + third.w > (float)top - 1.0f
+                    && first.y - third.w < (float)(top + %(TILE_HEIGHT)d) + 1.0f;
+            const unsigned taken = __ballot_sync(ALL, mine);
+            __syncwarp();  // the records before these have been read
+            if (mine) {
+                float4* to = stage + 3 * __popc(taken & ((1u << lane) - 1u));
+                to[0] = first;
+                to[1] = second;
+                to[2] = make_float4(third.x, third.y, __int_as_float(index.x),
+                                    __int_as_float(index.y));
+            }
+            __syncwarp();
+            fetch(at + 32);  // on their way while these are drawn
+            const int number = __popc(taken);
+            for (int k = 0; k < number; ++k) {
+                const float4 g0 = stage[3 * k], g1 = stage[3 * k + 1], g2 = stage[3 * k + 2];
+                const int row = __float_as_int(g2.z), partial = __float_as_int(g2.w);
+#else
+        #define DONE }
+        struct Four { float x, y, z, w; };
+        for (; at < end; ++at) {
+                bool running = false;
+                for (int i = 0; i < P; ++i) running |= T[i] > 0.0f;
+                if (!running) break;
+                const int row = indices_[2 * at], partial = indices_[2 * at + 1];
+                const float* g = records_ + 16ll * row;
+                const Four g0 = {g[0], g[1], g[2], g[3]}, g1 = {g[4], g[5], g[6], g[7]};
+                const Four g2 = {g[8], g[9], 0.0f, 0.0f};
+#endif
+                (void)partial;
+                const float dx = (float)x + 0.5f - g0.x, dy0 = (float)y + 0.5f - g0.y;
+                const float a = g0.z, shear = g0.w, c = g1.x, log2_opacity = g1.y;
+                float exponent[P], u[P];
+                bool on[P], hit = false;
+                #pragma unroll
+                for (int i = 0; i < P; ++i) {
+                    const float dy = dy0 + (float)(i * STEP);
+                    u[i] = dx - shear * dy;
+                    exponent[i] = log2_opacity - c * dy * dy - a * u[i] * u[i];
+                    on[i] = exponent[i] >= log2_min_alpha && T[i] > 0.0f;
+                    hit |= on[i];
+                }
+                if (!any(hit)) {
+                    %(MISS)s
+                    continue;
+                }
+                float f[4] = {g1.z, g1.w, g2.x, g2.y};
+                if (!COLOR)
+                    for (int j = 0; j < 4; ++j)
+                        f[j] = channel + j < channels ? features_[row * channels + channel + j]
+                                                      : 0.0f;
+"""
+
+_FORWARD = r"""
+        float sums[P][4] = {};
+        %(EACH)s
+                #pragma unroll
+                for (int i = 0; i < P; ++i) {
+                    if (!on[i]) continue;
+                    const float raw = exp2_of(exponent[i]);
+                    const float weight = T[i] * (raw < max_alpha ? raw : max_alpha);
+                    const float next = T[i] - weight;
+                    if (next > min_transmittance) {
+                        T[i] = next;
+                        for (int j = 0; j < 4; ++j) sums[i][j] += weight * f[j];
+                    } else {
+                        T[i] = -T[i];
+                    }
+                }
+        DONE
+        #undef DONE
+        #pragma unroll
+        for (int i = 0; i < P; ++i) {
+            if (!inside[i]) continue;
+            const int p = (y + i * STEP) * width + x;
+            if (COLOR) {
+                const float through = T[i] < 0.0f ? -T[i] : T[i];
+                const float* back = background_ + p * background_stride;
+                for (int j = 0; j < 3; ++j) color_[3 * p + j] = sums[i][j] + through * back[j];
+                alpha_[p] = 1.0f - through;
+                depth_[p] = sums[i][3];
+            } else {
+                for (int j = 0; j < 4 && channel + j < channels; ++j)
+                    feature_image_[p * channels + channel + j] = sums[i][j];
+            }
+        }
+"""
+
+# S: what the splats not yet passed still add, the sum of w (channels . v + net_v_alpha); see
+# `cpu.backward_source`.
+# Every partial is written, zeros where nothing is hit: they need not be cleared before.
+_BACKWARD = r"""
+        float S[P], net_v_alpha[P], v[P][4];
+        #pragma unroll
+        for (int i = 0; i < P; ++i) {
+            S[i] = net_v_alpha[i] = 0.0f;
+            for (int j = 0; j < 4; ++j) v[i][j] = 0.0f;
+            if (!inside[i]) continue;
+            const int p = (y + i * STEP) * width + x;
+            if (COLOR) {
+                const float* back = background_ + p * background_stride;
+                net_v_alpha[i] = v_alpha_[p];
+                v[i][3] = v_depth_[p];
+                S[i] = depth_[p] * v[i][3] + alpha_[p] * net_v_alpha[i];
+                for (int j = 0; j < 3; ++j) {
+                    v[i][j] = v_color_[3 * p + j];
+                    S[i] += (color_[3 * p + j] - back[j]) * v[i][j];
+                    net_v_alpha[i] -= back[j] * v[i][j];
+                }
+            } else {
+                for (int j = 0; j < 4 && channel + j < channels; ++j) {
+                    v[i][j] = v_feature_image_[p * channels + channel + j];
+                    S[i] += feature_image_[p * channels + channel + j] * v[i][j];
+                }
+            }
+        }
+        %(EACH)s
+                float sums[10] = {};  // six moments, four channels
+                #pragma unroll
+                for (int i = 0; i < P; ++i) {
+                    if (!on[i]) continue;
+                    const float raw = exp2_of(exponent[i]);
+                    const float opaque = raw < max_alpha ? raw : max_alpha;
+                    const float weight = T[i] * opaque, next = T[i] - weight;
+                    if (next > min_transmittance) {
+                        float value = net_v_alpha[i];
+                        for (int j = 0; j < 4; ++j) {
+                            value += f[j] * v[i][j];
+                            sums[6 + j] += weight * v[i][j];
+                        }
+                        S[i] -= weight * value;
+                        const float clear = 1.0f - opaque > 1e-7f ? 1.0f - opaque : 1e-7f;
+                        const float slope = opaque * (T[i] * value - quotient(S[i], clear));
+                        const float g = raw <= max_alpha ? slope : 0.0f;
+                        const float dy = dy0 + (float)(i * STEP), gu = g * u[i], gy = g * dy;
+                        sums[0] += g;
+                        sums[1] += gu;
+                        sums[2] += gy;
+                        sums[3] += gu * u[i];
+                        sums[4] += gu * dy;
+                        sums[5] += gy * dy;
+                        T[i] = next;
+                    } else {
+                        T[i] = -T[i];
+                    }
+                }
+                float* out = partials_ + (long long)partial * (10 + channels);
+#if defined(__CUDA_ARCH__)
+                // 10 sums over 32 lanes: 5, 3, 2, 1 remain to a lane, then the last two lanes add
+                const bool in5 = lane & 16, in3 = lane & 8, in2 = lane & 4, in1 = lane & 2;
+                #pragma unroll
+                for (int j = 0; j < 5; ++j) {
+                    const float given = in5 ? sums[j] : sums[j + 5];
+                    const float kept = in5 ? sums[j + 5] : sums[j];
+                    sums[j] = kept + __shfl_xor_sync(ALL, given, 16);
+                }
+                sums[5] = 0.0f;
+                #pragma unroll
+                for (int j = 0; j < 3; ++j) {
+                    const float given = in3 ? sums[j] : sums[j + 3];
+                    const float kept = in3 ? sums[j + 3] : sums[j];
+                    sums[j] = kept + __shfl_xor_sync(ALL, given, 8);
+                }
+                sums[3] = 0.0f;
+                #pragma unroll
+                for (int j = 0; j < 2; ++j) {
+                    const float given = in2 ? sums[j] : sums[j + 2];
+                    const float kept = in2 ? sums[j + 2] : sums[j];
+                    sums[j] = kept + __shfl_xor_sync(ALL, given, 4);
+                }
+                const float given = in1 ? sums[0] : sums[1], kept = in1 ? sums[1] : sums[0];
+                float total = kept + __shfl_xor_sync(ALL, given, 2);
+                total += __shfl_xor_sync(ALL, total, 1);
+                if (sum_of_lane >= 0 && (COLOR || sum_of_lane < 6
+                                         || channel + sum_of_lane - 6 < channels)) {
+                    float* to = out + sum_of_lane;
+                    if (!COLOR && sum_of_lane >= 6) to += 4 + channel;
+                    if (shared_list) atomicAdd(to, total);
+                    else if (!COLOR && sum_of_lane < 6) *to += total;
+                    else *to = total;
+                }
+#else
+                for (int j = 0; j < 10; ++j) {
+                    if (j < 6 || COLOR) out[j] += sums[j];
+                    else if (channel + j - 6 < channels) out[10 + channel + j - 6] += sums[j];
+                }
+#endif
+        DONE
+        #undef DONE
+#if defined(__CUDA_ARCH__)
+        if (!shared_list) {  // all pixels have stopped: the rest has no gradient
+            for (at += lane; at < end; at += 32) {
+                float* out = partials_ + (long long)indices_[2 * at + 1] * (10 + channels);
+                if (COLOR) {
+                    for (int j = 0; j < 10; ++j) out[j] = 0.0f;
+                } else {
+                    for (int j = 0; j < 4 && channel + j < channels; ++j)
+                        out[10 + channel + j] = 0.0f;
+                }
+            }
+        }
+#endif
+"""
+
+# a splat that touches no pixel of the tile, on CUDA
+_CLEAR = r"""
+#if defined(__CUDA_ARCH__)
+                    if (!shared_list && lane < (COLOR ? 10 : min(4, channels - channel)))
+                        partials_[(long long)partial * (10 + channels)
+                                  + (COLOR ? 0 : 10 + channel) + lane] = 0.0f;
+#endif
+"""
+
+# Which sum a lane holds after the halving, -1 for none: lanes in pairs, and some hold padding.
+_UPSTREAM = r"""
+    const float* v_color_ = (const float*)v_color.data;
+    const float* v_alpha_ = (const float*)v_alpha.data;
+    const float* v_depth_ = (const float*)v_depth.data;
+    const float* v_feature_image_ = (const float*)v_feature_image.data;
+    float* partials_ = (float*)partials.data;
+#if defined(__CUDA_ARCH__)
+    const int within = (thread & 4 ? 2 : 0) + (thread & 2 ? 1 : 0);  // of the three or two below
+    const int sum_of_lane = (thread & 1) || within >= (thread & 8 ? 2 : 3)
+        ? -1 : (thread & 16 ? 5 : 0) + (thread & 8 ? 3 : 0) + within;
+#endif
+"""
+
+_SIZES = {
+    "PIXELS": PIXELS,
+    "TILE_WIDTH": TILE_WIDTH,
+    "TILE_HEIGHT": TILE_HEIGHT,
+    "WARPS": WARPS,
+}
+
+
+def _filled(body: str, miss: str) -> str:
+    one = _STATE + body % {"EACH": _EACH % {**_SIZES, "MISS": miss}}
+    return f"""{_HEAD % _SIZES}
+    {{
+        constexpr bool COLOR = true;
+        constexpr int channel = 0;
+        (void)channel;
+        {one}
+    }}
+    for (int channel = 0; channel < channels; channel += 4) {{
+        constexpr bool COLOR = false;
+        {one}
+    }}
+"""
+
+
+FORWARD = _filled(_FORWARD, "")
+BACKWARD = _UPSTREAM + _filled(_BACKWARD, _CLEAR)

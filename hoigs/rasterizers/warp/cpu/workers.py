@@ -1,0 +1,151 @@
+"""Running Warp's CPU kernels on several cores.
+
+Warp runs a CPU launch as one loop on the calling thread and releases the GIL meanwhile. Two ways to
+use more cores, with the same results bit for bit:
+
+- *openmp*: the launches run on torch's own OpenMP pool, so that no second pool competes with it for
+  cores. This uses private parts of Warp, so a trial run checks it first.
+- *threads*: Python threads, with public interfaces only.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import torch
+
+from hoigs.core.errors import RenderError
+from hoigs.rasterizers.warp.common.cpu_launch import prepared
+from hoigs.rasterizers.warp.common.runtime import wp
+
+Scheduler = Literal["auto", "openmp", "threads", "serial"]
+
+
+class Workers(Protocol):
+    """Runs a list of prepared launches, in any order; all are finished when `run` returns.
+
+    Attributes:
+        name: for reports.
+        worthwhile: so many Gaussians take about as long as waking another worker.
+    """
+
+    name: str
+    worthwhile: int
+
+    def run(self, launches: Sequence[Any]) -> None: ...
+
+
+class SerialWorkers:
+    name = "serial"
+    worthwhile = 2**31
+
+    def run(self, launches: Sequence[Any]) -> None:
+        for launch in launches:
+            launch.launch()
+
+
+class ThreadWorkers:
+    """A shared pool of Python threads; the caller is one of the workers."""
+
+    name = "threads"
+    worthwhile = 4096
+    _pool: ThreadPoolExecutor | None = None
+    _owner = 0
+
+    def run(self, launches: Sequence[Any]) -> None:
+        others = [self._executor().submit(launch.launch) for launch in launches[1:]]
+        launches[0].launch()
+        for future in others:
+            future.result()
+
+    @classmethod
+    def _executor(cls) -> ThreadPoolExecutor:
+        if cls._pool is None or cls._owner != os.getpid():  # threads do not survive a fork
+            cls._pool = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="hoigs-warp")
+            cls._owner = os.getpid()
+        return cls._pool
+
+
+class _Job(ctypes.Structure):
+    _fields_ = (
+        ("function", ctypes.c_void_p),
+        ("bounds", ctypes.c_void_p),
+        ("arguments", ctypes.c_void_p),
+    )
+
+
+class _Queue(ctypes.Structure):
+    _fields_ = (("jobs", ctypes.c_void_p), ("count", ctypes.c_int), ("next", ctypes.c_int))
+
+
+class OpenMPWorkers:
+    """torch's libgomp pool, called through a function that Warp compiles (`native_kernels`).
+
+    Raises:
+        RuntimeError, OSError, AttributeError: this machine, torch or Warp does not offer it.
+    """
+
+    name = "openmp"
+    worthwhile = 512
+
+    def __init__(self) -> None:
+        from warp._src.context import _build_cpu_args_structs
+
+        from hoigs.rasterizers.warp.cpu import native_kernels
+
+        self._arguments = _build_cpu_args_structs
+        folder = Path(torch.__file__).parent / "lib"
+        found = sorted(folder.glob("libgomp*.so*"))
+        if not found:
+            raise OSError(f"no libgomp in {folder}: torch was built with another OpenMP")
+        self._gomp = ctypes.CDLL(str(found[0])).GOMP_parallel
+        self._gomp.restype = None
+        address = wp.zeros(1, dtype=wp.uint64, device="cpu")
+        wp.launch(native_kernels.queue_address, dim=1, inputs=[address], device="cpu")
+        self._drain = ctypes.c_void_p(int(address.numpy()[0]))
+        self._check(native_kernels.sum_numbers)
+
+    def run(self, launches: Sequence[Any]) -> None:
+        jobs = (_Job * len(launches))()
+        keep = []
+        for job, launch in zip(jobs, launches):
+            arguments, _ = self._arguments(launch.kernel, launch.hooks, launch.params, False)
+            bounds = launch.params[0]
+            keep.append((launch, arguments, bounds))
+            job.function = ctypes.cast(launch.hooks.forward, ctypes.c_void_p).value
+            job.bounds = ctypes.addressof(bounds)
+            job.arguments = ctypes.addressof(arguments)
+        queue = _Queue(ctypes.addressof(jobs), len(launches), 0)
+        self._gomp(self._drain, ctypes.byref(queue), ctypes.c_uint(len(launches)), ctypes.c_uint(0))
+
+    def _check(self, kernel: Any) -> None:
+        """Run a small kernel and compare its results."""
+        sums = [torch.zeros(1, dtype=torch.int32) for _ in range(4)]
+        self.run([prepared(kernel, 10, [s]) for s in sums])
+        if [int(s) for s in sums] != [45] * 4:
+            raise RuntimeError(f"a trial on torch's OpenMP pool gave {sums}, expected 45 each")
+
+
+def make_workers(scheduler: Scheduler) -> tuple[Workers, str]:
+    """Workers and a line with the reason for the choice.
+
+    Raises:
+        RenderError: "openmp" is requested and cannot be used here.
+    """
+    if scheduler == "serial":
+        return SerialWorkers(), "requested"
+    if scheduler == "threads":
+        return ThreadWorkers(), "requested"
+    try:
+        workers = OpenMPWorkers()
+    except (ImportError, OSError, AttributeError, RuntimeError, TypeError) as error:
+        reason = f"torch's OpenMP pool cannot be used here: {error}"
+        if scheduler == "openmp":
+            raise RenderError(f'WarpRasterizer: {reason}; use scheduler="threads"') from error
+        return ThreadWorkers(), reason
+    return workers, "torch's OpenMP pool passed its trial"

@@ -1,0 +1,7 @@
+"""Rendering on CUDA.
+
+pipeline        CudaPipeline: the stages of a render
+intersections   tile intersections without waiting for the device
+capacity        for how many intersections memory is allocated
+launch          launching kernels with little overhead
+"""

@@ -1,0 +1,106 @@
+"""The stages of a render on CUDA: one warp for each tile, and no waiting for the device."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from hoigs.rasterizers.warp.blend import gather_kernels, pixel_kernels, pixel_source
+from hoigs.rasterizers.warp.blend.arguments import tile_arguments, upstream_arguments
+from hoigs.rasterizers.warp.common.frame import (
+    Images,
+    Inputs,
+    Settings,
+    TileIntersections,
+    check_addressable,
+)
+from hoigs.rasterizers.warp.common.records import MOMENTS
+from hoigs.rasterizers.warp.cuda.capacity import IntersectionCapacity
+from hoigs.rasterizers.warp.cuda.intersections import Intersector
+from hoigs.rasterizers.warp.cuda.launch import CudaStreams
+from hoigs.rasterizers.warp.project.arguments import (
+    Gradients,
+    Projected,
+    adjoint_arguments,
+    project_arguments,
+)
+from hoigs.rasterizers.warp.project.kernels import project, project_adjoint
+from hoigs.rasterizers.warp.project.spherical_harmonics_adjoint import BLOCK as SH_BLOCK
+from hoigs.rasterizers.warp.project.spherical_harmonics_adjoint import harmonics_adjoint
+
+TILE_BLOCK = 32 * pixel_source.WARPS
+
+
+class CudaPipeline:
+    """Renders on one CUDA device, on torch's current stream."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.streams = CudaStreams()
+        self.capacity = IntersectionCapacity(device)
+        self._intersector = Intersector(self.streams, self.capacity)
+
+    def project(self, inputs: Inputs, settings: Settings) -> Projected:
+        out = Projected(inputs.means, inputs.count)
+        arguments = project_arguments(inputs, settings, out)
+        self.streams.current().each(project, inputs.count, arguments)
+        return out
+
+    def intersect(self, projected: Projected, settings: Settings) -> TileIntersections:
+        return self._intersector.intersect(projected, settings)
+
+    def blend(
+        self,
+        inputs: Inputs,
+        settings: Settings,
+        records: Tensor,
+        intersections: TileIntersections,
+    ) -> Images:
+        images = Images.empty(inputs, settings)
+        arguments = tile_arguments(inputs, settings, records, intersections, images)
+        lanes = intersections.tiles * pixel_source.LANES
+        self.streams.current().each(pixel_kernels.forward_pixels, lanes, arguments, TILE_BLOCK)
+        return images
+
+    def gradients(
+        self,
+        inputs: Inputs,
+        settings: Settings,
+        records: Tensor,
+        intersections: TileIntersections,
+        images: Images,
+        upstream: Images,
+        pose: bool,
+    ) -> Gradients:
+        stream, count, stride = self.streams.current(), inputs.count, MOMENTS + inputs.channels
+        capacity, tiles = intersections.count, intersections.tiles
+        check_addressable(capacity * stride, f"{capacity} tile intersections")
+        partials = inputs.means.new_empty(capacity, stride)
+        arguments = [tiles, stride, intersections.offsets, partials]
+        stream.each(gather_kernels.clear_partials, count, arguments)
+        arguments = tile_arguments(inputs, settings, records, intersections, images)
+        arguments += upstream_arguments(upstream, partials)
+        lanes = tiles * pixel_source.LANES
+        stream.each(pixel_kernels.backward_pixels, lanes, arguments, TILE_BLOCK)
+
+        first, drawn = intersections.first_partial, torch.empty_like(intersections.first_partial)
+        arguments = [count, stride, first, intersections.tiles_per_gaussian, partials, drawn]
+        blocks = -(-count // gather_kernels.ROWS)
+        stream.blocks(gather_kernels.gather_partials, blocks, gather_kernels.BLOCK, arguments)
+        gathered = replace(intersections, tiles_per_gaussian=drawn)  # one partial each from here on
+        out = Gradients(inputs, pose)
+        if settings.active_bases == 1:
+            arguments = adjoint_arguments(inputs, settings, records, gathered, partials, out)
+            stream.each(project_adjoint, count, arguments)
+            return out
+        without_sh = replace(inputs, sh=inputs.sh[:, :0]), replace(settings, active_bases=0)
+        arguments = adjoint_arguments(*without_sh, records, gathered, partials, out)
+        stream.each(project_adjoint, count, arguments)
+        arguments = [
+            *(inputs.means, inputs.sh, inputs.sh.shape[1], settings.active_bases),
+            *(inputs.world_to_camera, records, first, drawn, partials, stride),
+            *(out.sh, out.means, out.pose, int(pose), count),
+        ]
+        stream.blocks(harmonics_adjoint, -(-count // SH_BLOCK), SH_BLOCK, arguments)
+        return out

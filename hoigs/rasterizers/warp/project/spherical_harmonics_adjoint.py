@@ -1,0 +1,121 @@
+# mypy: ignore-errors
+# (Warp's arrays annotate as values)
+"""The adjoint of spherical harmonics on CUDA.
+
+A Gaussian has up to 48 coefficients. One thread that reads and writes them alone needs as many
+memory transactions, so a warp moves those of its 32 Gaussians together, through shared memory.
+With 111,785 Gaussians of degree 3 on an H200 this shortens the adjoint of projection and colour
+from 150 to 58 microseconds.
+"""
+
+from hoigs.rasterizers.warp.common.records import F32, I32, M_RED, POSE, RECORD, RED, VEC3
+from hoigs.rasterizers.warp.common.runtime import wp
+from hoigs.rasterizers.warp.project.kernels import camera_center
+from hoigs.rasterizers.warp.project.spherical_harmonics import (
+    Vec16,
+    sh_basis,
+    sh_direction_gradient,
+)
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 16})
+
+BLOCK = 128
+_ROW = 49  # numbers that a row of the buffer takes: odd, so that rows start in different banks
+RECORD_C = wp.constant(RECORD)
+POSE_C = wp.constant(POSE)
+
+# Walks the numbers of a warp's rows, `width` each, as they lie in memory: `i` in the array, and
+# `at` in the buffer.
+_WALK = r"""
+    const int lane = threadIdx.x & 31, first = row - lane;
+    const int rows = count - first < 32 ? count - first : 32;
+    float* mine = (float*)buffer + (threadIdx.x - lane) * %(ROW)d;
+    float* array = (float*)values.data + (long long)first * width;
+    int r = 0, column = lane;
+    for (int i = lane; i < rows * width; i += 32, column += 32) {
+        while (column >= width) {
+            column -= width;
+            ++r;
+        }
+        const int at = r * %(ROW)d + column;
+        %(MOVE)s
+    }
+"""
+
+
+def _walk(move: str) -> str:
+    return _WALK % {"ROW": _ROW, "MOVE": move}
+
+
+@wp.func_native(f"__shared__ float rows[{BLOCK * _ROW}]; return (wp::uint64)rows;")
+def row_buffer() -> wp.uint64: ...
+
+
+@wp.func_native(_walk("mine[at] = array[i];") + "__syncwarp();")
+def load_rows(values: F32, buffer: wp.uint64, row: int, count: int, width: int): ...
+
+
+@wp.func_native("__syncwarp();" + _walk("array[i] = mine[at];"))
+def store_rows(values: F32, buffer: wp.uint64, row: int, count: int, width: int): ...
+
+
+@wp.func_native(f"return ((float*)buffer)[threadIdx.x * {_ROW} + index];")
+def get(buffer: wp.uint64, index: int) -> float: ...
+
+
+@wp.func_native(f"((float*)buffer)[threadIdx.x * {_ROW} + index] = value;")
+def put(buffer: wp.uint64, index: int, value: float): ...
+
+
+@wp.kernel(launch_bounds=BLOCK)
+def harmonics_adjoint(
+    means: VEC3,
+    sh: F32,  # [N, stored_bases, 3]
+    stored_bases: int,
+    active_bases: int,  # more than 1
+    world_to_camera: F32,
+    records: F32,
+    first_partial: I32,  # index in `partials` of the sums of a Gaussian
+    drawn: I32,  # 1 where a Gaussian has partials, else 0
+    partials: F32,
+    stride: int,
+    v_sh: F32,
+    v_means: VEC3,  # the part that goes through the viewing direction is added
+    v_pose: F32,  # its camera centre is written
+    has_pose: int,
+    count: int,  # N; the launch is rounded up to whole blocks
+):
+    row = wp.tid()
+    buffer = row_buffer()
+    load_rows(sh, buffer, row, count, 3 * stored_bases)
+    basis = Vec16()
+    v_color = wp.vec3(0.0, 0.0, 0.0)
+    if row < count:  # noqa: SIM102  older Warps' `and` evaluates both sides
+        if drawn[row] != 0:
+            p = first_partial[row] * stride + M_RED
+            for j in range(3):
+                if records[row * RECORD_C + RED + j] > 0.0:  # not clamped at zero
+                    v_color[j] = partials[p + j]
+            toward = means[row] - camera_center(world_to_camera)
+            distance = wp.length(toward)
+            direction = toward / distance
+            basis = sh_basis(direction, active_bases)
+            dots = Vec16()
+            for k in range(16):
+                if k < active_bases:
+                    dots[k] = (
+                        get(buffer, 3 * k) * v_color[0]
+                        + get(buffer, 3 * k + 1) * v_color[1]
+                        + get(buffer, 3 * k + 2) * v_color[2]
+                    )
+            v_direction = sh_direction_gradient(direction, dots, active_bases)
+            v_center = (wp.dot(direction, v_direction) * direction - v_direction) / distance
+            v_means[row] = v_means[row] - v_center
+            if has_pose != 0:
+                for j in range(3):
+                    v_pose[row * POSE_C + 12 + j] = v_center[j]
+    for k in range(16):
+        if k < stored_bases:
+            for j in range(3):
+                put(buffer, 3 * k + j, basis[k] * v_color[j])
+    store_rows(v_sh, buffer, row, count, 3 * stored_bases)

@@ -1,0 +1,163 @@
+"""Checkpoints: safetensors with a JSON file beside it, each written under a temporary name."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from hoigs.compression.compact import COMPOSED, read_compact
+from hoigs.compression.compact import FORMAT as COMPACT
+from hoigs.core.errors import CheckpointError
+from hoigs.core.model.scene import SceneModel
+
+FORMAT = "hoigs-checkpoint"
+VERSION = 2
+READABLE = (1, VERSION)  # spec keys of version 1 had other names, so its model hashes differ
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The complete state of training after a step.
+
+    A pruned or compressed checkpoint holds the model alone, which can be drawn but not resumed.
+
+    Attributes:
+        tensors: "model.*", "optimizer.*", "density.*", "cameras.*", "rng.*".
+        meta: format, version, step, time_s, counts, sampler, skipped, spec_name, model_hash.
+    """
+
+    tensors: dict[str, torch.Tensor]
+    meta: dict[str, Any]
+
+    def part(self, prefix: str) -> dict[str, torch.Tensor]:
+        """The tensors whose names start with `prefix.`, under the rest of their names."""
+        start = prefix + "."
+        return {k.removeprefix(start): v for k, v in self.tensors.items() if k.startswith(start)}
+
+    def save(self, folder: Path) -> Path:
+        """Write `step_000123.safetensors`, then `.json`, which marks the checkpoint complete."""
+        folder.mkdir(parents=True, exist_ok=True)
+        stem = f"step_{self.meta['step']:06d}"
+        weights, meta = folder / f"{stem}.safetensors", folder / f"{stem}.json"
+        tensors = {k: v.detach().cpu().contiguous() for k, v in self.tensors.items()}
+        temporary = weights.with_suffix(".safetensors.part")
+        save_file(tensors, temporary)
+        temporary.replace(weights)
+        temporary = meta.with_suffix(".json.part")
+        temporary.write_text(json.dumps(self.meta, indent=1))
+        temporary.replace(meta)
+        return weights
+
+
+def _complete(folder: Path) -> list[Path]:
+    return sorted(
+        (p for p in folder.glob("step_*.json") if p.with_suffix(".safetensors").exists()),
+        key=lambda p: int(p.stem.removeprefix("step_")),  # beyond 999999 names grow
+    )
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Whether a run's `checkpoints/` folder has a complete checkpoint."""
+    return bool(_complete(folder))
+
+
+def latest_checkpoint(folder: Path) -> Path:
+    """The JSON file of the newest complete checkpoint in a run's `checkpoints/` folder.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    found = _complete(folder)
+    if not found:
+        raise CheckpointError(
+            f"{folder}: no checkpoint here; expected step_*.safetensors with step_*.json beside "
+            "it, as `hoigs train` writes them"
+        )
+    return found[-1]
+
+
+def load_checkpoint(meta_path: Path) -> Checkpoint:
+    """Read one checkpoint; `meta_path` is its JSON file.
+
+    Raises:
+        CheckpointError: a file is damaged or absent, or of another format.
+    """
+    try:
+        meta = json.loads(meta_path.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise CheckpointError(f"{meta_path}: cannot be read as JSON: {error}") from error
+    compact = meta.get("format") == COMPACT
+    if not compact and (meta.get("format") != FORMAT or meta.get("version") not in READABLE):
+        raise CheckpointError(
+            f"{meta_path}: format {meta.get('format')!r} version {meta.get('version')!r}, "
+            f"expected {FORMAT!r} version {' or '.join(map(str, READABLE))}"
+        )
+    try:
+        tensors = load_file(meta_path.with_suffix(".safetensors"))
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(
+            f"{meta_path.with_suffix('.safetensors')}: damaged or absent: {error}"
+        ) from error
+    if compact:
+        try:
+            tensors = read_compact(tensors, meta)
+        except CheckpointError as error:
+            raise CheckpointError(f"{meta_path.with_suffix('.safetensors')}: {error}") from error
+    return Checkpoint(tensors, meta)
+
+
+def restore_model(model: SceneModel, checkpoint: Checkpoint, model_hash: str) -> None:
+    """Load the parameters of a checkpoint into a composed model.
+
+    Raises:
+        CheckpointError: the checkpoint belongs to another spec, or its tensors do not fit.
+    """
+    stored = checkpoint.meta["model_hash"]
+    if checkpoint.meta["version"] == VERSION and stored != model_hash:
+        raise CheckpointError(
+            f"checkpoint of step {checkpoint.meta['step']} was made by the spec "
+            f"{checkpoint.meta['spec_name']!r} (model hash {stored[:12]}), but this model's hash "
+            f"is {model_hash[:12]}: its `model`, `interaction` or `entities` differ; use the "
+            "spec.yaml that lies beside the checkpoint"
+        )
+    counts = checkpoint.meta["counts"]
+    if set(counts) != set(model.entities):
+        raise CheckpointError(
+            f"checkpoint holds the entities {sorted(counts)}, the model has "
+            f"{sorted(model.entities)}; it belongs to another clip"
+        )
+    for name, count in counts.items():
+        model.entity(name).resize(count)
+    composed = model.state_dict()
+    known = {name: composed[name] for name in checkpoint.meta.get(COMPOSED, ()) if name in composed}
+    try:
+        model.load_state_dict(known | checkpoint.part("model"))
+    except RuntimeError as error:
+        raise CheckpointError(f"checkpoint does not fit the model: {error}") from error
+
+
+def restore_cameras(cameras: nn.Module | None, checkpoint: Checkpoint) -> None:
+    """Load the camera corrections of a checkpoint, if it has any.
+
+    Raises:
+        CheckpointError: the run refines no cameras, or the corrections are of another clip.
+    """
+    stored = checkpoint.part("cameras")
+    if not stored:
+        return
+    if cameras is None:
+        raise CheckpointError(
+            f"checkpoint of step {checkpoint.meta['step']} has refined cameras, but "
+            "train.rates.camera is 0: resume with the rate that it was trained with"
+        )
+    try:
+        cameras.load_state_dict(stored)
+    except RuntimeError as error:
+        raise CheckpointError(f"the checkpoint's cameras are of another clip: {error}") from error

@@ -1,0 +1,70 @@
+"""A clip argument: the folder that it means, its short name, and the clip read from it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hoigs.core.errors import ClipError
+from hoigs.core.registry.registry import Registry, default_registry
+from hoigs.core.values.clip import Clip
+from hoigs.runs.reader_choice import ReaderChoice, choose_reader
+from hoigs.synthesis.named import PREFIX, is_named, named_clip
+
+
+def clip_folder(clip: str | Path, registry: Registry | None = None) -> Path:
+    """The folder of a clip argument; a built-in clip is generated unless it is cached.
+
+    Args:
+        clip: a folder, or "builtin:NAME" (`hoigs.synthesis.named`).
+
+    Raises:
+        ClipError: there is no built-in clip of that name. Whether a folder exists is not checked.
+    """
+    if is_named(clip):
+        return named_clip(str(clip), (registry or default_registry()).get("body:anny")())
+    return Path(clip)
+
+
+def clip_name(clip: str | Path) -> str:
+    """A short name for run folders: "carry" of "builtin:carry", else the folder's name."""
+    if is_named(clip):
+        short, _, query = str(clip).removeprefix(PREFIX).partition("?")
+        return "-".join([short, *filter(None, query.replace("=", "-").split("&"))])
+    return Path(clip).resolve().name
+
+
+def require_folder(folder: Path) -> None:
+    """Raise ClipError unless the folder exists."""
+    if not folder.is_dir():
+        raise ClipError(f"{folder}: no such folder; `hoigs prepare VIDEO --out {folder}` makes one")
+
+
+def read_clip(
+    folder: Path | str,
+    registry: Registry | None = None,
+    width: int | None = None,
+    *,
+    allow_faults: bool = False,
+    reader: ReaderChoice | None = None,
+) -> Clip:
+    """Read the clip in `folder`.
+
+    Args:
+        folder: a folder in any layout that an installed reader recognises, or "builtin:NAME".
+        registry: of readers; by default the installed ones.
+        width: shrink wider frames to this image width, aspect kept; None keeps all sizes.
+        allow_faults: accept defects that training can tolerate (`ClipReader.allow_faults`).
+        reader: from `choose_reader`; by default the one that recognises the folder.
+
+    Raises:
+        ClipError: no reader or several recognise the folder, or the clip is incomplete.
+    """
+    registry = registry or default_registry()
+    folder = clip_folder(folder, registry)
+    require_folder(folder)
+    choice = reader or choose_reader(folder, registry)
+    choice.reader.allow_faults = allow_faults
+    clip = choice.reader.read(folder)
+    if width is None or width >= clip.cameras[0].width:
+        return clip
+    return clip.resized(width)

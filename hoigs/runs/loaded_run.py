@@ -1,0 +1,102 @@
+"""LoadedRun: a run folder read back, with its clip and its trained model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hoigs.core.errors import HoigsError
+from hoigs.core.model.camera_refinement import CameraRefinement
+from hoigs.core.model.compose import compose
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.registry.registry import default_registry
+from hoigs.core.spec.schema import Spec
+from hoigs.core.values.clip import Clip
+from hoigs.runs.checkpoint import (
+    latest_checkpoint,
+    load_checkpoint,
+    restore_cameras,
+    restore_model,
+)
+from hoigs.runs.choices import pick_device, with_rasterizer
+from hoigs.runs.clip_source import clip_folder, read_clip
+from hoigs.runs.reader_choice import recorded_reader
+from hoigs.runs.run_folder import RunFolder
+
+
+@dataclass(frozen=True)
+class LoadedRun:
+    """A run read back: its spec, its clip at training width and its model in eval mode.
+
+    Attributes:
+        clip: with the refined cameras, if training refined them. step: of the newest checkpoint.
+    """
+
+    spec: Spec
+    clip: Clip
+    model: SceneModel
+    step: int
+    provenance: dict[str, Any]
+
+    @classmethod
+    def open(
+        cls,
+        path: Path | str,
+        *,
+        clip: Path | str | None = None,
+        rasterizer: str | None = None,
+        device: str = "cpu",
+        plugins: Sequence[Path | str] = (),
+    ) -> LoadedRun:
+        """Read a run folder.
+
+        Args:
+            clip: in place of the one that it was trained on, a folder or "builtin:NAME".
+            rasterizer: in place of the spec's. device: "cpu", "cuda" or "auto".
+            plugins: Python files to load (and run) first.
+
+        Raises:
+            HoigsError: this is no run, it is damaged, or its clip is not there.
+        """
+        path = Path(path)
+        run = RunFolder(path)
+        run.require()
+        registry = default_registry(plugin_files=plugins)
+        device, changes = pick_device(device), with_rasterizer((), rasterizer)
+        spec = Spec.load(run.spec, overrides=changes, registry=registry)
+        provenance = run.read_provenance()
+        own = path / provenance["clip"]["path"]
+        folder = own if clip is None else clip_folder(clip, registry)
+        if not folder.is_dir():
+            raise HoigsError(f"{folder}: the clip of this run is not there; give --clip FOLDER")
+        torch.manual_seed(spec.train.seed)
+        allowed = bool(provenance.get("allow_faults"))
+        recorded = provenance["clip"].get("reader") if clip is None else None
+        choice = recorded_reader(recorded, path, folder, registry) if recorded else None
+        source = read_clip(folder, registry, spec.train.width, allow_faults=allowed, reader=choice)
+        model = compose(spec, source, registry).to(device)
+        checkpoint = load_checkpoint(latest_checkpoint(run.checkpoints))
+        restore_model(model, checkpoint, spec.model_hash())
+        if checkpoint.part("cameras"):
+            refinement = CameraRefinement.of(source)
+            restore_cameras(refinement, checkpoint)
+            source = refinement.refined(source)
+        model.eval()
+        model.set_progress(min(1.0, checkpoint.meta["step"] / spec.train.steps))
+        return cls(spec, source, model, checkpoint.meta["step"], provenance)
+
+
+def open_run(
+    run: Path | str,
+    *,
+    clip: Path | str | None = None,
+    rasterizer: str | None = None,
+    device: str = "auto",
+    plugins: Sequence[Path | str] = (),
+) -> LoadedRun:
+    """`LoadedRun.open` on CUDA where available."""
+    return LoadedRun.open(run, clip=clip, rasterizer=rasterizer, device=device, plugins=plugins)

@@ -1,0 +1,93 @@
+"""Defaults of a run: its folder, and what a resumed run keeps (spec, clip and reader)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hoigs.core.errors import HoigsError
+from hoigs.core.registry.registry import Registry
+from hoigs.core.spec.loader import load_yaml
+from hoigs.core.spec.older import with_present_names
+from hoigs.core.spec.schema import Spec
+from hoigs.runs.clip_source import clip_folder, clip_name, require_folder
+from hoigs.runs.reader_choice import ReaderChoice, choose_reader, recorded_reader
+from hoigs.runs.run_folder import RunFolder
+
+DEFAULT_SPEC = "hoigs"
+NO_CLIP = "name a clip, a folder or builtin:NAME"
+
+
+def default_out(clip: Path | str | None, name: str) -> Path:
+    """The run folder runs/CLIP-SPEC.
+
+    Raises:
+        HoigsError: `clip` is None, or clip and spec do not make the name of a single folder.
+    """
+    if clip is None:
+        raise HoigsError(f"{NO_CLIP}, or the run to resume: `hoigs train --resume --out RUN`")
+    folder = f"{clip_name(clip)}-{name}"
+    if "\0" in folder or Path(folder).name != folder:
+        raise HoigsError(
+            f"{folder!r} (clip and spec) cannot be the name of a folder in runs/; "
+            "name the run folder: --out RUN"
+        )
+    return Path("runs") / folder
+
+
+def own_spec(path: Path) -> Path:
+    """The spec of the run at `path`."""
+    run = RunFolder(path)
+    run.require()
+    return run.spec
+
+
+def changes_of(stored: Path, spec: Spec) -> list[str]:
+    """Settings of `spec` that differ from a run's spec.yaml (`stored`): "train.steps: 10 -> 20"."""
+    old = _leaves(with_present_names(load_yaml(stored.read_text(), str(stored))).data)
+    new = _leaves(spec.model_dump(mode="json"))
+    return [
+        f"{key}: {old.get(key, 'absent')} -> {new.get(key, 'absent')}"
+        for key in dict.fromkeys([*old, *new])
+        if old.get(key) != new.get(key) or (key in old) != (key in new)
+    ]
+
+
+def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
+    """The values of nested mappings by dotted name."""
+    if not isinstance(tree, dict) or not tree:
+        return {place: tree}
+    return {
+        name: value
+        for key, branch in tree.items()
+        for name, value in _leaves(branch, f"{place}.{key}" if place else str(key)).items()
+    }
+
+
+def clip_and_reader(
+    clip: Path | str | None,
+    run: RunFolder,
+    earlier: dict[str, Any],
+    registry: Registry,
+    reader: str | None,
+    reader_settings: Sequence[str],
+) -> tuple[Path, ReaderChoice]:
+    """The clip's folder and its reader: as given, else those of the provenance `earlier`.
+
+    Raises:
+        HoigsError: no clip is given or recorded, it is not there, or no reader fits.
+    """
+    if clip is None and not earlier:
+        raise HoigsError(f"{NO_CLIP}: `hoigs train builtin:carry`")
+    record = earlier.get("clip", {})
+    own = run.path / record["path"] if earlier else None
+    folder = own if clip is None else clip_folder(clip, registry)
+    assert folder is not None
+    if clip is None and not folder.is_dir():
+        raise HoigsError(f"{folder}: the clip of this run is not there; name it: hoigs train CLIP")
+    require_folder(folder)
+    same = own is not None and own.resolve() == folder.resolve()
+    if same and record.get("reader") and reader is None and not reader_settings:
+        return folder, recorded_reader(record["reader"], run.path, folder, registry)
+    return folder, choose_reader(folder, registry, reader, reader_settings)

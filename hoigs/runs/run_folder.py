@@ -1,0 +1,176 @@
+"""RunFolder: spec.yaml, provenance.json, metrics.jsonl and checkpoints/ of one run.
+
+Paths in it are relative, so the folder can be moved."""
+
+from __future__ import annotations
+
+import glob
+import json
+import os
+import platform
+import shutil
+from collections.abc import Iterable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from hoigs.core.errors import HoigsError
+from hoigs.core.safe_replace import Layout, one_of, put_in_place, require_replaceable
+
+PACKAGES = ("hoigs", "torch", "warp-lang", "kornia", "pluggy", "numpy")
+
+_PROTOCOL = "(given|interpolated|fitted)"
+_WRITTEN_WHOLE = (
+    r"(spec\.yaml|provenance\.json|job\.json|study\.json|report\.html"
+    rf"|evaluation(-{_PROTOCOL}-{_PROTOCOL})?\.json)"
+)
+# what train, eval, compress, render and studies write into a run, half-written files included
+RUN = Layout(
+    what="run",
+    maker="hoigs",
+    required=("spec.yaml", "provenance.json", "checkpoints"),
+    files=one_of(
+        _WRITTEN_WHOLE,
+        rf"\.{_WRITTEN_WHOLE}\.part",
+        r"metrics\.(jsonl|part)",
+        r"checkpoints/step_\d+\.((safetensors|json)(\.part)?|\d+\.part)",
+        r"renders/((playback|orbit)\.mp4|\.(playback|orbit)\.mp4\.part)",
+    ),
+    folders=one_of("checkpoints", "renders"),
+)
+
+
+class RunFolder:
+    """The files of one training run.
+
+    Args:
+        path: the folder; `create` makes it, once all input has been checked.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @property
+    def spec(self) -> Path:
+        return self.path / "spec.yaml"
+
+    @property
+    def metrics(self) -> Path:
+        return self.path / "metrics.jsonl"
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def provenance(self) -> Path:
+        return self.path / "provenance.json"
+
+    def require(self) -> None:
+        """Raise HoigsError unless this is a run."""
+        missing = RUN.missing(self.path)
+        if missing:
+            raise HoigsError(
+                f"{self.path}: not a run folder, {', '.join(missing)} absent; "
+                "`hoigs train CLIP --out RUN` makes one"
+            )
+
+    def refuse_existing(self, overwrite: bool, inputs: Iterable[Path | str] = ()) -> None:
+        """Raise HoigsError unless a run may be created here.
+
+        Args:
+            overwrite: allow an older run here, if it is complete and has no foreign files.
+            inputs: sources of the new run, which must not be inside the old one.
+        """
+        if not overwrite and self.path.is_dir() and any(self.path.iterdir()):
+            raise HoigsError(
+                f"{self.path}: already exists; choose another --out, go on with --resume, or "
+                "replace it with --overwrite"
+            )
+        require_replaceable(self.path, RUN, inputs=map(Path, inputs))
+
+    def replace_by(
+        self, new: RunFolder, overwrite: bool, inputs: Iterable[Path | str] = ()
+    ) -> None:
+        """Rename a finished run to this one; arguments as for `refuse_existing`."""
+        self.refuse_existing(overwrite, inputs)
+        put_in_place(new.path, self.path)
+
+    def create(
+        self,
+        spec_text: str,
+        provenance: dict[str, Any],
+        overwrite: bool = False,
+        inputs: Iterable[Path | str] = (),
+    ) -> None:
+        """Make the folder under a temporary name, then rename it into place.
+
+        Temporary folders of killed processes are removed. `overwrite` and `inputs` are as for
+        `refuse_existing`.
+        """
+        self.refuse_existing(overwrite, inputs)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        for stale in self.path.parent.glob(f".{glob.escape(self.path.name)}.*.part"):
+            if not _alive(stale.name.split(".")[-2]):
+                shutil.rmtree(stale)
+        temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
+        shutil.rmtree(temporary, ignore_errors=True)
+        (temporary / "checkpoints").mkdir(parents=True)
+        (temporary / "spec.yaml").write_text(spec_text)
+        (temporary / "provenance.json").write_text(json.dumps(provenance, indent=1))
+        (temporary / "metrics.jsonl").touch()
+        put_in_place(temporary, self.path)
+
+    def update(self, spec_text: str, changed: dict[str, Any]) -> None:
+        """Replace the spec of a resumed run, and the `changed` keys of its provenance."""
+        record = self.read_provenance() | changed
+        for path, text in ((self.spec, spec_text), (self.provenance, json.dumps(record, indent=1))):
+            temporary = path.with_name(f".{path.name}.part")
+            temporary.write_text(text)
+            temporary.replace(path)
+
+    def log(self, record: dict[str, Any]) -> None:
+        """Append a line to metrics.jsonl."""
+        with self.metrics.open("a") as file:
+            file.write(json.dumps(record) + "\n")
+
+    def cut_metrics(self, step: int) -> None:
+        """Drop records after `step`, which a resumed run writes again, and an unfinished line."""
+        whole = self.metrics.read_text().rpartition("\n")[0]
+        kept = [line for line in whole.splitlines() if json.loads(line)["step"] <= step]
+        temporary = self.metrics.with_suffix(".part")
+        temporary.write_text("".join(line + "\n" for line in kept))
+        temporary.replace(self.metrics)
+
+    def read_provenance(self) -> dict[str, Any]:
+        return json.loads(self.provenance.read_text())
+
+    def relative(self, path: Path) -> str:
+        """`path` relative to the run folder, so that both can move together."""
+        return os.path.relpath(path.resolve(), self.path.resolve())
+
+
+def _alive(pid: str) -> bool:
+    """Whether a process of this number runs; True for a text that is no number."""
+    if not pid.isdigit():
+        return True
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that decide a result, of Python, and the machine."""
+    found = {}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    found["python"] = platform.python_version()
+    found["machine"] = f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPUs"
+    return found

@@ -1,0 +1,248 @@
+"""What a chart is drawn from: one cell a training, one point a method; plain data from JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from statistics import mean
+from typing import Any, Literal
+
+from hoigs.core.errors import HoigsError
+from hoigs.evaluation.protocol import NotComputed, Value
+from hoigs.studies.jobs.results import ALL_CLIPS, Spread
+
+FORMAT, VERSION = "hoigs-chart", 1
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One measure of a cell.
+
+    Attributes:
+        name: in JSON and CSV. title: on paper. better: which way is good.
+        digits: shown in tables. timed: another machine gives another number.
+    """
+
+    name: str
+    title: str
+    better: Literal["higher", "lower"]
+    digits: int = 2
+    timed: bool = False
+
+    def no_worse(self, a: float, b: float) -> bool:
+        return a >= b if self.better == "higher" else a <= b
+
+
+ACCURACY = (
+    Axis("psnr_human_object", "PSNR, human + object (dB)", "higher"),
+    Axis("psnr_full", "PSNR, full frame (dB)", "higher"),
+    Axis("lpips_human_object", "LPIPS, human + object", "lower", 4),
+    Axis("lpips_full", "LPIPS, full frame", "lower", 4),
+)
+COST = (
+    Axis("train_s", "training (s)", "lower", 1, timed=True),
+    Axis("render_ms", "rendering a frame (ms)", "lower", 2, timed=True),
+    Axis("parameters", "parameters", "lower", 0),
+    Axis("megabytes", "size (MB)", "lower", 2),
+    Axis("joules", "training (J)", "lower", 0, timed=True),
+)
+AXES = {axis.name: axis for axis in (*ACCURACY, *COST)}
+
+CurvePoint = tuple[int, float, float]  # step, seconds of training, dB
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training of one spec on one clip.
+
+    Attributes:
+        spec: its label. definition: what it is: a name or file, and what is laid over it.
+        rasterizer: name. steps: the budget. clip: label. seed: of the training.
+        run: its folder, relative to the chart's. machine: fingerprint in words, "" if never run.
+        values: by axis name. protocol: how they came about, sentences.
+        curve: PSNR of a few test frames as training went.
+        missing: why there are no values; "" when there are.
+    """
+
+    spec: str
+    definition: str
+    rasterizer: str
+    steps: int
+    clip: str
+    seed: int
+    run: str = ""
+    machine: str = ""
+    values: Mapping[str, Value] = field(default_factory=dict)
+    protocol: tuple[str, ...] = ()
+    curve: tuple[CurvePoint, ...] = ()
+    missing: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        plain = {
+            name: {"not_computed": v.reason} if isinstance(v, NotComputed) else v
+            for name, v in self.values.items()
+        }
+        return vars(self) | {"values": plain, "protocol": list(self.protocol),
+                             "curve": [list(p) for p in self.curve]}  # fmt: skip
+
+    @staticmethod
+    def from_dict(data: Mapping[str, Any]) -> Cell:
+        values = {
+            name: NotComputed(v["not_computed"]) if isinstance(v, dict) else float(v)
+            for name, v in data["values"].items()
+        }
+        curve = tuple((int(s), float(t), float(q)) for s, t, q in data["curve"])
+        return Cell(**{**data, "values": values, "protocol": tuple(data["protocol"]),
+                       "curve": curve})  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Point:
+    """The seeds of one spec, rasterizer and budget, on one clip and one machine.
+
+    Attributes:
+        values: mean and spread over `seeds`, by axis name.
+        missing: why further seeds have none. curve: mean over seeds.
+    """
+
+    spec: str
+    definition: str
+    rasterizer: str
+    steps: int
+    clip: str
+    machine: str
+    seeds: tuple[int, ...]
+    values: Mapping[str, Spread | NotComputed]
+    protocol: tuple[str, ...]
+    curve: tuple[CurvePoint, ...]
+    missing: Mapping[int, str]
+
+    def number(self, axis: Axis) -> float | None:
+        value = self.values.get(axis.name)
+        return value.mean if isinstance(value, Spread) else None
+
+    def spread(self, axis: Axis) -> float:
+        """Standard deviation over seeds; 0 with a single seed."""
+        value = self.values.get(axis.name)
+        return value.std or 0.0 if isinstance(value, Spread) else 0.0
+
+
+def points_of(cells: Sequence[Cell]) -> list[Point]:
+    """Cells of one spec, rasterizer, budget, clip and machine become a point, in order."""
+    groups: dict[tuple[str, str, int, str, str], list[Cell]] = {}
+    for cell in cells:
+        if not cell.missing:
+            key = (cell.spec, cell.rasterizer, cell.steps, cell.clip, cell.machine)
+            groups.setdefault(key, []).append(cell)
+    return [_point(own, cells) for own in groups.values()]
+
+
+def _point(own: Sequence[Cell], cells: Sequence[Cell]) -> Point:
+    first = own[0]
+    missing = {
+        c.seed: c.missing
+        for c in cells
+        if c.missing and _method(c) == _method(first) and c.clip == first.clip
+    }
+    names = dict.fromkeys(name for cell in own for name in cell.values)
+    values = {name: _over([c.values.get(name) for c in own]) for name in names}
+    return Point(
+        first.spec, first.definition, first.rasterizer, first.steps, first.clip, first.machine,
+        tuple(c.seed for c in own), values, first.protocol, mean_curve([c.curve for c in own]),
+        missing,
+    )  # fmt: skip
+
+
+def _method(cell: Cell) -> tuple[str, str, int]:
+    return cell.spec, cell.rasterizer, cell.steps
+
+
+def _over(values: Sequence[Value | None]) -> Spread | NotComputed:
+    numbers = [v for v in values if v is not None and not isinstance(v, NotComputed)]
+    if len(numbers) == len(values):
+        return Spread.of(numbers)
+    reasons = sorted({v.reason for v in values if isinstance(v, NotComputed)})
+    return NotComputed("; ".join(reasons) or "this run has no such number")
+
+
+def mean_curve(curves: Sequence[Sequence[CurvePoint]]) -> tuple[CurvePoint, ...]:
+    """Mean seconds and dB at each step that every seed has."""
+    by_step = [{step: (s, q) for step, s, q in curve} for curve in curves]
+    shared = sorted(set(by_step[0]).intersection(*by_step[1:])) if by_step else []
+    return tuple(
+        (step, mean(c[step][0] for c in by_step), mean(c[step][1] for c in by_step))
+        for step in shared
+    )
+
+
+def all_clips(cells: Sequence[Cell]) -> list[Cell]:
+    """Each seed's mean over clips, of what has been run on every clip by one machine.
+
+    A number that one clip lacks is not computed, with that clip's reason.
+    """
+    clips = list(dict.fromkeys(c.clip for c in cells))
+    groups: dict[tuple[Any, ...], list[Cell]] = {}
+    for cell in cells:
+        if not cell.missing:
+            key = (*_method(cell), cell.machine, cell.seed)
+            groups.setdefault(key, []).append(cell)
+    merged = []
+    for own in groups.values():
+        if {c.clip for c in own} == set(clips):
+            names = dict.fromkeys(name for cell in own for name in cell.values)
+            values = {name: _clip_mean(own, name) for name in names}
+            protocol = tuple(f"{c.clip}: {' '.join(c.protocol)}" for c in own)
+            merged.append(replace(own[0], clip=ALL_CLIPS, run="", values=values,
+                                  protocol=protocol, curve=()))  # fmt: skip
+    return merged
+
+
+def _clip_mean(cells: Sequence[Cell], name: str) -> Value:
+    numbers = []
+    for cell in cells:
+        value = cell.values.get(name, NotComputed("this run has no such number"))
+        if isinstance(value, NotComputed):
+            return NotComputed(f"{cell.clip}: {value.reason}")
+        numbers.append(value)
+    return mean(numbers)
+
+
+def dump_cells(cells: Sequence[Cell], about: Mapping[str, Any]) -> str:
+    """chart.json, whole: `load_chart` reads it back."""
+    points = [_plain_point(p) for p in points_of(cells)]
+    data = {"format": FORMAT, "version": VERSION, "about": dict(about),
+            "cells": [c.to_dict() for c in cells], "points": points}  # fmt: skip
+    return json.dumps(data, indent=1, allow_nan=False)
+
+
+def load_chart(path: Path) -> tuple[list[Cell], dict[str, Any]]:
+    """The cells of a chart.json, and how they were made.
+
+    Raises:
+        HoigsError: the file is not one.
+    """
+    try:
+        data = json.loads(path.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise HoigsError(f"{path}: expected the chart.json of another chart: {error}") from error
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise HoigsError(f"{path}: not a chart.json; `hoigs chart` writes one")
+    if data["version"] != VERSION:
+        raise HoigsError(f"{path}: version {data['version']} of a chart; this hoigs has {VERSION}")
+    return [Cell.from_dict(cell) for cell in data["cells"]], data["about"]
+
+
+def _plain_point(point: Point) -> dict[str, Any]:
+    values = {
+        name: {"not_computed": v.reason}
+        if isinstance(v, NotComputed)
+        else {"mean": v.mean, "std": v.std, "n": len(v.values)}
+        for name, v in point.values.items()
+    }
+    return vars(point) | {
+        "seeds": list(point.seeds), "values": values, "protocol": list(point.protocol),
+        "curve": [list(p) for p in point.curve],
+        "missing": {str(seed): why for seed, why in point.missing.items()},
+    }  # fmt: skip

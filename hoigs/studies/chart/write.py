@@ -1,0 +1,190 @@
+"""A chart's files: chart.json, chart.csv, chart.md, chart.html, and figures of every clip."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hoigs.evaluation.protocol import NotComputed
+from hoigs.studies.chart.data import (
+    ACCURACY,
+    AXES,
+    COST,
+    Axis,
+    Cell,
+    Point,
+    all_clips,
+    dump_cells,
+    points_of,
+)
+from hoigs.studies.chart.pareto import dominances, front, usable_axes
+from hoigs.studies.chart.series import letter, machines, name_of
+from hoigs.studies.jobs.results import Spread
+
+
+def by_clip(cells: Sequence[Cell]) -> dict[str, list[Point]]:
+    """Points of each clip that has any, then the mean of all where there are several."""
+    clips = list(dict.fromkeys(c.clip for c in cells))
+    sheets = {clip: points_of([c for c in cells if c.clip == clip]) for clip in clips}
+    if len(clips) > 1:
+        merged = all_clips(cells)
+        sheets |= {c.clip: points_of(merged) for c in merged[:1]}
+    return {clip: points for clip, points in sheets.items() if points}
+
+
+def write_chart(
+    cells: Sequence[Cell], out: Path, about: Mapping[str, Any], *, mix_machines: bool = False
+) -> list[Path]:
+    """All files, each whole or not at all; figures of a clip only where something can be drawn.
+
+    Args:
+        about: how the study was made, JSON values.
+        mix_machines: draw times of several machines in one panel.
+    """
+    from hoigs.studies.chart.interactive import page
+
+    out.mkdir(parents=True, exist_ok=True)
+    sheets = by_clip(cells)
+    files: dict[str, bytes] = {
+        "chart.json": dump_cells(cells, about).encode(),
+        "chart.csv": as_csv(cells).encode(),
+        "chart.md": markdown(cells, sheets, about, mix_machines).encode(),
+        "chart.html": page(cells, sheets, about, mix_machines).encode(),
+    }
+    for clip, points in sheets.items():
+        files |= _figures(clip, points, mix_machines)
+    for name, content in files.items():
+        temporary = out / f".{name}.part"
+        temporary.write_bytes(content)
+        temporary.replace(out / name)
+    return [out / name for name in files]
+
+
+def _figures(clip: str, points: Sequence[Point], mix_machines: bool) -> dict[str, bytes]:
+    from hoigs.studies.chart.curves import curve_chart
+    from hoigs.studies.chart.panels import accuracy_chart
+
+    stem = f"chart-{slug(clip)}"
+    drawn = accuracy_chart(points, f"{clip}: accuracy against cost", mix_machines=mix_machines)
+    curves = curve_chart(points, f"{clip}: quality during training", mix_machines=mix_machines)
+    found: dict[str, bytes] = {}
+    for name, figure in ((stem, drawn), (f"{stem}-curves", curves)):
+        if figure is not None:
+            found[f"{name}.png"] = _saved(figure, "png", {"Software": None})
+            found[f"{name}.svg"] = _saved(figure, "svg", {"Date": None, "Creator": None})
+    return found
+
+
+def _saved(figure: Any, kind: str, metadata: dict[str, None]) -> bytes:
+    import matplotlib
+
+    from hoigs.studies.plotting.style import STYLE
+
+    buffer = io.BytesIO()
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(buffer, format=kind, metadata=metadata)
+    return buffer.getvalue()
+
+
+def slug(name: str) -> str:
+    """A clip's name as part of a file's."""
+    return re.sub(r"[^\w.]+", "-", name).strip("-")
+
+
+def as_csv(cells: Sequence[Cell]) -> str:
+    """One number a line, every seed on its own, each with its protocol."""
+    columns = ("clip", "spec", "definition", "rasterizer", "steps", "seed", "measure", "value",
+               "not_computed", "machine", "run", "protocol")  # fmt: skip
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for cell in cells:
+        base = vars(cell) | {"protocol": " ".join(cell.protocol)}
+        for name in AXES:
+            value = cell.values.get(
+                name, NotComputed(cell.missing or "this run has no such number")
+            )
+            absent = value.reason if isinstance(value, NotComputed) else ""
+            number = "" if isinstance(value, NotComputed) else repr(value)
+            writer.writerow(base | {"measure": name, "value": number, "not_computed": absent})
+    return text.getvalue()
+
+
+def markdown(
+    cells: Sequence[Cell],
+    sheets: Mapping[str, Sequence[Point]],
+    about: Mapping[str, Any],
+    mix_machines: bool,
+) -> str:
+    """Numbers and dominances, a section a clip."""
+    lines = ["# Accuracy against cost", "", *(f"- {k}: {v}" for k, v in about.items()), ""]
+    for clip, points in sheets.items():
+        lines += [f"## {clip}", "", *machine_lines(points), ""]
+        lines += [*_numbers(points), "", *dominance_table(points, mix_machines), ""]
+        lines += ["Protocol:", "", *(f"- {s}" for s in points[0].protocol), ""]
+    lost = [c for c in cells if c.missing]
+    if lost:
+        lines += ["## Not run or failed", ""]
+        lines += [
+            f"- {c.spec}, {c.clip}, {c.steps} steps, seed {c.seed}: {c.missing}" for c in lost
+        ]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def machine_lines(points: Sequence[Point]) -> list[str]:
+    """The sentence on machines that every table has."""
+    found = machines(points)
+    if len(found) == 1:
+        return [f"Measured on {found[0]}."]
+    each = [f"- machine {letter(i)}: {words}" for i, words in enumerate(found)]
+    return [f"**Points of {len(found)} machines**, whose times and joules cannot be compared:",
+            "", *each]  # fmt: skip
+
+
+def _numbers(points: Sequence[Point]) -> list[str]:
+    axes = (*ACCURACY, *COST)
+    notes: dict[str, int] = {}
+    lines = ["| | steps | seeds | " + " | ".join(a.title for a in axes) + " |",
+             "|---" * (len(axes) + 3) + "|"]  # fmt: skip
+    for p in points:
+        cells = [_shown(p, axis, notes) for axis in axes]
+        lines.append(f"| {name_of(p, points)} | {p.steps} | {len(p.seeds)} | {' | '.join(cells)} |")
+    lines += ["", "± is the sample standard deviation over seeds.  "]
+    return [*lines, *(f"({n}) not computed: {reason}  " for reason, n in notes.items())]
+
+
+def _shown(point: Point, axis: Axis, notes: dict[str, int]) -> str:
+    value = point.values.get(axis.name, NotComputed("this run has no such number"))
+    if not isinstance(value, Spread):
+        return f"– ({notes.setdefault(value.reason, len(notes) + 1)})"
+    spread = "" if value.std is None else f" ± {value.std:,.{axis.digits}f}"
+    return f"{value.mean:,.{axis.digits}f}{spread}"
+
+
+def dominance_table(points: Sequence[Point], mix_machines: bool) -> list[str]:
+    """For each cost, and for all at once, by whom a point is dominated; Markdown lines."""
+    rows, _ = usable_axes(points, ACCURACY, mix_machines)
+    columns, refused = usable_axes(points, COST, mix_machines)
+    if not rows or not columns:
+        return ["Nothing to compare: no accuracy or no cost is computed."]
+    sets: dict[str, tuple[Axis, ...]] = {
+        f"{rows[0].title} against {c.title}": (c, rows[0]) for c in columns
+    }
+    sets["everything that is computed"] = (*columns, *rows)
+    lines = ["Who dominates: no worse on every axis of the column and better on one. (?): on some "
+             "axis by less than one standard deviation over seeds, or of single seeds.", "",
+             "| | " + " | ".join(sets) + " |", "|---" * (len(sets) + 1) + "|"]  # fmt: skip
+    found = {name: (dominances(points, axes), front(points, axes)) for name, axes in sets.items()}
+    for p in points:
+        cells = []
+        for pairs, best in found.values():
+            winners = [f"{name_of(d.winner, points, True)}{'' if d.sure else ' (?)'}"
+                       for d in pairs if d.loser is p]  # fmt: skip
+            on_front = any(p is q for q in best)
+            cells.append("**front**" if on_front else "; ".join(winners) or "–")
+        lines.append(f"| {name_of(p, points, True)} | {' | '.join(cells)} |")
+    return [*lines, "", *(f"{name}: {why}.  " for name, why in refused.items())]

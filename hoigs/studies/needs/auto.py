@@ -1,0 +1,128 @@
+"""auto: find what a clip needs of a spec, train that, then prune and compress the model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from hoigs.core.errors import HoigsError
+from hoigs.core.progress import Progress
+from hoigs.runs.choices import pick_device
+from hoigs.runs.clip_source import clip_name
+from hoigs.runs.resuming import DEFAULT_SPEC
+from hoigs.runs.run_folder import RunFolder
+from hoigs.studies.needs.after_training import After, add_to_answer, finish
+from hoigs.studies.needs.needs import needs
+from hoigs.studies.needs.pruning.compact_run import compact_of
+from hoigs.studies.needs.result import Needs
+from hoigs.workflows.evaluate_run import evaluate_run
+from hoigs.workflows.train import OnStart, OnStep, Report, TrainedRun, silent, train
+
+
+@dataclass(frozen=True)
+class AutoRun:
+    """What `auto` made.
+
+    Attributes:
+        run: the pruned run and its scores; its session holds the model as it was before pruning.
+        compact: folder of the compressed copy. answer: folder that `needs` wrote.
+        needs: the search; None where the run was resumed. after: pruning and compression.
+    """
+
+    run: TrainedRun
+    compact: Path
+    answer: Path
+    needs: Needs | None
+    after: After
+
+
+def auto(
+    clip: Path | str,
+    spec: str | Path | None = None,
+    *,
+    out: Path | str | None = None,
+    overrides: Sequence[str] = (),
+    rasterizer: str | None = None,
+    device: str = "auto",
+    resume: bool = False,
+    overwrite: bool = False,
+    allow_faults: bool = False,
+    evaluate: bool = True,
+    plugins: Sequence[Path | str] = (),
+    on_found: Callable[[Needs], None] | None = None,
+    on_start: OnStart | None = None,
+    on_step: OnStep | None = None,
+    progress: Progress | None = None,
+    report: Report = silent,
+) -> AutoRun:
+    """Find how much of a spec a clip needs, train that, prune it, and compress it.
+
+    The answer of `needs` is written to OUT-needs, the compressed copy to OUT-compact.
+
+    Args:
+        clip: a clip folder, or "builtin:NAME", of a layout that one reader alone recognises.
+        spec: a name or a file, to be reduced; by default "hoigs".
+        out: the run folder; by default runs/CLIP-SPEC-auto.
+        resume: continue the training in `out`, with the answer that it was started with.
+        on_found: called with the result of the search, before the training.
+        overrides, rasterizer, device, overwrite, allow_faults, evaluate, plugins, on_start,
+            on_step, progress, report: as for `train`.
+
+    Raises:
+        HoigsError: anything wrong with the input, or the run to resume was pruned already.
+    """
+    name = str(spec or DEFAULT_SPEC)
+    path = Path(out) if out is not None else Path("runs") / f"{clip_name(clip)}-{Path(name).stem}"
+    if out is None:
+        path = path.with_name(f"{path.name}-auto")
+    answer, compact = needs_of(path), compact_of(path)
+    device = pick_device(device)
+    found: Needs | None = None
+    if resume:
+        _require_unfinished(path, answer)
+    else:
+        for folder in (path, compact):  # before the search, which may take hours
+            RunFolder(folder).refuse_existing(overwrite, [clip])
+        found = needs(
+            clip, name, out=answer, overrides=overrides, rasterizer=rasterizer, device=device,
+            overwrite=overwrite, allow_faults=allow_faults, plugins=plugins, report=report,
+        )  # fmt: skip
+        overrides, rasterizer = (), None  # the answer holds them
+        if on_found is not None:
+            on_found(found)
+    run = train(
+        clip, answer / "spec.yaml", out=path, overrides=overrides, rasterizer=rasterizer,
+        device=device, resume=resume, overwrite=overwrite, allow_faults=allow_faults,
+        evaluate=False, plugins=plugins, on_start=on_start, on_step=on_step, report=report,
+    )  # fmt: skip
+    report(f"pruning {path}:")
+    trained_s = run.session.trainer.elapsed
+    after = finish(
+        path, compact, device=device, plugins=plugins, overwrite=overwrite,
+        clock=(found.seconds, trained_s, found.full_seconds) if found else None,
+        report=lambda line: report(f"  {line}"),
+    )  # fmt: skip
+    add_to_answer(after, answer)
+    report(f"run: {path}, compressed: {compact}, reasons: {answer / 'needs.md'}")
+    if evaluate:
+        scored = evaluate_run(path, device=device, plugins=plugins, progress=progress)
+        report(f"report: {scored.report}")
+        run = replace(run, evaluated=scored)
+    return AutoRun(run, compact, answer, found, after)
+
+
+def needs_of(run: Path) -> Path:
+    """Folder of the `needs` answer that a run of `auto` is trained with."""
+    return run.with_name(f"{run.name}-needs")
+
+
+def _require_unfinished(path: Path, answer: Path) -> None:
+    """HoigsError unless a run of `auto` was begun in `path` and is not pruned yet."""
+    if not (answer / "spec.yaml").is_file():
+        raise HoigsError(
+            f"{answer / 'spec.yaml'}: not found, so no run of --auto was begun in {path}"
+        )
+    if RunFolder(path).provenance.is_file() and RunFolder(path).read_provenance().get("pruned"):
+        raise HoigsError(f"{path}: is trained and pruned already; there is nothing to resume")
+    RunFolder(path).refuse_existing(overwrite=True)  # pruning will replace it

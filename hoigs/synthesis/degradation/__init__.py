@@ -1,0 +1,1 @@
+"""Errors in written clips: `noise` (values) and `damage` (whole files and frames)."""

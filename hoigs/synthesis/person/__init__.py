@@ -1,0 +1,1 @@
+"""The person: `choreography.Choreographer` poses it, `clothes.dress` dresses it."""

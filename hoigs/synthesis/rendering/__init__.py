@@ -1,0 +1,1 @@
+"""Rendering: `raycast.RayCaster` renders a view, `paths` places cameras, `shutter` adds blur."""

@@ -1,0 +1,1 @@
+"""The room: `room.build_room` furnishes it; `textures`, `designs` and `meshes` make its parts."""

@@ -1,0 +1,71 @@
+"""NanGuard: a step that is not finite is skipped, and the first such tensor is named."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+
+import torch
+from torch import Tensor, nn
+
+from hoigs.core.errors import NotFiniteError
+from hoigs.core.values.gaussians import Gaussians
+
+
+def first_not_finite(
+    losses: Mapping[str, Tensor],
+    gaussians: Mapping[str, Gaussians],
+    parameters: Mapping[str, nn.Parameter],
+) -> str | None:
+    """Name of the first tensor with NaN or infinity, or None.
+
+    In the order of computation: parameters, deformed Gaussians, losses, gradients.
+    """
+    for name, parameter in parameters.items():
+        if not torch.isfinite(parameter).all():
+            return f"parameter {name}"
+    for entity, values in gaussians.items():
+        for f in fields(values):
+            if not torch.isfinite(getattr(values, f.name)).all():
+                return f"{f.name} of the deformed Gaussians of {entity!r}"
+    for name, loss in losses.items():
+        if not torch.isfinite(loss).all():
+            return f"loss term {name!r}"
+    for name, parameter in parameters.items():
+        if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
+            return f"gradient of {name}"
+    return None
+
+
+class NanGuard:
+    """Counts skipped steps.
+
+    Raises:
+        NotFiniteError: by `failed`, at the `patience`-th skipped step in a row.
+    """
+
+    def __init__(self, patience: int = 10) -> None:
+        self.patience = patience
+        self.in_a_row = 0
+        self.skipped: list[tuple[int, str]] = []
+
+    def passed(self) -> None:
+        self.in_a_row = 0
+
+    def failed(self, step: int, culprit: str) -> None:
+        self.skipped.append((step, culprit))
+        self.in_a_row += 1
+        if self.in_a_row >= self.patience:
+            raise NotFiniteError(
+                f"step {step}: {culprit} is not finite, {self.in_a_row} steps in a row; lower its "
+                "learning rate (train.rates) or check the frame's masks and depth"
+            )
+
+
+def gradients_finite(parameters: Mapping[str, nn.Parameter]) -> bool:
+    """Whether all gradients are finite, by one fused operation."""
+    gradients = [p.grad for p in parameters.values() if p.grad is not None]
+    if not gradients:
+        return True
+    norms = torch._foreach_norm(gradients)
+    return bool(torch.isfinite(torch.stack([n.float() for n in norms])).all())

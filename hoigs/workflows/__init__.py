@@ -1,0 +1,7 @@
+"""Commands that use several parts of hoigs in a row, as functions.
+
+- `train.train`: from a clip and a spec to a run folder with scores and a report.
+- `evaluate_run.evaluate_run`: the scores and the report of a run folder.
+- `demo.demo`: `train` on the built-in clip, with a static model for comparison.
+- `doctor.doctor`: versions and devices of this machine, and the rasterizers that work on it.
+"""

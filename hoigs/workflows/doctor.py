@@ -1,0 +1,100 @@
+"""doctor: versions and devices of this machine, and whether each rasterizer works on it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from hoigs.core.errors import PluginError
+from hoigs.core.interfaces.rasterizer import Rasterizer
+from hoigs.core.registry.manager import Offer, Status
+from hoigs.core.registry.registry import Registry
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.metrics.lpips import find_weights
+from hoigs.runs.run_folder import versions
+
+
+class Inspected(NamedTuple):
+    """One row of `doctor`'s report.
+
+    Attributes:
+        what: a package, a device or a component. found: its version or state.
+    """
+
+    what: str
+    found: str
+    note: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """False if it is installed and does not work."""
+        return not self.found.startswith(("failed", "wrong"))
+
+
+def doctor() -> list[Inspected]:
+    """Check the installation: versions, devices, rasterizers, LPIPS weights."""
+    from hoigs.core.registry.registry import default_registry
+
+    rows = [Inspected(name, version) for name, version in versions().items()]
+    rows += [*_devices(), *rasterizer_rows(default_registry())]
+    weights = find_weights()
+    return [*rows, Inspected("LPIPS weights", weights.location or "none", weights.reason)]
+
+
+def _devices() -> list[Inspected]:
+    rows = [Inspected("cpu", "ok", f"{torch.get_num_threads()} torch threads")]
+    if torch.cuda.is_available():
+        rows.append(Inspected("cuda", "ok", torch.cuda.get_device_name(0)))
+    else:
+        rows.append(Inspected("cuda", "none", "everything runs on the CPU"))
+    return rows
+
+
+def rasterizer_rows(registry: Registry) -> list[Inspected]:
+    """One row for each rasterizer and each of its devices that this machine has."""
+    shown = (Status.OK, Status.NEEDS_EXTRA)
+    offers = [o for o in registry.manager.offers if o.component.kind == "rasterizer"]
+    offers = sorted((o for o in offers if o.status in shown), key=lambda offer: offer.key)
+    return [row for offer in offers for row in _rows_of(offer, registry)]
+
+
+def _rows_of(offer: Offer, registry: Registry) -> list[Inspected]:
+    try:
+        backend = registry.get(offer.exact)
+        declared = sorted(backend.capabilities.devices)
+    except PluginError:
+        absent = offer.status is Status.NEEDS_EXTRA
+        found = "not run: needs an extra" if absent else "failed"
+        return [Inspected(offer.key, found, offer.error)]
+    except Exception as error:  # a plugin's class may raise anything here
+        return [Inspected(offer.key, _failed(error), "capabilities.devices could not be read")]
+    present = {"cpu"} | ({"cuda"} if torch.cuda.is_available() else set())
+    devices = [device for device in declared if device in present]
+    if not devices:
+        return [Inspected(offer.key, f"not run: needs {' or '.join(declared)}")]
+    return [Inspected(f"{offer.key} on {device}", *_draw(backend, device)) for device in devices]
+
+
+def _failed(error: Exception) -> str:
+    return f"failed: {type(error).__name__}: {error}"
+
+
+def _draw(backend: type[Rasterizer], device: str) -> tuple[str, str]:
+    """Draw one Gaussian on a device: the state by its middle pixel, and the backend's report."""
+    points = torch.tensor([[0.0, 0.0, 2.0]])
+    red = Gaussians.from_points(points, torch.tensor([[1.0, 0.0, 0.0]]), scales=0.2, opacity=0.9)
+    K = torch.tensor([[32.0, 0, 8.5], [0, 32.0, 8.5], [0, 0, 1]])
+    camera = Camera(K, torch.eye(4), 17, 17)
+    try:
+        rasterizer = backend()
+        output = rasterizer.render(red.to(device), camera.to(device))
+        middle = output.color[8, 8].tolist()
+        report: dict[str, str] = getattr(rasterizer, "backend_report", dict)()
+    except Exception as error:  # reported as the backend's state
+        return _failed(error), ""
+    note = ", ".join(f"{name.replace('_', ' ')}: {value}" for name, value in report.items())
+    if max(abs(value - truth) for value, truth in zip(middle, (0.9, 0, 0), strict=True)) < 1e-3:
+        return "ok: drew a test splat", note
+    return f"wrong: test splat is {middle}, expected [0.9, 0, 0]", note

@@ -1,0 +1,107 @@
+"""train: from a clip and a spec to a run folder with scores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from hoigs.core.progress import Progress
+from hoigs.core.spec.schema import Spec
+from hoigs.training.session import Session
+from hoigs.training.trainer import StepReport
+from hoigs.workflows.evaluate_run import EvaluatedRun, evaluate_run
+
+OnStart = Callable[[Session], None]
+OnStep = Callable[[StepReport], None]
+Report = Callable[[str], None]
+
+
+def silent(line: str) -> None:
+    """A `report` that drops every line."""
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A run that has just been trained.
+
+    Attributes:
+        path: the run folder. session: its spec, clip and trainer (with the model).
+        evaluated: its scores; None with `evaluate=False`.
+    """
+
+    path: Path
+    session: Session
+    evaluated: EvaluatedRun | None
+
+
+def train(
+    clip: Path | str | None = None,
+    spec: str | Path | Spec | None = None,
+    *,
+    out: Path | str | None = None,
+    overrides: Sequence[str] = (),
+    rasterizer: str | None = None,
+    device: str = "auto",
+    resume: bool = False,
+    overwrite: bool = False,
+    allow_faults: bool = False,
+    reader: str | None = None,
+    reader_settings: Sequence[str] = (),
+    evaluate: bool = True,
+    plugins: Sequence[Path | str] = (),
+    on_start: OnStart | None = None,
+    on_step: OnStep | None = None,
+    progress: Progress | None = None,
+    report: Report = silent,
+) -> TrainedRun:
+    """Fit a model to a clip; then score it and write report.html.
+
+    Args:
+        clip: a clip folder, or "builtin:NAME"; with `resume` by default the run's.
+        spec: the name of a built-in spec ("hoigs", "hoigs@PROFILE"), a file, or a Spec; by default
+            "hoigs", with `resume` the run's.
+        out: the run folder; by default runs/CLIP-SPEC.
+        overrides: settings laid over the spec's, "train.steps=500"; not with a Spec.
+        rasterizer: "warp", "torch", "oracle" or a plugin's. device: "cpu", "cuda" or "auto".
+        resume: continue the run in `out`, with its spec and clip unless others are given.
+        overwrite: replace the run in `out`.
+        allow_faults: train without masks, images and depth that are absent or broken.
+        reader: reads the clip; by default the one that recognises its layout. reader_settings:
+            of the reader, "masks=false".
+        evaluate: score the run and write its report.
+        plugins: Python files to load (and run) first.
+        on_start: called with the Session once all input has been checked, before the first step.
+        on_step: called with the StepReport of each logged step.
+        progress: called during the evaluation with the share done, in [0, 1], and the work.
+        report: called with a line of text after each part of the work.
+
+    Raises:
+        HoigsError: the input is wrong; then nothing has been written.
+    """
+    session = Session.open(
+        clip,
+        spec,
+        out=out,
+        overrides=overrides,
+        rasterizer=rasterizer,
+        device=device,
+        resume=resume,
+        overwrite=overwrite,
+        plugins=plugins,
+        allow_faults=allow_faults,
+        reader=reader,
+        reader_settings=reader_settings,
+    )
+    if on_start is not None:
+        on_start(session)
+    session.train(on_step)
+    for step, culprit in session.trainer.guard.skipped[:5]:
+        report(f"skipped step {step}: {culprit} was not finite")
+    path = session.run.path
+    report(f"run: {path}")
+    if not evaluate:
+        return TrainedRun(path, session, None)
+    evaluated = evaluate_run(path, device=device, plugins=plugins, progress=progress)
+    report(f"report: {evaluated.report}")
+    return TrainedRun(path, session, evaluated)

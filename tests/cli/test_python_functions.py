@@ -1,0 +1,89 @@
+"""Each command is one public function: the same options by the same names, the same defaults."""
+
+from __future__ import annotations
+
+import inspect
+import pkgutil
+from enum import Enum
+from typing import Any
+
+import pytest
+import typer
+
+import hoigs
+from hoigs.cli.main import app
+
+# command -> functions that it wraps; together they have every option
+FUNCTIONS = {
+    "train": (hoigs.train, hoigs.auto),
+    "needs": (hoigs.needs,),
+    "eval": (hoigs.evaluate_run,),
+    "prepare": (hoigs.prepare, hoigs.prepare_until),
+    "compress": (hoigs.compress,),
+    "render": (hoigs.render,),
+    "doctor": (hoigs.doctor,),
+    "demo": (hoigs.demo,),
+}
+# option -> argument, where the names differ
+RENAMED = {
+    "set": "overrides",
+    "plugin": "plugins",
+    "reader_set": "reader_settings",
+    "eval": "evaluate",
+}
+# options that choose the function: --auto is hoigs.auto, --stage is hoigs.prepare_until(stage, ...)
+CHOOSING = {("train", "auto"), ("prepare", "stage")}
+# options of a command that the second of its functions is without, and why
+WITHOUT = {
+    hoigs.auto: {"reader", "reader_settings"},  # a clip is read by the reader that it looks like
+    # the options of prepare_until are ready-made
+    hoigs.prepare_until: {"width", "camera", "max_frames", "every", "fps", "focal", "keep_black",
+                          "overwrite", "overrides"},
+}  # fmt: skip
+# arguments that only a Python caller can give: objects and callbacks
+PYTHON = {"on_start", "on_step", "on_found", "progress", "report", "body", "estimators",
+          "positions"}  # fmt: skip
+
+
+def options_of(command: str) -> dict[str, Any]:
+    """Argument name -> default of everything that a command takes."""
+    parser = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
+    found = {}
+    for parameter in parser.params:
+        if parameter.name == "help":
+            continue
+        name = parameter.name
+        if parameter.param_type_name == "option":
+            name = parameter.opts[0].removeprefix("--").replace("-", "_")
+        found[RENAMED.get(name, name)] = _plain(parameter.default)
+    return found
+
+
+def _plain(value: Any) -> Any:
+    """Of equal meaning: nothing, () and None; a choice and its text; a path and its text."""
+    if isinstance(value, Enum):
+        return value.value
+    if value in (None, (), []) or value is inspect.Parameter.empty:
+        return None
+    return value if isinstance(value, bool | int | float) else str(value)
+
+
+@pytest.mark.parametrize("command", FUNCTIONS)
+def test_a_function_has_every_option_of_its_command(command):
+    options = options_of(command)
+    for function in FUNCTIONS[command]:
+        arguments = inspect.signature(function).parameters
+        wanted = {k: v for k, v in options.items() if (command, k) not in CHOOSING}
+        wanted = {k: v for k, v in wanted.items() if k not in WITHOUT.get(function, ())}
+        missing = set(wanted) - set(arguments)
+        assert not missing, f"{function.__name__} is without {missing}"
+        more = set(arguments) - set(options) - PYTHON
+        assert not more, f"hoigs {command} is without {more}"
+        for name, default in wanted.items():
+            if default is not None or command != "prepare":  # prepare's defaults are its options'
+                assert _plain(arguments[name].default) == default, f"{function.__name__}: {name}"
+
+
+def test_no_public_name_is_hidden_by_a_module():
+    """Importing hoigs.x would put the module in place of a function x."""
+    assert not set(hoigs.__all__) & {module.name for module in pkgutil.iter_modules(hoigs.__path__)}

@@ -1,0 +1,134 @@
+"""core/planes.py: sampling against torch's own, and the paired space-time planes."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+
+from hoigs.core.maths.feature_planes import PairedPlanes, ProductPlanes, roughness, sample_planes
+
+
+def test_equals_grid_sample():
+    planes = torch.randn(3, 7, 5, 4, dtype=torch.float64, requires_grad=True)
+    points = (torch.rand(3, 50, 2, dtype=torch.float64) * 2.6 - 1.3).requires_grad_()
+    ours = sample_planes(planes, points)
+    theirs = F.grid_sample(
+        planes.permute(0, 3, 1, 2), points[:, None], align_corners=True, padding_mode="border"
+    )
+    torch.testing.assert_close(ours, theirs[:, :, 0].permute(2, 0, 1).flatten(1))
+    weights = torch.randn_like(ours)
+    grads = torch.autograd.grad((ours * weights).sum(), (planes, points))
+    expected = torch.autograd.grad(
+        (theirs[:, :, 0].permute(2, 0, 1).flatten(1) * weights).sum(), (planes, points)
+    )
+    torch.testing.assert_close(grads, expected)
+
+
+def test_corners_edges_and_single_cells():
+    planes = torch.arange(6.0).view(1, 2, 3, 1)  # rows along the second coordinate
+    corners = torch.tensor([[[-1.0, -1], [1, -1], [-1, 1], [1, 1], [0, 0]]])
+    assert sample_planes(planes, corners).flatten().tolist() == [0, 2, 3, 5, 2.5]
+    one = torch.full((1, 1, 1, 1), 4.0)
+    assert sample_planes(one, corners).flatten().tolist() == [4.0] * 5
+
+
+def test_paired_planes_by_hand():
+    torch.manual_seed(0)
+    planes = PairedPlanes(channels=2, resolution=5, time_resolution=4)
+    points = torch.rand(6, 3) * 2 - 1
+    torch.testing.assert_close(planes(points), planes(points, 0.3))  # time planes start at one
+    assert planes(points).shape == (6, 6) and planes.width == 6
+    with torch.no_grad():
+        planes.time.normal_()
+    # the first two features are xy times zt, the next xz times yt, the last yz times xt
+    space = planes.space.permute(0, 3, 1, 2)
+    time = planes.time.permute(0, 3, 1, 2)
+    clock = torch.full((6,), 2 * 0.3 - 1)
+    x, y, z = points.unbind(-1)
+
+    def read(plane: torch.Tensor, u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+        return F.grid_sample(plane[None], torch.stack((u, v), -1)[None, None], align_corners=True)[
+            0, :, 0
+        ].T
+
+    expected = torch.cat(
+        (
+            read(space[0], x, y) * read(time[0], z, clock),
+            read(space[1], x, z) * read(time[1], y, clock),
+            read(space[2], y, z) * read(time[2], x, clock),
+        ),
+        dim=-1,
+    )
+    torch.testing.assert_close(planes(points, 0.3), expected)
+
+
+def test_all_of_the_time_axis_is_used():  # F10
+    planes = PairedPlanes(channels=1, resolution=3, time_resolution=6)
+    points = torch.rand(20, 3) * 2 - 1
+    for frame in range(12):
+        planes(points, frame / 11).sum().backward()
+    assert (planes.time.grad.abs().sum((0, 2, 3)) > 0).all()
+
+
+def test_penalties_by_hand():
+    planes = PairedPlanes(channels=1, resolution=2, time_resolution=3)
+    assert planes.time_smoothness() == 0 and planes.time_sparsity() == 0
+    with torch.no_grad():
+        planes.time[:, 1] = 3.0
+    assert planes.time_smoothness().item() == 16  # (1 - 6 + 1)^2
+    torch.testing.assert_close(planes.time_sparsity(), torch.tensor(2 / 3))
+    assert PairedPlanes(1, 2, 2).time_smoothness() == 0
+
+
+def test_product_planes_are_4dgs_field():
+    """Against grid_sample on six planes xy, xz, xt, yz, yt, zt, multiplied, scales concatenated."""
+    torch.manual_seed(0)
+    field = ProductPlanes(3, (4, 8), 5).double()
+    for parameter in field.parameters():
+        torch.nn.init.uniform_(parameter, 0.2, 1.5)
+    points = torch.rand(20, 3, dtype=torch.float64) * 2.4 - 1.2
+    clock = 0.3
+    four = torch.cat((points, torch.full((20, 1), clock, dtype=torch.float64)), 1)
+    scales = []
+    for space, time in zip(field.space, field.time, strict=True):
+        product = torch.ones(20, 3, dtype=torch.float64)
+        for plane, axes in zip(
+            (*space, *time), ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3)), strict=True
+        ):
+            sampled = F.grid_sample(
+                plane.permute(2, 0, 1)[None],
+                four[None, None, :, axes],
+                align_corners=True,
+                padding_mode="border",
+            )
+            product = product * sampled[0, :, 0].T
+        scales.append(product)
+    torch.testing.assert_close(field(points, (1 + clock) / 2), torch.cat(scales, 1))
+    assert field.width == 6 and field.space[1].shape == (3, 8, 8, 3)
+    assert field.time[1].shape == (3, 5, 8, 3)  # time keeps its resolution
+
+
+def test_roughness():
+    line = torch.arange(4.0).view(1, 4, 1, 1)
+    assert roughness(line) == 0 and roughness(line[:, :2]) == 0
+    assert roughness(line**2) == 4  # second difference 2, squared
+
+
+def test_no_time_planes_are_time_planes_of_one():
+    points = torch.rand(6, 3) * 2 - 1
+    for make in (
+        lambda time: PairedPlanes(2, 5, time),
+        lambda time: ProductPlanes(2, (4, 8), time),
+    ):
+        torch.manual_seed(0)
+        ones, none = make(4), make(0)
+        stored = {k: v for k, v in ones.state_dict().items() if not k.startswith("time")}
+        assert len(stored) < len(ones.state_dict())
+        none.load_state_dict(stored)
+        torch.testing.assert_close(none(points, 0.3), ones(points, 0.3), rtol=0, atol=0)
+    assert PairedPlanes(2, 5, 0).time_sparsity() == PairedPlanes(2, 5, 0).time_smoothness() == 0
+    assert (
+        ProductPlanes(2, (4,), 0).time_sparsity()
+        == 0
+        == ProductPlanes(2, (4,), 0).time_smoothness()
+    )

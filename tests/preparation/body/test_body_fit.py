@@ -1,0 +1,296 @@
+"""The body fit, against bodies whose pose is known: landmarks are the body's own points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from hoigs.core.errors import HoigsError
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.maths.skinning import skin, transform_points
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.moment import BodyPose
+from hoigs.plugins.bodies.anny import AnnyBody
+from hoigs.preparation.body.fit import fit_body
+from hoigs.preparation.body.fit_problem import BodyFit, FitOptions
+from hoigs.preparation.body.joint_limits import limit_penalty
+from hoigs.preparation.body.landmarks import LandmarkTrack, points_of
+from hoigs.preparation.body.limb_start import limb_pose
+from hoigs.preparation.report.mesh_overlay import overlay_frame
+from hoigs.preparation.scene.scale import ground_scale
+
+FRAMES, WIDTH, HEIGHT, FOCAL = 9, 640, 480, 600.0
+QUICK = FitOptions(steps=60)
+
+
+@cache
+def body() -> AnnyBody:
+    return AnnyBody()
+
+
+def camera(center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Camera:
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    w2c = torch.eye(4)
+    w2c[:3, 3] = -torch.tensor(center)
+    return Camera(K, w2c, WIDTH, HEIGHT)
+
+
+def truth() -> BodyPose:
+    """Facing the camera (y down), arms hanging and bending, a knee that lifts, walking aside."""
+    t = torch.linspace(0, 1, FRAMES)
+    pose = BodyPose.zeros(FRAMES)
+    angles, orient, transl = pose.body.clone(), pose.global_orient.clone(), pose.transl.clone()
+    orient[:, 0] = torch.pi  # feet down in axes whose y points down; facing the camera at -z
+    angles[:, 15, 2], angles[:, 16, 2] = -1.1, 1.1
+    angles[:, 17, 1], angles[:, 18, 1] = -0.4 - 0.8 * t, 0.5
+    angles[:, 1, 0], angles[:, 4, 0] = -0.9 * t, 1.2 * t
+    transl[:, 0], transl[:, 2] = -0.15 + 0.3 * t, 3.0
+    return pose.replace(global_orient=orient, body=angles, transl=transl)
+
+
+def seen_by(cameras: list[Camera], pose: BodyPose) -> LandmarkTrack:
+    """What a perfect detector would see of the body; marks that the fit does not use stay 0."""
+    points = points_of(body())
+    vertices, joints = body().shaped(pose.betas)
+    transforms = body().skinning_transforms(pose)
+    rows = points.vertices
+    places = torch.cat(
+        (
+            transform_points(transforms[:, points.joints], joints[points.joints]),
+            skin(vertices[rows], transforms, body().skinning_weights[rows]),
+        ),
+        1,
+    )
+    marks = list(points.landmarks)
+    image, world = torch.zeros(FRAMES, 33, 3), torch.zeros(FRAMES, 33, 3)
+    for i, view in enumerate(cameras):
+        image[i, marks, :2] = view.project(places[i])[0]
+        image[i, marks, 2] = 1.0
+        world[i, marks] = places[i] @ view.world_to_camera[:3, :3].mT
+    hips = world[:, [23, 24]].mean(1, keepdim=True)
+    return LandmarkTrack(image, world - hips)
+
+
+@cache
+def static_fit() -> BodyFit:
+    cameras = [camera()] * FRAMES
+    return fit_body(body(), seen_by(cameras, truth()), cameras, options=QUICK)
+
+
+def joint_errors(found: BodyPose, true: BodyPose) -> Tensor:
+    """Distance of each of the 22 body joints, metres, [F, 22]."""
+    with torch.no_grad():
+        apart = body()(found).joints[:, :22] - body()(true).joints[:, :22]
+    return apart.norm(dim=-1)
+
+
+def test_a_known_pose_is_found() -> None:
+    fit = static_fit()
+    assert fit.residual_px.max() < 3.0
+    errors = joint_errors(fit.poses, truth())
+    assert errors.mean() < 0.04
+    assert errors.max() < 0.12
+    assert fit.report["frames_with_landmarks"] == FRAMES
+    assert fit.scene_scale == 1.0
+    assert fit.poses.hand_pose_convention == "flat"
+
+
+def test_frames_without_landmarks_lie_between_their_neighbours() -> None:
+    cameras = [camera()] * FRAMES
+    landmarks = seen_by(cameras, truth())
+    image, world = landmarks.image.clone(), landmarks.world.clone()
+    image[4:6] = torch.nan
+    world[4:6] = torch.nan
+    fit = fit_body(body(), LandmarkTrack(image, world), cameras, options=QUICK)
+    assert torch.isnan(fit.residual_px[4:6]).all()
+    assert torch.isfinite(fit.residual_px[[0, 1, 2, 3, 6, 7, 8]]).all()
+    assert fit.report["frames_with_landmarks"] == FRAMES - 2
+    for field in (fit.poses.body, fit.poses.transl, fit.poses.global_orient):
+        assert torch.isfinite(field).all()
+    # arms do not rise to the T-pose, the elbow goes on bending
+    assert joint_errors(fit.poses, truth())[4:6].mean() < 0.06
+
+
+def test_first_and_last_frames_may_be_unseen() -> None:
+    cameras = [camera()] * FRAMES
+    landmarks = seen_by(cameras, truth())
+    image = landmarks.image.clone()
+    image[[0, 1, FRAMES - 1]] = torch.nan
+    fit = fit_body(body(), replace(landmarks, image=image), cameras, options=QUICK)
+    assert joint_errors(fit.poses, truth()).mean() < 0.08
+
+
+def test_an_outlier_landmark_is_outvoted() -> None:
+    cameras = [camera()] * FRAMES
+    landmarks = seen_by(cameras, truth())
+    image = landmarks.image.clone()
+    image[4, 15, :2] += torch.tensor([200.0, -150.0])  # one wrist, one frame
+    fit = fit_body(body(), LandmarkTrack(image, landmarks.world), cameras, options=QUICK)
+    errors = joint_errors(fit.poses, truth())
+    assert errors[4, 20] < 0.12
+    assert errors.mean() < 0.04  # nor does it pull the body nearer or change its size
+
+
+def walking_camera(unit: float) -> tuple[list[Camera], list[Camera]]:
+    """Cameras in metres, and the same in units of `unit` metres."""
+    metric = [camera((0.05 * i, 0.0, 0.02 * i)) for i in range(FRAMES)]
+    own = [camera(tuple((c.center / unit).tolist())) for c in metric]
+    return metric, own
+
+
+def test_scene_scale_from_the_ground_at_the_feet() -> None:
+    unit = 0.25
+    metric, own = walking_camera(unit)
+    pose = truth()
+    with torch.no_grad():
+        floor = float(body()(pose).vertices[..., 1].max())
+    x, z = torch.meshgrid(torch.linspace(-1, 1, 41), torch.linspace(2, 5, 61), indexing="xy")
+    ground = torch.stack((x, torch.full_like(x, floor), z), -1).reshape(-1, 3)
+    fit = fit_body(
+        body(), seen_by(metric, pose), own,
+        options=replace(QUICK, scale=True), points=ground / unit,
+    )  # fmt: skip
+    assert fit.scene_scale == pytest.approx(unit, rel=0.06)
+    assert "ground" in fit.report["scene_scale_from"]
+    # in the metric world that the scale makes, the body is where it was
+    assert joint_errors(fit.poses, pose).mean() < 0.08
+    assert fit.residual_px.max() < 4.0
+
+
+def test_scene_scale_without_points_comes_from_still_feet() -> None:
+    unit = 0.25
+    metric, own = walking_camera(unit)
+    pose = truth()
+    still = pose.replace(transl=pose.transl[:1].expand(FRAMES, 3), body=pose.body[:1].expand(
+        FRAMES, 21, 3))  # fmt: skip
+    fit = fit_body(
+        body(), seen_by(metric, still), own, options=replace(QUICK, scale=True), points=None
+    )
+    assert fit.scene_scale == pytest.approx(unit, rel=0.1)
+    assert "still" in fit.report["scene_scale_from"]
+
+
+def test_ground_scale_needs_points_near_the_feet() -> None:
+    feet = torch.tensor([[[0.0, 0.8, 3.0]]]).expand(5, 1, 3)
+    cameras, seen = [camera()] * 5, torch.ones(5, dtype=torch.bool)
+    floor = torch.tensor([[0.1 * i, 0.8 + 0.01 * i, 3.0] for i in range(-3, 4)])
+    found = ground_scale(feet, floor * 4, cameras, seen)  # four units a metre
+    assert found is not None
+    assert found[0] == pytest.approx(0.25, rel=1e-5) and found[1] == 5
+    assert ground_scale(feet, floor * 4, cameras, torch.zeros(5, dtype=torch.bool)) is None
+    above = floor - torch.tensor([0.0, 1.5, 0.0])
+    assert ground_scale(feet, above, cameras, seen) is None
+
+
+def test_limbs_start_on_their_landmarks() -> None:
+    """The closed form alone gives each limb its directions, in any orientation of the torso."""
+    pose = truth()
+    landmarks = seen_by([camera()] * FRAMES, pose)
+    torso = axis_angle_to_matrices(pose.global_orient)
+    angles = limb_pose(landmarks.world, torso)
+    with torch.no_grad():
+        ours = body()(pose.replace(body=angles)).joints
+        true = body()(pose).joints
+    for a, b in ((16, 18), (18, 20), (17, 19), (19, 21), (1, 4), (4, 7), (2, 5), (5, 8)):
+        way = torch.nn.functional.normalize(ours[:, b] - ours[:, a], dim=-1)
+        goal = torch.nn.functional.normalize(true[:, b] - true[:, a], dim=-1)
+        assert (way * goal).sum(-1).min() > np.cos(np.deg2rad(3)), (a, b)
+    assert limit_penalty(angles) < 0.02  # elbows and knees bend the way they can
+
+
+def test_joint_limits() -> None:
+    straight = torch.zeros(4, 21, 3)
+    assert limit_penalty(straight) == 0
+    for joint, axis, wrong in ((4, 0, -0.5), (5, 0, -0.5), (18, 1, 0.5), (19, 1, -0.5)):
+        bent = straight.clone()
+        bent[:, joint - 1, axis] = wrong
+        assert limit_penalty(bent) > 0.1  # a knee or elbow that bends backwards
+        bent[:, joint - 1, axis] = -2 * wrong
+        assert limit_penalty(bent) == 0
+
+
+def test_mirrored_offsets() -> None:
+    points = points_of(body())
+    for left, right in ((11, 12), (7, 8), (29, 30)):
+        a, b = points.index(left), points.index(right)
+        assert points.pairs[a] == points.pairs[b]
+        assert points.mirror[a].tolist() == [1, 1, 1] and points.mirror[b].tolist() == [-1, 1, 1]
+    assert points.mirror[points.index(0)].tolist() == [0, 1, 1]
+    assert (points.pairs == points.pairs[points.index(0)]).sum() == 1
+
+
+def test_landmark_points_of_the_head_and_feet_are_where_they_belong() -> None:
+    points = points_of(body())
+    vertices, joints = body().shaped(torch.zeros(10))
+    at = {m: vertices[v] for m, v in zip(points.landmarks[len(points.joints) :], points.vertices)}
+    assert abs(at[0][0]) < 0.01 and at[0][2] > joints[15][2] + 0.08  # nose: middle, in front
+    assert at[7][0] > 0.05 and at[8][0] < -0.05  # ears
+    assert at[31][2] - at[29][2] > 0.18 and at[32][2] - at[30][2] > 0.18  # toe before heel
+    assert at[29][0] > 0 > at[30][0]
+
+
+def test_mediapipe_arrays_and_missing_frames() -> None:
+    image = np.ones((3, 33, 4), np.float32) * (1, 2, 3, 0.5)
+    world = np.ones((3, 33, 4), np.float32)
+    image[1] = np.nan
+    image[2, 8:] = np.nan  # of the head, three landmarks have a point of the body
+    track = LandmarkTrack.from_mediapipe(image, world)
+    assert track.image[0, 0].tolist() == [1.0, 2.0, 0.5]
+    assert track.found.tolist() == [True, False, False]
+    image[2, 11:18] = 1  # with shoulders, elbows, wrists and one finger it is enough
+    world[2, 13] = np.nan
+    track = LandmarkTrack.from_mediapipe(image, world)
+    assert track.found.tolist() == [True, False, True]
+    assert track.solid.tolist() == [True, False, False]
+
+
+def test_too_little_to_fit_is_refused() -> None:
+    cameras = [camera()] * FRAMES
+    landmarks = seen_by(cameras, truth())
+    with pytest.raises(HoigsError, match=rf"3 cameras but landmarks of {FRAMES} frames"):
+        fit_body(body(), landmarks, cameras[:3])
+    image = landmarks.image.clone()
+    image[1:] = torch.nan
+    with pytest.raises(HoigsError, match=r"in 1 of 9 frames.*at least 2"):
+        fit_body(body(), replace(landmarks, image=image), cameras)
+
+
+def test_overlay_paints_the_mesh_and_nothing_else() -> None:
+    image = np.full((HEIGHT, WIDTH, 3), 40, np.uint8)
+    view = camera()
+    vertices = body()(truth().frame(0)).vertices
+    before = image.copy()
+    painted = overlay_frame(image, view, vertices.detach(), body().faces)
+    assert (image == before).all()
+    changed = (painted != image).any(-1)
+    pixels, _ = view.project(vertices)
+    low, high = pixels.min(0).values, pixels.max(0).values
+    rows, columns = np.nonzero(changed)
+    assert abs(columns.min() - float(low[0])) < 3 and abs(columns.max() - float(high[0])) < 3
+    assert abs(rows.min() - float(low[1])) < 3 and abs(rows.max() - float(high[1])) < 3
+    behind = overlay_frame(
+        image, view, vertices.detach() * torch.tensor([1, 1, -1.0]), body().faces
+    )
+    assert (behind == image).all()  # a body behind the camera leaves no trace
+
+
+@pytest.mark.slow
+def test_real_landmarks_of_a_juggler(shared_data) -> None:
+    """MediaPipe's landmarks of a real clip: every fourth frame, 12 px at 1280 is the bar."""
+    arrays = np.load(shared_data / "juggle" / "pose_mediapipe.npz")
+    image, world = arrays["image_xyzv"][::4], arrays["world_xyzv"][::4]
+    K = torch.tensor([[1536.0, 0, 640], [0, 1536.0, 360], [0, 0, 1]])
+    cameras = [Camera(K, torch.eye(4), 1280, 720)] * len(image)
+    fit = fit_body(
+        body(), LandmarkTrack.from_mediapipe(image, world), cameras, options=FitOptions(steps=120)
+    )
+    assert fit.report["landmark_error_px"] < 12
+    assert fit.report["landmark_offset_m_largest"] < 0.12  # errors are not explained away
+    assert limit_penalty(fit.poses.body) < 0.05
+    depth = fit.poses.transl[:, 2]
+    assert depth.min() > 3.5 and depth.max() < 5.0

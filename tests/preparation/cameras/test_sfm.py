@@ -1,0 +1,171 @@
+"""A moving camera is distinguished from a static one, and its path is found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from scipy import ndimage
+
+from hoigs.preparation.body.person import RawLandmarks
+from hoigs.preparation.cameras.choose import choose_cameras
+from hoigs.preparation.cameras.motion import background_motion
+from hoigs.preparation.cameras.sfm import structure_from_motion
+from hoigs.preparation.masks.entity_masks import GivenMasks
+from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.video.frames import Frames, open_frames
+from hoigs.preparation.video.source import SourceError
+
+WIDTH, HEIGHT, FOCAL, COUNT = 320, 240, 260.0, 8
+
+
+def texture(seed: int, size: int) -> np.ndarray:
+    """Blotches of several sizes, which features like."""
+    noise = np.random.default_rng(seed).normal(size=(size, size))
+    layers = [ndimage.gaussian_filter(noise, s) * s for s in (1.5, 3, 6)]
+    total = np.add.reduce(layers)
+    return np.clip(128 + 90 * total / total.std() / 2, 0, 255)
+
+
+WALLS = [(4.0, texture(0, 900), None), (2.5, texture(1, 900), 0.55)]  # depth, texture, lower part
+
+
+def view(eye: float) -> np.ndarray:
+    """What a camera sees that walks sideways: a far wall, and a near one below."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    image = np.zeros((HEIGHT, WIDTH))
+    for depth, pattern, start in WALLS:
+        at_x = (x - WIDTH / 2) / FOCAL * depth + eye
+        at_y = (y - HEIGHT / 2) / FOCAL * depth
+        shown = ndimage.map_coordinates(
+            pattern, (at_y * 110 + 450, at_x * 110 + 450), order=1, mode="mirror"
+        )
+        image = np.where(y > HEIGHT * start, shown, image) if start else shown
+    return image
+
+
+def recorded(folder: Path, steps: list[float], block: bool = True) -> tuple[Frames, GivenMasks]:
+    """Frames and the mask of a textured block that goes its own way."""
+    folder.mkdir()
+    moving = texture(2, 90)
+    masks = MaskStack()
+    for i, eye in enumerate(steps):
+        image, mask = view(eye), np.zeros((HEIGHT, WIDTH), bool)
+        if block:
+            left = 30 + 18 * i
+            image[60:150, left : left + 90] = moving
+            mask[60:150, left : left + 90] = True
+        masks.append(mask)
+        grey = image.astype(np.uint8)
+        Image.fromarray(np.stack([grey] * 3, -1)).save(folder / f"{i:05d}.png")
+    return open_frames(folder), GivenMasks(together=masks)
+
+
+def nobody(count: int) -> RawLandmarks:
+    unseen = np.full((count, 33, 4), np.nan)
+    return RawLandmarks(unseen, unseen)
+
+
+def test_a_camera_that_stands_still(tmp_path: Path) -> None:
+    video, masks = recorded(tmp_path / "still", [0.0] * COUNT)
+    motion = background_motion(video, masks)
+    assert motion.known and motion.static and motion.largest < 0.5
+    chosen = choose_cameras(
+        video, nobody(COUNT), masks, None, PrepareOptions(focal=FOCAL), tmp_path, lambda _: None
+    )
+    assert chosen.track.static and "features outside the masks move by" in chosen.track.provenance
+    assert chosen.track.figures["displacement_px"] < 0.5
+
+
+def test_a_camera_that_moves_and_one_that_shows_nothing(tmp_path: Path) -> None:
+    video, masks = recorded(tmp_path / "moves", [0.08 * i for i in range(COUNT)])
+    motion = background_motion(video, masks)
+    assert motion.known and not motion.static and motion.largest > 5
+    hidden = GivenMasks(together=MaskStack([np.ones((HEIGHT, WIDTH), bool)] * COUNT))
+    nothing = background_motion(video, hidden)
+    assert not nothing.known and nothing.static
+    chosen = choose_cameras(
+        video, nobody(COUNT), hidden, None, PrepareOptions(), tmp_path, lambda _: None
+    )
+    assert any("too few to tell" in warning for warning in chosen.warnings)
+
+
+def test_the_way_of_a_moving_camera(tmp_path: Path) -> None:
+    steps = [0.1 * i for i in range(COUNT)]
+    video, masks = recorded(tmp_path / "moves", steps)
+    chosen = choose_cameras(
+        video, nobody(COUNT), masks, None, PrepareOptions(focal=FOCAL), tmp_path, lambda _: None
+    )
+    track = chosen.track
+    assert chosen.own_model and track.positions == tuple(range(COUNT))
+    assert track.figures["registered"] == COUNT and track.figures["reprojection_px"] < 1
+    centers = np.stack([c.center.numpy() for c in track.cameras])
+    way = centers - centers[0]
+    along = way[-1] / np.linalg.norm(way[-1])
+    done = way @ along / np.linalg.norm(way[-1])
+    np.testing.assert_allclose(done, np.linspace(0, 1, COUNT), atol=0.02)
+    off = np.linalg.norm(way - np.outer(way @ along, along), axis=1)
+    assert off.max() < 0.03 * np.linalg.norm(way[-1])
+
+
+def test_a_turning_camera_is_refused_with_advice(tmp_path: Path) -> None:
+    folder = tmp_path / "flat"
+    folder.mkdir()
+    for i in range(4):
+        Image.new("RGB", (WIDTH, HEIGHT), (90, 90, 90)).save(folder / f"{i}.png")
+    video = open_frames(folder)
+    empty = GivenMasks(together=MaskStack([np.zeros((HEIGHT, WIDTH), bool)] * 4))
+    with pytest.raises(SourceError, match=r"gave cameras to 0 of 4 frames.*--camera static"):
+        choose_cameras(
+            video,
+            nobody(4),
+            empty,
+            None,
+            PrepareOptions(camera="moving"),
+            tmp_path,
+            lambda _: None,
+        )
+
+
+def test_features_and_matches_survive_a_kill(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    video, masks = recorded(tmp_path / "moves", [0.1 * i for i in range(COUNT)])
+    work, done = tmp_path / "work", []
+
+    def counted(name: str, killed: bool = False) -> None:
+        real = getattr(pycolmap, name)
+
+        def run(*arguments, **settings):
+            done.append(name)
+            found = real(*arguments, **settings)
+            if killed:
+                raise KeyboardInterrupt
+            return found
+
+        monkeypatch.setattr(pycolmap, name, run)
+
+    counted("extract_features")
+    counted("match_sequential", killed=True)
+    with pytest.raises(KeyboardInterrupt):
+        structure_from_motion(video, masks, work, focal=FOCAL)
+    assert done == ["extract_features", "match_sequential"]
+    assert (work / "features.db").is_file() and not (work / "matches.db").exists()
+    monkeypatch.undo()
+    done.clear()
+    counted("extract_features")
+    counted("match_sequential")
+    resumed = pycolmap.Reconstruction(structure_from_motion(video, masks, work, focal=FOCAL))
+    again = pycolmap.Reconstruction(structure_from_motion(video, masks, work, focal=FOCAL))
+    assert done == ["match_sequential"], "features were kept, and then the matches, too"
+    for image in resumed.images.values():
+        twin = again.images[image.image_id]
+        # mapping runs in threads, whose order moves the last digits: a degree, 1 % of the distance
+        np.testing.assert_allclose(
+            twin.cam_from_world().matrix(), image.cam_from_world().matrix(), atol=0.05
+        )
+    assert resumed.num_reg_images() == COUNT

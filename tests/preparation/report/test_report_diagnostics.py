@@ -1,0 +1,112 @@
+"""Diagnostics of measures, the page that shows them, and DyCheck's multi-view factors."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+import torch
+from test_prepare_report import report
+
+from hoigs.core.values.camera import Camera
+from hoigs.preparation.cameras.multiview import angular_factor, full_factor
+from hoigs.preparation.report.diagnostics import diagnose
+from hoigs.preparation.report.page import plot, report_page
+
+
+def states(**changes: object) -> dict[str, tuple[str, str]]:
+    changed = dataclasses.replace(report(), **changes)  # type: ignore[arg-type]
+    return {d.kind: (d.severity, d.do) for d in diagnose(changed)}
+
+
+def test_every_measure_is_judged_and_advised() -> None:
+    bad = states(
+        camera="moving", registered=0.6, reprojection_px=3.0, parallax_degrees=2.0,
+        sharpness=[1.0] * 30 + [0.2] * 10, body_residual_px=9.0, object_scale_spread=0.3,
+        depth_residual=0.2, omega=1.0, coverage={"human": [0.0] * 20 + [0.1] * 20},
+    )  # fmt: skip
+    assert {state for state, _ in bad.values()} == {"bad"} and len(bad) == 9
+    assert all(advice for _, advice in bad.values())
+    good = states(
+        camera="moving", registered=1.0, reprojection_px=0.3, parallax_degrees=25.0,
+        sharpness=[1.0] * 40, body_residual_px=0.5, object_scale_spread=0.02, depth_residual=0.02,
+        omega=60.0, coverage={"human": [0.1] * 40},
+    )  # fmt: skip
+    assert set(good) == set(bad)
+    assert set(good.values()) == {("good", "")}
+
+
+def test_a_static_camera_is_not_asked_for_parallax() -> None:
+    judged = states(displacement_px=0.13)
+    assert (
+        "parallax" not in judged
+        and judged["camera"][0] == "fair"
+        and "--focal" in judged["camera"][1]
+    )
+
+
+class Tags(HTMLParser):
+    """Counts open tags, and every address that is not inside the file."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.links: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in ("meta", "polyline", "br"):
+            self.open.append(tag)
+        self.links += [value or "" for name, value in attrs if name in ("src", "href")]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_and_asks_for_nothing(tmp_path: Path) -> None:
+    shown = dataclasses.replace(
+        report(), name="<mine>", sharpness=[1.0] * 40, body_residuals_px=[None, 2.0, 3.0, None, 1.0]
+    )
+    parser = Tags()
+    page = report_page(shown, diagnose(shown), shown.rows(), overlay=True)
+    parser.feed(page.replace("/>", ">"))
+    assert parser.open == [] and parser.links == ["overlay.mp4"]
+    assert "&lt;mine&gt;" in page and "<mine>" not in page and "$" not in page
+    assert "beware of the dog" in page and "Masks, % of the image" in page
+    assert "<video" not in report_page(shown, [], [], overlay=False)
+    shown.save(tmp_path)
+    assert "What to do" in (tmp_path / "report.md").read_text()
+    assert (tmp_path / "report.html").read_text().startswith("<!doctype html>")
+
+
+def test_plots_leave_gaps() -> None:
+    drawn = plot("x", {"": [1.0, 2.0, None, 2.0, None, None]})
+    assert drawn.count("<polyline") == 2
+    assert "0.0,45.0 60.0,0.0" in drawn
+
+
+def orbiting(step: float, count: int = 5) -> list[Camera]:
+    """Cameras 3 m from the origin, `step` degrees apart."""
+    cameras = []
+    for i in range(count):
+        a = math.radians(step * i)
+        eye = torch.tensor([3 * math.sin(a), 0.0, -3 * math.cos(a)])
+        cameras.append(Camera.look_at(eye, torch.zeros(3), width=64, height=48, fov_y=0.8))
+    return cameras
+
+
+def test_effective_multi_view_factors() -> None:
+    cameras, middle = orbiting(0.01), torch.zeros(5, 3)
+    assert angular_factor(cameras, middle, 30.0) == pytest.approx(0.3, rel=2e-2)
+    cameras = orbiting(4)
+    assert angular_factor(cameras, middle, 25.0) == pytest.approx(100, rel=1e-4)
+    chord = 2 * 3 * math.sin(math.radians(2))
+    points = torch.zeros(5, 2, 3)
+    points[:, :, 0] = 0.1 * torch.arange(5.0)[:, None]
+    assert full_factor(cameras, points) == pytest.approx(chord / 0.1, rel=1e-4)
+    assert full_factor(cameras, torch.zeros(5, 2, 3)) is None
+    still = [cameras[0]] * 5
+    assert angular_factor(still, middle, 25.0) == pytest.approx(0, abs=1e-6)
+    assert full_factor(still, points) == pytest.approx(0, abs=1e-6)

@@ -1,0 +1,152 @@
+"""Stages are kept and taken up again; what is killed leaves nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from filelock import FileLock
+
+from hoigs.core.clip_folder.check import check_clip
+from hoigs.core.errors import ClipError, HoigsError
+from hoigs.plugins.bodies.anny import AnnyBody
+from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until, work_folder
+from hoigs.preparation.stages.plan import PLAN, with_dependents
+from hoigs.preparation.stages.work_folder import LOCK, Result, WorkFolder, digest, fingerprint
+
+OPTIONS = PrepareOptions(fit_steps=3, overlay_width=0, max_frames=6)
+REPOSITORY = Path(__file__).resolve().parents[3]
+
+
+def made(out: Path) -> dict[str, int]:
+    """When each stage's result was made."""
+    found = {name: work_folder(out) / name / "result.json" for name in PLAN}
+    return {name: path.stat().st_mtime_ns for name, path in found.items() if path.is_file()}
+
+
+def test_stages_are_taken_up_and_redone(tiny_source: Path, tmp_path: Path) -> None:
+    out, body = tmp_path / "clip", AnnyBody()
+    seconds = prepare_until("body", tiny_source, out, body=body, options=OPTIONS)
+    assert list(seconds) == ["frames", "evidence", "cameras", "inputs", "body"] == list(made(out))
+    assert not out.exists()
+    first = made(out)
+    report = prepare(tiny_source, out, body=body, options=OPTIONS)
+    assert check_clip(out) == [] and set(report.seconds) == set(PLAN)
+    assert {name: when for name, when in made(out).items() if name in first} == first
+    assert report.seconds["body"] == seconds["body"], "as long as it took when it was made"
+    assert "estimated from the person" in " ".join(report.warnings), "of a stage that did not run"
+    # one stage anew, and what builds on it; the older clip is replaced
+    before = made(out)
+    again = prepare(tiny_source, out, body=body, options=OPTIONS, redo=["masks"])
+    after = made(out)
+    changed = {name for name in after if after[name] != before[name]}
+    assert changed == {"masks", "object", "depth", "scene"}
+    assert again.warnings == report.warnings and again.coverage == report.coverage
+
+
+def test_other_options_and_files_make_other_results(tiny_source: Path, tmp_path: Path) -> None:
+    out, body = tmp_path / "clip", AnnyBody()
+    prepare_until("masks", tiny_source, out, body=body, options=OPTIONS)
+    before = made(out)
+    black = OPTIONS.model_copy(update={"keep_black": True})
+    prepare_until("masks", tiny_source, out, body=body, options=black)
+    assert {name for name, when in made(out).items() if before[name] != when} == {"masks"}
+    before = made(out)
+    track = dict(np.load(tiny_source / "ball_track.npz"))
+    track["xyr"][2] += 1
+    np.savez(tiny_source / "ball_track.npz", **track)
+    prepare_until("masks", tiny_source, out, body=body, options=black)
+    changed = {name for name, when in made(out).items() if before[name] != when}
+    assert changed == {"inputs", "body", "masks"}
+
+
+def test_what_builds_on_what() -> None:
+    assert with_dependents(["scene"]) == {"scene", "writing"}
+    assert with_dependents(["frames"]) == set(PLAN)
+    for name, stage in PLAN.items():
+        assert set(stage.reads) <= set(list(PLAN)[: list(PLAN).index(name)])
+        assert set(stage.options) <= set(PrepareOptions.model_fields)
+
+
+def test_unknown_and_last_stages(tiny_source: Path, tmp_path: Path) -> None:
+    with pytest.raises(HoigsError, match=r'no stage .camera.; did you mean "cameras"'):
+        prepare(tiny_source, tmp_path / "clip", body=AnnyBody(), redo=["camera"])
+    with pytest.raises(HoigsError, match="writing is the last stage"):
+        prepare_until("writing", tiny_source, tmp_path / "clip", body=AnnyBody())
+
+
+def test_one_process_at_a_time(tiny_source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "clip"
+    work_folder(out).mkdir()
+    with (
+        FileLock(work_folder(out) / LOCK),
+        pytest.raises(ClipError, match="another `hoigs prepare` is at work"),
+    ):
+        prepare(tiny_source, out, body=AnnyBody(), options=OPTIONS)
+
+
+def test_a_fault_after_long_work_keeps_it(tiny_source: Path, tmp_path: Path) -> None:
+    out, body = tmp_path / "clip", AnnyBody()
+    prepare_until("body", tiny_source, out, body=body, options=OPTIONS)
+    (tiny_source / "hoi_mask/00002.png").unlink()
+    with pytest.raises(HoigsError, match="lacks 1 of 6 frames: 2"):
+        prepare(tiny_source, out, body=body, options=OPTIONS)
+    assert "body" in made(out)
+
+
+def test_results_survive_exactly_and_only_for_their_key(tmp_path: Path) -> None:
+    values = {"third": 1 / 3, "none": None, "list": [1, 2.5, "x"]}
+    array = np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32)
+    with WorkFolder(tmp_path / "work") as work:
+        work.save("a", "key", Result(values, {"x": array}, lambda f: _write(f / "note", "hi")))
+        found = work.load("a", "key")
+        assert found is not None and found.folder is not None
+        assert found.values == values
+        assert np.array_equal(found.arrays["x"], array) and found.arrays["x"].dtype == np.float32
+        assert (found.folder / "note").read_text() == "hi"
+        assert work.load("a", "other") is None and work.load("b", "key") is None
+        work.save("a", "other", Result({"new": True}))
+        assert work.load("a", "key") is None and not (found.folder / "note").exists()
+        work.forget("a")
+        assert work.load("a", "other") is None
+
+
+def test_leavings_of_a_killed_process_are_swept_away(tmp_path: Path) -> None:
+    root = tmp_path / "work"
+    (root / ".half").mkdir(parents=True)
+    _write(root / ".half/result.json", json.dumps({"key": "key", "values": {}}))
+    with WorkFolder(root) as work:
+        assert not (root / ".half").exists()
+        assert work.load(".half", "key") is None
+
+
+def test_fingerprints_see_every_edit(tmp_path: Path) -> None:
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    _write(folder / "0.png", "aaa")
+    first = digest(fingerprint([folder]))
+    _write(folder / "0.png", "abcd")
+    second = digest(fingerprint([folder]))
+    _write(folder / "1.png", "x")
+    assert len({first, second, digest(fingerprint([folder]))}) == 3
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text)
+
+
+def test_killed_at_random_moments() -> None:
+    """Real processes, real SIGKILLs; benchmarks/kill_prepare.py does it as often as one likes."""
+    script = REPOSITORY / "benchmarks/kill_prepare.py"
+    done = subprocess.run(
+        [sys.executable, str(script), "--times", "5", "--seed", "3"],
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    match = re.match(r"5 kills in runs of .* (\d+) clips finished, (\d+) of them", done.stdout)
+    assert match and int(match[1]) >= 1, done.stdout

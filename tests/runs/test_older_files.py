@@ -1,0 +1,36 @@
+"""Clip and run folders that version 0.1 wrote before names and files moved still open."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from hoigs.core.clip_folder.check import check_clip
+from hoigs.evaluation.evaluate import evaluate
+from hoigs.runs.loaded_run import LoadedRun
+from hoigs.training.session import Session
+
+WRITTEN = Path(__file__).resolve().parents[1] / "fixtures" / "written_by_0_1"
+# `hoigs eval` of the code that wrote the run: PSNR of whole test frames, dB
+PSNR = 11.801479
+
+
+def test_the_clip_folder_is_whole() -> None:
+    assert check_clip(WRITTEN / "clip") == []
+
+
+@pytest.mark.parametrize(("run", "tolerance"), [("run", 0.002), ("run-compact", 0.05)])
+def test_a_run_opens_and_scores_as_it_did(run: str, tolerance: float) -> None:
+    loaded = LoadedRun.open(WRITTEN / run)
+    result = evaluate(loaded.model, loaded.clip, timing_frames=0)
+    assert result.score("full", "psnr") == pytest.approx(PSNR, abs=tolerance)
+
+
+def test_a_run_can_be_resumed(tmp_path: Path) -> None:
+    shutil.copytree(WRITTEN, tmp_path / "written")
+    run = tmp_path / "written" / "run"
+    session = Session.open(out=run, resume=True, overrides=["train.steps=8"])
+    session.train()
+    assert LoadedRun.open(run).step == 8

@@ -1,0 +1,209 @@
+"""Figures, page and tables of made-up results: legends apart, machines named, pages whole."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from itertools import combinations
+from pathlib import Path
+
+import plotly.graph_objects as go
+import pytest
+from chart_tables import METHODS, A, B, cell, study
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from hoigs.core.errors import HoigsError
+from hoigs.studies.chart.curves import curve_chart
+from hoigs.studies.chart.data import load_chart, points_of
+from hoigs.studies.chart.interactive import details, page
+from hoigs.studies.chart.panels import accuracy_chart
+from hoigs.studies.chart.series import series_of
+from hoigs.studies.chart.write import by_clip, write_chart
+from hoigs.studies.plotting.style import is_log, short_number
+
+FEW = {name: METHODS[name] for name in ("hoigs", "4dgs", "static-3dgs")}
+
+
+def _texts(figure: Figure) -> str:
+    return "\n".join(t.get_text() for t in figure.findobj(Text))
+
+
+def test_numbers_and_axes() -> None:
+    assert [short_number(v) for v in (2.5e6, 12000, 0.25)] == ["2.5M", "12k", "0.25"]
+    assert is_log([1, 4]) and not is_log([1, 3.9]) and not is_log([0, 9]) and not is_log([])
+
+
+def test_every_series_looks_different() -> None:
+    many = {f"spec-{i}": METHODS["hoigs"] for i in range(20)}
+    for cells in (study(many, seeds=1), study(machines=(A, B), rasterizers=("warp", "torch"))):
+        series = series_of(points_of(cells))
+        assert len({(s.color, s.marker) for s in series}) == len(series)
+        assert len({s.name for s in series}) == len(series)
+        assert all([p.steps for p in s.points] == [200, 1000] for s in series)
+
+
+def test_title_legend_notes_and_panels_do_not_overlap() -> None:
+    points = points_of(study(seeds=2, lpips=False))
+    drawn, curves = accuracy_chart(points, "carry"), curve_chart(points, "carry")
+    assert drawn is not None and len(drawn.axes) == 2 * 4, "two accuracies, four costs"
+    assert curves is not None and len(curves.axes) == 2
+    for figure in (drawn, curves):
+        figure.canvas.draw()
+        renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+        (legend,) = figure.legends
+        assert {t.get_text() for t in legend.get_texts()} >= set(METHODS)
+        boxes = [x.get_window_extent(renderer) for x in (legend, *figure.texts)]
+        boxes += [axes.get_tightbbox(renderer) for axes in figure.axes]
+        for a, b in combinations(boxes, 2):
+            assert min(a.x1, b.x1) - max(a.x0, b.x0) < 2 or min(a.y1, b.y1) - max(a.y0, b.y0) < 2
+        assert all(b.x1 <= figure.bbox.x1 + 1 for b in boxes)
+    text = _texts(drawn)
+    assert "LPIPS, full frame: not computed: no LPIPS weights" in text
+    assert "training (J): not computed: this machine does not tell" in text
+    assert f"Measured on {A}" in text and "2 seeds a point" in text
+
+
+def test_two_machines_are_named_and_their_times_refused() -> None:
+    points = points_of(study(FEW, machines=(A, B), seeds=1, lpips=False))
+    apart = accuracy_chart(points, "carry")
+    mixed = accuracy_chart(points, "carry", mix_machines=True)
+    assert apart is not None and mixed is not None
+    assert len(apart.axes) == 2 * 2 and len(mixed.axes) == 2 * 4
+    for figure in (apart, mixed):
+        text = _texts(figure)
+        assert "carry: points of 2 machines" in text and f"machine B: {B}" in text
+    assert "not drawn: measured on 2 machines" in _texts(apart)
+    assert len(curve_chart(points, "c").axes) == 1  # type: ignore[union-attr]
+    assert len(curve_chart(points, "c", mix_machines=True).axes) == 2  # type: ignore[union-attr]
+
+
+def test_nothing_to_draw_is_no_figure() -> None:
+    (point,) = points_of([cell()])
+    assert curve_chart([point], "c") is None
+    (bare,) = points_of([cell(curve=())])
+    assert accuracy_chart([bare], "c") is not None
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("chart")
+    cells = study(FEW, clips=("carry", "throw?x=<1>"), seeds=2, lpips=False)
+    cells.append(cell("hoigs", seed=9, steps=1000, missing="it fell </script>"))
+    write_chart(cells, out, {"date": "a day"})
+    return out
+
+
+def test_every_clip_and_their_mean_have_figures(written: Path) -> None:
+    stems = {p.stem for p in written.glob("*.svg")}
+    assert stems == {"chart-carry", "chart-carry-curves", "chart-throw-x-1",
+                     "chart-throw-x-1-curves", "chart-mean-of-all-clips"}  # fmt: skip
+    assert stems == {p.stem for p in written.glob("*.png")} and not list(written.glob(".*"))
+    svg = (written / "chart-carry.svg").read_text()
+    assert ">hoigs</text>" in svg, "text stays text"
+
+
+class Tags(HTMLParser):
+    """Checks that tags are closed in order, and collects attributes and scripts."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.attributes: set[str] = set()
+        self.scripts: list[str] = []
+        self.words: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.attributes |= {name for name, _ in attrs}
+        if tag != "meta":
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        (self.scripts if self.open[-1:] == ["script"] else self.words).append(data)
+
+
+def test_the_page_opens_offline_and_has_every_point(written: Path) -> None:
+    tags = Tags((written / "chart.html").read_text())
+    assert not tags.open and not tags.attributes & {"src", "href"}
+    assert "@import" not in "".join(tags.words)
+    library, figures = tags.scripts[1], _figures(tags)
+    assert len(library) > 1e6 and "plotly.js v" in library
+    sheets = by_clip(load_chart(written / "chart.json")[0])
+    assert len(figures) == len(sheets) == 3
+    for (figure, config), points in zip(figures, sheets.values(), strict=True):
+        assert config["showSendToCloud"] is False
+        shown = [text for trace in figure.data if trace.xaxis == "x"
+                 for text in trace.hovertext or ()]  # fmt: skip
+        assert sorted(shown) == sorted(details(p) for p in points)
+    words = " ".join(tags.words)
+    assert "it fell </script>" in words and "throw?x=<1>" in words
+    assert "training (J): not computed: this machine does not tell" in words
+
+
+def _figures(tags: Tags) -> list[tuple[go.Figure, dict[str, object]]]:
+    """The arguments of each call of Plotly.newPlot: figure and config."""
+    decoder, found = json.JSONDecoder(), []
+    for script in tags.scripts:
+        call = re.search(r"Plotly\.newPlot\(\s*\"chart-\d+\",\s*", script)
+        if call is not None:
+            position, parts = call.end(), []
+            for _ in range(3):
+                part, position = decoder.raw_decode(script, position)
+                parts.append(part)
+                position += len(re.match(r"[\s,]*", script[position:])[0])  # type: ignore[index]
+            found.append((go.Figure(parts[0], parts[1]), parts[2]))
+    return found
+
+
+def test_every_menu_entry_draws_what_it_names(written: Path) -> None:
+    (figure, _), *_ = _figures(Tags((written / "chart.html").read_text()))
+    axes, scale, curves = figure.layout.updatemenus
+    assert len(axes.buttons) == 2 * 4 and len(scale.buttons) == len(curves.buttons) == 2
+    points = by_clip(load_chart(written / "chart.json")[0])["carry"]
+    best, *others = (next(p for p in points if (p.spec, p.steps) == ("hoigs", s))
+                     for s in (1000, 200))  # fmt: skip
+    for button in (*axes.buttons, *scale.buttons, *curves.buttons):
+        figure.plotly_update(*button.args)  # what a click does; plotly checks names and values
+    figure.plotly_update(*next(b for b in axes.buttons if b.label ==
+                               "PSNR, human + object (dB) against parameters").args)  # fmt: skip
+    assert figure.layout.xaxis.title.text == "parameters"
+    front, hoigs = figure.data[0], figure.data[1]
+    assert hoigs.name == "hoigs"
+    assert list(hoigs.x) == [p.values["parameters"].mean for p in (*others, best)]
+    assert list(hoigs.error_y.array) == [p.values["psnr_human_object"].std for p in (*others, best)]
+    assert list(hoigs.marker.symbol) == ["circle-open", "circle"], "1000 steps are on the front"
+    assert best.values["psnr_human_object"].mean in front.y
+
+
+def test_times_of_two_machines_are_in_no_menu() -> None:
+    cells = study(FEW, machines=(A, B), seeds=1)
+    for mixed, expected in ((False, False), (True, True)):
+        ((figure, _),) = _figures(Tags(page(cells, by_clip(cells), {}, mixed)))
+        labels = [b.label for menu in figure.layout.updatemenus for b in menu.buttons]
+        assert any("training (s)" in label for label in labels) is expected
+        assert ("curves over seconds of training" in labels) is expected
+
+
+def test_without_plotly_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hoigs.studies.chart.interactive.find_spec", lambda name: None)
+    with pytest.raises(HoigsError, match=r"pip install 'hoigs\[charts\]'"):
+        page([], {}, {}, False)
+
+
+def test_the_table_says_who_dominates(written: Path) -> None:
+    text = (written / "chart.md").read_text()
+    assert f"Measured on {A}." in text and "2 frames of split 'test'" in text
+    row = next(line for line in text.splitlines() if line.startswith("| 4dgs, 1000 steps |"))
+    assert "hoigs, 200 steps" in row  # 24.9 dB in 28 s against 23.1 dB in 118 s
+    assert "hoigs, carry, 1000 steps, seed 9: it fell" in text
+    assert "| hoigs | 1000 | 2 |" in text
+
+
+def test_sheets_are_of_clips_with_points() -> None:
+    assert by_clip([cell(missing="it fell")]) == {}
+    assert list(by_clip([cell(), cell(clip="b", missing="it fell")])) == ["carry"]

@@ -1,0 +1,66 @@
+"""Energy counters that start again, what a killed training leaves, fingerprints."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from hoigs.evaluation.protocol import NotComputed
+from hoigs.studies.jobs.cost import INTERRUPTED, OLD, read_cost
+from hoigs.studies.jobs.energy import EnergyMeter, rapl_meter, spent
+from hoigs.studies.jobs.machine import Machine, cpu_model
+
+MACHINE = Machine("Xeon", 2, None, "2.13", "1.19")
+
+
+def _package(root: Path, name: str, joules: float, what: str = "package-0") -> Path:
+    folder = root / name
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "name").write_text(f"{what}\n")
+    (folder / "energy_uj").write_text(str(round(joules * 1e6)))
+    (folder / "max_energy_range_uj").write_text(str(1000 * 10**6))
+    return folder
+
+
+def test_packages_are_added_and_a_counter_that_started_again_is_understood(tmp_path: Path) -> None:
+    _package(tmp_path, "intel-rapl:0", 990.0)
+    _package(tmp_path, "intel-rapl:1", 5.0, "package-1")
+    _package(tmp_path, "intel-rapl:0:0", 7.0, "core")  # part of package 0, not counted again
+    meter = rapl_meter(tmp_path)
+    assert isinstance(meter, EnergyMeter)
+    _package(tmp_path, "intel-rapl:0", 10.0)
+    _package(tmp_path, "intel-rapl:1", 6.0, "package-1")
+    _package(tmp_path, "intel-rapl:0:0", 70.0, "core")
+    assert abs(float(spent(meter)) - 21.0) < 1e-6  # type: ignore[arg-type]
+
+
+def test_what_does_not_tell_says_why(tmp_path: Path) -> None:
+    assert "which reports the energy" in str(rapl_meter(tmp_path / "none"))
+    assert "no counter" in str(rapl_meter(tmp_path))
+
+
+def _study(folder: Path, *parts: dict[str, object]) -> None:
+    more = {"machine": MACHINE.to_dict(), "runs_at_once": 1}
+    data = {"job": {}, "parts": [more | part for part in parts], "train_s": 4.5}
+    (folder / "study.json").write_text(json.dumps(data))
+
+
+def test_an_interrupted_training_has_seconds_but_no_joules(tmp_path: Path) -> None:
+    whole = {"from_step": 0, "to_step": 9, "joules": 80.0, "source": "RAPL"}
+    _study(tmp_path, whole)
+    assert read_cost(tmp_path).joules == 80.0 and read_cost(tmp_path).source == "RAPL"
+    moved = MACHINE.to_dict() | {"cpu": "Ryzen"}
+    _study(tmp_path, {"from_step": 0}, whole | {"from_step": 5, "machine": moved})
+    cost = read_cost(tmp_path)
+    assert cost.train_s == 4.5 and cost.joules == NotComputed(INTERRUPTED)
+    assert [m.partition(",")[0] for m in cost.machines] == ["Xeon", "Ryzen"]
+    (tmp_path / "study.json").unlink()
+    assert read_cost(tmp_path).train_s == NotComputed(OLD)
+
+
+def test_a_fingerprint_names_what_decides_a_time(tmp_path: Path) -> None:
+    assert MACHINE.words == "Xeon, 2 cores; torch 2.13, warp 1.19"
+    assert Machine("Xeon", 1, "H200", "2", "1").words == "H200, with Xeon, 1 core; torch 2, warp 1"
+    info = tmp_path / "cpuinfo"
+    info.write_text("processor : 0\nmodel name\t: Intel(R)  Xeon(R)\n")
+    assert cpu_model(info) == "Intel(R) Xeon(R)" and cpu_model(tmp_path / "none")

@@ -1,0 +1,154 @@
+"""Loss terms against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from hoigs.core.spec.train_schema import LossSpec
+from hoigs.core.values.camera import Camera
+from hoigs.metrics.image_loss import image_loss
+from hoigs.metrics.ssim import ssim
+from hoigs.training.losses.crops import Crop
+from hoigs.training.losses.terms import (
+    align_depth,
+    depth_loss,
+    masked_loss,
+    scene_only_loss,
+    term_weights,
+)
+
+
+def crop(mask: torch.Tensor, ignore: torch.Tensor | None = None) -> Crop:
+    height, width = mask.shape
+    camera = Camera(torch.eye(3), torch.eye(4), width, height)
+    image = torch.full((height, width, 3), 0.5)
+    return Crop(camera, image, mask, torch.zeros_like(mask) if ignore is None else ignore)
+
+
+def test_supplement_weights_and_overrides():
+    supplement = {"human": 0.5, "object": 1.0, "scene": 0.25, "depth": 1.0}
+    assert term_weights(LossSpec(weights="supp")) == supplement
+    assert set(term_weights(LossSpec()).values()) == {1.0}
+    assert term_weights(LossSpec(depth=0.1))["depth"] == 0.1
+
+
+def test_image_loss_mixes_l1_and_dssim():
+    a, b = torch.zeros(16, 16, 3), torch.full((16, 16, 3), 0.25)
+    assert float(image_loss(a, b, 0.0)) == pytest.approx(0.25)
+    assert float(image_loss(a, a, 0.2)) == pytest.approx(0.0, abs=1e-6)
+    assert float(image_loss(a, b, 0.2)) > 0.8 * 0.25
+
+
+def test_masked_loss_is_normalised_by_the_mask_and_blind_to_hidden_pixels():
+    mask = torch.zeros(12, 12, dtype=torch.bool)
+    mask[:3, :4] = True
+    background = torch.tensor([1.0, 0.0, 0.0])
+    target = torch.where(mask[..., None], torch.tensor(0.5), background)
+    render = target.clone()
+    render[5, 5] += 0.6  # sticks out of the mask by one pixel, 0.6 in three channels
+    assert float(masked_loss(render, crop(mask), background, 0.0)) == pytest.approx(0.6 / 12)
+    ignore = torch.zeros_like(mask)
+    ignore[5, 5] = True
+    assert float(masked_loss(render, crop(mask, ignore), background, 0.0)) == pytest.approx(0.0)
+
+
+def test_ssim_by_kernels_and_by_convolutions_teach_the_same():
+    torch.manual_seed(0)
+    target, start = torch.rand(40, 50, 3), torch.rand(40, 50, 3)
+    mask = torch.zeros(40, 50, dtype=torch.bool)
+    mask[8:30, 10:35] = True
+    entity = crop(mask, torch.roll(mask, 15, 1))
+    found = {}
+    for backend in ("warp", "torch"):
+        render = start.clone().requires_grad_()
+        terms = (
+            image_loss(render, target, 0.3, backend),
+            scene_only_loss(render, target, mask, 0.3, backend),
+            masked_loss(render, entity, torch.rand(3, generator=torch.Generator()), 0.3, backend),
+        )
+        found[backend] = [torch.autograd.grad(term, render)[0] for term in terms]
+        found[backend] += [term.detach() for term in terms]
+    for warp, plain in zip(found["warp"], found["torch"], strict=True):
+        assert float((warp - plain).norm() / plain.norm()) < 1e-5
+    assert LossSpec().ssim == "warp"
+    assert LossSpec.model_validate({"ssim": "torch"}).ssim == "torch"
+
+
+def test_depth_loss_skips_what_is_unknown():
+    depth = torch.full((8, 8), 2.0)
+    prior = torch.full((8, 8), 4.0)
+    alpha = torch.ones(8, 8)
+    prior[0] = 0.0  # unknown
+    loss = depth_loss(depth, alpha, prior, "metric")
+    assert loss is not None and float(loss) == pytest.approx(0.5)
+    assert depth_loss(depth, alpha, torch.zeros(8, 8), "metric") is None
+    assert depth_loss(depth, alpha, prior, "none") is None
+    assert depth_loss(depth, 0.4 * alpha, prior, "metric") is None
+
+
+def test_affine_disparity_is_recovered_through_outliers():
+    torch.manual_seed(0)
+    depth = 1.0 + 3.0 * torch.rand(400)
+    prior = (1.0 / depth - 0.1) / 0.7
+    prior[:20] += 3.0
+    aligned = align_depth(depth, prior, "affine-disparity")
+    assert float((aligned[20:] - depth[20:]).abs().median()) < 0.02
+
+
+def scene_depth() -> tuple[torch.Tensor, torch.Tensor]:
+    """Depths of a render, and a disparity with another scale and a shift, both metres-like."""
+    g = torch.Generator().manual_seed(3)
+    depth = 1.0 + 3.0 * torch.rand(500, generator=g)
+    return depth, (1.0 / depth - 0.1) / 0.7
+
+
+def test_how_a_depth_prior_meets_the_render():
+    """Each fit against its formula in float64: factors and lines in disparity."""
+    depth, relative = scene_depth()
+    metric = 1.3 * depth  # a scale is wrong, nothing else
+    torch.testing.assert_close(align_depth(depth, metric, "metric"), metric)  # auto: as it stands
+    torch.testing.assert_close(align_depth(depth, metric, "metric", "scale"), depth)
+    torch.testing.assert_close(
+        align_depth(depth, metric, "metric", "affine"), depth, rtol=1e-3, atol=0
+    )
+    factor = ((1 / depth.double()) / relative.double()).median()
+    scaled = align_depth(depth, relative, "affine-disparity", "scale").double()
+    torch.testing.assert_close(scaled, 1 / (factor * relative.double()), rtol=1e-4, atol=0)
+    # scaling cannot mend a shift of disparity; scale and shift can
+    assert ((scaled - depth) / depth).abs().max() > 0.15
+    for fit in ("auto", "affine"):
+        line = align_depth(depth, relative, "affine-disparity", fit)
+        torch.testing.assert_close(line, depth, rtol=1e-3, atol=0)
+    shifted = 1.0 / (0.7 / depth + 0.1)  # metres, but wrong by a shift in disparity
+    assert (align_depth(depth, shifted, "metric", "scale") - depth).abs().max() > 0.2
+    line = align_depth(depth, shifted, "metric", "affine")
+    torch.testing.assert_close(line, depth, rtol=1e-3, atol=0)
+
+
+def test_depth_loss_equals_its_formula():
+    """Mean |D_render / alpha - D| over known, opaque pixels, over the median of D."""
+    g = torch.Generator().manual_seed(0)
+    alpha = torch.rand(9, 11, generator=g)
+    depth = alpha * (2 + torch.rand(9, 11, generator=g))
+    prior = (1 + torch.rand(9, 11, generator=g)) * (torch.rand(9, 11, generator=g) > 0.2)
+    pairs = [
+        (float(d) / float(a), float(p))
+        for d, a, p in zip(depth.flatten(), alpha.flatten(), prior.flatten(), strict=True)
+        if a > 0.5 and p > 0
+    ]
+    middle = sorted(p for _, p in pairs)[(len(pairs) - 1) // 2]
+    expected = sum(abs(d - p) for d, p in pairs) / len(pairs) / middle
+    leaf = depth.clone().requires_grad_()
+    found = depth_loss(leaf, alpha, prior, "metric")
+    assert float(found.detach()) == pytest.approx(expected, rel=1e-5)
+    found.backward()
+    assert (leaf.grad[(alpha <= 0.5) | (prior == 0)] == 0).all() and leaf.grad.abs().max() > 0
+    assert depth_loss(depth, alpha, prior, "metric", "scale") < found
+
+
+def test_main_texts_plain_sum_is_half_and_half_doubled():
+    torch.manual_seed(0)
+    a, b = torch.rand(20, 24, 3), torch.rand(20, 24, 3)
+    plain = (a - b).abs().mean() + 1 - ssim(a, b)
+    torch.testing.assert_close(2 * image_loss(a, b, 0.5, "torch"), plain)

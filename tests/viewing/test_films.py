@@ -1,0 +1,37 @@
+"""Films: frames are those of SceneModel.render; what goes in comes out; no rest of a failure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from hoigs.viewing.films import write_video
+
+
+def test_frames_come_back(tmp_path: Path) -> None:
+    frames = [np.full((33, 48, 3), 20 + 40 * i, np.uint8) for i in range(5)]
+    path = write_video(tmp_path / "deep" / "clip.mp4", frames, fps=12.5)
+    with av.open(str(path)) as container:
+        decoded = [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
+        assert container.streams.video[0].average_rate == 12.5
+    assert len(decoded) == 5 and decoded[0].shape == (32, 48, 3)
+    for i, image in enumerate(decoded):
+        assert abs(float(image.mean()) - (20 + 40 * i)) < 4
+
+
+def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
+    def breaks():
+        yield np.zeros((16, 16, 3), np.uint8)
+        raise RuntimeError("out of paint")
+
+    with pytest.raises(RuntimeError, match="paint"):
+        write_video(tmp_path / "a.mp4", breaks(), fps=10)
+    sizes = [np.zeros((16, 16, 3), np.uint8), np.zeros((16, 18, 3), np.uint8)]
+    with pytest.raises(ValueError, match="18x16"):
+        write_video(tmp_path / "a.mp4", sizes, fps=10)
+    with pytest.raises(ValueError, match="at least one"):
+        write_video(tmp_path / "a.mp4", [], fps=10)
+    assert list(tmp_path.iterdir()) == []
