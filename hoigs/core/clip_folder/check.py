@@ -29,12 +29,12 @@ from hoigs.core.clip_folder.format import (
     depth_path,
     ignored_path,
     image_path,
-    load_arrays,
     mask_path,
     parse_header,
 )
 from hoigs.core.diagnostics import Severity, ranges
 from hoigs.core.errors import ClipError
+from hoigs.core.npz import load_arrays
 
 ROTATION_TOLERANCE = 1e-3  # of R R^T - I, generous to float16 and text files
 _HEADER_FROM = "clip.json comes from `hoigs prepare VIDEO --out FOLDER` or ClipWriter"

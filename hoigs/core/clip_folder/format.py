@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from hoigs.core.names import NAME, RULE
@@ -264,21 +263,6 @@ def ignored_path(folder: Path, frame: int) -> Path:
 
 def depth_path(folder: Path, frame: int) -> Path:
     return folder / "depth" / f"{stem(frame)}.npz"
-
-
-def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an npz; pickled content is refused (it could run code).
-
-    Raises:
-        ValueError: not an npz, damaged, or holding pickled objects.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # zipfile, zlib, numpy and EOF errors all mean the same here
-        raise ValueError(f"not a readable npz without pickled objects ({error})") from error
 
 
 def is_clip_folder(folder: Path) -> bool:

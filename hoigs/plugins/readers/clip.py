@@ -23,13 +23,13 @@ from hoigs.core.clip_folder.format import (
     depth_path,
     ignored_path,
     image_path,
-    load_arrays,
     mask_path,
     parse_header,
 )
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
+from hoigs.core.npz import load_arrays
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment

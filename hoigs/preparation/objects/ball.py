@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 from torch import Tensor
 
-from hoigs.core.clip_folder.format import load_arrays
 from hoigs.core.maths.series import fill_gaps, smooth
+from hoigs.core.npz import load_arrays
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.undistortion import Undistortion
 from hoigs.preparation.video.frames import Frames

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from hoigs.core.clip_folder.format import load_arrays
 from hoigs.core.errors import ClipError
+from hoigs.core.npz import load_arrays
 
 TEMPORARY = "."  # names that begin with it are not read, and are removed at the start
 UNFINISHED = "unfinished-"

@@ -10,8 +10,8 @@ import torch
 from test_clip_folder import write
 
 from hoigs.core.clip_folder.check import usable_clip
-from hoigs.core.clip_folder.format import load_arrays
 from hoigs.core.errors import ClipError
+from hoigs.core.npz import load_arrays
 from hoigs.core.values.clip import Clip
 from hoigs.metrics.regions import region_masks
 from hoigs.plugins.readers.clip import ClipFolderReader

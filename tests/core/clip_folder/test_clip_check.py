@@ -15,8 +15,8 @@ from test_clip_folder import HEIGHT, WIDTH, write
 from hoigs.core.clip_folder.check import check_clip, require_clip
 from hoigs.core.clip_folder.diagnostics import summarize, wrong
 from hoigs.core.clip_folder.docs import with_tables
-from hoigs.core.clip_folder.format import load_arrays
 from hoigs.core.errors import ClipError
+from hoigs.core.npz import load_arrays
 
 PAGE = Path(__file__).parents[3] / "docs/reference/clip.md"
 

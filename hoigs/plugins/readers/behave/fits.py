@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.clip_folder.format import load_arrays
 from hoigs.core.errors import ClipError
+from hoigs.core.npz import load_arrays
 from hoigs.plugins.readers.common.listing import Need
 from hoigs.plugins.readers.common.pickles import load_pickle
 

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from hoigs.core.clip_folder.format import load_arrays
 from hoigs.core.errors import ClipError
+from hoigs.core.npz import load_arrays
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import FrameStore
 from hoigs.core.values.lens import Lens
