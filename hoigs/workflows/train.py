@@ -80,19 +80,10 @@ def train(
         HoigsError: the input is wrong; then nothing has been written.
     """
     session = Session.open(
-        clip,
-        spec,
-        out=out,
-        overrides=overrides,
-        rasterizer=rasterizer,
-        device=device,
-        resume=resume,
-        overwrite=overwrite,
-        plugins=plugins,
-        allow_faults=allow_faults,
-        reader=reader,
-        reader_settings=reader_settings,
-    )
+        clip, spec, out=out, overrides=overrides, rasterizer=rasterizer, device=device,
+        resume=resume, overwrite=overwrite, plugins=plugins, allow_faults=allow_faults,
+        reader=reader, reader_settings=reader_settings,
+    )  # fmt: skip
     if on_start is not None:
         on_start(session)
     session.train(on_step)
