@@ -15,7 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.safe_replace import Layout, one_of, put_in_place, require_replaceable
+from hoigs.core.safe_replace import (
+    Layout,
+    one_of,
+    put_in_place,
+    refuse_unwritable,
+    require_replaceable,
+)
 
 PACKAGES = ("hoigs", "torch", "warp-lang", "kornia", "pluggy", "numpy")
 
@@ -82,6 +88,7 @@ class RunFolder:
             overwrite: allow an older run here, if it is complete and has no foreign files.
             inputs: sources of the new run, which must not be inside the old one.
         """
+        refuse_unwritable(self.path)
         if not overwrite and self.path.is_dir() and any(self.path.iterdir()):
             raise HoigsError(
                 f"{self.path}: already exists; choose another --out, go on with --resume, or "

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from hoigs.core.clip_folder.health import depth_factor
-from hoigs.core.errors import CheckpointError
+from hoigs.core.errors import CheckpointError, Interrupted
 from hoigs.core.interfaces.deformation import DeformationModel, StepStatistics
 from hoigs.core.interfaces.density import DensityControl, DensityStatistics, check_rasterizer
 from hoigs.core.model.camera_refinement import CameraRefinement, check_camera_gradients
@@ -35,6 +35,7 @@ from hoigs.training.nan_guard import NanGuard, first_not_finite, gradients_finit
 from hoigs.training.objective import JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
 from hoigs.training.sampler import EpochSampler
+from hoigs.training.stop_request import StopRequest, resume_command
 
 
 @dataclass(frozen=True)
@@ -123,13 +124,29 @@ class Trainer:
     ) -> None:
         """Train to `spec.steps`, writing metrics and checkpoints.
 
+        With a run folder, the first Ctrl-C or SIGTERM ends the present step and writes a
+        checkpoint; a second one stops at once.
+
         Args:
             until: stop after this step; another call continues. Schedules depend on `spec.steps`
                 alone.
 
         Raises:
             NotFiniteError: see `NanGuard`.
+            Interrupted: stopped by a signal; the message has the command that continues.
         """
+        if self.run is None:
+            self._steps(on_step, until, None)
+            return
+        with StopRequest() as stop:
+            self._steps(on_step, until, stop)
+
+    def _steps(
+        self,
+        on_step: Callable[[StepReport], object] | None,
+        until: int | None,
+        stop: StopRequest | None,
+    ) -> None:
         end = self.spec.steps if until is None else min(until, self.spec.steps)
         self.model.train()
         started = time.perf_counter() - self.elapsed
@@ -143,9 +160,16 @@ class Trainer:
                     self.run.log(report.record())
                 if on_step is not None:
                     on_step(report)
-            last = self.step == self.spec.steps
-            if self.run is not None and (last or self.step % self.spec.checkpoint_every == 0):
+            signal = None if stop is None else stop.signal
+            due = self.step == self.spec.steps or self.step % self.spec.checkpoint_every == 0
+            if self.run is not None and (due or signal is not None):
                 self.checkpoint().save(self.run.checkpoints)
+            if self.run is not None and signal is not None and self.step < end:
+                raise Interrupted(
+                    f"stopped at step {self.step} of {self.spec.steps}; continue with: "
+                    f"{resume_command(self.run)}",
+                    signal,
+                )
         self.model.eval()
         self.model.set_progress(self.step / self.spec.steps)
 
