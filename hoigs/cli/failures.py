@@ -76,6 +76,8 @@ def message_of(error: Exception) -> str | None:
         return str(error)
     if isinstance(error, MemoryError) or is_out_of_memory(error):
         return f"{TOO_LARGE} ({_first_line(error)})"
+    if type(error).__name__ == "DecompressionBombError":  # Pillow's, which is not imported here
+        return f"an image is too large to be opened safely: {_first_line(error)}"
     if isinstance(error, OSError) and error.errno not in (None, errno.EPIPE):
         return _of_system(error)
     return None

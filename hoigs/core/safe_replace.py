@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -91,15 +92,16 @@ def refuse_unwritable(folder: Path, *, error: type[HoigsError] = HoigsError) -> 
         HoigsError: or `error`: a parent is a file or a broken link, the disk can only be read or is
             full, or the name is too long.
     """
-    place = folder.absolute()
-    name, parent = place.name, place.parent
+    parent, names = folder.absolute().parent, [f".{folder.absolute().name}.old.1234567.part"]
     while not os.path.lexists(parent):
-        name, parent = parent.name, parent.parent
+        parent, names = parent.parent, [*names, parent.name]
     if not parent.is_dir():
         raise error(f"{folder}: {parent} is no folder; name another folder to write")
     try:
-        # as long as the longest temporary name beside it
-        Path(tempfile.mkdtemp(prefix=f".{name}.", suffix=".old.part", dir=parent)).rmdir()
+        with tempfile.TemporaryDirectory(prefix=".hoigs-", suffix=".part", dir=parent) as made:
+            for name in names:
+                with contextlib.suppress(FileNotFoundError):
+                    (Path(made) / name).lstat()  # for the error of a name that is too long
     except OSError as problem:
         raise error(
             f"{folder} cannot be made in {parent}: {problem.strerror}; name another folder to write"

@@ -31,7 +31,12 @@ from hoigs.runs.checkpoint import (
 from hoigs.runs.run_folder import RunFolder
 from hoigs.training.density_update import EntityDensity, evolve
 from hoigs.training.losses.face import unwrap_faces
-from hoigs.training.nan_guard import NanGuard, first_not_finite, gradients_finite
+from hoigs.training.nan_guard import (
+    NanGuard,
+    first_not_finite,
+    gradients_finite,
+    require_finite_outputs,
+)
 from hoigs.training.objective import JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
 from hoigs.training.sampler import EpochSampler
@@ -160,9 +165,12 @@ class Trainer:
                     self.run.log(report.record())
                 if on_step is not None:
                     on_step(report)
+            if self.step == self.spec.steps:
+                self.guard.require_any(self.step)
             signal = None if stop is None else stop.signal
             due = self.step == self.spec.steps or self.step % self.spec.checkpoint_every == 0
             if self.run is not None and (due or signal is not None):
+                self.run.require_lock()
                 self.checkpoint().save(self.run.checkpoints)
             if self.run is not None and signal is not None and self.step < end:
                 raise Interrupted(
@@ -187,6 +195,8 @@ class Trainer:
         frame = self.clip[self.sampler.next()]
         camera = self._camera(frame)
         result = self.objective(frame, camera, self.generator)
+        if self.step in (1, self.spec.steps) or self.step % self.spec.log_every == 0:
+            require_finite_outputs(self.model, result.state)
         self.optimizer.zero_grad()
         result.total.backward()
         if not gradients_finite(self.optimizer.names):
@@ -315,6 +325,16 @@ class Trainer:
                 f"the checkpoint of step {checkpoint.meta['step']} was pruned or compressed: it "
                 "has a model, but no optimizer state to resume with"
             )
+        try:
+            self._restore(checkpoint)
+        except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
+            raise CheckpointError(
+                f"the checkpoint of step {checkpoint.meta['step']} is damaged: {error}"
+            ) from error
+        if self.run is not None:
+            self.run.cut_metrics(self.step)
+
+    def _restore(self, checkpoint: Checkpoint) -> None:
         restore_model(self.model, checkpoint, self.identity["model_hash"])
         restore_cameras(self.cameras, checkpoint)
         self.optimizer.load_tensors(checkpoint.part("optimizer"))
@@ -328,5 +348,3 @@ class Trainer:
         self.sampler.load(checkpoint.meta["sampler"])
         self.step = checkpoint.meta["step"]
         self.elapsed = checkpoint.meta["time_s"]
-        if self.run is not None:
-            self.run.cut_metrics(self.step)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hoigs.core.errors import Interrupted
+from hoigs.core.folder_lock import FolderLock
 from hoigs.core.progress import Progress
 from hoigs.core.spec.schema import Spec
 from hoigs.training.session import Session
@@ -107,7 +108,8 @@ def train(
     if not evaluate:
         return TrainedRun(path, session, None)
     try:
-        evaluated = evaluate_run(path, device=device, plugins=plugins, progress=progress)
+        with FolderLock(path, "scoring"):
+            evaluated = evaluate_run(path, device=device, plugins=plugins, progress=progress)
     except KeyboardInterrupt as stop:
         number = stop.code - 128 if isinstance(stop, Interrupted) else signal.SIGINT
         rest = f"stopped; {path} is trained, but not scored: hoigs eval {shlex.quote(str(path))}"
