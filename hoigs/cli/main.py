@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import typer
 
 from hoigs import __version__
@@ -22,10 +20,11 @@ from hoigs.cli import (
     tables,
     train,
 )
-from hoigs.core.errors import HoigsError
+from hoigs.cli.failures import GuardedGroup, failures_as_messages
 
 app = typer.Typer(
     name="hoigs",
+    cls=GuardedGroup,
     help="People handling things, reconstructed from one video as moving 3D Gaussians.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -62,15 +61,9 @@ def _options(
 
 
 def main() -> None:
-    """Entry point: user errors become one message on stderr and exit code 2."""
-    try:
+    """Entry point: what goes wrong becomes one message on stderr and an exit code."""
+    with failures_as_messages():
         app()
-    except HoigsError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        sys.exit(130)
 
 
 if __name__ == "__main__":
