@@ -10,6 +10,7 @@ from hoigs.cli import (
     compress,
     demo,
     doctor,
+    estimators,
     evaluate,
     needs,
     plugins,
@@ -42,6 +43,7 @@ app.command("needs")(needs.needs)
 app.command("compress")(compress.compress)
 app.add_typer(plugins.app, name="plugins")
 app.add_typer(spec.app, name="spec")
+app.add_typer(estimators.app, name="estimators")
 app.command("doctor")(doctor.doctor)
 
 
