@@ -19,8 +19,7 @@ from hoigs.core.interfaces.estimator import (
     checked,
 )
 from hoigs.preparation.body.landmarks import LandmarkTrack
-from hoigs.preparation.body.person import RawLandmarks, chosen_landmarks
-from hoigs.preparation.masks.entity_masks import GivenMasks
+from hoigs.preparation.given import GivenMasks, RawLandmarks, chosen_landmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack
 from hoigs.preparation.options import PrepareOptions

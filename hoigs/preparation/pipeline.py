@@ -15,9 +15,9 @@ from hoigs.core.diagnostics import ranges
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST, BodyModel
 from hoigs.core.values.clip import BodyTrack, ObjectTrack
-from hoigs.preparation.body.person import FittedBody, fit_person
 from hoigs.preparation.body.silhouette import silhouette
 from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras
+from hoigs.preparation.entity_masks import EntityMasks, entity_masks
 from hoigs.preparation.estimates import (
     EstimateReader,
     Estimators,
@@ -25,11 +25,12 @@ from hoigs.preparation.estimates import (
     identity,
     paths_of,
 )
-from hoigs.preparation.masks.entity_masks import EntityMasks, entity_masks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack, load_ball, refine_ball
 from hoigs.preparation.objects.make_object import make_object
 from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.person import FittedBody, fit_person
+from hoigs.preparation.saved import from_result, to_result
 from hoigs.preparation.scene.depth import (
     POOR,
     DepthFit,
@@ -41,7 +42,6 @@ from hoigs.preparation.scene.depth import (
 from hoigs.preparation.scene.scene_points import ScenePoints, colmap_scene, static_scene
 from hoigs.preparation.stages.plan import PLAN
 from hoigs.preparation.stages.progress import Stages
-from hoigs.preparation.stages.saved import from_result, to_result
 from hoigs.preparation.stages.work_folder import Result, WorkFolder, digest, fingerprint
 from hoigs.preparation.video.blank import blank_pixels
 from hoigs.preparation.video.frames import FrameList, open_frames
@@ -209,8 +209,9 @@ class Pipeline:
     def _inputs(self) -> None:
         def make() -> UndistortedEstimates:
             landmarks, masks = self.raw.landmarks, self.raw.masks
+            placed = self.track.undistort, self.track.positions
             return UndistortedEstimates(
-                landmarks.undistorted(self.track), masks.undistorted(self.track), self._ball()
+                landmarks.undistorted(*placed), masks.undistorted(*placed), self._ball()
             )
 
         ball = self.source.ball

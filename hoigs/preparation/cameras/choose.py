@@ -6,13 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from hoigs.preparation.body.person import RawLandmarks
 from hoigs.preparation.cameras.camera_track import CameraTrack, colmap_cameras, static_cameras
-from hoigs.preparation.cameras.given import given_cameras
+from hoigs.preparation.cameras.given_cameras import given_cameras
 from hoigs.preparation.cameras.motion import background_motion
 from hoigs.preparation.cameras.sfm import structure_from_motion
 from hoigs.preparation.cameras.static_focal import static_focal
-from hoigs.preparation.masks.entity_masks import GivenMasks
+from hoigs.preparation.given import GivenMasks, RawLandmarks
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hoigs.preparation.cameras.given import given_cameras
+from hoigs.preparation.cameras.given_cameras import given_cameras
 from hoigs.preparation.video.frames import open_frames
 from hoigs.preparation.video.source import SourceError, find_source
 from tests.preparation.tiny import FRAMES, HEIGHT, WIDTH, picture
