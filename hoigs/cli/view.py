@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from hoigs.cli.common import DeviceOption, PluginOption, RasterizerOption
+from hoigs.cli.display import Display
 
 
 def view(
@@ -21,6 +22,17 @@ def view(
         str, typer.Option("--host", help="Address to listen on; by default this machine alone.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", help="0 finds a free one.")] = 8090,
+    html: Annotated[
+        Path | None,
+        typer.Option("--html", help="Write one file that plays the run without a server."),
+    ] = None,
+    max_mb: Annotated[
+        float | None, typer.Option("--max-mb", min=0.1, help="Thin the file of --html to this.")
+    ] = None,
+    entities: Annotated[
+        list[str] | None,
+        typer.Option("--entities", help="Write only this entity with --html. Repeatable."),
+    ] = None,
     width: Annotated[
         int, typer.Option("--width", min=64, help="Pixels of a still picture at most.")
     ] = 1280,
@@ -32,15 +44,22 @@ def view(
     """Look at a run from any side while it moves; of one in training, at its checkpoints."""
     from hoigs.viewing.view import view as show
 
-    show(
-        what,
-        second,
-        host=host,
-        port=port,
-        width=width,
-        clip=clip,
-        rasterizer=rasterizer,
-        device=device,
-        plugins=plugin or (),
-        report=typer.echo,
-    )
+    with Display() as display:
+        page = show(
+            what,
+            second,
+            host=host,
+            port=port,
+            html=html,
+            max_mb=max_mb,
+            entities=entities or (),
+            width=width,
+            clip=clip,
+            rasterizer=rasterizer,
+            device=device,
+            plugins=plugin or (),
+            report=typer.echo,
+            progress=display.fraction,
+        )
+    if page is not None:
+        typer.echo(str(page))

@@ -7,14 +7,16 @@ from functools import partial
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.progress import Progress
 from hoigs.core.registry.registry import default_registry
 from hoigs.runs.clip_source import read_clip
 from hoigs.runs.loaded_run import LoadedRun
+from hoigs.viewing.html.page import Page, write_page
 from hoigs.viewing.viewer.bodies import bodies_of_clip, bodies_of_run
 from hoigs.viewing.viewer.clip_drawing import ClipDrawing
 from hoigs.viewing.viewer.drawing import Drawing, RunDrawing
 from hoigs.viewing.viewer.following import FollowedRun, wait_for_checkpoint
-from hoigs.viewing.viewer.overlays import OF_CLIP, OF_RUN
+from hoigs.viewing.viewer.overlays import offered
 from hoigs.viewing.viewer.server import LOCAL, is_loopback, open_server, stop
 from hoigs.viewing.viewer.viewer import Viewer
 
@@ -27,14 +29,18 @@ def view(
     *,
     host: str = LOCAL,
     port: int = 8090,
+    html: Path | str | None = None,
+    max_mb: float | None = None,
+    entities: Sequence[str] = (),
     width: int = 1280,
     clip: Path | str | None = None,
     rasterizer: str | None = None,
     device: str = "auto",
     plugins: Sequence[Path | str] = (),
     report: Report = print,
+    progress: Progress | None = None,
     started: Callable[[Viewer], None] | None = None,
-) -> None:
+) -> Page | None:
     """Show a run, two runs with one clock, or a clip in the browser, until interrupted.
 
     A run in training is read again after each checkpoint.
@@ -42,10 +48,17 @@ def view(
     Args:
         what: a run folder, a clip folder, or "builtin:NAME". second: another run.
         host: the address to listen on; other machines can reach any but a loopback address.
-        port: 0 finds a free one. width: of a still picture at most, pixels.
+        port: 0 finds a free one.
+        html: write the run to this file instead, to be opened without a server or a network.
+        max_mb, entities: of that file (`write_page`).
+        width: of a still picture at most, pixels.
         clip, rasterizer, device, plugins: as for `open_run`.
         report: receives lines: the address, and warnings.
+        progress: called with the share done of the file, in [0, 1], and the work.
         started: receives the viewer before it draws, for example to stop it from a thread.
+
+    Returns:
+        The page that was written with `html`; otherwise None.
 
     Raises:
         HoigsError: this is neither a run nor a clip, or the port is in use.
@@ -54,6 +67,15 @@ def view(
     if second is not None and len(runs) < 2:
         odd = what if not is_run(what) else second
         raise HoigsError(f"{odd}: two can be shown together if both are run folders; this is none")
+    if html is not None:
+        if len(runs) != 1 or second is not None:
+            raise HoigsError(f"--html writes one run, and {what} is none; `hoigs train` makes one")
+        loaded = LoadedRun.open(
+            runs[0], clip=clip, rasterizer=rasterizer, device=device, plugins=plugins
+        )
+        return write_page(loaded, html, max_mb=max_mb, entities=entities, progress=progress)
+    if max_mb is not None or entities:
+        raise HoigsError("max_mb and entities are of the file that `html` names")
     registry = default_registry(plugin_files=plugins)
     followed = []
     for path in runs:
@@ -66,13 +88,13 @@ def view(
     if followed:
         drawings = [RunDrawing(run.loaded) for run in followed]
         bodies = bodies_of_run(followed[0].loaded.model, followed[0].loaded.clip)
-        overlays = OF_RUN
     else:
         source = read_clip(what, registry, allow_faults=True)
         bodies, missing = bodies_of_clip(source, registry)
         for name, why in missing.items():
             report(f"{name}: {why}")
-        drawings, overlays = [ClipDrawing(source)], OF_CLIP
+        drawings = [ClipDrawing(source)]
+    overlays = offered(drawings[0].clip, bodies, before_training=not followed)
     server = open_server(host, port, "hoigs")
     try:
         viewer = Viewer(
@@ -93,6 +115,7 @@ def view(
         report("stopped")
     finally:
         stop(server)
+    return None
 
 
 def is_run(what: Path | str) -> bool:

@@ -58,8 +58,8 @@ def bodies_of_run(model: SceneModel, clip: Clip) -> dict[str, PosedBody]:
     found = {}
     for name in model.names("human"):
         deformation = model.entity(name).deformation
-        body = next((m for m in deformation.modules() if isinstance(m, BodyModel)), None)
-        if body is not None and isinstance(deformation, ProvidesSkeleton):
+        body = getattr(deformation, "body", None)
+        if isinstance(body, BodyModel) and isinstance(deformation, ProvidesSkeleton):
             found[name] = PosedBody(body, deformation.pose, clip)
     return found
 

@@ -19,8 +19,23 @@ from hoigs.viewing.viewer.views import View
 CAMERAS = 24  # frusta that are drawn at most
 THUMBNAIL = 160  # pixels of width of a camera's image
 DEPTH_POINTS = 30_000  # of the depth of one frame at most
-OF_RUN = ("body mesh", "skeleton", "object track", "cameras", "camera images")
-OF_CLIP = (*OF_RUN, "object points", "scene points", "depth points")
+
+
+def offered(
+    clip: Clip, bodies: Mapping[str, PosedBody], *, before_training: bool
+) -> tuple[str, ...]:
+    """Names of the overlays that there is something to show of."""
+    names = {
+        "body mesh": bool(bodies),
+        "skeleton": bool(bodies),
+        "object track": bool(clip.objects),
+        "cameras": True,
+        "camera images": True,
+        "object points": before_training and bool(clip.objects),
+        "scene points": before_training and len(clip.points) > 0,
+        "depth points": before_training and clip.depth_kind == "metric",
+    }
+    return tuple(name for name, there in names.items() if there)
 
 
 class Overlays:

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from hoigs.viewing.viewer.drawing import Look
 from hoigs.viewing.viewer.panes import Layout
 
-OVERLAYS = ("body mesh", "skeleton", "object track", "cameras", "camera images")
-
 
 @dataclass
 class Settings:
