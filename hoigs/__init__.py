@@ -71,6 +71,7 @@ _PUBLIC = {
     "prepare_until": "hoigs.preparation.prepare",
     "render": "hoigs.viewing.films",
     "train": "hoigs.workflows.train",
+    "view": "hoigs.viewing.view",
     "LoadedRun": "hoigs.runs.loaded_run",
     "Playback": "hoigs.viewing.playback",
     "PrepareOptions": "hoigs.preparation.options",

@@ -20,6 +20,7 @@ from hoigs.cli import (
     stress,
     tables,
     train,
+    view,
 )
 from hoigs.cli.failures import GuardedGroup, failures_as_messages
 
@@ -36,6 +37,7 @@ app.command("prepare")(prepare.prepare)
 app.command("train")(train.train)
 app.command("eval")(evaluate.evaluate)
 app.command("render")(render.render)
+app.command("view")(view.view)
 app.command("tables")(tables.tables)
 app.command("chart")(chart.chart)
 app.command("stress")(stress.stress)
