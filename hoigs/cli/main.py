@@ -13,6 +13,7 @@ from hoigs.cli import (
     demo,
     doctor,
     evaluate,
+    export,
     needs,
     plugins,
     prepare,
@@ -36,6 +37,7 @@ app.command("prepare")(prepare.prepare)
 app.command("train")(train.train)
 app.command("eval")(evaluate.evaluate)
 app.command("render")(render.render)
+app.command("export")(export.export)
 app.command("tables")(tables.tables)
 app.command("chart")(chart.chart)
 app.command("stress")(stress.stress)
