@@ -65,6 +65,7 @@ _PUBLIC = {
     "demo": "hoigs.workflows.demo",
     "doctor": "hoigs.workflows.doctor",
     "evaluate_run": "hoigs.workflows.evaluate_run",
+    "export": "hoigs.workflows.export",
     "needs": "hoigs.studies.needs.needs",
     "open_run": "hoigs.runs.loaded_run",
     "prepare": "hoigs.preparation.prepare",

@@ -12,6 +12,7 @@ from hoigs.cli import (
     doctor,
     estimators,
     evaluate,
+    export,
     needs,
     plugins,
     prepare,
@@ -38,6 +39,7 @@ app.command("train")(train.train)
 app.command("eval")(evaluate.evaluate)
 app.command("render")(render.render)
 app.command("view")(view.view)
+app.command("export")(export.export)
 app.command("tables")(tables.tables)
 app.command("chart")(chart.chart)
 app.command("stress")(stress.stress)
