@@ -10,6 +10,7 @@ import typer
 from hoigs.cli.common import (
     AllowFaultsOption,
     DeviceOption,
+    OverwriteOption,
     PluginOption,
     RasterizerOption,
     SetOption,
@@ -48,9 +49,7 @@ def train(
         bool,
         typer.Option("--resume", help="Continue the run in --out, with its own spec and clip."),
     ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the run in --out.")
-    ] = False,
+    overwrite: OverwriteOption = False,
     allow_faults: AllowFaultsOption = False,
     reader: Annotated[
         str | None,
