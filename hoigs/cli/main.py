@@ -21,6 +21,7 @@ from hoigs.cli import (
     train,
 )
 from hoigs.cli.failures import GuardedGroup, failures_as_messages
+from hoigs.core.cpus import share_processors
 
 app = typer.Typer(
     name="hoigs",
@@ -62,6 +63,7 @@ def _options(
 
 def main() -> None:
     """Entry point: what goes wrong becomes one message on stderr and an exit code."""
+    share_processors()
     with failures_as_messages():
         app()
 

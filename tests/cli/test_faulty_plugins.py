@@ -33,7 +33,7 @@ def hoigs_components():
     ],
 )
 def test_a_faulty_deformation(hoigs, tiny_clip, tmp_path, body, words):
-    file = tmp_path / "faulty.py"
+    file = tmp_path / f"faulty{len(body)}.py"
     file.write_text(SOURCE.format(body=body))
     outcome = hoigs("train", tiny_clip, "--spec", "hoigs", "--out", tmp_path / "run",
                     "--plugin", file, "--device", "cpu", "--no-eval",
