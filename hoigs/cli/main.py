@@ -10,7 +10,9 @@ from hoigs.cli import (
     compress,
     demo,
     doctor,
+    estimators,
     evaluate,
+    export,
     needs,
     plugins,
     prepare,
@@ -19,6 +21,7 @@ from hoigs.cli import (
     stress,
     tables,
     train,
+    view,
 )
 from hoigs.cli.failures import GuardedGroup, failures_as_messages
 from hoigs.core.cpus import share_processors
@@ -36,6 +39,8 @@ app.command("prepare")(prepare.prepare)
 app.command("train")(train.train)
 app.command("eval")(evaluate.evaluate)
 app.command("render")(render.render)
+app.command("view")(view.view)
+app.command("export")(export.export)
 app.command("tables")(tables.tables)
 app.command("chart")(chart.chart)
 app.command("stress")(stress.stress)
@@ -43,6 +48,7 @@ app.command("needs")(needs.needs)
 app.command("compress")(compress.compress)
 app.add_typer(plugins.app, name="plugins")
 app.add_typer(spec.app, name="spec")
+app.add_typer(estimators.app, name="estimators")
 app.command("doctor")(doctor.doctor)
 
 

@@ -51,7 +51,7 @@ def evaluate(
     """Score a model on a split of a clip and on its held-out cameras, and measure it.
 
     Args:
-        lpips_weights: see `lpips.find_weights`; without any, LPIPS is "not computed".
+        lpips_weights: see `lpips.find_weights`; None: the package's own.
         held_out: also score the clip's held-out cameras, where it has them.
         test_pose, test_camera, fit_steps: source of body poses and cameras; see
             `posing.posed_clip`. The clip with these is `Evaluation.scored`.
@@ -144,6 +144,7 @@ def _protocol(
         width=camera.width,
         height=camera.height,
         lpips_net=None if isinstance(lpips, NotComputed) else lpips.net,
+        lpips_weights="" if isinstance(lpips, NotComputed) else lpips.source,
         device=device_name(model.device),
         rasterizer=type(model.rasterizer).__name__,
         cameras_refined=bool(clip.provenance.get(CAMERAS_REFINED)),

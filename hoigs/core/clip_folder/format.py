@@ -242,7 +242,7 @@ CLIP = Layout(
         r"clip\.json|cameras\.npz|points\.npz",
         rf"(held_out/)?{_VIEW}|held_out/(views\.json|cameras\.npz)",
         rf"(bodies|objects)/{NAME.pattern}\.npz",
-        r"report\.(json|md|html)|overlay\.mp4|truth\.npz",
+        r"report\.(json|md|html)|overlay\.mp4|object\.jpg|truth\.npz",
         r"colmap/.+",
     ),
     folders=one_of(

@@ -116,14 +116,15 @@ def _tracks(report: Measures) -> Iterator[MeasureDiagnostic]:
         "look at overlay.mp4: if the landmarks jump, use another estimator (estimators.landmarks); "
         "if all of the body is off, the focal length or the cameras are",
     )
-    yield _judged(
-        "object's apparent size",
-        f"± {100 * report.object_scale_spread:.1f} %",
-        "over its expected size; its depth is as uncertain",
-        _judge(report.object_scale_spread, 0.05, 0.15),
-        "the object's masks grow and shrink, or it turns: mend the masks, or give its shape as a "
-        "mesh (initializer:mesh)",
-    )
+    if report.object_scale_spread is not None:
+        yield _judged(
+            "object's apparent size",
+            f"± {100 * report.object_scale_spread:.1f} %",
+            "over its expected size; its depth is as uncertain",
+            _judge(report.object_scale_spread, 0.05, 0.15),
+            "the object's masks grow and shrink, or it turns: mend the masks, or give its shape as "
+            "a mesh (initializer:mesh)",
+        )
     if report.depth_residual is not None:
         yield _judged(
             "depth",
