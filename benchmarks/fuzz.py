@@ -306,7 +306,7 @@ def make_targets(root: Path, clip: Path) -> list[Target]:
     for name in ("hoigs", "static", "4dgs"):
         shutil.copy(BUILTIN_SPECS / f"{name}.yaml", root / "specs")
     (root / "options" / "options.yaml").write_text(OPTIONS)
-    (root / "options" / "options.toml").write_text("width = 320\n[estimators.masks]\nuse = 'x'\n")
+    (root / "options" / "options.toml").write_text(OPTIONS_TOML)
     _make_shapes(root / "shapes")
     shutil.copytree(clip, root / "clips" / "clip")
     shutil.copytree(clip, root / "runs" / "clip")
@@ -336,6 +336,11 @@ def make_targets(root: Path, clip: Path) -> list[Target]:
     ]  # fmt: skip
 
 
+OPTIONS_TOML = """width = 320
+[estimators.masks]
+use = "estimator:masks-files"
+path = "masks"
+"""
 OPTIONS = """width: 320
 camera: static
 max_frames: 20

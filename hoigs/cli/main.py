@@ -6,6 +6,7 @@ import typer
 
 from hoigs import __version__
 from hoigs.cli import (
+    bug_report,
     chart,
     compress,
     demo,
@@ -50,6 +51,7 @@ app.add_typer(plugins.app, name="plugins")
 app.add_typer(spec.app, name="spec")
 app.add_typer(estimators.app, name="estimators")
 app.command("doctor")(doctor.doctor)
+app.command("bug-report")(bug_report.bug_report)
 
 
 def _version(show: bool) -> None:
