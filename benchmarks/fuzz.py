@@ -403,12 +403,21 @@ def _read_run(folder: Path) -> None:
     assert torch.isfinite(output.color).all(), "the render is not finite"
 
 
-def run(targets: Sequence[Target], count: int, seed: int) -> dict[str, Outcome]:
-    """`count` cases of each target; the seeds of case i are seed + i."""
+def run(
+    targets: Sequence[Target], count: int, seed: int, limit_s: float = math.inf
+) -> dict[str, Outcome]:
+    """`count` cases of each target, or as many as the time allows; the seed of case i is seed + i.
+
+    Args:
+        limit_s: seconds for each target.
+    """
     outcomes = {}
     for target in targets:
         outcome = outcomes[target.name] = Outcome()
+        until = time.perf_counter() + limit_s
         for i in range(count):
+            if time.perf_counter() > until:
+                break
             try:
                 try_one(target, random.Random(f"{target.name}{seed + i}"), outcome)
             except AssertionError as error:
@@ -432,17 +441,21 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=10_000, help="cases in all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", help="names of targets")
+    parser.add_argument("--minutes", type=float, help="stop after this time, all targets alike")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
+    limit = math.inf if arguments.minutes is None else 60 * arguments.minutes
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         targets = make_targets(Path(folder), small_clip_folder())
         chosen = [t for t in targets if not arguments.only or t.name in arguments.only]
         began = time.perf_counter()
-        outcomes = run(chosen, max(1, arguments.count // len(chosen)), arguments.seed)
+        each = max(1, arguments.count // len(chosen))
+        outcomes = run(chosen, each, arguments.seed, limit / len(chosen))
     if arguments.json:
         record = {
-            "command": f"benchmarks/fuzz.py --count {arguments.count} --seed {arguments.seed}",
+            "command": " ".join(["python benchmarks/fuzz.py", *sys.argv[1:]]),
+            "cases": sum(outcome.cases for outcome in outcomes.values()),
             "seconds": round(time.perf_counter() - began),
             "peak_gib": round(_peak() / 2**30, 2),
             "targets": {name: vars(outcome) for name, outcome in outcomes.items()},
