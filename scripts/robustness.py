@@ -32,7 +32,7 @@ def fuzz(record: dict[str, Any]) -> str:
     ]  # fmt: skip
     columns = ("files", "cases", "read", "refused", "wrong", "slowest, s")
     note = (
-        f"`{record['command']}`: {record['cases']:,} cases in {record['seconds'] / 60:.0f} minutes"
+        f"`{record['command']}`: {record['cases']:,} cases in {minutes}"
     )
     return f"{table(columns, rows)}\n\n{note}, at most {record['peak_gib']} GiB."
 

@@ -35,7 +35,7 @@ RENAMED = {
     "from": "start",
     "to": "end",
 }
-# options that choose the function: --auto is hoigs.auto, --stage is hoigs.prepare_until(stage, ...);
+# options that choose the function: --auto is hoigs.auto, --stage is hoigs.prepare_until(stage, ...)
 # --json is another way to print what hoigs.doctor returns
 CHOOSING = {("train", "auto"), ("prepare", "stage"), ("doctor", "json")}
 # options of a command that the second of its functions is without, and why
