@@ -28,6 +28,7 @@ WHAT = {
     "object": "object's mask",
     "depth": "depth",
 }
+PERSON_ONLY = ("estimator:mediapipe",)  # give no masks of objects
 _OFFLINE: dict[Place, ComponentSpec] = {
     "landmarks": ComponentSpec(use="estimator:mediapipe"),
     "masks": ComponentSpec(use="estimator:mediapipe"),
@@ -171,7 +172,8 @@ def _object(source: Source, options: PrepareOptions, given: Collection[str]) -> 
         return Choice("object", source.ball.name, "lies beside the video", 0.0)
     if options.object in source.masked:
         return Choice("object", "with the person's mask", "both lie beside the video", 0.0)
-    if "masks" in given:
+    named = options.estimators.get("masks")
+    if "masks" in given and (named is None or named.use not in PERSON_ONLY):
         return Choice("object", "with the person's mask", "your estimator of masks gives both")
     if options.preset == "files":
         return Choice("object", "none", "there is no file of it beside the video", 0.0)
