@@ -46,6 +46,6 @@ def uneven_times(path: Path, fps: float) -> list[str]:
         return []
     return [
         f"the video has a variable frame rate ({100 * share:.0f} % of the gaps between its frames "
-        f"are longer or shorter): the clip counts them evenly, at {fps:.4g} a second, so that motion "
+        f"are longer or shorter): the clip counts them evenly, at {fps:.4g} a second, and motion "
         "is uneven in it; `ffmpeg -i VIDEO -vf fps=30 even.mp4` makes it even"
     ]
