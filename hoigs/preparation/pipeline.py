@@ -230,8 +230,8 @@ class Pipeline:
             }
 
     def _cameras(self) -> None:
-        model = self.source.colmap
-        files = None if model is None else [str(model), fingerprint([model])]
+        known = [p for p in (self.source.colmap, self.source.cameras) if p is not None]
+        files = [[str(path), fingerprint([path])] for path in known]
         folder = self.work.unfinished("cameras", self._key("cameras", files))
         chosen = self._stage(
             "cameras", lambda: self._choose_cameras(folder), files, save_cameras, load_cameras
@@ -245,7 +245,7 @@ class Pipeline:
     def _choose_cameras(self, folder: Path) -> ChosenCameras:
         chosen = choose_cameras(
             self.video, self.raw.landmarks, self.raw.masks, self.source.colmap, self.options,
-            folder, self.stages.advance,
+            folder, self.stages.advance, self.source.cameras,
         )  # fmt: skip
         self.provenance["cameras"] = chosen.track.provenance
         self.warnings.extend(chosen.warnings)

@@ -14,6 +14,7 @@ from hoigs.core.spec.schema import ComponentSpec
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 LANDMARKS = "pose_mediapipe.npz"
+CAMERAS = "cameras.npz"
 FRAME_FOLDERS = ("frames", "images")  # where a folder of frames may keep them
 _COLMAP_FILES = ("cameras", "images", "points3D")
 _LAYOUT = """  FOLDER/
@@ -22,7 +23,8 @@ _LAYOUT = """  FOLDER/
     hoi_mask/00000.png   person and object together, 0/255, one file a video frame,
                          from a video segmenter; or masks/human/ and masks/object/ apart
     depth/               depth maps as .npz, in an array named metric_depth or disparity
-    sparse/              a COLMAP model, if you have one; else hoigs checks whether the camera
+    sparse/              a COLMAP model, or cameras.npz (K, world_to_camera, points, in metres),
+                         if you have one; else hoigs checks whether the camera
                          moves, and then runs structure from motion itself
     ball_track.npz       xyr [F, 3] pixels, if the object is a ball: centre and radius"""
 
@@ -41,7 +43,7 @@ class Source:
             gives.
         masked: entities whose masks `beside` reads.
         colmap: folder of a COLMAP model, or None.
-        ball: ball_track.npz, or None.
+        cameras: cameras.npz, or None. ball: ball_track.npz, or None.
         absent: which of "landmarks", "masks" (the person's) and "object" (the object's masks, or
             its track) are not there and given by no other estimator.
     """
@@ -51,6 +53,7 @@ class Source:
     beside: dict[EstimateKind, ComponentSpec] = field(default_factory=dict)
     masked: tuple[str, ...] = ()
     colmap: Path | None = None
+    cameras: Path | None = None
     ball: Path | None = None
     absent: frozenset[str] = frozenset()
 
@@ -111,6 +114,7 @@ def find_source(
     if (folder / "depth").is_dir():
         beside["depth"] = _files("depth", "depth")
     colmap = None if own_cameras else _find_colmap(folder, missing)
+    cameras = folder / CAMERAS
     if missing:
         lines = "\n".join(f"  - {line}" for line in missing)
         raise SourceError(
@@ -120,8 +124,16 @@ def find_source(
         )
     assert video is not None
     beside = {kind: spec for kind, spec in beside.items() if kind not in given}
-    ball_track = ball if ball.is_file() else None
-    return Source(video, folder, beside, masked, colmap, ball_track, frozenset(absent - set(given)))
+    return Source(
+        video,
+        folder,
+        beside,
+        masked,
+        colmap,
+        cameras if cameras.is_file() and not own_cameras else None,
+        ball if ball.is_file() else None,
+        frozenset(absent - set(given)),
+    )
 
 
 def _files(kind: EstimateKind, path: str, **settings: Any) -> ComponentSpec:
