@@ -131,7 +131,7 @@ def plan_estimators(
         choice = _choose(place, source, options, given)
         if choice is not None:
             found[place] = choice
-    _check_words(found, options)
+    _check_prompt(found, options)
     return EstimatorPlan(found, _frames(source.video, options))
 
 
@@ -191,7 +191,8 @@ def _of_preset(place: Place, options: PrepareOptions) -> Choice:
     if place == "object":
         prompt = options.prompts.get(options.object)
         where = prompt.places() if prompt else []
-        why = f"{len(where)} frames with --object" if where else "proposed: moves, near the hands"
+        frames = ", ".join(str(at.frame) for at in where)
+        why = f"--object in frame {frames}" if where else "proposed: moves, near the hands"
         if prompt is not None and prompt.text:
             why = f'"{prompt.text}"'
         if not _installed(spec.use):
@@ -207,13 +208,18 @@ def _installed(key: str) -> bool:
     return True
 
 
-def _check_words(found: Mapping[Place, Choice], options: PrepareOptions) -> None:
+def _check_prompt(found: Mapping[Place, Choice], options: PrepareOptions) -> None:
     prompt = options.prompts.get(options.object)
     choice = found.get("object")
-    if prompt is None or prompt.text is None or choice is None or choice.spec is None:
+    if prompt is None or choice is None or choice.spec is None:
         return
-    if choice.use == _OFFLINE["object"].use and not prompt.places():
+    if choice.use == _OFFLINE["object"].use and prompt.text is not None:
         raise SpecError(
             f'--object "{prompt.text}": words need a network that reads them; point at it, such as '
             "--object 640,402, or use --estimators hub"
+        )
+    if choice.use == _HUB["object"].use and len(prompt.places()) > 1:
+        raise SpecError(
+            "--object: SAM 2 takes points and a box of one frame; give those of one, or use "
+            "--estimators offline"
         )
