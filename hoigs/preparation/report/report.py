@@ -32,6 +32,7 @@ class PrepareReport(Measures):
             ("scene scale", f"{self.scene_scale:.4g}", "metres a unit of the source"),
             ("object seen", f"{100 * self.object_observed:.0f} %", "of the frames"),
             ("object scale spread", f"{100 * self.object_scale_spread:.1f} %", "so its depth's"),
+            ("object's poses", self.object_way, self.object_reason),
             ("scene points", f"{self.scene_points}", ""),
         ]
         if self.depth_residual is not None:
