@@ -9,6 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+
+SMALL = ("model.scene.points=2000", "model.human.points=1500", "model.object.points=500")
 
 
 @pytest.fixture(scope="session")
@@ -19,8 +22,11 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("viewing")
     clip = folder / "clip"
     shutil.copytree(hoigs.builtin_clip(hoigs.AnnyBody(), _tiny()), clip)
-    steps = ["train.steps=12", "train.checkpoint_every=6"]
-    hoigs.train(clip, out=folder / "run", overrides=steps, device="cpu", evaluate=False)
+    small = ["train.steps=4", "train.checkpoint_every=2", *SMALL]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    hoigs.train(clip, out=folder / "run", overrides=small, device="cpu", evaluate=False)
+    torch.set_num_threads(threads)
     return folder / "run"
 
 
@@ -54,9 +60,7 @@ class Window:
         self.page = self.context.new_page()
         self.errors: list[str] = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on(
-            "console", lambda m: self.errors.append(m.text) if m.type == "error" else None
-        )
+        self.page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
 
     def pixels(self) -> Any:
         """The window as RGB, [H, W, 3] in [0, 255]."""

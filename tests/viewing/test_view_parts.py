@@ -22,6 +22,8 @@ from hoigs.viewing.viewer.takes import Path as TakenPath
 from hoigs.viewing.viewer.takes import turned_to
 from hoigs.viewing.viewer.views import View
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 def test_the_clock_plays_loops_steps_and_stops() -> None:
     clock = Clock(10, fps=5.0)
@@ -93,7 +95,9 @@ def test_panes_put_two_pictures_in_one() -> None:
         return lambda camera: np.full((camera.height, camera.width, 3), value, np.uint8)
 
     beside = joined("beside", 0.5, (41, 8), camera_of, plain(10), plain(90))
-    assert beside.shape == (8, 41, 3) and (beside[:, :20] == 10).all() and (beside[:, 21:] == 90).all()
+    assert (
+        beside.shape == (8, 41, 3) and (beside[:, :20] == 10).all() and (beside[:, 21:] == 90).all()
+    )
     blend = joined("blend", 0.25, (40, 8), camera_of, plain(10), plain(90))
     assert (blend == 30).all()
     wipe = joined("wipe", 0.75, (40, 8), camera_of, plain(10), plain(90))
