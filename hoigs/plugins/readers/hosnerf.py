@@ -18,6 +18,7 @@ from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.core.model.smpl_params import betas_of_joints, pose_from_smpl
+from hoigs.core.npz import load_array
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, uniform_test_split
 from hoigs.core.values.lens import Lens
 from hoigs.core.values.tokens import EntityKind
@@ -199,7 +200,10 @@ def _bounds(
         ClipError: the number of rows is wrong, or rows are rotated differently from the cameras,
             as they are if rows and images are paired wrongly.
     """
-    rows = np.load(path, allow_pickle=False)
+    try:
+        rows = load_array(path)
+    except (OSError, ValueError) as error:
+        raise ClipError(f"{path} cannot be read ({error}); write it again") from error
     if rows.shape != (len(images), 17):
         raise ClipError(
             f"{path} has shape {list(rows.shape)}, expected [{len(images)}, 17], "

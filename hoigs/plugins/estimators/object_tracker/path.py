@@ -72,7 +72,7 @@ def _candidates(
     small = odds[::step, ::step]
     p = 1 / (1 + np.exp(-small))
     r = size / step
-    best, scale = None, None
+    best = None
     for factor in (0.75, 1.15):
         s = r * factor / 1.5
         inner = ndimage.gaussian_filter(p, s, mode="constant", truncate=2.5)
@@ -102,12 +102,12 @@ def _likeness(bins: np.ndarray, colors: ColorModel, place: np.ndarray, size: flo
 def _cheapest(frames: list, size: float, known: list[int]) -> Path:
     """Viterbi's path over candidates and absence; an absence keeps the place it began at."""
     # state: row of x, y of the last sighting, its age, whether it is seen now
-    spots, costs, back, aged = [], [], [], []
+    spots, costs, back = [], [], []
     for i, (places, unary) in enumerate(frames):
         here = [(p, 0) for p in places]
         if i == 0:
-            total = list(unary) + [ABSENT]
-            state = here + [(None, 1)]
+            total = [*unary, ABSENT]
+            state = [*here, (None, 1)]
             parent = [-1] * len(total)
         else:
             total, parent, state = [], [], []
