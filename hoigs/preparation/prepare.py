@@ -175,7 +175,9 @@ def _run(
         own_cameras=options.camera in ("static", "sfm"), complete=options.preset == "files",
     )  # fmt: skip
     plan = plan_estimators(found, options, set(chosen))
-    specs = {**found.beside, **plan.specs()}
+    specs = plan.specs()
+    for kind, spec in found.beside.items():
+        specs[kind] = spec
     chosen = {**installed_estimators(PrepareOptions(estimators=specs)), **chosen}
     if announce is not None:
         announce(plan)
