@@ -71,7 +71,7 @@ def measure(source: Path, keep: Path, args: argparse.Namespace) -> dict[str, Any
         {"estimators": {"landmarks": use, "masks": use}, "overwrite": True}
     )
     out, start = keep / source.name, time.perf_counter()
-    common: dict[str, Any] = {"object": args.object, "options": options, "consent": lambda _: True}
+    common: dict[str, Any] = {"object": args.object, "options": options, "yes": True}
     if args.until:
         seconds = prepare_until(args.until, video, out, **common)
     else:

@@ -22,7 +22,7 @@ COST = {
     "estimator:transformers-depth": 1.5,
 }
 STAGES_COST = 0.35  # of all other stages, likewise
-WHAT = {
+WHAT: dict[Place, str] = {
     "landmarks": "person's landmarks",
     "masks": "person's mask",
     "object": "object's mask",
@@ -127,7 +127,6 @@ def plan_estimators(
     """
     found: dict[Place, Choice] = {}
     for place in WHAT:
-        assert place in ("landmarks", "masks", "object", "depth")
         choice = _choose(place, source, options, given)
         if choice is not None:
             found[place] = choice

@@ -45,7 +45,8 @@ class Pose:
     def process(self, image):
         self.frame += 1
         points = [
-            [Box(x=p[0] / size[0], y=p[1] / size[1], z=p[2] / size[0], visibility=p[3]) for p in rows]
+            [Box(x=p[0] / size[0], y=p[1] / size[1], z=p[2] / size[0], visibility=p[3])
+             for p in rows]
             for rows, size in (
                 (known["image_xyzv"][self.frame], ({WIDTH}, {HEIGHT})),
                 (known["world_xyzv"][self.frame], (1, 1)),
