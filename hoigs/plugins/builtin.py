@@ -13,6 +13,7 @@ INTERACTION = "hoigs.plugins.interaction"
 INITIALIZERS = "hoigs.plugins.initializers"
 ESTIMATORS = "hoigs.plugins.estimators"
 READERS = "hoigs.plugins.readers"
+EXPORTERS = "hoigs.plugins.exporters"
 
 # key, module, class, config class, summary
 PARTS = (
@@ -130,6 +131,8 @@ PARTS = (
     ("reader:davis", f"{READERS}.davis", "DavisReader",
      "DavisConfig",
      "frames and annotated masks as DAVIS or DreamScene4D has them; no cameras"),
+    ("exporter:ply", f"{EXPORTERS}.ply", "PlyExporter", "PlyConfig",
+     "Gaussians of one moment in the layout of 3DGS"),
     ("density:adc", "hoigs.plugins.density.adc", "AdaptiveDensity", "AdaptiveDensityConfig",
      "clone, split and prune as 3DGS does, under a hard cap"),
     ("density:absgrad", "hoigs.plugins.density.absgrad", "AbsoluteGradientDensity",

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from hoigs.core.environments.managed import ManagedEnvironment
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.progress import Progress, no_progress
 
@@ -255,9 +256,12 @@ class Estimator(Configurable, ABC):
 
     Attributes:
         provides: which of "masks", "landmarks" and "depth" it gives, of every request.
+        environment: of the programs that it runs, where hoigs makes it; None: it runs none, or in
+            an environment of the user's.
     """
 
     provides: ClassVar[frozenset[EstimateKind]] = frozenset()
+    environment: ClassVar[ManagedEnvironment | None] = None
 
     def __init__(self, config: Any = None) -> None:
         """`config`: a `Config`; by default one with its defaults."""
