@@ -13,7 +13,8 @@ from hoigs.cli.display import Display, print_scores
 LpipsOption = Annotated[
     Path | None,
     typer.Option(
-        "--lpips-weights", help="File of AlexNet LPIPS weights; default $HOIGS_LPIPS_WEIGHTS."
+        "--lpips-weights",
+        help="File of LPIPS weights; default $HOIGS_LPIPS_WEIGHTS, or else AlexNet's, shipped.",
     ),
 ]
 

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from hoigs.core.errors import ClipError
 from hoigs.core.maths.skinning import skin
+from hoigs.core.npz import load_arrays
 from hoigs.core.values.clip import Clip
 from hoigs.evaluation.protocol import NotComputed
 
@@ -76,9 +77,13 @@ def read_truth(clip: Clip) -> Truth | NotComputed:
     if name is None or root is None:
         return NotComputed("the clip has no true geometry")
     path = Path(root) / str(name)
+    if not path.resolve().is_relative_to(Path(root).resolve()):
+        raise ClipError(f"{path} is outside of the clip's folder {root}; copy the file into it")
+    if not path.is_file():
+        return NotComputed(f"the clip's {name} is absent")
     try:
-        with np.load(path) as file:
-            arrays = {field: file[key] for field, key in FIELDS.items()}
+        file = load_arrays(path, FIELDS.values())
+        arrays = {field: file[key] for field, key in FIELDS.items()}
     except (OSError, ValueError, KeyError) as error:
         raise ClipError(f"{path} cannot be read ({error}); make the clip again") from error
     return Truth(**{k: v.astype(np.float64 if v.dtype.kind == "f" else np.int64)

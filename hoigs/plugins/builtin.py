@@ -13,6 +13,7 @@ INTERACTION = "hoigs.plugins.interaction"
 INITIALIZERS = "hoigs.plugins.initializers"
 ESTIMATORS = "hoigs.plugins.estimators"
 READERS = "hoigs.plugins.readers"
+EXPORTERS = "hoigs.plugins.exporters"
 
 # key, module, class, config class, summary
 PARTS = (
@@ -130,6 +131,8 @@ PARTS = (
     ("reader:davis", f"{READERS}.davis", "DavisReader",
      "DavisConfig",
      "frames and annotated masks as DAVIS or DreamScene4D has them; no cameras"),
+    ("exporter:ply", f"{EXPORTERS}.ply", "PlyExporter", "PlyConfig",
+     "Gaussians of one moment in the layout of 3DGS"),
     ("density:adc", "hoigs.plugins.density.adc", "AdaptiveDensity", "AdaptiveDensityConfig",
      "clone, split and prune as 3DGS does, under a hard cap"),
     ("density:absgrad", "hoigs.plugins.density.absgrad", "AbsoluteGradientDensity",
@@ -166,6 +169,9 @@ PARTS = (
     ("estimator:mediapipe", f"{ESTIMATORS}.mediapipe", "MediapipeEstimator",
      "MediapipeConfig",
      "landmarks of a person by MediaPipe Pose, in an environment of its own"),
+    ("estimator:object-tracker", f"{ESTIMATORS}.object_tracker.estimator",
+     "ObjectTrackerEstimator", "ObjectTrackerConfig",
+     "masks of objects from clicks, or of what moves beside the person; no network"),
     ("estimator:command", f"{ESTIMATORS}.command", "CommandEstimator",
      "CommandConfig",
      "masks, depth or landmarks that a command line of yours writes"),

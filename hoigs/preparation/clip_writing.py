@@ -25,10 +25,9 @@ BODY_JOINTS = 22  # without the hands', which are not fitted
 def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
     """Writes and checks what the other stages made, and gives the folder its name."""
     options = made.options
-    entities: dict[str, Literal["human", "object"]] = {
-        options.human: "human",
-        options.object: "object",
-    }
+    entities: dict[str, Literal["human", "object"]] = {options.human: "human"}
+    if made.object is not None:
+        entities[options.object] = "object"
     with ClipWriter(
         made.out, fps=made.video.fps, entities=entities, image_format=options.image_format,
         quality=options.quality, depth_kind="none" if made.depth is None else "metric",
@@ -38,7 +37,8 @@ def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
         with made.stages.stage("writing"):
             _write_frames(made, writer)
         writer.set_body(options.human, made.body_track)
-        writer.set_object(options.object, made.object)
+        if made.object is not None:
+            writer.set_object(options.object, made.object)
         writer.set_points(made.scene.points, made.scene.colors)
         if made.track.model is not None:
             writer.set_colmap(made.track.model)
@@ -64,19 +64,25 @@ def _write_frames(made: Pipeline, writer: ClipWriter) -> None:
         for i, (image, camera, human, object_mask, blank, (vertices, _)) in enumerate(
             made.stages.track(rows, len(made.video))
         ):
-            masks = {options.human: human, options.object: object_mask}
+            masks = {options.human: human}
+            points = torch.zeros(0, 3)
+            if made.object is not None:
+                masks[options.object] = object_mask
+                points = made.object.points @ made.object.rotations[i].mT
+                points = points + made.object.translations[i]
             writer.add_frame(image, camera, masks, made.metres(i), blank)
-            points = made.object.points @ made.object.rotations[i].mT
-            points = points + made.object.translations[i]
             overlay.add(image, camera, vertices, human, object_mask, points)
 
 
 def _report(made: Pipeline, name: str) -> PrepareReport:
     middle = torch.median(made.scene.points, dim=0).values
     options, person, figures = made.options, made.person, made.track.figures
-    coverage = {options.human: made.masks.human, options.object: made.masks.object}
+    coverage = {options.human: made.masks.human}
     pelvis = person.joints[:, PELVIS]
-    moving = torch.cat((person.joints[:, :BODY_JOINTS], made.object.translations[:, None]), 1)
+    moving = person.joints[:, :BODY_JOINTS]
+    if made.object is not None:
+        coverage[options.object] = made.masks.object
+        moving = torch.cat((moving, made.object.translations[:, None]), 1)
     focal, depth = float(made.cameras[0].K[0, 0]), made.depth
     return PrepareReport(
         name=name,
@@ -90,8 +96,10 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         coverage={n: m.coverage().round(5).tolist() for n, m in coverage.items()},
         body_residual_px=person.residual_px,
         scene_scale=person.scene_scale,
-        object_scale_spread=made.object_made.spread,
-        object_observed=float(made.object.observed.float().mean()),
+        object_scale_spread=None if made.object_made is None else made.object_made.spread,
+        object_observed=(
+            None if made.object is None else float(made.object.observed.float().mean())
+        ),
         scene_points=len(made.scene.points),
         body=person.report,
         provenance=made.provenance,
@@ -106,7 +114,7 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         depth_residual=None if depth is None else depth.typical,
         depth_residuals=[] if depth is None else _numbers(depth.residual, 4),
         depth_against="" if depth is None else depth.against,
-        **_object_measures(made.object_made.confidence),
+        **({} if made.object_made is None else _object_measures(made.object_made.confidence)),
         omega=angular_factor(made.cameras, pelvis, made.video.fps),
         big_omega=full_factor(made.cameras, moving),
     )

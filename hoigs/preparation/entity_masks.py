@@ -47,6 +47,8 @@ def entity_masks(
         return human, given.object, "given for each entity; the object's win where they overlap"
     together = given.together or given.human
     assert together is not None  # EstimateReader requires one or the other
+    if ball is None and given.together is None:
+        return together, MaskStack(np.zeros_like(m) for m in together), "given; there is no object"
     if ball is not None:
         human, objects = _disc_masks(together, ball)
         return human, objects, "ball: its disc; person: the given mask without the disc"

@@ -23,7 +23,7 @@ from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.cameras.choose import ChosenCameras
 from hoigs.preparation.entity_masks import EntityMasks
-from hoigs.preparation.estimates import RawEstimates, UndistortedEstimates
+from hoigs.preparation.estimates import FoundObject, RawEstimates, UndistortedEstimates
 from hoigs.preparation.given import GivenMasks, RawLandmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack
@@ -39,8 +39,8 @@ CLASSES = {
     found.__name__: found
     for found in (
         BallTrack, BodyPose, CameraTrack, ChosenCameras, DepthFit, EntityMasks, FittedBody,
-        FrameList, GivenMasks, LandmarkTrack, Lens, MadeObject, ObjectConfidence, ObjectTrack,
-        RawEstimates, RawLandmarks, ScenePoints, UndistortedEstimates,
+        FoundObject, FrameList, GivenMasks, LandmarkTrack, Lens, MadeObject, ObjectConfidence,
+        ObjectTrack, RawEstimates, RawLandmarks, ScenePoints, UndistortedEstimates,
     )
 }  # fmt: skip
 

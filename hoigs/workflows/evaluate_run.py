@@ -51,7 +51,8 @@ def evaluate_run(
 
     Args:
         clip, rasterizer, device, plugins: as for `open_run`.
-        lpips_weights: AlexNet LPIPS weights; by default those that $HOIGS_LPIPS_WEIGHTS names.
+        lpips_weights: LPIPS weights; by default those that $HOIGS_LPIPS_WEIGHTS names, or
+            AlexNet's, which are shipped.
         test_pose: body poses of test frames: "given", "interpolated" from training frames, or
             "fitted" to the test images themselves; by default the spec's. test_camera: likewise.
         fit_steps: optimizer steps per "fitted" frame; by default the spec's.

@@ -21,6 +21,7 @@ FUNCTIONS = {
     "prepare": (hoigs.prepare, hoigs.prepare_until),
     "compress": (hoigs.compress,),
     "render": (hoigs.render,),
+    "export": (hoigs.export,),
     "doctor": (hoigs.doctor,),
     "demo": (hoigs.demo,),
 }
@@ -30,6 +31,8 @@ RENAMED = {
     "plugin": "plugins",
     "reader_set": "reader_settings",
     "eval": "evaluate",
+    "from": "start",
+    "to": "end",
 }
 # options that choose the function: --auto is hoigs.auto, --stage is hoigs.prepare_until(stage, ...)
 CHOOSING = {("train", "auto"), ("prepare", "stage")}

@@ -209,6 +209,11 @@ class Clip:
             held_out=self.held_out.resized(width) if self.held_out else None,
         )
 
+    def up(self) -> Float[Tensor, " 3"]:
+        """The mean upward direction of the cameras, unit, as a COLMAP world defines none."""
+        ups = torch.stack([-camera.world_to_camera[1, :3] for camera in self.cameras])
+        return torch.nn.functional.normalize(ups.mean(0), dim=0)
+
     def extent(self) -> float:
         """Scene extent, metres: 1.1 x camera spread (Kerbl et al. 2023, arXiv:2308.04079), but at
         least half the median depth of the points, so that a static camera does not give zero."""

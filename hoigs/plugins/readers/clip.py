@@ -190,7 +190,7 @@ def _decode(path: Path, mode: str) -> Tensor:
     try:
         with Image.open(path) as image:
             return torch.from_numpy(np.array(image.convert(mode)))
-    except OSError as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ClipError(f"{path} cannot be decoded ({error}); write it again") from error
 
 

@@ -117,14 +117,15 @@ def _tracks(report: Measures) -> Iterator[MeasureDiagnostic]:
         "look at overlay.mp4: if the landmarks jump, use another estimator (estimators.landmarks); "
         "if all of the body is off, the focal length or the cameras are",
     )
-    yield _judged(
-        "object's apparent size",
-        f"± {100 * report.object_scale_spread:.1f} %",
-        "over its expected size; its depth is as uncertain",
-        _judge(report.object_scale_spread, 0.05, 0.15),
-        "the object's masks grow and shrink, or it turns: mend the masks, or give its shape as a "
-        "mesh (initializer:mesh)",
-    )
+    if report.object_scale_spread is not None:
+        yield _judged(
+            "object's apparent size",
+            f"± {100 * report.object_scale_spread:.1f} %",
+            "over its expected size; its depth is as uncertain",
+            _judge(report.object_scale_spread, 0.05, 0.15),
+            "the object's masks grow and shrink, or it turns: mend the masks, or give its shape as "
+            "a mesh (initializer:mesh)",
+        )
     yield from _object(report)
     if report.depth_residual is not None:
         yield _judged(
@@ -167,7 +168,7 @@ def _object(report: Measures) -> Iterator[MeasureDiagnostic]:
         "object's shape",
         f"{sum(off) / len(off):.0f} mm",
         f"between its outline and the mask's ({worst:.0f} mm in the worst twentieth of the frames)",
-        _judge(report.object_scale_spread, 0.05, 0.15),
+        _judge(report.object_scale_spread or 0.0, 0.05, 0.15),
         "it is not rigid, or its masks are off: a spec whose object deforms may fit better",
     )
     palms = [1000 * v for v in report.hand_distance_m if v is not None]

@@ -19,7 +19,8 @@ class Measures:
         body: whatever else the body fit reports.
         scene_scale: metres a COLMAP unit; 1 for a static camera.
         object_scale_spread: standard deviation over frames of the object's apparent over its
-            expected size: 0.05 means that its depth is uncertain by about 5 %.
+            expected size: 0.05 means that its depth is uncertain by about 5 %; None
+            without an object.
         object_observed: part of the frames in which the object was seen.
         scene_points: number of points that start the background.
         provenance: what each part was made from, and how weak it is.
@@ -55,8 +56,8 @@ class Measures:
     coverage: dict[str, list[float]]
     body_residual_px: float
     scene_scale: float
-    object_scale_spread: float
-    object_observed: float
+    object_scale_spread: float | None
+    object_observed: float | None
     scene_points: int
     body: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, str] = field(default_factory=dict)

@@ -44,6 +44,8 @@ class Source:
         masked: entities whose masks `beside` reads.
         colmap: folder of a COLMAP model, or None.
         cameras: cameras.npz, or None. ball: ball_track.npz, or None.
+        absent: which of "landmarks", "masks" (the person's) and "object" (the object's masks, or
+            its track) are not there and given by no other estimator.
     """
 
     video: Path
@@ -53,6 +55,7 @@ class Source:
     colmap: Path | None = None
     cameras: Path | None = None
     ball: Path | None = None
+    absent: frozenset[str] = frozenset()
 
 
 def find_source(
@@ -62,10 +65,13 @@ def find_source(
     object_name: str = "object",
     given: Collection[str] = (),
     own_cameras: bool = False,
+    complete: bool = True,
 ) -> Source:
     """The inputs in a folder, or beside a video file.
 
     Args:
+        complete: landmarks and masks have to be there; False: `Source.absent` names those that are
+            not.
         given: "masks", "landmarks" or "depth" that estimators give: no files are needed for them.
         own_cameras: cameras are made from the video: no COLMAP model is looked for.
 
@@ -81,20 +87,32 @@ def find_source(
     if video is not None and video.is_file() and not video.stat().st_size:
         raise SourceError(f"{video} is empty: 0 bytes; copy it again")
     beside: dict[EstimateKind, ComponentSpec] = {}
+    absent: set[str] = set()
     if (folder / LANDMARKS).is_file():
         beside["landmarks"] = _files("landmarks", LANDMARKS)
+    elif "landmarks" not in given and not complete:
+        absent.add("landmarks")
     elif "landmarks" not in given:
         missing.append(
             "pose_mediapipe.npz: body landmarks, from MediaPipe Pose (`pip install mediapipe` in "
-            "an environment of its own), arrays image_xyzv and world_xyzv [F, 33, 4]; or name "
-            "an estimator: --set estimators.landmarks.use=estimator:mediapipe"
+            "an environment of its own), arrays image_xyzv and world_xyzv [F, 33, 4]; or let hoigs "
+            "find them: --estimators offline"
         )
     masked: tuple[str, ...] = ()
+    ball = folder / "ball_track.npz"
     if "masks" not in given:
-        beside["masks"], masked = _find_masks(folder, human, object_name, missing)
+        lacking: list[str] = []
+        spec, masked = _find_masks(folder, human, object_name, lacking)
+        if masked or complete:
+            beside["masks"] = spec
+        if complete:
+            missing += lacking
+        else:
+            absent |= {"masks"} if human not in masked else set()
+    if object_name not in masked and not ball.is_file():
+        absent.add("object")
     if (folder / "depth").is_dir():
         beside["depth"] = _files("depth", "depth")
-    ball = folder / "ball_track.npz"
     colmap = None if own_cameras else _find_colmap(folder, missing)
     cameras = folder / CAMERAS
     if missing:
@@ -114,6 +132,7 @@ def find_source(
         colmap,
         cameras if cameras.is_file() and not own_cameras else None,
         ball if ball.is_file() else None,
+        frozenset(absent - set(given)),
     )
 
 

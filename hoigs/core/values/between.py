@@ -1,0 +1,90 @@
+"""Moments and cameras of a clip at frame numbers that need not be whole."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from hoigs.core.maths.rotations import (
+    axis_angle_to_quats,
+    matrices_to_quats,
+    quats_to_axis_angle,
+    quats_to_matrices,
+    slerp,
+)
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.moment import BodyPose, Moment
+
+
+def frame_of(clip: Clip, moment: Moment) -> float:
+    """The frame number of a moment, between frames a fraction."""
+    return float(moment.time) * max(clip.num_frames - 1, 1)
+
+
+def moment_between(clip: Clip, frame: float) -> Moment:
+    """The clip at a frame number: joints by slerp, translations linearly between two frames.
+
+    Before the first frame and after the last, the pose is theirs.
+    """
+    low, high, r = _neighbours(clip, frame)
+    time = min(max(frame / max(clip.num_frames - 1, 1), 0.0), 1.0)
+    before, after = clip.moments[low], clip.moments[high]
+    index = (before if r < 0.5 else after).index
+    if r == 0.0:
+        return Moment(before.time if before.index == frame else time, index, before.poses)
+    shared = [name for name in before.poses if name in after.poses]
+    poses = {name: blend_poses(before.poses[name], after.poses[name], r) for name in shared}
+    return Moment(time, index, poses)
+
+
+def blend_poses(a: BodyPose, b: BodyPose, r: float) -> BodyPose:
+    """The pose a share r of the way from `a` to `b`."""
+
+    def turned(x: Tensor, y: Tensor) -> Tensor:
+        return quats_to_axis_angle(slerp(axis_angle_to_quats(x), axis_angle_to_quats(y), r))
+
+    return a.replace(
+        global_orient=turned(a.global_orient, b.global_orient),
+        body=turned(a.body, b.body),
+        left_hand=turned(a.left_hand, b.left_hand),
+        right_hand=turned(a.right_hand, b.right_hand),
+        transl=torch.lerp(a.transl, b.transl, r),
+        betas=torch.lerp(a.betas, b.betas, r),
+    )
+
+
+def camera_between(clip: Clip, frame: float) -> Camera:
+    """The clip's camera at a frame number: rotation by slerp, centre and intrinsics linearly."""
+    low, high, r = _neighbours(clip, frame)
+    return blend_cameras(clip.cameras[low], clip.cameras[high], r)
+
+
+def blend_cameras(a: Camera, b: Camera, r: float) -> Camera:
+    """The camera a share r of the way from `a` to `b`, in the image size of `a`."""
+    if r == 0.0:
+        return a
+    b = b.resized(a.width, a.height)
+    quats = [matrices_to_quats(c.world_to_camera[:3, :3]) for c in (a, b)]
+    rotation = quats_to_matrices(slerp(*quats, r))
+    pose = torch.eye(4).to(a.world_to_camera)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ torch.lerp(a.center, b.center, r)
+    return Camera(torch.lerp(a.K, b.K, r), pose, a.width, a.height)
+
+
+def _neighbours(clip: Clip, frame: float) -> tuple[int, int, float]:
+    """Positions of the frames before and after, and the share of the way between them."""
+    order = sorted(range(len(clip)), key=lambda i: clip.moments[i].index)
+    indices: Sequence[int] = [clip.moments[i].index for i in order]
+    place = bisect_right(indices, frame)
+    if place == 0:
+        return order[0], order[0], 0.0
+    low = place - 1
+    if low == len(indices) - 1 or indices[low] == frame:
+        return order[low], order[low], 0.0
+    r = (frame - indices[low]) / (indices[low + 1] - indices[low])
+    return order[low], order[low + 1], r
