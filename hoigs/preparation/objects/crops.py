@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -43,6 +43,10 @@ class Crops:
     outside: Float[Tensor, "C 1 S S"]
     edges: Float[Tensor, "C E 2"]
     edge_weights: Float[Tensor, " C"]
+
+    def rows(self, rows: np.ndarray) -> Crops:
+        """Some of the crops."""
+        return Crops(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     @property
     def size(self) -> int:

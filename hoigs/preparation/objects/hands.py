@@ -20,7 +20,7 @@ from hoigs.preparation.objects.track import hand_depths
 HAND_JOINTS = 30  # the last joints of a body: fifteen of each hand, three a finger, index first
 MIDDLE, INDEX, LITTLE = 3, 0, 6  # first joints of these fingers within a hand
 REACH = 0.13  # metres in the image between a palm and what it holds
-STILL = 0.06  # metres a second: an object that moves less rests
+STILL = 0.07  # metres a second: an object that moves less rests
 SHORTEST = 0.2  # seconds of a grasp or a rest
 STEADY = 0.45  # seconds over which the hands' noise is smoothed
 

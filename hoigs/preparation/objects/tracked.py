@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ from hoigs.preparation.objects.alignment import (
 )
 from hoigs.preparation.objects.crops import make_crops
 from hoigs.preparation.objects.hands import HandMotion, hand_motion
+from hoigs.preparation.objects.search import placed_by_texture
 from hoigs.preparation.objects.surface import hull, with_samples
 
 FEWEST = 8  # frames that show the object whole
@@ -97,8 +98,24 @@ def tracked_object(
     shown = outlines.observed
     crops = make_crops(images, masks, humans, cameras, shown, SIDE)
     start = _start(hands, outlines, cameras, shown)
-    surface = hull(crops, start, _radius(outlines, hands, cameras), SAMPLES)
-    found = align(crops, surface, start, _held(hands, shown), fps, levels=levels, progress=progress)
+    radius = _radius(outlines, hands, cameras)
+    held = _held(hands, shown)
+    known, others = _pieces(hands, shown)
+    if others.any():
+        part = np.flatnonzero(known)
+        surface = hull(crops.rows(part), start.rows(part), radius, SAMPLES)
+        first = align(
+            crops.rows(part), surface, start.rows(part), held.rows(part), fps, levels=levels,
+            progress=_share(0, progress),
+        )  # fmt: skip
+        start = placed_by_texture(crops, surface, first, start, hands, fps)
+        surface = replace(surface, rest=first.vertices)
+        found = align(
+            crops, surface, start, held, fps, levels=levels[1:], progress=_share(1, progress)
+        )
+    else:
+        surface = hull(crops, start, radius, SAMPLES)
+        found = align(crops, surface, start, held, fps, levels=levels, progress=progress)
     agreement = _over_frames(found.agreement, shown)
     typical = float(np.nanmedian(found.agreement)) if np.isfinite(found.agreement).any() else 0.0
     if typical < AGREES:
@@ -107,6 +124,23 @@ def tracked_object(
             f"{AGREES} is needed): it has hardly any texture, is not rigid, or its masks are off"
         )
     return _result(found, surface, hands, outlines, agreement, count)
+
+
+def _pieces(
+    hands: HandMotion, shown: Bool[np.ndarray, " F"]
+) -> tuple[Bool[np.ndarray, " C"], Bool[np.ndarray, " C"]]:
+    """Frames of the longest piece whose rotations are known against each other; the others."""
+    tied = ~hands.free & shown
+    if tied.sum() < FEWEST:  # never held, never at rest: one piece, from no rotation at all
+        every = np.ones(int(shown.sum()), bool)
+        return every, ~every
+    longest = np.bincount(hands.pieces[tied]).argmax()
+    known = (tied & (hands.pieces == longest))[shown]
+    return known, ~known
+
+
+def _share(half: int, progress: Callable[[float], None]) -> Callable[[float], None]:
+    return lambda done: progress((half + done) / 2)
 
 
 def _check(outlines: Outlines) -> None:
@@ -146,7 +180,13 @@ def _radius(outlines: Outlines, hands: HandMotion, cameras: Sequence[Camera]) ->
 
 def _held(hands: HandMotion, shown: Bool[np.ndarray, " F"]) -> Held:
     grasps = np.where(hands.near & hands.held[:, None], hands.pieces[:, None], -1)
-    return Held(torch.from_numpy(hands.palms[shown]).float(), torch.from_numpy(grasps[shown]))
+    starts = np.diff(hands.rests.astype(int), prepend=0) == 1
+    rests = np.where(hands.rests, np.cumsum(starts), -1)
+    return Held(
+        torch.from_numpy(hands.palms[shown]).float(),
+        torch.from_numpy(grasps[shown]),
+        torch.from_numpy(rests[shown]),
+    )
 
 
 def _over_frames(
