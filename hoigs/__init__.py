@@ -61,6 +61,7 @@ _PUBLIC = {
     "WarpRasterizer": "hoigs.rasterizers.warp",
     # work: the commands as functions, then what they are made of
     "auto": "hoigs.studies.needs.auto",
+    "bug_report": "hoigs.workflows.bug_report",
     "compress": "hoigs.studies.needs.pruning.compact_run",
     "demo": "hoigs.workflows.demo",
     "doctor": "hoigs.workflows.doctor",
@@ -72,6 +73,7 @@ _PUBLIC = {
     "prepare_until": "hoigs.preparation.prepare",
     "render": "hoigs.viewing.films",
     "train": "hoigs.workflows.train",
+    "view": "hoigs.viewing.view",
     "LoadedRun": "hoigs.runs.loaded_run",
     "Playback": "hoigs.viewing.playback",
     "PrepareOptions": "hoigs.preparation.options",

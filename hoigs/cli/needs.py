@@ -70,21 +70,11 @@ def needs(
 
     with Display() as show:
         found = find(
-            clip,
-            spec,
-            out=out,
-            criterion=criterion,
-            least=least,
-            share=share,
-            search_spaces=search_spaces,
-            overrides=settings or (),
-            rasterizer=rasterizer,
-            device=device,
-            overwrite=overwrite,
-            allow_faults=allow_faults,
-            plugins=plugin or (),
+            clip, spec, out=out, criterion=criterion, least=least, share=share,
+            search_spaces=search_spaces, overrides=settings or (), rasterizer=rasterizer,
+            device=device, overwrite=overwrite, allow_faults=allow_faults, plugins=plugin or (),
             report=show.line,
-        )
+        )  # fmt: skip
     print_needs(found)
     answer = (out or needs_folder(clip)) / "spec.yaml"
     typer.echo(f"train it: hoigs train {clip} --spec {answer}")

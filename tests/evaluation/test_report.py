@@ -21,9 +21,10 @@ from hoigs.core.values.clip import Clip
 from hoigs.evaluation.evaluate import evaluate
 from hoigs.evaluation.report import write_report
 from hoigs.evaluation.report.contact_sheet import contact_sheet
-from hoigs.evaluation.report.curves import read_metrics, smoothed
+from hoigs.evaluation.report.curves import smoothed
 from hoigs.evaluation.report.media import animation, evenly, key_position
 from hoigs.evaluation.report.sections import clock, short
+from hoigs.runs.run_folder import RunFolder
 
 VOID = {"meta", "img", "input", "br"}
 
@@ -54,7 +55,9 @@ class Balance(HTMLParser):
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     (tmp_path / "spec.yaml").write_text("name: toy # <tricky> & $title\n")
-    (tmp_path / "provenance.json").write_text(json.dumps({"versions": {"torch": "9.9.9"}}))
+    (tmp_path / "provenance.json").write_text(
+        json.dumps({"versions": {"torch": "9.9.9"}, "clip": {"path": "../clip"}})
+    )
     lines = []
     for step in range(25, 1001, 25):
         decay = math.exp(-step / 300)
@@ -132,11 +135,18 @@ def test_damaged_metrics_name_the_line_and_leave_no_page(
     run: Path, model: SceneModel, clip: Clip
 ) -> None:
     with (run / "metrics.jsonl").open("a") as file:
-        file.write('{"step": 1025, "lo')
+        file.write('{"step": 1025, "lo\n')
     with pytest.raises(HoigsError, match=r"metrics\.jsonl:41"):
         write_report(run, model, clip, evaluate(model, clip, timing_frames=0))
     assert not (run / "report.html").exists()
-    assert read_metrics(run / "absent.jsonl") == []
+
+
+def test_a_line_that_is_still_being_written_is_left_out(run: Path) -> None:
+    before = RunFolder(run).read_metrics()
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 1025, "lo')
+    assert RunFolder(run).read_metrics() == before != []
+    assert RunFolder(run / "absent").read_metrics() == []
 
 
 def test_key_moment_is_where_man_and_ball_meet(clip: Clip) -> None:

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.values.clip import Clip
+from hoigs.plugins.readers.common.config import ReaderConfig
 from hoigs.plugins.readers.common.frame_order import timed_moments
 from hoigs.plugins.readers.common.json_file import parse_json
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames
@@ -26,7 +26,7 @@ POINT_FILES = ("fused.ply", "points3d.ply", "points3D.ply")
 COLORS = {"white": (255, 255, 255), "black": (0, 0, 0)}
 
 
-class DnerfConfig(ComponentConfig):
+class DnerfConfig(ReaderConfig):
     """Settings of reader:dnerf."""
 
     background: Literal["white", "black"] = Field(
@@ -37,7 +37,6 @@ class DnerfConfig(ComponentConfig):
         default=2000, ge=1, description="random points to start from where no file has any (4DGS)"
     )
     box: float = Field(default=1.3, gt=0, description="their coordinates are between -box and box")
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class DnerfReader(ClipReader):
@@ -45,9 +44,6 @@ class DnerfReader(ClipReader):
 
     Images keep their own size, times are the files' (divided by the largest if that exceeds 1).
     The scene has no unit. Test frames have cameras and mostly times of their own.
-
-    Args:
-        background, points, box, cache_mb: see DnerfConfig.
     """
 
     Config: ClassVar = DnerfConfig
@@ -104,9 +100,6 @@ class DnerfReader(ClipReader):
             ),
             cameras=cameras,
             moments=timed_moments(times, split["train"]),
-            kinds={},
-            bodies={},
-            objects={},
             points=points,
             point_colors=colors,
             split=split,

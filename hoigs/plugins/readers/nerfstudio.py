@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip, uniform_test_split
 from hoigs.core.values.moment import Moment
+from hoigs.plugins.readers.common.config import VideoReaderConfig
 from hoigs.plugins.readers.common.frame_order import natural, timed_moments, video_moments
 from hoigs.plugins.readers.common.json_file import parse_json
 from hoigs.plugins.readers.common.lazy_frames import DepthFiles, LazyFrames, MaskFiles, dark
@@ -30,7 +30,7 @@ DEPTH_MAKER = "your capture app or depth network makes it; or remove depth_file_
 RANDOM_BOX = 5.0  # times the largest camera coordinate: splatfacto's random_scale of 10
 
 
-class NerfstudioConfig(ComponentConfig):
+class NerfstudioConfig(VideoReaderConfig):
     """Settings of reader:nerfstudio."""
 
     factor: int = Field(default=1, ge=1, description="2 reads images_2/, and so on")
@@ -38,8 +38,6 @@ class NerfstudioConfig(ComponentConfig):
     points: int = Field(
         default=50_000, ge=1, description="random points to start from where there is no PLY"
     )
-    fps: float = Field(default=30.0, gt=0, description="of the video that the images come from")
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class NerfstudioReader(ClipReader):
@@ -48,9 +46,6 @@ class NerfstudioReader(ClipReader):
     The world is the file's, divided by its `applied_scale`, which restores the metres of
     capture apps. Masks are nerfstudio's: black pixels are ignored. Depth is in metres. Frames
     without "time" are evenly spaced.
-
-    Args:
-        factor, depth_unit, points, fps, cache_mb: see NerfstudioConfig.
     """
 
     Config: ClassVar = NerfstudioConfig
@@ -91,9 +86,6 @@ class NerfstudioReader(ClipReader):
             ),
             cameras=cameras,
             moments=_moments(frames, split["train"]),
-            kinds={},
-            bodies={},
-            objects={},
             points=points,
             point_colors=colors,
             split=split,

@@ -1,0 +1,136 @@
+"""view: a run or a clip in the browser, live or as one HTML file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+from hoigs.core.errors import HoigsError
+from hoigs.core.progress import Progress
+from hoigs.core.registry.registry import default_registry
+from hoigs.runs.clip_source import read_clip
+from hoigs.runs.loaded_run import LoadedRun
+from hoigs.viewing.html.page import Page, write_page
+from hoigs.viewing.viewer.bodies import bodies_of_clip, bodies_of_run
+from hoigs.viewing.viewer.clip_drawing import ClipDrawing
+from hoigs.viewing.viewer.drawing import Drawing, RunDrawing
+from hoigs.viewing.viewer.following import FollowedRun, wait_for_checkpoint
+from hoigs.viewing.viewer.overlays import offered
+from hoigs.viewing.viewer.server import LOCAL, is_loopback, open_server, stop
+from hoigs.viewing.viewer.viewer import Viewer
+
+Report = Callable[[str], None]
+
+
+def view(
+    what: Path | str,
+    second: Path | str | None = None,
+    *,
+    host: str = LOCAL,
+    port: int = 8090,
+    html: Path | str | None = None,
+    max_mb: float | None = None,
+    entities: Sequence[str] = (),
+    width: int = 1280,
+    clip: Path | str | None = None,
+    rasterizer: str | None = None,
+    device: str = "auto",
+    plugins: Sequence[Path | str] = (),
+    report: Report = print,
+    progress: Progress | None = None,
+    started: Callable[[Viewer], None] | None = None,
+) -> Page | None:
+    """Show a run, two runs with one clock, or a clip in the browser, until interrupted.
+
+    A run in training is read again after each checkpoint.
+
+    Args:
+        what: a run folder, a clip folder, or "builtin:NAME". second: another run.
+        host: the address to listen on; other machines can reach any but a loopback address.
+        port: 0 finds a free one.
+        html: write the run to this file instead, to be opened without a server or a network.
+        max_mb, entities: of that file (`write_page`).
+        width: of a still picture at most, pixels.
+        clip, rasterizer, device, plugins: as for `open_run`.
+        report: receives lines: the address, and warnings.
+        progress: called with the share done of the file, in [0, 1], and the work.
+        started: receives the viewer before it draws, for example to stop it from a thread.
+
+    Returns:
+        The page that was written with `html`; otherwise None.
+
+    Raises:
+        HoigsError: this is neither a run nor a clip, or the port is in use.
+    """
+    runs = [Path(p) for p in (what, second) if p is not None and is_run(p)]
+    if second is not None and len(runs) < 2:
+        odd = what if not is_run(what) else second
+        raise HoigsError(f"{odd}: two can be shown together if both are run folders; this is none")
+    if html is not None:
+        if len(runs) != 1 or second is not None:
+            raise HoigsError(f"--html writes one run, and {what} is none; `hoigs train` makes one")
+        loaded = LoadedRun.open(
+            runs[0], clip=clip, rasterizer=rasterizer, device=device, plugins=plugins
+        )
+        return write_page(loaded, html, max_mb=max_mb, entities=entities, progress=progress)
+    if max_mb is not None or entities:
+        raise HoigsError("max_mb and entities are of the file that `html` names")
+    registry = default_registry(plugin_files=plugins)
+    followed = []
+    for path in runs:
+        wait_for_checkpoint(path, report)
+        opened = partial(
+            LoadedRun.open, path, clip=clip, rasterizer=rasterizer, device=device, plugins=plugins
+        )
+        followed.append(FollowedRun(path, opened))
+    drawings: list[Drawing]
+    if followed:
+        drawings = [RunDrawing(run.loaded) for run in followed]
+        bodies = bodies_of_run(followed[0].loaded.model, followed[0].loaded.clip)
+    else:
+        source = read_clip(what, registry, allow_faults=True)
+        bodies, missing = bodies_of_clip(source, registry)
+        for name, why in missing.items():
+            report(f"{name}: {why}")
+        drawings = [ClipDrawing(source)]
+    overlays = offered(drawings[0].clip, bodies, before_training=not followed)
+    server = open_server(host, port, "hoigs")
+    try:
+        viewer = Viewer(
+            server, drawings, bodies, overlays, widest=width,
+            refresh=partial(_newer, followed, drawings, report),
+        )  # fmt: skip
+        if not is_loopback(host):
+            report(
+                f"warning: anybody who can reach {host} can look at this and use this machine's "
+                "time; there is no password"
+            )
+        shown = f"[{host}]" if ":" in host else host
+        report(f"open http://{shown}:{server.get_port()} (Ctrl-C ends it)")
+        if started is not None:
+            started(viewer)
+        viewer.serve()
+    except KeyboardInterrupt:
+        report("stopped")
+    finally:
+        stop(server)
+    return None
+
+
+def is_run(what: Path | str) -> bool:
+    """Whether a folder is a run, whole or not."""
+    return any((Path(what) / name).exists() for name in ("spec.yaml", "checkpoints"))
+
+
+def _newer(
+    followed: Sequence[FollowedRun], drawings: list[Drawing], report: Report
+) -> Sequence[Drawing] | None:
+    """The drawings with those of newer checkpoints in their places; None if there are none."""
+    changed = False
+    for i, run in enumerate(followed):
+        loaded = run.poll()
+        if loaded is not None:
+            drawings[i], changed = RunDrawing(loaded), True
+            report(f"{run.path}: step {loaded.step}")
+    return drawings if changed else None

@@ -1,0 +1,207 @@
+"""Controls: the panel of the viewer, which writes Settings and the clock."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from hoigs.viewing.viewer.clock import Clock
+from hoigs.viewing.viewer.drawing import Drawing
+from hoigs.viewing.viewer.panes import Layout
+from hoigs.viewing.viewer.settings import Settings
+
+COMPARE: dict[str, tuple[Layout, str]] = {
+    "nothing": ("one", "video"),
+    "video, beside": ("beside", "video"),
+    "video, wipe": ("wipe", "video"),
+    "video, blend": ("blend", "video"),
+}
+WITH_RUN: dict[str, tuple[Layout, str]] = {
+    "second run, beside": ("beside", "run"),
+    "second run, wipe": ("wipe", "run"),
+    "second run, blend": ("blend", "run"),
+}
+
+
+class Controls:
+    """The panel. Callbacks of viser's threads change `settings` and `clock` under `lock`.
+
+    Args:
+        gui: viser's. drawing: gives modes and entities. overlays: names on offer. second: whether
+            there is a second run. wake: called after every change. act: called with the name of
+            a button and the client who pressed it: "screenshot", "add key", "clear keys", "film".
+    """
+
+    def __init__(
+        self,
+        gui: Any,
+        drawing: Drawing,
+        settings: Settings,
+        clock: Clock,
+        overlays: Sequence[str],
+        *,
+        second: bool,
+        wake: Callable[[], None],
+        act: Callable[[str, Any], None],
+    ) -> None:
+        self.gui, self.settings, self.clock = gui, settings, clock
+        self._wake, self._act = wake, act
+        self.lock = threading.RLock()
+        self._sent_at, self._sent_frame = 0.0, -1.0
+        self.status = gui.add_markdown("connecting …")
+        self._time()
+        self._picture(drawing, second)
+        self._camera(drawing)
+        self._overlays(overlays)
+        self._takes(drawing)
+
+    def _time(self) -> None:
+        gui, clock = self.gui, self.clock
+        with gui.add_folder("Time"):
+            self.frame = gui.add_slider("Frame", 0.0, float(max(clock.last, 1)), 0.05, 0.0)
+            self.play = gui.add_button("Play", icon="player-play")
+            steps = gui.add_button_group("Step", ("◀ frame", "frame ▶"))
+            speed = gui.add_slider("Speed", 0.1, 4.0, 0.1, 1.0)
+            loop = gui.add_checkbox("Loop", clock.loop)
+        now = time.monotonic
+
+        def press(_: Any) -> None:
+            (clock.pause if clock.playing else clock.play)(now())
+
+        def step(event: Any) -> None:
+            clock.step(-1 if event.target.value.startswith("◀") else 1, now())
+
+        def faster(event: Any) -> None:
+            clock.seek(clock.frame(now()), now())
+            clock.speed = event.target.value
+
+        def looped(event: Any) -> None:
+            clock.loop = event.target.value
+
+        def seek(event: Any) -> None:
+            if event.client is not None:  # not by the server itself
+                clock.seek(event.target.value, now())
+
+        self.play.on_click(self._locked(press))
+        steps.on_click(self._locked(step))
+        speed.on_update(self._locked(faster))
+        loop.on_update(self._locked(looped))
+        self.frame.on_update(self._locked(seek))
+
+    def _picture(self, drawing: Drawing, second: bool) -> None:
+        gui, settings = self.gui, self.settings
+        choices = COMPARE | (WITH_RUN if second else {})
+        with gui.add_folder("Picture"):
+            mode = gui.add_dropdown("Show", drawing.modes, initial_value=settings.mode)
+            self._bind(mode, "mode")
+            for name in drawing.names:
+                box = gui.add_checkbox(name, name in settings.entities)
+                box.on_update(self._toggle(settings.entities, name))
+            if drawing.has_interaction:
+                self._bind(gui.add_checkbox("interaction", settings.interaction), "interaction")
+            if drawing.anywhere:
+                start = next(
+                    n for n, c in choices.items() if c == (settings.layout, settings.other)
+                )
+                compare = gui.add_dropdown("Beside", tuple(choices), initial_value=start)
+                self._bind(gui.add_slider("Wipe or blend", 0.0, 1.0, 0.01, settings.share), "share")
+                paint = gui.add_rgb("Background", (0, 0, 0))
+
+                def chosen(event: Any) -> None:
+                    settings.layout, settings.other = choices[event.target.value]
+
+                def painted(event: Any) -> None:
+                    r, g, b = (channel / 255 for channel in event.target.value)
+                    settings.background = (r, g, b)
+
+                compare.on_update(self._locked(chosen))
+                paint.on_update(self._locked(painted))
+
+    def _camera(self, drawing: Drawing) -> None:
+        gui, settings = self.gui, self.settings
+        moving = [name for name in drawing.names if name != "scene"]
+        with gui.add_folder("Camera"):
+            self.video = gui.add_checkbox(
+                "Camera of the video", settings.video, hint="A drag of the mouse ends it."
+            )
+            self.follow = gui.add_dropdown("Orbit about", ("free", *moving), initial_value="free")
+
+        def follow(event: Any) -> None:
+            settings.follow = None if event.target.value == "free" else event.target.value
+            if settings.follow and self.video.value:
+                self.leave_video()
+
+        self._bind(self.video, "video")
+        self.follow.on_update(self._locked(follow))
+
+    def _overlays(self, names: Sequence[str]) -> None:
+        gui, settings = self.gui, self.settings
+        with gui.add_folder("In 3D"):
+            through = gui.add_checkbox(
+                "See through", settings.see_through, hint="Draw what follows over everything."
+            )
+            self._bind(through, "see_through")
+            for name in names:
+                box = gui.add_checkbox(name, name in settings.overlays)
+                box.on_update(self._toggle(settings.overlays, name))
+                if name == "skeleton":  # it lies inside of the person
+                    box.on_update(lambda event: _set(through, event.target.value or through.value))
+
+    def _takes(self, drawing: Drawing) -> None:
+        gui = self.gui
+        with gui.add_folder("Take away", expand_by_default=False):
+            self._button("Screenshot", "camera", "screenshot")
+            if drawing.anywhere:
+                self._button("Add this view to the path", "plus", "add key")
+                self._button("Clear the path", "trash", "clear keys")
+                self.seconds = gui.add_slider("Seconds of film", 1.0, 20.0, 0.5, 4.0)
+                self.keys = gui.add_markdown("The path has no view yet.")
+                self._button("Film the path (mp4)", "movie", "film")
+
+    def _button(self, label: str, icon: str, action: str) -> None:
+        button = self.gui.add_button(label, icon=icon)
+        button.on_click(lambda event: self._act(action, event.client))
+
+    def leave_video(self) -> None:
+        """End "camera of the video", and what needs it."""
+        with self.lock:
+            self.settings.video = False
+            self.video.value = False
+
+    def show_time(self, frame: float, now: float) -> None:
+        """Bring slider and button in line with the clock, ten times a second at most."""
+        label = "Pause" if self.clock.playing else "Play"
+        if self.play.label != label:
+            self.play.label = label
+            self.play.icon = "player-pause" if self.clock.playing else "player-play"
+        if frame != self._sent_frame and (now - self._sent_at > 0.1 or not self.clock.playing):
+            self._sent_at, self._sent_frame = now, frame
+            self.frame.value = round(frame, 2)
+
+    def _bind(self, handle: Any, name: str) -> None:
+        """A control that sets one field of the settings."""
+
+        def changed(event: Any) -> None:
+            setattr(self.settings, name, event.target.value)
+
+        handle.on_update(self._locked(changed))
+
+    def _toggle(self, chosen: set[str], name: str) -> Callable[[Any], None]:
+        def changed(event: Any) -> None:
+            (chosen.add if event.target.value else chosen.discard)(name)
+
+        return self._locked(changed)
+
+    def _locked(self, change: Callable[[Any], None]) -> Callable[[Any], None]:
+        def callback(event: Any) -> None:
+            with self.lock:
+                change(event)
+            self._wake()
+
+        return callback
+
+
+def _set(handle: Any, value: Any) -> None:
+    handle.value = value

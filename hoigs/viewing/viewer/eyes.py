@@ -1,0 +1,76 @@
+"""Eye: one browser that looks at the viewer, its camera, and what it was last sent."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from hoigs.viewing.viewer.resolution import Resolution
+from hoigs.viewing.viewer.views import View
+
+STILL_S = 0.25  # a picture is drawn in full once nothing has changed for so long
+ECHO_S = 3.0  # for so long a browser may still answer with a camera that was set
+
+
+class Eye:
+    """One connected browser.
+
+    Args:
+        client: viser's handle. widest: pixels of a still picture at most.
+        dragged: called when a person moved the camera.
+
+    Attributes:
+        resolution: sizes of this canvas. drawn: what was last drawn (any key).
+        full: whether that was in full size. changed: when something last changed, seconds.
+        rates: times of the last drawings.
+    """
+
+    def __init__(self, client: Any, widest: int, dragged: Callable[[Eye], None]) -> None:
+        self.client, self._dragged = client, dragged
+        self.resolution = Resolution(widest)
+        self.drawn: object = None
+        self.full, self.changed = False, 0.0
+        self.rates: deque[float] = deque(maxlen=20)
+        self._set: deque[tuple[float, View]] = deque(maxlen=120)
+        self._answered = False  # whether the browser has taken a camera that was set
+
+    @property
+    def canvas(self) -> tuple[int, int]:
+        """Width and height of the browser's picture, pixels."""
+        camera = self.client.camera
+        return max(int(camera.image_width), 1), max(int(camera.image_height), 1)
+
+    @property
+    def view(self) -> View:
+        return View.of_client(self.client.camera)
+
+    def look(self, view: View, now: float) -> None:
+        """Set the browser's camera."""
+        self._set.append((now, view))
+        view.apply(self.client.camera)
+
+    def moved(self, now: float) -> None:
+        """The browser has sent a camera: `dragged` is called unless it is one that was set.
+
+        What comes before the browser has taken the first one is its own start.
+        """
+        seen = self.view
+        if any(now - t < ECHO_S and seen.near(view, 3e-3) for t, view in list(self._set)):
+            self._answered = True
+        elif self._answered:
+            self._dragged(self)
+
+    def rate(self) -> float:
+        """Pictures a second over the last ones; 0 with fewer than three."""
+        times = list(self.rates)
+        span = times[-1] - times[0] if len(times) > 2 else 0.0
+        return (len(times) - 1) / span if span > 0 else 0.0
+
+    def pose_key(self) -> tuple[object, ...]:
+        """The camera and the canvas, rounded, to notice changes."""
+        view = self.view
+        numbers = np.concatenate((view.position, view.rotation.ravel(), [view.fov]))
+        return (self.canvas, *np.round(numbers, 5).tolist())

@@ -1,0 +1,47 @@
+"""Pictures of the video, and its cameras, fitted into a canvas of another size and aspect."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import UInt8
+
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip
+
+
+def nearest_position(clip: Clip, frame: float) -> int:
+    """The position in the clip whose frame number is nearest."""
+    return min(range(len(clip)), key=lambda i: abs(clip.moments[i].index - frame))
+
+
+def source_frame(clip: Clip, frame: float, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
+    """The video's nearest frame in the middle of a picture of the camera's size."""
+    image = clip.store.image(nearest_position(clip, frame)).numpy()
+    return placed(image, (camera.width, camera.height))
+
+
+def placed(
+    image: UInt8[np.ndarray, "h w 3"], canvas: tuple[int, int]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """An image fitted into the middle of a canvas (width, height), with black around it."""
+    from PIL import Image
+
+    source = Image.fromarray(image)
+    left, top, width, height = inner_rectangle(source.size, canvas)
+    whole = Image.new("RGB", canvas)
+    whole.paste(source.resize((width, height), Image.Resampling.BILINEAR), (left, top))
+    return np.array(whole)
+
+
+def inner_rectangle(image: tuple[int, int], canvas: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Left, top, width and height of an image that is fitted into the middle of a canvas."""
+    scale = min(canvas[0] / image[0], canvas[1] / image[1])
+    width, height = max(1, round(image[0] * scale)), max(1, round(image[1] * scale))
+    return (canvas[0] - width) // 2, (canvas[1] - height) // 2, width, height
+
+
+def fitted(camera: Camera, canvas: tuple[int, int]) -> Camera:
+    """The camera with its whole image in the middle of a canvas of another size and aspect."""
+    left, top, width, height = inner_rectangle((camera.width, camera.height), canvas)
+    inner = camera.resized(width, height)
+    return inner.cropped(-left, -top, *canvas)
