@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from hoigs.cli.common import DeviceOption, PluginOption, RasterizerOption
+from hoigs.cli.common import ClipOption, DeviceOption, PluginOption, RasterizerOption
 from hoigs.cli.display import Display
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def render(
     only: Annotated[
         list[str] | None, typer.Option("--only", help="Render only this entity. Repeatable.")
     ] = None,
-    clip: Annotated[Path | None, typer.Option("--clip", help="The clip, if it was moved.")] = None,
+    clip: ClipOption = None,
     rasterizer: RasterizerOption = None,
     device: DeviceOption = "auto",
     plugin: PluginOption = None,

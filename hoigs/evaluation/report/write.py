@@ -13,6 +13,7 @@ import hoigs
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.values.clip import Clip
+from hoigs.core.whole_files import write_whole
 from hoigs.evaluation.report import curves, media, sections
 from hoigs.evaluation.scores import Evaluation, Table, score_table, size_table, timing_table
 from hoigs.runs.run_folder import RunFolder
@@ -65,9 +66,7 @@ def write_report(
         created=escape(evaluation.created),
     )
     path = folder / "report.html"
-    temporary = folder / ".report.html.part"
-    temporary.write_text(page, encoding="utf-8")
-    temporary.replace(path)
+    write_whole(path, page)
     report(1.0, "")
     return path
 

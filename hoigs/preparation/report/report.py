@@ -37,6 +37,7 @@ class PrepareReport(Measures):
             spread = f"{100 * self.object_scale_spread:.1f} %"
             rows.append(("object seen", f"{100 * self.object_observed:.0f} %", "of the frames"))
             rows.append(("object scale spread", spread, "so its depth's"))
+            rows.append(("object's poses", self.object_way, self.object_reason))
         rows.append(("scene points", f"{self.scene_points}", ""))
         if self.depth_residual is not None:
             rows.append(
@@ -67,7 +68,11 @@ class PrepareReport(Measures):
         (folder / "report.json").write_text(self.to_json(), encoding="utf-8")
         (folder / "report.md").write_text(self.to_markdown(), encoding="utf-8")
         page = report_page(
-            self, self.diagnostics(), self.rows(), overlay=(folder / "overlay.mp4").is_file()
+            self,
+            self.diagnostics(),
+            self.rows(),
+            overlay=(folder / "overlay.mp4").is_file(),
+            object_picture=(folder / "object.jpg").is_file(),
         )
         (folder / "report.html").write_text(page, encoding="utf-8")
 
