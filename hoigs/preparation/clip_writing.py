@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from hoigs.core.clip_folder.write import ClipWriter
 from hoigs.core.interfaces.body import PELVIS
 from hoigs.preparation.cameras.camera_track import parallax
 from hoigs.preparation.cameras.multiview import angular_factor, full_factor
+from hoigs.preparation.objects.tracked import ObjectConfidence
 from hoigs.preparation.pipeline import Pipeline
 from hoigs.preparation.report.object_picture import save_object_picture, shown_frame
 from hoigs.preparation.report.overlay import OverlayVideo
@@ -109,7 +110,7 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         coverage={n: m.coverage().round(5).tolist() for n, m in coverage.items()},
         body_residual_px=person.residual_px,
         scene_scale=person.scene_scale,
-        object_scale_spread=made.spread,
+        object_scale_spread=None if made.object_made is None else made.object_made.spread,
         object_observed=(
             None if made.object is None else float(made.object.observed.float().mean())
         ),
@@ -127,9 +128,22 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         depth_residual=None if depth is None else depth.typical,
         depth_residuals=[] if depth is None else _numbers(depth.residual, 4),
         depth_against="" if depth is None else depth.against,
+        **({} if made.object_made is None else _object_measures(made.object_made.confidence)),
         omega=angular_factor(made.cameras, pelvis, made.video.fps),
         big_omega=full_factor(made.cameras, moving),
     )
+
+
+def _object_measures(found: ObjectConfidence) -> dict[str, Any]:
+    return {
+        "object_way": found.way,
+        "object_reason": found.reason,
+        "object_agreement": _numbers(found.agreement, 3),
+        "object_outline_m": _numbers(found.outline, 4),
+        "object_held": found.held,
+        "object_rests": found.rests,
+        "hand_distance_m": _numbers(found.hand_distance, 4),
+    }
 
 
 def _numbers(values: Float[np.ndarray, " F"], digits: int) -> list[float | None]:

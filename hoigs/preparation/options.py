@@ -10,6 +10,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
 from hoigs.preparation.body.fit_problem import FitOptions
+from hoigs.preparation.objects.make_object import ObjectWay
 from hoigs.preparation.video.frames import Pick
 
 Place = EstimateKind | Literal["object"]  # "object": masks of the object alone
@@ -102,6 +103,11 @@ class PrepareOptions(ComponentConfig):
     )
     human: str = Field(default="human", description="name of the person's entity")
     object: str = Field(default="object", description="name of the object's entity")
+    object_track: ObjectWay = Field(
+        default="auto",
+        description='how the object\'s poses are found: "auto": from hands, outlines and texture, '
+        'or, where that cannot be, by "outline": its place and roll only',
+    )
     ball_radius: float = Field(
         default=0.11, gt=0, description="radius of a tracked ball, metres; a football's is 0.11"
     )

@@ -13,8 +13,8 @@ import numpy as np
 import hoigs
 from hoigs.core.diagnostics import ranges
 from hoigs.core.errors import HoigsError
-from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST, BodyModel
-from hoigs.core.values.clip import BodyTrack, ObjectTrack
+from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.values.clip import BodyTrack
 from hoigs.preparation.body.silhouette import silhouette
 from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras
 from hoigs.preparation.entity_masks import EntityMasks, entity_masks
@@ -29,7 +29,7 @@ from hoigs.preparation.estimates import (
 from hoigs.preparation.given import GivenMasks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack, load_ball, refine_ball
-from hoigs.preparation.objects.make_object import make_object
+from hoigs.preparation.objects.make_object import MadeObject, make_object
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.person import FittedBody, fit_person
 from hoigs.preparation.prompts import check_prompts
@@ -327,9 +327,10 @@ class Pipeline:
         return MaskStack(silhouette(v, self.body.faces, c) for (v, _), c in pairs)
 
     def _object(self) -> None:
-        self.object, self.spread = self._stage("object", self._place_object)
+        self.object_made = self._stage("object", self._place_object)
+        self.object = None if self.object_made is None else self.object_made.track
 
-    def _place_object(self) -> tuple[ObjectTrack | None, float | None]:
+    def _place_object(self) -> MadeObject | None:
         if self.estimates.ball is None and not self.masks.object.coverage().any():
             self.provenance["object"] = "none: the clip shows the person alone"
             if self.options.find_object:
@@ -337,22 +338,23 @@ class Pipeline:
                     "no object was found, so the clip has none; point at it with --object X,Y, or "
                     "say that there is none with --object none"
                 )
-            return None, None
-        wrists = self.person.joints[:, [LEFT_WRIST, RIGHT_WRIST]]
-        track, spread = make_object(
-            self.estimates.ball, self.masks.object, self.cameras, wrists, self.images,
-            radius=self.options.ball_radius, count=self.options.object_points,
+            return None
+        options = self.options
+        made = make_object(
+            self.estimates.ball, self.masks.object, self.masks.human, self.cameras,
+            self.person.joints, self.images, way=options.object_track, radius=options.ball_radius,
+            count=options.object_points, fps=self.video.fps, progress=self.stages.advance,
         )  # fmt: skip
-        self.provenance["object"] = track.provenance
-        lost = (~track.observed).nonzero().flatten().tolist()
+        self.provenance["object"] = made.track.provenance
+        lost = (~made.track.observed).nonzero().flatten().tolist()
         if lost:
             self.warnings.append(f"the object is not seen in {len(lost)} frames: {ranges(lost)}")
-        if self.estimates.ball is None:
+        if made.confidence.way == "outline":
             self.warnings.append(
-                "of the object's rotation only the roll is known, and its shape is a cushion "
-                "inflated from one outline: training has to find both"
+                "the object's rotation is not tracked but for its roll, and its shape is a cushion "
+                f"inflated from one outline: {made.confidence.reason}. Training has to find both"
             )
-        return track, spread
+        return made
 
     def _depth(self) -> None:
         estimator, self.depth_maps = self.estimators.get("depth"), None

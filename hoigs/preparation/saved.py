@@ -27,6 +27,8 @@ from hoigs.preparation.estimates import FoundObject, RawEstimates, UndistortedEs
 from hoigs.preparation.given import GivenMasks, RawLandmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack
+from hoigs.preparation.objects.make_object import MadeObject
+from hoigs.preparation.objects.tracked import ObjectConfidence
 from hoigs.preparation.person import FittedBody
 from hoigs.preparation.scene.depth import DepthFit
 from hoigs.preparation.scene.scene_points import ScenePoints
@@ -37,8 +39,8 @@ CLASSES = {
     found.__name__: found
     for found in (
         BallTrack, BodyPose, CameraTrack, ChosenCameras, DepthFit, EntityMasks, FittedBody,
-        FoundObject, FrameList, GivenMasks, LandmarkTrack, Lens, ObjectTrack, RawEstimates,
-        RawLandmarks, ScenePoints, UndistortedEstimates,
+        FoundObject, FrameList, GivenMasks, LandmarkTrack, Lens, MadeObject, ObjectConfidence,
+        ObjectTrack, RawEstimates, RawLandmarks, ScenePoints, UndistortedEstimates,
     )
 }  # fmt: skip
 

@@ -74,6 +74,8 @@ def _plots(report: Measures) -> str:
         plots.append(plot("Sharpness", {"": report.sharpness}))
     if any(v is not None for v in report.body_residuals_px):
         plots.append(plot("Body off its landmarks, px", {"": report.body_residuals_px}))
+    if any(v is not None for v in report.object_agreement):
+        plots.append(plot("Object's texture against other frames", {"": report.object_agreement}))
     if any(v is not None for v in report.depth_residuals):
         off = [None if v is None else 100 * v for v in report.depth_residuals]
         plots.append(plot(f"Depth off {report.depth_against}, %", {"": off}))

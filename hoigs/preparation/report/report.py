@@ -37,6 +37,7 @@ class PrepareReport(Measures):
             spread = f"{100 * self.object_scale_spread:.1f} %"
             rows.append(("object seen", f"{100 * self.object_observed:.0f} %", "of the frames"))
             rows.append(("object scale spread", spread, "so its depth's"))
+            rows.append(("object's poses", self.object_way, self.object_reason))
         rows.append(("scene points", f"{self.scene_points}", ""))
         if self.depth_residual is not None:
             rows.append(

@@ -32,7 +32,7 @@ PLAN = {
     "inputs": Stage(6, ("evidence", "cameras"), ("find_object",)),
     "body": Stage(40, ("inputs",), ("body", "fit_steps"), slow=True),
     "masks": Stage(10, ("inputs", "body", "object_masks"), ("keep_black",), slow=True),
-    "object": Stage(4, ("masks",), ("ball_radius", "object_points"), slow=True),
+    "object": Stage(40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True),
     "depth": Stage(4, ("masks",), ("prompts",), slow=True),
     "scene": Stage(6, ("masks", "depth"), ("scene_points", "backdrop"), slow=True),
     "writing": Stage(40, ("object", "scene")),
