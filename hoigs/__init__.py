@@ -61,10 +61,12 @@ _PUBLIC = {
     "WarpRasterizer": "hoigs.rasterizers.warp",
     # work: the commands as functions, then what they are made of
     "auto": "hoigs.studies.needs.auto",
+    "bug_report": "hoigs.workflows.bug_report",
     "compress": "hoigs.studies.needs.pruning.compact_run",
     "demo": "hoigs.workflows.demo",
     "doctor": "hoigs.workflows.doctor",
     "evaluate_run": "hoigs.workflows.evaluate_run",
+    "export": "hoigs.workflows.export",
     "needs": "hoigs.studies.needs.needs",
     "open_run": "hoigs.runs.loaded_run",
     "prepare": "hoigs.preparation.prepare",

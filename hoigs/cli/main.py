@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import sys
-
 import typer
 
 from hoigs import __version__
 from hoigs.cli import (
+    bug_report,
     chart,
     compress,
     demo,
     doctor,
+    estimators,
     evaluate,
+    export,
     needs,
     plugins,
     prepare,
@@ -23,10 +24,12 @@ from hoigs.cli import (
     train,
     view,
 )
-from hoigs.core.errors import HoigsError
+from hoigs.cli.failures import GuardedGroup, failures_as_messages
+from hoigs.core.cpus import share_processors
 
 app = typer.Typer(
     name="hoigs",
+    cls=GuardedGroup,
     help="People handling things, reconstructed from one video as moving 3D Gaussians.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -38,6 +41,7 @@ app.command("train")(train.train)
 app.command("eval")(evaluate.evaluate)
 app.command("render")(render.render)
 app.command("view")(view.view)
+app.command("export")(export.export)
 app.command("tables")(tables.tables)
 app.command("chart")(chart.chart)
 app.command("stress")(stress.stress)
@@ -45,7 +49,9 @@ app.command("needs")(needs.needs)
 app.command("compress")(compress.compress)
 app.add_typer(plugins.app, name="plugins")
 app.add_typer(spec.app, name="spec")
+app.add_typer(estimators.app, name="estimators")
 app.command("doctor")(doctor.doctor)
+app.command("bug-report")(bug_report.bug_report)
 
 
 def _version(show: bool) -> None:
@@ -64,15 +70,10 @@ def _options(
 
 
 def main() -> None:
-    """Entry point: user errors become one message on stderr and exit code 2."""
-    try:
+    """Entry point: what goes wrong becomes one message on stderr and an exit code."""
+    share_processors()
+    with failures_as_messages():
         app()
-    except HoigsError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hoigs.cli.common import print_table
 from hoigs.cli.display import Display
+
+if TYPE_CHECKING:
+    from hoigs.preparation.estimator_plan import EstimatorPlan
+    from hoigs.preparation.readiness import Consent
 
 
 def prepare(
@@ -17,6 +22,25 @@ def prepare(
         typer.Argument(help="A video, or a folder with a video or frames and further inputs."),
     ],
     out: Annotated[Path, typer.Option("--out", help="Clip folder to make.")],
+    object_at: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--object",
+            help="The object: a point 640,402 or 640,402@FRAME, one beside it -700,380, a box "
+            'x0,y0,x1,y1, words "football" (with --estimators hub), or none. Repeatable.',
+        ),
+    ] = None,
+    estimators: Annotated[
+        str | None,
+        typer.Option(
+            "--estimators",
+            help="What finds landmarks and masks that no file beside the video gives: offline "
+            "(MediaPipe and hoigs's tracker; default), hub (networks), or files (nothing does).",
+        ),
+    ] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Install and download what is needed, unasked.")
+    ] = False,
     width: Annotated[
         int | None, typer.Option("--width", help="Resize frames; default: the video's own.")
     ] = None,
@@ -83,14 +107,15 @@ def prepare(
 
     flags = {
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
-        "focal": focal, "keep_black": keep_black, "overwrite": overwrite,
+        "focal": focal, "keep_black": keep_black, "overwrite": overwrite, "preset": estimators,
     }  # fmt: skip
     options = load_options(file, settings or (), flags)
     if stage is not None:
         with Display() as show:
             seconds = prepare_until(
                 stage, source, out, options=options, progress=show.fraction,
-                redo=redo or (), allow_commands=allow_commands,
+                redo=redo or (), allow_commands=allow_commands, object=object_at or (),
+                yes=yes, consent=_consent(), announce=_announce,
             )  # fmt: skip
         rows = [(name, f"{value:.1f} s") for name, value in seconds.items()]
         print_table(f"stages kept in {work_folder(out)}", ("stage", "made in"), rows)
@@ -98,7 +123,23 @@ def prepare(
     with Display() as show:
         report = run(
             source, out, options=options, progress=show.fraction,
-            redo=redo or (), allow_commands=allow_commands,
+            redo=redo or (), allow_commands=allow_commands, object=object_at or (),
+            yes=yes, consent=_consent(), announce=_announce,
         )  # fmt: skip
     print_table(f"prepared {out}", ("what", "value", "note"), report.rows())
+    for warning in report.warnings:
+        typer.echo(f"- {warning}")
     typer.echo(f"clip: {out}")
+    typer.echo(f"report: {out / 'report.html'}")
+
+
+def _announce(plan: EstimatorPlan) -> None:
+    title = "plan" if plan.frames is None else f"plan for {plan.frames} frames"
+    print_table(title, ("what", "from", "why", "about, on 2 cores"), plan.rows())
+
+
+def _consent() -> Consent | None:
+    """Asks on a terminal; elsewhere nobody can answer."""
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        return None
+    return lambda question: typer.confirm(question, default=True)

@@ -7,6 +7,7 @@ holds the shape, dtype, bits and CRC-32 of each.
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -74,8 +75,8 @@ def unpack(
         if name not in streams:
             raise CheckpointError(f"{name}: described, but not in the file")
         try:
-            data = zlib.decompress(streams[name].numpy().tobytes())
-        except zlib.error as error:
+            data = _decompressed(streams[name].numpy().tobytes(), _size(record))
+        except (zlib.error, ValueError, KeyError, TypeError) as error:
             raise CheckpointError(f"{name}: damaged: {error}") from error
         if zlib.crc32(data) != record["crc32"]:
             raise CheckpointError(f"{name}: damaged: its checksum differs")
@@ -83,6 +84,31 @@ def unpack(
             found[name] = _tensor(data, record)
         except (KeyError, ValueError) as error:
             raise CheckpointError(f"{name}: does not match its description: {error}") from error
+    return found
+
+
+def _size(record: Mapping[str, Any]) -> int:
+    """Bytes of a tensor's stream when it is decompressed."""
+    shape = [int(size) for size in record["shape"]]
+    count = math.prod(shape)
+    if record["dtype"] not in FLOATS | EXACT:
+        raise ValueError(f"unknown dtype {record['dtype']!r}")
+    if record.get("bits") is None:
+        return count * np.dtype(record["dtype"] if record["dtype"] != "bfloat16" else "f2").itemsize
+    channels = shape[-1] if len(shape) > 1 else 1
+    return 16 * channels + count * record["bits"] // 8
+
+
+def _decompressed(data: bytes, size: int) -> bytes:
+    """Exactly `size` bytes, however many the stream would give.
+
+    Raises:
+        zlib.error, ValueError: it is damaged, or of another size.
+    """
+    stream = zlib.decompressobj()
+    found = stream.decompress(data, size + 1)
+    if len(found) != size or not (stream.eof or stream.decompress(b"") == b""):
+        raise ValueError(f"not the {size} bytes that its shape needs")
     return found
 
 

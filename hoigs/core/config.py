@@ -19,4 +19,5 @@ class ComponentConfig(BaseModel):
         validate_assignment=True,
         protected_namespaces=(),
         use_attribute_docstrings=True,
+        allow_inf_nan=False,
     )

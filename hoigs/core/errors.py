@@ -34,6 +34,18 @@ class NotFiniteError(HoigsError):
     """A tensor holds NaN or infinity; the message names it."""
 
 
+class Interrupted(KeyboardInterrupt):
+    """Work that was stopped by Ctrl-C or SIGTERM; the message says how to go on.
+
+    Attributes:
+        code: the exit code that shells expect, 128 + the signal's number.
+    """
+
+    def __init__(self, message: str, signal_number: int) -> None:
+        super().__init__(message)
+        self.code = 128 + signal_number
+
+
 def did_you_mean(name: str, valid: Iterable[str], count: int = 1) -> str:
     """`; did you mean "x"?` with the nearest of `valid`, or "" when nothing is near."""
     near = difflib.get_close_matches(name, list(valid), n=count, cutoff=0.5)

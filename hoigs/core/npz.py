@@ -1,11 +1,13 @@
-"""Reading npz files: without pickles, and safely from several threads."""
+"""Reading npz and npy files: without pickles, sizes before content, safe from several threads."""
 
 from __future__ import annotations
 
+import math
 import threading
 import zipfile
+from collections.abc import Collection
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -14,9 +16,26 @@ from numpy.lib import format as npy
 # threads together in 3.11 (python/cpython#106905): reading in a pool failed once in a while.
 _header_lock = threading.Lock()
 
+# A small file may claim gigabytes: zeros compress to a thousandth. Arrays of our own files do not
+# compress to a hundredth, and small ones may.
+SMALL_BYTES = 256 * 2**20
+MOST_RATIO = 100
 
-def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an npz; pickled content is refused (it could run code).
+
+class ArrayHeader(NamedTuple):
+    """What is known of an array before it is read."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    fortran: bool
+
+    @property
+    def nbytes(self) -> int:
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def array_headers(path: Path) -> dict[str, ArrayHeader]:
+    """Shapes and dtypes of all arrays of an npz, whose content is not read.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -24,29 +43,108 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            return {
-                name.removesuffix(".npy"): _member(archive, name) for name in archive.namelist()
-            }
+            found = {}
+            for name in archive.namelist():
+                with archive.open(name) as file:
+                    found[name.removesuffix(".npy")] = _header(file, name)
+            return found
     except FileNotFoundError:
         raise
     except Exception as error:  # zipfile, zlib, numpy and EOF errors all mean the same here
-        raise ValueError(f"not a readable npz without pickled objects ({error})") from error
+        raise _unreadable("npz", error) from error
+
+
+def load_arrays(path: Path, only: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """The arrays of an npz; pickled content is refused (it could run code).
+
+    Args:
+        only: names to read; None reads all.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: not an npz, damaged, holding pickled objects, or far larger than its file.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [
+                n for n in archive.namelist() if only is None or n.removesuffix(".npy") in only
+            ]
+            _check_size(path, sum(archive.getinfo(name).file_size for name in names))
+            return {name.removesuffix(".npy"): _member(archive, name) for name in names}
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # zipfile, zlib, numpy and EOF errors all mean the same here
+        raise _unreadable("npz", error) from error
+
+
+def load_array(path: Path) -> np.ndarray:
+    """The array of an npy file; pickled content is refused.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: not an npy, damaged, or holding pickled objects.
+    """
+    try:
+        with path.open("rb") as file:
+            return _array(file, path.name, path.stat().st_size)
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        raise _unreadable("npy", error) from error
+
+
+def _unreadable(what: str, error: Exception) -> ValueError:
+    return ValueError(f"not a readable {what} without pickled objects ({plain_reason(error)})")
+
+
+def plain_reason(error: Exception) -> str:
+    """The message of numpy's error, without its advice to allow pickles, which could run code."""
+    text = str(error)
+    if "allow_pickle=" in text or "pickle.load" in text:
+        return "it holds pickled objects, or is no such file"
+    return text.split("\n", 1)[0] or "it is empty"
+
+
+def _check_size(path: Path, size: int) -> None:
+    stored = path.stat().st_size
+    if size > max(SMALL_BYTES, MOST_RATIO * stored):
+        raise ValueError(
+            f"its {stored} bytes claim {size / 2**30:.1f} GiB, more than {MOST_RATIO} times as much"
+        )
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     with archive.open(name) as file:
-        with _header_lock:
-            shape, fortran, dtype = _header(file)
-        if dtype.hasobject:
-            raise ValueError(f"{name} holds pickled objects")
-        content = file.read()
-    values = np.frombuffer(bytearray(content), dtype)
-    return values.reshape(shape, order="F" if fortran else "C")
+        return _array(file, name, archive.getinfo(name).file_size)
 
 
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+def _array(file: IO[bytes], name: str, size: int) -> np.ndarray:
+    """One array; `size` is that of its member or file, header included."""
+    header = _header(file, name)
+    if header.nbytes > size:
+        raise ValueError(f"{name} is cut: {size} bytes for {header.nbytes} of content")
+    content = file.read(header.nbytes)
+    values = np.frombuffer(bytearray(content), header.dtype, math.prod(header.shape))
+    return values.reshape(header.shape, order="F" if header.fortran else "C")
+
+
+def _header(file: IO[bytes], name: str) -> ArrayHeader:
+    with _header_lock:
+        shape, fortran, dtype = _parsed(file)
+    if dtype.hasobject:
+        raise ValueError(f"{name} holds pickled objects")
+    if any(size < 0 for size in shape):
+        raise ValueError(f"{name} has the shape {shape}")
+    return ArrayHeader(shape, dtype, fortran)
+
+
+def _parsed(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     version = npy.read_magic(file)
     read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
     if read is None:
         raise ValueError(f"npy version {version} is not supported")
-    return read(file)
+    try:
+        return read(file)
+    except ValueError as error:
+        # numpy advises to allow pickles where a header is too long; that could run code
+        raise ValueError(str(error).split("\n", 1)[0]) from error

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,6 +81,31 @@ def refuse_place(
     for path in inputs:
         if path.resolve().is_relative_to(real):
             raise error(f"{folder} is or holds the input {path}; {advice}")
+
+
+def refuse_unwritable(folder: Path, *, error: type[HoigsError] = HoigsError) -> None:
+    """Raise where no folder of this name can be made: found out before work, not after it.
+
+    A temporary folder is made in the nearest parent that exists, and removed.
+
+    Raises:
+        HoigsError: or `error`: a parent is a file or a broken link, the disk can only be read or is
+            full, or the name is too long.
+    """
+    parent, names = folder.absolute().parent, [f".{folder.absolute().name}.old.1234567.part"]
+    while not os.path.lexists(parent):
+        parent, names = parent.parent, [*names, parent.name]
+    if not parent.is_dir():
+        raise error(f"{folder}: {parent} is no folder; name another folder to write")
+    try:
+        with tempfile.TemporaryDirectory(prefix=".hoigs-", suffix=".part", dir=parent) as made:
+            for name in names:
+                with contextlib.suppress(FileNotFoundError):
+                    (Path(made) / name).lstat()  # for the error of a name that is too long
+    except OSError as problem:
+        raise error(
+            f"{folder} cannot be made in {parent}: {problem.strerror}; name another folder to write"
+        ) from problem
 
 
 def require_replaceable(

@@ -51,7 +51,7 @@ def evaluate(
     """Score a model on a split of a clip and on its held-out cameras, and measure it.
 
     Args:
-        lpips_weights: see `lpips.find_weights`; without any, LPIPS is "not computed".
+        lpips_weights: see `lpips.find_weights`; None: the package's own.
         held_out: also score the clip's held-out cameras, where it has them.
         test_pose, test_camera, fit_steps: source of body poses and cameras; see
             `posing.posed_clip`. The clip with these is `Evaluation.scored`.
@@ -62,14 +62,13 @@ def evaluate(
         progress: called with the share that is done, in [0, 1], and the present work.
 
     Raises:
-        ValueError: the clip has no such split, or no frames in it.
+        ValueError: the clip has no such split. In one without frames nothing is scored, and every
+            score gives that as its reason.
         HoigsError: `lpips_weights` names no file, or a damaged one.
     """
-    if split not in clip.split or len(clip.split[split]) == 0:
-        known = [name for name, positions in clip.split.items() if len(positions)]
-        raise ValueError(
-            f"clip has no frames in split {split!r}: {known}{did_you_mean(split, known)}"
-        )
+    if split not in clip.split:
+        known = list(clip.split)
+        raise ValueError(f"clip has no split {split!r}: {known}{did_you_mean(split, known)}")
     if device is not None:
         model.to(device)
     found = find_weights(lpips_weights)
@@ -87,7 +86,7 @@ def evaluate(
     chosen = [("test frames" if split == "test" else f"{split} frames", clip, split)]
     if held_out and clip.held_out is not None and len(clip.held_out):
         chosen.append(("held-out cameras", clip.held_out, "test"))
-    work = sum(len(source.split[name]) for _, source, name in chosen)
+    work = max(1, sum(len(source.split[name]) for _, source, name in chosen))
     trained = {clip.moments[p].index for p in clip.split.get("train", ())}
     views, done = [], 0
     for title, source, name in chosen:
@@ -105,9 +104,9 @@ def evaluate(
     report(1 - TIMING_SHARE, "geometry")
     geometry = measure_geometry(model, clip, clip.split[split])
     report(1 - TIMING_SHARE, "render time")
+    timed = list(clip.split[split]) or list(range(len(clip)))
     timing = NotComputed("timing_frames is 0") if timing_frames == 0 else render_time(
-        model, clip, list(clip.split[split]), frames=timing_frames, warmup=timing_warmup,
-        budget_s=timing_budget_s,
+        model, clip, timed, frames=timing_frames, warmup=timing_warmup, budget_s=timing_budget_s,
     )  # fmt: skip
     report(1.0, "")
     model.train(was_training)
@@ -127,10 +126,10 @@ def _protocol(
     lpips: Lpips | NotComputed,
 ) -> Protocol:
     positions = clip.split[split]
-    camera = clip.cameras[positions[0]]
+    camera = clip.cameras[positions[0] if positions else 0]
     first = camera.world_to_camera
     ignored = [clip.store.ignored(p) for p in positions]
-    share = sum(float(m.float().mean()) for m in ignored if m is not None) / len(positions)
+    share = sum(float(m.float().mean()) for m in ignored if m is not None) / max(1, len(positions))
     fixed = all(torch.equal(c.world_to_camera, first) for c in clip.cameras)
     views = title if title == "held-out cameras" else "training cameras"
     return Protocol(
@@ -145,6 +144,7 @@ def _protocol(
         width=camera.width,
         height=camera.height,
         lpips_net=None if isinstance(lpips, NotComputed) else lpips.net,
+        lpips_weights="" if isinstance(lpips, NotComputed) else lpips.source,
         device=device_name(model.device),
         rasterizer=type(model.rasterizer).__name__,
         cameras_refined=bool(clip.provenance.get(CAMERAS_REFINED)),

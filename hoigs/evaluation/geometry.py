@@ -102,6 +102,8 @@ def rigid_motion(
 @torch.no_grad()
 def measure_geometry(model: SceneModel, clip: Clip, positions: Sequence[int]) -> dict[str, Value]:
     """Every measure of GEOMETRY as its mean over some frames of a clip, or why there is none."""
+    if not positions:
+        return dict.fromkeys(GEOMETRY, NotComputed("no frames of the clip are scored"))
     truth = read_truth(clip)
     moments = {p: clip.moments[p].to(model.device) for p in positions}
     states = {p: dict(model(m).gaussians) for p, m in moments.items()}

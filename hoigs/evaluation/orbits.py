@@ -37,7 +37,7 @@ def orbit_cameras(
     position = len(clip) // 2 if position is None else position
     camera = clip.cameras[position]
     center = pivot(model, clip, clip.moments[position], camera)
-    up = world_up(clip)
+    up = clip.up()
     right = torch.nn.functional.normalize(camera.world_to_camera[0, :3], dim=0)
     path = []
     for i in range(count):
@@ -75,9 +75,3 @@ def pivot(model: SceneModel, clip: Clip, moment: Moment, camera: Camera) -> Floa
     distance = ahead.median() if len(ahead) else torch.tensor(2.0)
     middle = torch.tensor([camera.width / 2, camera.height / 2]).to(camera.world_to_camera)
     return camera.unproject(middle, distance)
-
-
-def world_up(clip: Clip) -> Float[Tensor, " 3"]:
-    """The mean upward direction of the cameras, as a COLMAP world defines none."""
-    ups = torch.stack([-camera.world_to_camera[1, :3] for camera in clip.cameras])
-    return torch.nn.functional.normalize(ups.mean(0), dim=0)

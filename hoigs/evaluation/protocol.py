@@ -39,6 +39,7 @@ class Protocol:
         background: colour behind all Gaussians.
         width, height: of the scored images, pixels.
         lpips_net: "alex", "vgg", or None if LPIPS was not computed. lpips_range: of its input.
+        lpips_weights: where the network's weights came from; "" in scores of 0.1.
         device, rasterizer: that drew the images.
         test_camera: source of the cameras, as `test_pose`; those of held-out views are given.
         fit_steps: optimizer steps per fitted frame; 0 if nothing was fitted.
@@ -64,6 +65,7 @@ class Protocol:
     cameras_refined: bool = False
     ignored: float = 0.0
     background: str = "black"
+    lpips_weights: str = ""
     lpips_range: str = "[-1, 1]"
     averages: str = "mean over frames of the metric of each frame"
     ssim: str = "11x11 Gaussian, sigma 1.5, zero padding; of regions: mean of the map over them"
@@ -103,8 +105,10 @@ class Protocol:
 
     def footnotes(self) -> list[str]:
         """The protocol in sentences, for the foot of a table."""
+        weights = f" (weights: {self.lpips_weights})" if self.lpips_weights else ""
         lpips = (
-            f"LPIPS v0.1 {self.lpips_net} on {self.lpips_range}, of regions: {self.lpips_regions}"
+            f"LPIPS v0.1 {self.lpips_net}{weights} on {self.lpips_range}, of regions: "
+            f"{self.lpips_regions}"
             if self.lpips_net
             else "LPIPS not computed"
         )

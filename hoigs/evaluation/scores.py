@@ -10,6 +10,7 @@ from typing import Any
 
 from hoigs.core.errors import did_you_mean
 from hoigs.core.values.clip import Clip
+from hoigs.core.whole_files import write_whole
 from hoigs.evaluation.geometry import GEOMETRY
 from hoigs.evaluation.geometry import NOTES as GEOMETRY_NOTES
 from hoigs.evaluation.protocol import NotComputed, Protocol, Value
@@ -57,6 +58,8 @@ class ViewScores:
 
     def mean(self, region: str, metric: str) -> tuple[Value, int]:
         """Mean over the frames that have this score, and their number."""
+        if not self.frames:
+            return NotComputed(f"the clip has no {self.protocol.split} frames"), 0
         values = [frame.values[region][metric] for frame in self.frames]
         numbers = [v for v in values if not isinstance(v, NotComputed)]
         if numbers:
@@ -180,14 +183,13 @@ class Evaluation:
 
     def save(self, path: Path | str) -> None:
         """Write JSON under a temporary name, then rename."""
-        path = Path(path)
-        temporary = path.with_name(f".{path.name}.part")
-        temporary.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False))
-        temporary.replace(path)
+        write_whole(Path(path), json.dumps(self.to_dict(), indent=1, allow_nan=False))
 
 
 def score_table(view: ViewScores) -> Table:
     """A row per region, a column per metric; notes explain metrics that no region has."""
+    if not view.frames:
+        return Table(view.name, ("region", "frames"), [], [str(view.mean("full", "psnr")[0])])
     rows, notes = [], {}
     shown = [m for m in METRICS if any(view.mean(r, m)[1] for r in REGIONS)]
     for metric in METRICS:

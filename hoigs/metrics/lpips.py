@@ -1,8 +1,8 @@
-"""LPIPS v0.1 (Zhang et al. 2018) in plain torch, with weights from files of the user.
+"""LPIPS v0.1 (Zhang et al. 2018) in plain torch.
 
-The package ships no backbone weights. `find_weights` tries, in this order, the given path, the
-environment variable HOIGS_LPIPS_WEIGHTS, and torchvision's download cache (its backbones need the
-heads of an installed `lpips` package).
+The package ships AlexNet's weights (`metrics/data`). `find_weights` tries, in this order, the given
+path, the environment variable HOIGS_LPIPS_WEIGHTS, and the package's own for AlexNet; for VGG-16
+torchvision's download cache, whose backbone needs the heads of an installed `lpips` package.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.npz import load_arrays
 
 Net = Literal["alex", "vgg"]
 VARIABLE = "HOIGS_LPIPS_WEIGHTS"
+SHIPPED = Path(__file__).parent / "data" / "lpips_alex.npz"
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 MIN_SIZE = 32  # AlexNet's two poolings leave nothing of smaller images
 
@@ -91,12 +92,14 @@ def find_weights(path: Path | str | None = None, net: Net = "alex") -> FoundWeig
         if not Path(named).is_file():
             return FoundWeights(None, f"{VARIABLE} names {named}, where no file is")
         return _with_heads(Path(named), net, f"from {VARIABLE}")
+    if net == "alex":
+        return FoundWeights(str(SHIPPED), "shipped with hoigs, half precision")
     cache = Path(torch.hub.get_dir()) / "checkpoints"
     for file in sorted(cache.glob(STACKS[net].checkpoint)):
         return _with_heads(file, net, "in torchvision's cache")
     return FoundWeights(
         None,
-        f"no LPIPS weights: give --lpips-weights FILE or set {VARIABLE}; "
+        f"no LPIPS weights of {net}: give --lpips-weights FILE or set {VARIABLE}; "
         f"torchvision's {STACKS[net].checkpoint} is not in {cache} either",
     )
 
@@ -122,11 +125,13 @@ class Lpips(nn.Module):
 
     Args:
         net: backbone. arrays: `conv{i}_w [O,I,k,k]`, `conv{i}_b [O]`, `lin{i} [O]`.
+        source: where the weights came from, for protocols.
     """
 
-    def __init__(self, net: Net, arrays: dict[str, Tensor]) -> None:
+    def __init__(self, net: Net, arrays: dict[str, Tensor], source: str = "") -> None:
         super().__init__()
         self.net: Net = net
+        self.source = source
         self.stack = STACKS[net]
         for key in _keys(self.stack):
             if key not in arrays:
@@ -147,7 +152,7 @@ class Lpips(nn.Module):
             raise HoigsError(found.reason)
         file = Path(found.location)
         arrays = _read_npz(file) if file.suffix == ".npz" else _read_checkpoint(file, found.heads)
-        return cls("vgg" if "conv12_w" in arrays else "alex", arrays)
+        return cls("vgg" if "conv12_w" in arrays else "alex", arrays, found.reason)
 
     def forward(
         self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]
@@ -199,8 +204,7 @@ def _keys(stack: _Stack) -> list[str]:
 
 def _read_npz(file: Path) -> dict[str, Tensor]:
     try:
-        with np.load(file, allow_pickle=False) as arrays:
-            return {key: torch.from_numpy(arrays[key]) for key in arrays.files}
+        return {key: torch.from_numpy(values) for key, values in load_arrays(file).items()}
     except (OSError, ValueError) as error:
         raise HoigsError(f"LPIPS weights {file} cannot be read: {error}") from error
 

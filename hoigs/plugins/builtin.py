@@ -13,6 +13,7 @@ INTERACTION = "hoigs.plugins.interaction"
 INITIALIZERS = "hoigs.plugins.initializers"
 ESTIMATORS = "hoigs.plugins.estimators"
 READERS = "hoigs.plugins.readers"
+EXPORTERS = "hoigs.plugins.exporters"
 
 # key, module, class, config class, summary
 PARTS = (
@@ -130,6 +131,36 @@ PARTS = (
     ("reader:davis", f"{READERS}.davis", "DavisReader",
      "DavisConfig",
      "frames and annotated masks as DAVIS or DreamScene4D has them; no cameras"),
+    ("exporter:ply", f"{EXPORTERS}.ply", "PlyExporter", "PlyConfig",
+     "Gaussians of one moment in the layout of 3DGS"),
+    ("exporter:ply-sequence", f"{EXPORTERS}.ply_sequence", "PlySequenceExporter",
+     "PlySequenceConfig", "Gaussians of every moment, a PLY each, merged or by entity"),
+    ("exporter:tracks", f"{EXPORTERS}.tracks", "TracksExporter", "TracksConfig",
+     "poses of objects, joints, cameras (COLMAP too) and contacts of hands, as csv and json"),
+    ("exporter:bvh", f"{EXPORTERS}.bvh", "BvhExporter", "BvhConfig",
+     "the skeleton of each person as motion capture"),
+    ("exporter:amass", f"{EXPORTERS}.smpl_npz", "AmassExporter", "AmassConfig",
+     "poses of each person as AMASS has them"),
+    ("exporter:smplx", f"{EXPORTERS}.smpl_npz", "SmplxExporter", "SmplxNpzConfig",
+     "parameters of each person for an SMPL-X layer, and joints"),
+    ("exporter:gltf-body", f"{EXPORTERS}.gltf_body", "GltfBodyExporter", "GltfBodyConfig",
+     "skinned people, moving objects and the camera in one animated glb"),
+    ("exporter:gltf-splat", f"{EXPORTERS}.gltf_splat", "GltfSplatExporter", "GltfSplatConfig",
+     "Gaussians of one moment by KHR_gaussian_splatting, which is new"),
+    ("exporter:mesh-sequence", f"{EXPORTERS}.mesh_sequence", "MeshSequenceExporter",
+     "MeshSequenceConfig", "meshes of people and objects at every moment: ply, obj or glb"),
+    ("exporter:rgba", f"{EXPORTERS}.rgba", "RgbaExporter", "RgbaConfig",
+     "entities with transparency, from the camera of the video: ProRes 4444, VP9 or PNG"),
+    ("exporter:spz", f"{EXPORTERS}.gaussforge", "SpzExporter", "GaussForgeConfig",
+     "Gaussians of one moment in a spz, Niantic's, about a tenth of the PLY"),
+    ("exporter:splat", f"{EXPORTERS}.gaussforge", "SplatExporter", "GaussForgeConfig",
+     "Gaussians of one moment in a splat, 32 bytes a Gaussian, no SH"),
+    ("exporter:sog", f"{EXPORTERS}.gaussforge", "SogExporter", "GaussForgeConfig",
+     "Gaussians of one moment in a sog, PlayCanvas's, the smallest"),
+    ("exporter:compressed-ply", f"{EXPORTERS}.gaussforge", "CompressedPlyExporter",
+     "GaussForgeConfig", "Gaussians of one moment in a compressed PLY, PlayCanvas's"),
+    ("exporter:usd", f"{EXPORTERS}.usd", "UsdExporter", "UsdConfig",
+     "Gaussians, people, objects and the camera over time in one OpenUSD stage"),
     ("density:adc", "hoigs.plugins.density.adc", "AdaptiveDensity", "AdaptiveDensityConfig",
      "clone, split and prune as 3DGS does, under a hard cap"),
     ("density:absgrad", "hoigs.plugins.density.absgrad", "AbsoluteGradientDensity",
@@ -166,6 +197,9 @@ PARTS = (
     ("estimator:mediapipe", f"{ESTIMATORS}.mediapipe", "MediapipeEstimator",
      "MediapipeConfig",
      "landmarks of a person by MediaPipe Pose, in an environment of its own"),
+    ("estimator:object-tracker", f"{ESTIMATORS}.object_tracker.estimator",
+     "ObjectTrackerEstimator", "ObjectTrackerConfig",
+     "masks of objects from clicks, or of what moves beside the person; no network"),
     ("estimator:command", f"{ESTIMATORS}.command", "CommandEstimator",
      "CommandConfig",
      "masks, depth or landmarks that a command line of yours writes"),
@@ -182,6 +216,10 @@ PARTS = (
 EXTRAS = {
     "rasterizer:gsplat": "gsplat",
     "initializer:sds": "sds",
+    **dict.fromkeys(
+        ("exporter:spz", "exporter:splat", "exporter:sog", "exporter:compressed-ply"), "export"
+    ),
+    "exporter:usd": "usd",
     "estimator:transformers-sam2": "estimators",
     "estimator:transformers-depth": "estimators",
     "estimator:transformers-pose": "estimators",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -13,7 +13,9 @@ from hoigs.core.clip_folder.write import ClipWriter
 from hoigs.core.interfaces.body import PELVIS
 from hoigs.preparation.cameras.camera_track import parallax
 from hoigs.preparation.cameras.multiview import angular_factor, full_factor
+from hoigs.preparation.objects.tracked import ObjectConfidence
 from hoigs.preparation.pipeline import Pipeline
+from hoigs.preparation.report.object_picture import save_object_picture, shown_frame
 from hoigs.preparation.report.overlay import OverlayVideo
 from hoigs.preparation.report.report import PrepareReport
 from hoigs.preparation.stages.cleanup import Cleanup
@@ -24,10 +26,9 @@ BODY_JOINTS = 22  # without the hands', which are not fitted
 def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
     """Writes and checks what the other stages made, and gives the folder its name."""
     options = made.options
-    entities: dict[str, Literal["human", "object"]] = {
-        options.human: "human",
-        options.object: "object",
-    }
+    entities: dict[str, Literal["human", "object"]] = {options.human: "human"}
+    if made.object is not None:
+        entities[options.object] = "object"
     with ClipWriter(
         made.out, fps=made.video.fps, entities=entities, image_format=options.image_format,
         quality=options.quality, depth_kind="none" if made.depth is None else "metric",
@@ -37,7 +38,8 @@ def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
         with made.stages.stage("writing"):
             _write_frames(made, writer)
         writer.set_body(options.human, made.body_track)
-        writer.set_object(options.object, made.object)
+        if made.object is not None:
+            writer.set_object(options.object, made.object)
         writer.set_points(made.scene.points, made.scene.colors)
         if made.track.model is not None:
             writer.set_colmap(made.track.model)
@@ -52,6 +54,7 @@ def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
 
 def _write_frames(made: Pipeline, writer: ClipWriter) -> None:
     options = made.options
+    picture = _object_picture(made)
     overlay = OverlayVideo(
         writer.root / "overlay.mp4", made.video.fps, options.overlay_width, made.body.faces
     )
@@ -63,19 +66,37 @@ def _write_frames(made: Pipeline, writer: ClipWriter) -> None:
         for i, (image, camera, human, object_mask, blank, (vertices, _)) in enumerate(
             made.stages.track(rows, len(made.video))
         ):
-            masks = {options.human: human, options.object: object_mask}
+            masks = {options.human: human}
+            points = torch.zeros(0, 3)
+            if made.object is not None:
+                masks[options.object] = object_mask
+                points = made.object.points @ made.object.rotations[i].mT
+                points = points + made.object.translations[i]
             writer.add_frame(image, camera, masks, made.metres(i), blank)
-            points = made.object.points @ made.object.rotations[i].mT
-            points = points + made.object.translations[i]
+            if i == picture:
+                save_object_picture(writer.root, image, object_mask)
             overlay.add(image, camera, vertices, human, object_mask, points)
+
+
+def _object_picture(made: Pipeline) -> int | None:
+    """Position of the frame that shows which object was taken; None where nobody had to choose."""
+    if made.object is None or made.found_object is None:
+        return None
+    prompt = made.options.prompts.get(made.options.object)
+    prompted = [at.frame for at in prompt.places()] if prompt else []
+    coverage = made.masks.object.coverage().tolist()
+    return shown_frame(made.video.indices, made.found_object.boxes, prompted, coverage)
 
 
 def _report(made: Pipeline, name: str) -> PrepareReport:
     middle = torch.median(made.scene.points, dim=0).values
     options, person, figures = made.options, made.person, made.track.figures
-    coverage = {options.human: made.masks.human, options.object: made.masks.object}
+    coverage = {options.human: made.masks.human}
     pelvis = person.joints[:, PELVIS]
-    moving = torch.cat((person.joints[:, :BODY_JOINTS], made.object.translations[:, None]), 1)
+    moving = person.joints[:, :BODY_JOINTS]
+    if made.object is not None:
+        coverage[options.object] = made.masks.object
+        moving = torch.cat((moving, made.object.translations[:, None]), 1)
     focal, depth = float(made.cameras[0].K[0, 0]), made.depth
     return PrepareReport(
         name=name,
@@ -89,8 +110,10 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         coverage={n: m.coverage().round(5).tolist() for n, m in coverage.items()},
         body_residual_px=person.residual_px,
         scene_scale=person.scene_scale,
-        object_scale_spread=made.spread,
-        object_observed=float(made.object.observed.float().mean()),
+        object_scale_spread=None if made.object_made is None else made.object_made.spread,
+        object_observed=(
+            None if made.object is None else float(made.object.observed.float().mean())
+        ),
         scene_points=len(made.scene.points),
         body=person.report,
         provenance=made.provenance,
@@ -105,9 +128,22 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         depth_residual=None if depth is None else depth.typical,
         depth_residuals=[] if depth is None else _numbers(depth.residual, 4),
         depth_against="" if depth is None else depth.against,
+        **({} if made.object_made is None else _object_measures(made.object_made.confidence)),
         omega=angular_factor(made.cameras, pelvis, made.video.fps),
         big_omega=full_factor(made.cameras, moving),
     )
+
+
+def _object_measures(found: ObjectConfidence) -> dict[str, Any]:
+    return {
+        "object_way": found.way,
+        "object_reason": found.reason,
+        "object_agreement": _numbers(found.agreement, 3),
+        "object_outline_m": _numbers(found.outline, 4),
+        "object_held": found.held,
+        "object_rests": found.rests,
+        "hand_distance_m": _numbers(found.hand_distance, 4),
+    }
 
 
 def _numbers(values: Float[np.ndarray, " F"], digits: int) -> list[float | None]:

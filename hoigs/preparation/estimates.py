@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import (
@@ -13,23 +16,23 @@ from hoigs.core.interfaces.estimator import (
     EstimateKind,
     Estimates,
     Estimator,
+    FramePrompt,
     Landmarks,
     PromptPoint,
     VideoRequest,
     checked,
 )
 from hoigs.preparation.body.landmarks import LandmarkTrack
-from hoigs.preparation.body.person import RawLandmarks, chosen_landmarks
-from hoigs.preparation.masks.entity_masks import GivenMasks
+from hoigs.preparation.given import GivenMasks, RawLandmarks, chosen_landmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack
-from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.options import Place, PrepareOptions, PromptAt
 from hoigs.preparation.stages.work_folder import digest
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.resizing import resized_mask
 from hoigs.preparation.video.source import Source, SourceError
 
-Estimators = Mapping[EstimateKind, Estimator]
+Estimators = Mapping[Place, Estimator]
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,24 @@ class RawEstimates:
 
     landmarks: RawLandmarks
     masks: GivenMasks
+
+
+@dataclass(frozen=True)
+class FoundObject:
+    """The object's masks from an estimator of its own, of the chosen frames, distortion still in.
+
+    Attributes:
+        confidence: of each chosen frame, 0..1; None: not computed.
+        boxes: frame of the video and box x0, y0, x1, y1 in its pixels where the object was proposed
+            because no prompt said where it is.
+        notes: for the report.
+    """
+
+    masks: MaskStack
+    provenance: str
+    confidence: Float[np.ndarray, " F"] | None = None
+    boxes: list[tuple[float, ...]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -70,19 +91,44 @@ class EstimateReader:
             landmarks, self._masks((self.options.human, self.options.object), progress)
         )
 
-    def estimate(self, kind: EstimateKind, progress: Callable[[float], None]) -> Estimates:
-        """The result of the estimator of a kind.
+    def object_masks(self, progress: Callable[[float], None]) -> FoundObject:
+        """Masks of the object alone, from an estimator that has seen the person's.
+
+        Raises:
+            SourceError: it gave no masks of the object.
+        """
+        found = self.estimate("object", progress).masks
+        assert found is not None  # `checked` saw to it
+        name = self.options.object
+        if name not in found.entities:
+            raise SourceError(
+                f"estimators.object: {_name(self.estimators['object'])} gave masks of "
+                f"{_listed(found.entities)}, not of {name}"
+            )
+        confidence = found.confidence.get(name)
+        chosen = found.chosen.get(name, ())
+        return FoundObject(
+            self._stack(found.entities[name]),
+            found.provenance or _name(self.estimators["object"]),
+            None if confidence is None else np.asarray(confidence)[self.video.indices],
+            [(at.frame, *at.box) for at in chosen if at.box is not None],
+            list(found.notes),
+        )
+
+    def estimate(self, role: Place, progress: Callable[[float], None]) -> Estimates:
+        """The result of the estimator of a kind, or of that of the object's masks.
 
         Raises:
             SourceError: it does not give what it should.
         """
-        estimator = self.estimators[kind]
+        estimator = self.estimators[role]
+        kind: EstimateKind = "masks" if role == "object" else role
         if kind not in estimator.provides:
             raise SourceError(
-                f"estimators.{kind}: {type(estimator).__name__} provides "
+                f"estimators.{role}: {type(estimator).__name__} provides "
                 f"{_listed(estimator.provides)}, not {kind}"
             )
-        request = self.request(kind)
+        request = self.request(role)
         try:
             return checked(
                 estimator.estimate(request, lambda x, _: progress(x)), request, estimator
@@ -90,9 +136,9 @@ class EstimateReader:
         except HoigsError:
             raise
         except ValueError as error:
-            raise SourceError(f"estimators.{kind}: {error}") from error
+            raise SourceError(f"estimators.{role}: {error}") from error
 
-    def request(self, kind: EstimateKind) -> VideoRequest:
+    def request(self, kind: Place) -> VideoRequest:
         """The video as estimators see it: whole, at its own size."""
         video, options = self.video, self.options
         path = self.source.video
@@ -108,22 +154,35 @@ class EstimateReader:
             wanted=tuple(video.indices),
             video=path if path.is_file() else None,
             fps=video.list.rate,
+            known=self._known() if kind == "object" else None,
         )
+
+    def _known(self) -> Estimates:
+        """What was found of the person; estimators keep their results, so this is fast."""
+        masks = self.estimate("masks", lambda _done: None).masks
+        return Estimates(masks, self.estimate("landmarks", lambda _done: None).landmarks)
 
     @cached_property
     def _total(self) -> int:
         """Frames of the whole video, which are counted only where the survey stopped early."""
         return self.video.total if self.options.max_frames is None else self.video.count()
 
-    def _entities(self, kind: EstimateKind) -> tuple[EntityRequest, ...]:
+    def _entities(self, kind: Place) -> tuple[EntityRequest, ...]:
         options = self.options
-        entities = (
-            _request(options, options.human, "human"),
-            _request(options, options.object, "object"),
-        )
+        person = _request(options, options.human, "human")
+        thing = _request(options, options.object, "object")
+        if kind == "object":
+            return (thing,)
         if kind == "masks" and kind in self.source.beside:
-            return tuple(entity for entity in entities if entity.name in self.source.masked)
-        return entities
+            return tuple(e for e in (person, thing) if e.name in self.source.masked)
+        if not self.of_both:
+            return (person,)
+        return (person, thing)
+
+    @property
+    def of_both(self) -> bool:
+        """The estimator of masks gives those of the object, too."""
+        return self.options.find_object and "object" not in self.estimators
 
     def _landmarks(self, progress: Callable[[float], None]) -> RawLandmarks:
         tracks = self.estimate("landmarks", progress).landmarks
@@ -143,16 +202,15 @@ class EstimateReader:
             self._stack(found.entities[n]) if n in found.entities else None for n in names
         )
         together = None if found.together is None else self._stack(found.together)
-        ball = self.source.ball is not None
-        if not (together or (human and (object_mask or ball))):
+        if not (together or human):
             raise SourceError(
                 f"estimators.masks: {_name(self.estimators['masks'])} gave masks of "
-                f"{_listed(found.entities)}; needed are those of {names[0]} and {names[1]}, or one "
-                "of both together"
+                f"{_listed(found.entities)}; needed is that of {names[0]}, or one of {names[0]} "
+                f"and {names[1]} together"
             )
-        if human and object_mask:
+        if human and (object_mask or together is None):
             return GivenMasks(human=human, object=object_mask)
-        return GivenMasks(together=together) if together else GivenMasks(human=human)
+        return GivenMasks(together=together)
 
     def _stack(self, masks) -> MaskStack:
         size = (self.video.width, self.video.height)
@@ -178,8 +236,13 @@ def _request(options: PrepareOptions, name: str, kind) -> EntityRequest:
     prompt = options.prompts.get(name)
     if prompt is None:
         return EntityRequest(name, kind)
-    points = tuple(PromptPoint(x, y, bool(inside)) for x, y, inside in prompt.points)
-    return EntityRequest(name, kind, prompt.text, points, prompt.box, prompt.frame)
+    further = tuple(FramePrompt(at.frame, _points(at), at.box) for at in prompt.further)
+    points = _points(prompt)
+    return EntityRequest(name, kind, prompt.text, points, prompt.box, prompt.frame, further)
+
+
+def _points(prompt: PromptAt) -> tuple[PromptPoint, ...]:
+    return tuple(PromptPoint(x, y, bool(inside)) for x, y, inside in prompt.points)
 
 
 def _name(estimator: Estimator) -> str:

@@ -10,13 +10,16 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
 from hoigs.preparation.body.fit_problem import FitOptions
+from hoigs.preparation.objects.make_object import ObjectWay
 from hoigs.preparation.video.frames import Pick
 
+Place = EstimateKind | Literal["object"]  # "object": masks of the object alone
+Preset = Literal["auto", "offline", "hub", "files"]
 
-class Prompt(ComponentConfig):
-    """Where, or what, an entity is, for segmenters that need it."""
 
-    text: str | None = Field(default=None, description='what to look for: "a man", "football"')
+class PromptAt(ComponentConfig):
+    """Where an entity is in one frame."""
+
     points: list[tuple[float, float, bool]] = Field(
         default_factory=list, description="x, y in pixels of the video, and whether it is inside"
     )
@@ -28,13 +31,26 @@ class Prompt(ComponentConfig):
     )
 
 
+class Prompt(PromptAt):
+    """Where, or what, an entity is, for segmenters that need it."""
+
+    text: str | None = Field(default=None, description='what to look for: "a man", "football"')
+    further: list[PromptAt] = Field(default_factory=list, description="the same in other frames")
+
+    def places(self) -> list[PromptAt]:
+        """All frames in which it is shown."""
+        first = [self] if self.points or self.box else []
+        return [*first, *self.further]
+
+
 class PrepareOptions(ComponentConfig):
     """Settings of `prepare`; the defaults suit a phone's video of one person and one object."""
 
     width: int | None = Field(
         default=None,
         ge=16,
-        description="width of the stored frames, pixels; None keeps the video's",
+        description="width of the stored frames, pixels; None keeps the video's, but makes frames "
+        "whose longer side is over 1920 pixels smaller, to 1280",
     )
     every: int = Field(default=1, ge=1, description="take every n-th frame")
     fps: float | None = Field(
@@ -67,16 +83,31 @@ class PrepareOptions(ComponentConfig):
     )
     body: str = Field(default="body:anny", description="key of the body model, for the clip")
     fit_steps: int = Field(default=FitOptions.steps, ge=1, description="steps of the body fit")
-    estimators: dict[EstimateKind, ComponentSpec] = Field(
+    preset: Preset = Field(
+        default="auto",
+        description='what finds that which no file beside the video gives: "offline": MediaPipe '
+        'and a tracker of hoigs; "hub": networks of the Hugging Face hub; "files": nothing, the '
+        'files must be there; "auto": offline',
+    )
+    estimators: dict[Place, ComponentSpec] = Field(
         default_factory=dict,
         description="where masks, landmarks and depth come from, each an estimator with its "
-        "settings; by default from the files beside the video",
+        'settings, before files and preset; "object": masks of the object, where "masks" gives the '
+        "person's alone",
+    )
+    find_object: bool = Field(
+        default=True, description="look for an object; False: the clip has the person alone"
     )
     prompts: dict[str, Prompt] = Field(
         default_factory=dict, description="by entity, where or what it is"
     )
     human: str = Field(default="human", description="name of the person's entity")
     object: str = Field(default="object", description="name of the object's entity")
+    object_track: ObjectWay = Field(
+        default="auto",
+        description='how the object\'s poses are found: "auto": from hands, outlines and texture, '
+        'or, where that cannot be, by "outline": its place and roll only',
+    )
     ball_radius: float = Field(
         default=0.11, gt=0, description="radius of a tracked ball, metres; a football's is 0.11"
     )

@@ -13,23 +13,27 @@ import numpy as np
 import hoigs
 from hoigs.core.diagnostics import ranges
 from hoigs.core.errors import HoigsError
-from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST, BodyModel
-from hoigs.core.values.clip import BodyTrack, ObjectTrack
-from hoigs.preparation.body.person import FittedBody, fit_person
+from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.values.clip import BodyTrack
 from hoigs.preparation.body.silhouette import silhouette
 from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras
+from hoigs.preparation.entity_masks import EntityMasks, entity_masks
 from hoigs.preparation.estimates import (
     EstimateReader,
     Estimators,
+    FoundObject,
     UndistortedEstimates,
     identity,
     paths_of,
 )
-from hoigs.preparation.masks.entity_masks import EntityMasks, entity_masks
+from hoigs.preparation.given import GivenMasks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack, load_ball, refine_ball
-from hoigs.preparation.objects.make_object import make_object
+from hoigs.preparation.objects.make_object import MadeObject, make_object
 from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.person import FittedBody, fit_person
+from hoigs.preparation.prompts import check_prompts
+from hoigs.preparation.saved import from_result, to_result
 from hoigs.preparation.scene.depth import (
     POOR,
     DepthFit,
@@ -41,13 +45,14 @@ from hoigs.preparation.scene.depth import (
 from hoigs.preparation.scene.scene_points import ScenePoints, colmap_scene, static_scene
 from hoigs.preparation.stages.plan import PLAN
 from hoigs.preparation.stages.progress import Stages
-from hoigs.preparation.stages.saved import from_result, to_result
 from hoigs.preparation.stages.work_folder import Result, WorkFolder, digest, fingerprint
-from hoigs.preparation.video.blank import blank_pixels
+from hoigs.preparation.video.blank import blank_pixels, require_pictures
 from hoigs.preparation.video.frames import FrameList, open_frames
+from hoigs.preparation.video.header import uneven_times
 from hoigs.preparation.video.source import Source
 
-FORMAT = 4  # of what the stages keep; another number makes older results unread
+FORMAT = 5  # of what the stages keep; another number makes older results unread
+LARGEST, REDUCED = 1920, 1280  # longer sides, pixels: of frames that are kept, and of smaller ones
 T = TypeVar("T")
 
 
@@ -143,10 +148,27 @@ class Pipeline:
                 path, options.width, options.every, options.max_frames, fps=options.fps,
                 pick=options.pick, rate=options.folder_fps,
             )  # fmt: skip
+            require_pictures(frames)
+            if path.is_file():
+                self.warnings += uneven_times(path, frames.fps)
             return frames.list
 
         found = self._stage("frames", make, fingerprint([path]))
-        self.video = open_frames(path, options.width, known=found)
+        check_prompts(options, found)
+        width = options.width or self._smaller_width(found)
+        self.video = open_frames(path, width, known=found)
+
+    def _smaller_width(self, found: FrameList) -> int | None:
+        """Of frames that are larger than what can be seen of them in a clip."""
+        longest = max(found.native_width, found.native_height)
+        if longest <= LARGEST:
+            return None
+        width = round(found.native_width * REDUCED / longest)
+        self.warnings.append(
+            f"frames of {found.native_width}x{found.native_height} are stored at a width of {width}"
+            " (--width keeps more)"
+        )
+        return width
 
     def _evidence(self) -> None:
         # all estimates before the slow stages, so that errors in them are reported at once
@@ -155,7 +177,7 @@ class Pipeline:
         )
         self._without_unusable_depth()
         beside = self.source.beside
-        used = {kind: estimator for kind, estimator in self.estimators.items() if kind != "depth"}
+        used = {k: e for k, e in self.estimators.items() if k in ("landmarks", "masks")}
         paths = [
             path for estimator in used.values() for path in paths_of(estimator, self.source.folder)
         ]
@@ -163,11 +185,34 @@ class Pipeline:
             fingerprint(paths),
             {kind: identity(estimator) for kind, estimator in used.items()},
             self.source.masked,
+            self.reader.of_both,
+            self._prompts(*((self.options.object,) if self.reader.of_both else ())),
         ]
         self.worth_keeping |= any(kind not in beside for kind in used)
         self.raw = self._stage(
             "evidence", lambda: self.reader.landmarks_and_masks(self.stages.advance), made_from
         )
+
+    def _prompts(self, *names: str) -> dict[str, Any]:
+        """The prompts of the person and of `names`, as JSON."""
+        prompts = self.options.prompts
+        wanted = (self.options.human, *names)
+        return {n: prompts[n].model_dump(mode="json") for n in wanted if n in prompts}
+
+    def _object_masks(self) -> None:
+        estimator = self.estimators.get("object")
+        made_from = None
+        if estimator is not None:
+            files = fingerprint(paths_of(estimator, self.source.folder))
+            made_from = [identity(estimator), files, self._prompts(self.options.object)]
+        self.found_object = self._stage("object_masks", self._find_object, made_from)
+
+    def _find_object(self) -> FoundObject | None:
+        if "object" not in self.estimators:
+            return None
+        found = self.reader.object_masks(self.stages.advance)
+        self.warnings += found.notes
+        return found
 
     def _without_unusable_depth(self) -> None:
         """Leaves out depth maps beside the video that were not requested and cannot be used."""
@@ -185,8 +230,8 @@ class Pipeline:
             }
 
     def _cameras(self) -> None:
-        model = self.source.colmap
-        files = None if model is None else [str(model), fingerprint([model])]
+        known = [p for p in (self.source.colmap, self.source.cameras) if p is not None]
+        files = [[str(path), fingerprint([path])] for path in known]
         folder = self.work.unfinished("cameras", self._key("cameras", files))
         chosen = self._stage(
             "cameras", lambda: self._choose_cameras(folder), files, save_cameras, load_cameras
@@ -200,7 +245,7 @@ class Pipeline:
     def _choose_cameras(self, folder: Path) -> ChosenCameras:
         chosen = choose_cameras(
             self.video, self.raw.landmarks, self.raw.masks, self.source.colmap, self.options,
-            folder, self.stages.advance,
+            folder, self.stages.advance, self.source.cameras,
         )  # fmt: skip
         self.provenance["cameras"] = chosen.track.provenance
         self.warnings.extend(chosen.warnings)
@@ -209,8 +254,9 @@ class Pipeline:
     def _inputs(self) -> None:
         def make() -> UndistortedEstimates:
             landmarks, masks = self.raw.landmarks, self.raw.masks
+            placed = self.track.undistort, self.track.positions
             return UndistortedEstimates(
-                landmarks.undistorted(self.track), masks.undistorted(self.track), self._ball()
+                landmarks.undistorted(*placed), masks.undistorted(*placed), self._ball()
             )
 
         ball = self.source.ball
@@ -218,7 +264,7 @@ class Pipeline:
         self.estimates = self._stage("inputs", make, files)
 
     def _ball(self) -> BallTrack | None:
-        if self.source.ball is None:
+        if self.source.ball is None or not self.options.find_object:
             return None
         rough = load_ball(self.source.ball, self.video, self.track.undistort)
         return refine_ball(rough, self.images())
@@ -242,13 +288,25 @@ class Pipeline:
     def _masks(self) -> None:
         def make() -> EntityMasks:
             human, object_masks, text = entity_masks(
-                self.estimates.masks, self.estimates.ball, self.images, self._silhouettes,
+                self._given_masks(), self.estimates.ball, self.images, self._silhouettes,
                 self.person.found,
             )  # fmt: skip
-            self.provenance["masks"] = text
+            found = self.found_object
+            self.provenance["masks"] = text if found is None else f"{text}: {found.provenance}"
             return EntityMasks(human, object_masks, self._blank(human, object_masks))
 
         self.masks = self._stage("masks", make)
+
+    def _given_masks(self) -> GivenMasks:
+        """The source's masks with those that were found of the object alone, undistorted."""
+        given, found = self.estimates.masks, self.found_object
+        if not self.options.find_object:
+            return GivenMasks(human=given.persons(None))
+        if found is None:
+            return given
+        undistort = self.track.undistort
+        masks = MaskStack(undistort.mask(found.masks[i]) for i in self.track.positions)
+        return replace(given, object=masks)
 
     def _blank(self, humans: MaskStack, objects: MaskStack) -> MaskStack:
         rows = zip(self.images(), humans, objects, strict=True)
@@ -269,24 +327,34 @@ class Pipeline:
         return MaskStack(silhouette(v, self.body.faces, c) for (v, _), c in pairs)
 
     def _object(self) -> None:
-        self.object, self.spread = self._stage("object", self._place_object)
+        self.object_made = self._stage("object", self._place_object)
+        self.object = None if self.object_made is None else self.object_made.track
 
-    def _place_object(self) -> tuple[ObjectTrack, float]:
-        wrists = self.person.joints[:, [LEFT_WRIST, RIGHT_WRIST]]
-        track, spread = make_object(
-            self.estimates.ball, self.masks.object, self.cameras, wrists, self.images,
-            radius=self.options.ball_radius, count=self.options.object_points,
+    def _place_object(self) -> MadeObject | None:
+        if self.estimates.ball is None and not self.masks.object.coverage().any():
+            self.provenance["object"] = "none: the clip shows the person alone"
+            if self.options.find_object:
+                self.warnings.append(
+                    "no object was found, so the clip has none; point at it with --object X,Y, or "
+                    "say that there is none with --object none"
+                )
+            return None
+        options = self.options
+        made = make_object(
+            self.estimates.ball, self.masks.object, self.masks.human, self.cameras,
+            self.person.joints, self.images, way=options.object_track, radius=options.ball_radius,
+            count=options.object_points, fps=self.video.fps, progress=self.stages.advance,
         )  # fmt: skip
-        self.provenance["object"] = track.provenance
-        lost = (~track.observed).nonzero().flatten().tolist()
+        self.provenance["object"] = made.track.provenance
+        lost = (~made.track.observed).nonzero().flatten().tolist()
         if lost:
             self.warnings.append(f"the object is not seen in {len(lost)} frames: {ranges(lost)}")
-        if self.estimates.ball is None:
+        if made.confidence.way == "outline":
             self.warnings.append(
-                "of the object's rotation only the roll is known, and its shape is a cushion "
-                "inflated from one outline: training has to find both"
+                "the object's rotation is not tracked but for its roll, and its shape is a cushion "
+                f"inflated from one outline: {made.confidence.reason}. Training has to find both"
             )
-        return track, spread
+        return made
 
     def _depth(self) -> None:
         estimator, self.depth_maps = self.estimators.get("depth"), None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import builtins
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -13,12 +14,15 @@ from hoigs.core.clip_folder.write import refuse_to_overwrite
 from hoigs.core.errors import ClipError, HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.context import BuildContext
-from hoigs.core.progress import Progress
+from hoigs.core.progress import Progress, no_progress
 from hoigs.core.registry.registry import default_registry
 from hoigs.preparation.clip_writing import write_clip_folder
 from hoigs.preparation.estimates import Estimators
-from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.estimator_plan import EstimatorPlan, plan_estimators
+from hoigs.preparation.options import PrepareOptions, Preset
 from hoigs.preparation.pipeline import Pipeline
+from hoigs.preparation.prompts import with_prompts
+from hoigs.preparation.readiness import Consent, agree, get_ready
 from hoigs.preparation.report.report import PrepareReport
 from hoigs.preparation.settings import installed_estimators, load_options, refuse_commands
 from hoigs.preparation.stages.cleanup import Cleanup
@@ -48,12 +52,16 @@ def prepare(
     focal: float | None = None,
     keep_black: bool | None = None,
     overwrite: bool | None = None,
+    object: str | Sequence[str] = (),
     overrides: Sequence[str] = (),
     options: PrepareOptions | Path | str | None = None,
     allow_commands: bool = False,
     redo: Sequence[str] = (),
     body: BodyModel | None = None,
-    estimators: Estimators | None = None,
+    estimators: Estimators | Preset | None = None,
+    yes: bool = False,
+    consent: Consent | None = None,
+    announce: Callable[[EstimatorPlan], builtins.object] | None = None,
     progress: Progress | None = None,
 ) -> PrepareReport:
     """Turn a source into a clip folder, stage by stage.
@@ -69,13 +77,19 @@ def prepare(
             appears when it is whole.
         width, camera, max_frames, every, fps, focal, keep_black, overwrite: fields of
             `PrepareOptions`, laid over `options`; None leaves a field as it is.
+        object: where the object is, in place of its prompt in `options`: "640,402@0", or several
+            such (`prompts.parse_prompts`); "none": there is none.
         overrides: any field likewise: "estimators.masks.use=estimator:masks-files".
         options: ready-made, or a YAML or TOML file.
         body: the model to fit, whose key is `options.body`; by default it is made from that key.
         progress: called with the done fraction, 0 to 1, and the stage's name.
         redo: stages to run anew, with all that build on them; an older clip is then replaced.
-        estimators: by kind of estimate, "masks", "landmarks" or "depth"; those of
+        estimators: by kind of estimate, "masks", "landmarks", "object" or "depth"; those of
             `options.estimators`, which are looked up among the installed plugins, come second.
+            Or a preset, in place of `options.preset`.
+        yes: install and download what is needed. consent: called with a question before that,
+            where `yes` does not answer it; None: nothing is downloaded.
+        announce: called with the plan before work begins.
         allow_commands: let `options.estimators` run the programs that they name.
 
     Raises:
@@ -88,10 +102,11 @@ def prepare(
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
         "focal": focal, "keep_black": keep_black, "overwrite": overwrite,
     }  # fmt: skip
-    options = load_options(options, overrides, flags)
+    options = with_prompts(load_options(options, overrides, flags), object, estimators)
     replace = options.overwrite or bool(redo)
     _, report = _run(
-        source, out, body, options, progress, redo, estimators, None, replace, allow_commands
+        source, out, body, options, progress, redo, estimators, None, replace, allow_commands,
+        agree if yes else consent, announce,
     )  # fmt: skip
     assert report is not None  # the last stage makes it
     return report
@@ -102,11 +117,15 @@ def prepare_until(
     source: str | Path,
     out: str | Path,
     *,
+    object: str | Sequence[str] = (),
     options: PrepareOptions | Path | str | None = None,
     allow_commands: bool = False,
     redo: Sequence[str] = (),
     body: BodyModel | None = None,
-    estimators: Estimators | None = None,
+    estimators: Estimators | Preset | None = None,
+    yes: bool = False,
+    consent: Consent | None = None,
+    announce: Callable[[EstimatorPlan], builtins.object] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, float]:
     """As `prepare`, but only up to and including `stage`; no clip is written.
@@ -120,10 +139,11 @@ def prepare_until(
     check_stage(stage)
     if stage == list(PLAN)[-1]:
         raise HoigsError(f"{stage} is the last stage: run prepare as a whole")
-    options = load_options(options)
+    options = with_prompts(load_options(options), object, estimators)
     pipeline, _ = _run(
-        source, out, body, options, progress, redo, estimators, stage, True, allow_commands
-    )
+        source, out, body, options, progress, redo, estimators, stage, True, allow_commands,
+        agree if yes else consent, announce,
+    )  # fmt: skip
     return pipeline.stages.seconds
 
 
@@ -134,10 +154,12 @@ def _run(
     options: PrepareOptions,
     progress: Progress | None,
     redo: Sequence[str],
-    estimators: Estimators | None,
+    estimators: Estimators | Preset | None,
     until: str | None,
     replace: bool,
     allow_commands: bool,
+    consent: Consent | None,
+    announce: Callable[[EstimatorPlan], object] | None,
 ) -> tuple[Pipeline, PrepareReport | None]:
     source, out = Path(source), Path(out)
     for name in redo:
@@ -146,12 +168,20 @@ def _run(
     named = installed_estimators(options)
     if not allow_commands:
         refuse_commands(named)  # `estimators` are the caller's own code
-    chosen = {**named, **(estimators or {})}
+    own = {} if isinstance(estimators, str) else (estimators or {})
+    chosen = {**named, **own}
     found = find_source(
         source, human=options.human, object_name=options.object, given=set(chosen),
-        own_cameras=options.camera in ("static", "sfm"),
+        own_cameras=options.camera in ("static", "sfm"), complete=options.preset == "files",
     )  # fmt: skip
-    chosen = {**installed_estimators(PrepareOptions(estimators=found.beside)), **chosen}
+    plan = plan_estimators(found, options, set(chosen))
+    specs = plan.specs()
+    for kind, spec in found.beside.items():
+        specs[kind] = spec
+    chosen = {**installed_estimators(PrepareOptions(estimators=specs)), **chosen}
+    if announce is not None:
+        announce(plan)
+    get_ready(plan, chosen, consent, progress or no_progress)
     body = body or _body(options.body)
     stages = Stages({name: stage.weight for name, stage in PLAN.items()}, progress)
     with WorkFolder(work_folder(out)) as work:

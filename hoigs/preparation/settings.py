@@ -15,7 +15,7 @@ from hoigs.core.interfaces.estimator import EstimateKind, Estimator
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.errors import explain
 from hoigs.core.spec.loader import Document, load_overrides, read_document
-from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.options import Place, PrepareOptions
 
 
 def load_options(
@@ -53,7 +53,7 @@ def load_options(
 
 def installed_estimators(
     options: PrepareOptions, document: Document | None = None, registry: Registry | None = None
-) -> dict[EstimateKind, Estimator]:
+) -> dict[Place, Estimator]:
     """The estimators that `options.estimators` names, built from their plugins.
 
     Args:
@@ -64,11 +64,12 @@ def installed_estimators(
     """
     registry = registry or default_registry()
     document = document or Document("options", options.model_dump(mode="json"))
-    estimators: dict[EstimateKind, Estimator] = {}
+    estimators: dict[Place, Estimator] = {}
     problems: list[str] = []
-    for kind, spec in options.estimators.items():
-        place = ("estimators", kind)
-        at = f"{document.where((*place, 'use'))} estimators.{kind}.use"
+    for role, spec in options.estimators.items():
+        kind: EstimateKind = "masks" if role == "object" else role
+        place = ("estimators", role)
+        at = f"{document.where((*place, 'use'))} estimators.{role}.use"
         try:
             component, config_class = registry.get(spec.use), registry.config_class(spec.use)
         except PluginError as error:
@@ -85,13 +86,13 @@ def installed_estimators(
         except ValidationError as error:
             problems += explain(error, config_class, document, place)
             continue
-        estimators[kind] = component.from_config(config, BuildContext())
+        estimators[role] = component.from_config(config, BuildContext())
     if problems:
         raise SpecError("\n".join(problems))
     return estimators
 
 
-def refuse_commands(estimators: Mapping[EstimateKind, Estimator]) -> None:
+def refuse_commands(estimators: Mapping[Place, Estimator]) -> None:
     """SpecError, showing the command lines, if estimators would run programs."""
     lines = [
         f"  estimators.{kind}: {c}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,15 @@ from torch import nn
 from hoigs.compression.compact import COMPOSED, read_compact
 from hoigs.compression.compact import FORMAT as COMPACT
 from hoigs.core.errors import CheckpointError
+from hoigs.core.json_file import read_json, short, validated
 from hoigs.core.model.scene import SceneModel
+from hoigs.core.whole_files import write_whole, written_whole
+from hoigs.runs.records import CheckpointRecord, CompactRecord
 
 FORMAT = "hoigs-checkpoint"
 VERSION = 2
+MOST_GAUSSIANS = 10**8  # of an entity whose means are not stored, since spec and clip give them
+ADVICE = "train again, or restore it from a copy"
 READABLE = (1, VERSION)  # spec keys of version 1 had other names, so its model hashes differ
 
 
@@ -42,23 +48,31 @@ class Checkpoint:
         return {k.removeprefix(start): v for k, v in self.tensors.items() if k.startswith(start)}
 
     def save(self, folder: Path) -> Path:
-        """Write `step_000123.safetensors`, then `.json`, which marks the checkpoint complete."""
+        """Write `step_000123.safetensors`, then `.json`, which marks the checkpoint complete.
+
+        Raises:
+            CheckpointError, OSError: the disk is full or cannot be written; nothing is left there.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         stem = f"step_{self.meta['step']:06d}"
         weights, meta = folder / f"{stem}.safetensors", folder / f"{stem}.json"
         tensors = {k: v.detach().cpu().contiguous() for k, v in self.tensors.items()}
-        temporary = weights.with_suffix(".safetensors.part")
-        save_file(tensors, temporary)
-        temporary.replace(weights)
-        temporary = meta.with_suffix(".json.part")
-        temporary.write_text(json.dumps(self.meta, indent=1))
-        temporary.replace(meta)
+        try:
+            with written_whole(weights, weights.with_suffix(".safetensors.part")) as part:
+                save_file(tensors, part)
+        except SafetensorError as error:
+            raise CheckpointError(f"{weights} cannot be written: {error}") from error
+        write_whole(meta, json.dumps(self.meta, indent=1), meta.with_suffix(".json.part"))
         return weights
 
 
 def _complete(folder: Path) -> list[Path]:
     return sorted(
-        (p for p in folder.glob("step_*.json") if p.with_suffix(".safetensors").exists()),
+        (
+            p
+            for p in folder.glob("step_*.json")
+            if p.stem.removeprefix("step_").isdecimal() and p.with_suffix(".safetensors").exists()
+        ),
         key=lambda p: int(p.stem.removeprefix("step_")),  # beyond 999999 names grow
     )
 
@@ -83,34 +97,89 @@ def latest_checkpoint(folder: Path) -> Path:
     return found[-1]
 
 
+def load_newest(folder: Path) -> Checkpoint:
+    """The newest complete checkpoint in a run's `checkpoints/` folder.
+
+    Raises:
+        CheckpointError: there is none, or it is damaged; the message then names the newest one that
+            is whole, if any, and how to go back to it.
+    """
+    newest = latest_checkpoint(folder)
+    try:
+        return load_checkpoint(newest)
+    except CheckpointError as error:
+        broken = [newest.stem]
+        for older in reversed(_complete(folder)[:-1]):
+            try:
+                whole = load_checkpoint(older)
+            except CheckpointError:
+                broken.append(older.stem)
+                continue
+            files = ", ".join(f"{folder / stem}.json" for stem in broken)
+            raise CheckpointError(
+                f"{error}\nThe checkpoint of step {whole.meta['step']} is whole: to use it, "
+                f"remove {files} and give the same command again"
+            ) from error
+        raise
+
+
 def load_checkpoint(meta_path: Path) -> Checkpoint:
     """Read one checkpoint; `meta_path` is its JSON file.
 
     Raises:
-        CheckpointError: a file is damaged or absent, or of another format.
+        CheckpointError: a file is damaged or absent, or of another format, or holds values that
+            are not finite.
     """
-    try:
-        meta = json.loads(meta_path.read_text())
-    except (OSError, json.JSONDecodeError) as error:
-        raise CheckpointError(f"{meta_path}: cannot be read as JSON: {error}") from error
+    meta = read_json(meta_path, error=CheckpointError, advice=ADVICE)
+    if not isinstance(meta, dict):
+        raise CheckpointError(f"{meta_path}: damaged: expected an object, got {short(meta)}")
     compact = meta.get("format") == COMPACT
     if not compact and (meta.get("format") != FORMAT or meta.get("version") not in READABLE):
         raise CheckpointError(
-            f"{meta_path}: format {meta.get('format')!r} version {meta.get('version')!r}, "
-            f"expected {FORMAT!r} version {' or '.join(map(str, READABLE))}"
+            f"{meta_path}: format {short(meta.get('format'))} version "
+            f"{short(meta.get('version'))}, expected {FORMAT!r} version "
+            f"{' or '.join(map(str, READABLE))}"
         )
+    record = CompactRecord if compact else CheckpointRecord
+    validated(meta, record, meta_path, error=CheckpointError, advice=ADVICE)
+    weights = meta_path.with_suffix(".safetensors")
     try:
-        tensors = load_file(meta_path.with_suffix(".safetensors"))
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(
-            f"{meta_path.with_suffix('.safetensors')}: damaged or absent: {error}"
-        ) from error
+        tensors = load_file(weights)
+    except (OSError, SafetensorError, ValueError, KeyError) as error:
+        raise CheckpointError(f"{weights}: damaged or absent: {error}; {ADVICE}") from error
     if compact:
         try:
             tensors = read_compact(tensors, meta)
         except CheckpointError as error:
-            raise CheckpointError(f"{meta_path.with_suffix('.safetensors')}: {error}") from error
+            raise CheckpointError(f"{weights}: {error}; {ADVICE}") from error
+    _check_values(weights, tensors)
+    _check_counts(meta_path, meta["counts"], tensors)
     return Checkpoint(tensors, meta)
+
+
+def _check_values(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
+    """CheckpointError if a number is NaN or infinite: it would be drawn, and scored, in silence."""
+    for name, values in tensors.items():
+        if not values.is_floating_point() or name.startswith("density."):
+            continue
+        count = int((~torch.isfinite(values)).sum())
+        if count:
+            raise CheckpointError(
+                f"{path}: damaged: {name} has {count} of {values.numel()} values that are NaN or "
+                f"infinite; {ADVICE}"
+            )
+
+
+def _check_counts(path: Path, counts: dict[str, int], tensors: dict[str, torch.Tensor]) -> None:
+    """CheckpointError unless as many Gaussians are stored as the record says."""
+    for name, count in counts.items():
+        means = tensors.get(f"model.entities.{name}.means")
+        stored = MOST_GAUSSIANS if means is None or means.dim() == 0 else len(means)
+        if count > stored or (means is not None and count != stored):
+            raise CheckpointError(
+                f"{path}: damaged: {count} Gaussians of {name!r}, but "
+                f"{stored if means is not None else 'at most ' + str(stored)} are stored; {ADVICE}"
+            )
 
 
 def restore_model(model: SceneModel, checkpoint: Checkpoint, model_hash: str) -> None:
@@ -133,8 +202,11 @@ def restore_model(model: SceneModel, checkpoint: Checkpoint, model_hash: str) ->
             f"checkpoint holds the entities {sorted(counts)}, the model has "
             f"{sorted(model.entities)}; it belongs to another clip"
         )
-    for name, count in counts.items():
-        model.entity(name).resize(count)
+    try:
+        for name, count in counts.items():
+            model.entity(name).resize(count)
+    except (RuntimeError, IndexError, ValueError) as error:
+        raise CheckpointError(f"checkpoint does not fit the model: {error}") from error
     composed = model.state_dict()
     known = {name: composed[name] for name in checkpoint.meta.get(COMPOSED, ()) if name in composed}
     try:

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from hoigs.core.errors import HoigsError
+from hoigs.core.errors import CheckpointError, HoigsError
 from hoigs.core.model.camera_refinement import CameraRefinement
 from hoigs.core.model.compose import compose
 from hoigs.core.model.scene import SceneModel
@@ -17,8 +17,7 @@ from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
 from hoigs.runs.checkpoint import (
-    latest_checkpoint,
-    load_checkpoint,
+    load_newest,
     restore_cameras,
     restore_model,
 )
@@ -78,9 +77,11 @@ class LoadedRun:
         recorded = provenance["clip"].get("reader") if clip is None else None
         choice = recorded_reader(recorded, path, folder, registry) if recorded else None
         source = read_clip(folder, registry, spec.train.width, allow_faults=allowed, reader=choice)
-        model = compose(spec, source, registry).to(device)
-        checkpoint = load_checkpoint(latest_checkpoint(run.checkpoints))
+        checkpoint = load_newest(run.checkpoints)
+        model = compose(spec, source, registry)
         restore_model(model, checkpoint, spec.model_hash())
+        _try(model, source, run.checkpoints)
+        model.to(device)
         if checkpoint.part("cameras"):
             refinement = CameraRefinement.of(source)
             restore_cameras(refinement, checkpoint)
@@ -88,6 +89,25 @@ class LoadedRun:
         model.eval()
         model.set_progress(min(1.0, checkpoint.meta["step"] / spec.train.steps))
         return cls(spec, source, model, checkpoint.meta["step"], provenance)
+
+
+@torch.no_grad()
+def _try(model: SceneModel, clip: Clip, checkpoints: Path) -> None:
+    """Compute one moment of a restored model: its stored indices may point anywhere.
+
+    Raises:
+        CheckpointError: that fails.
+    """
+    integers = any(not v.is_floating_point() and v.numel() for v in model.state_dict().values())
+    if not integers:
+        return
+    try:
+        model(clip.moments[0])
+    except (IndexError, RuntimeError, ValueError) as error:
+        raise CheckpointError(
+            f"{checkpoints}: the newest checkpoint is damaged: its model cannot be computed "
+            f"({str(error).splitlines()[0]})"
+        ) from error
 
 
 def open_run(

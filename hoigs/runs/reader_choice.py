@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from hoigs.core.config import ComponentConfig
-from hoigs.core.errors import ClipError, did_you_mean
+from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.registry.registry import Registry
-from hoigs.core.spec.loader import load_yaml
+from hoigs.runs.given_settings import parse_settings, validated
 
 KIND = "reader"
 
@@ -62,8 +60,11 @@ def choose_reader(
     reader = registry.get(key)  # raises for an unknown name
     if not issubclass(reader, ClipReader):
         raise ClipError(f"--reader {name}: {key} is no reader; readers: {_known(registry)}")
-    values = dict(settings) if isinstance(settings, Mapping) else _parsed(settings)
-    config = _validated(registry.config_class(key), values, key)
+    if isinstance(settings, Mapping):
+        values = dict(settings)
+    else:
+        values = parse_settings(settings, "--reader-set", ClipError)
+    config = validated(registry.config_class(key), values, key, ClipError)
     return ReaderChoice(key, reader.from_config(config, BuildContext()), config)
 
 
@@ -72,7 +73,7 @@ def recorded_reader(
 ) -> ReaderChoice:
     """The reader that a run was trained with, from `ReaderChoice.record`."""
     key, settings = record["use"], dict(record["settings"])
-    config = _validated(registry.config_class(key), settings, key)
+    config = validated(registry.config_class(key), settings, key, ClipError)
     for name in config.model_fields_set:
         value = getattr(config, name)
         if isinstance(value, Path):
@@ -102,28 +103,3 @@ def _detected(folder: Path, registry: Registry) -> str:
 
 def _known(registry: Registry) -> str:
     return ", ".join(k.partition(":")[2] for k in registry.keys(KIND))
-
-
-def _parsed(settings: Sequence[str]) -> dict[str, Any]:
-    values = {}
-    for text in settings:
-        key, equals, value = text.partition("=")
-        if not equals or not key:
-            raise ClipError(f"--reader-set {text}: expected key=value")
-        document = load_yaml(f"value: {value}", f"--reader-set {text}")
-        values[key] = document.data["value"]
-    return values
-
-
-def _validated(kind: type[Any], values: dict[str, Any], key: str) -> ComponentConfig:
-    try:
-        return kind.model_validate(values)
-    except ValidationError as error:
-        lines = []
-        for problem in error.errors():
-            place = ".".join(map(str, problem["loc"]))
-            near = did_you_mean(place, kind.model_fields)
-            known = f" (known: {', '.join(kind.model_fields)})"
-            extra = problem["type"] == "extra_forbidden"
-            lines.append(f"{key}: {place}: {problem['msg']}{near + known if extra else ''}")
-        raise ClipError("\n".join(lines)) from error

@@ -15,7 +15,17 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.safe_replace import Layout, one_of, put_in_place, require_replaceable
+from hoigs.core.folder_lock import FolderLock
+from hoigs.core.json_file import read_json, validated
+from hoigs.core.safe_replace import (
+    Layout,
+    one_of,
+    put_in_place,
+    refuse_unwritable,
+    require_replaceable,
+)
+from hoigs.core.whole_files import write_whole
+from hoigs.runs.records import MetricsRecord, Provenance, StepRecord
 
 PACKAGES = ("hoigs", "torch", "warp-lang", "kornia", "pluggy", "numpy")
 
@@ -34,7 +44,8 @@ RUN = Layout(
         rf"\.{_WRITTEN_WHOLE}\.part",
         r"metrics\.(jsonl|part)",
         r"checkpoints/step_\d+\.((safetensors|json)(\.part)?|\d+\.part)",
-        r"renders/((playback|orbit)\.mp4|\.(playback|orbit)\.mp4\.part)",
+        r"renders/[\w-]+\.(mp4|webm|mov|gif)",
+        r"renders/\.[\w-]+\.(mp4|webm|mov|gif)\.part",
     ),
     folders=one_of("checkpoints", "renders"),
 )
@@ -49,6 +60,25 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._lock: FolderLock | None = None
+
+    def lock(self, work: str) -> None:
+        """Keep other processes from writing this run, until `unlock` or the end of this process.
+
+        Raises:
+            HoigsError: another process writes it.
+        """
+        self._lock = FolderLock(self.path, work).acquire()
+
+    def unlock(self) -> None:
+        if self._lock is not None:
+            self._lock.release()
+        self._lock = None
+
+    def require_lock(self) -> None:
+        """Raise HoigsError if another process took over the lock that this one had."""
+        if self._lock is not None:
+            self._lock.require_held()
 
     @property
     def spec(self) -> Path:
@@ -82,6 +112,7 @@ class RunFolder:
             overwrite: allow an older run here, if it is complete and has no foreign files.
             inputs: sources of the new run, which must not be inside the old one.
         """
+        refuse_unwritable(self.path)
         if not overwrite and self.path.is_dir() and any(self.path.iterdir()):
             raise HoigsError(
                 f"{self.path}: already exists; choose another --out, go on with --resume, or "
@@ -94,7 +125,8 @@ class RunFolder:
     ) -> None:
         """Rename a finished run to this one; arguments as for `refuse_existing`."""
         self.refuse_existing(overwrite, inputs)
-        put_in_place(new.path, self.path)
+        with FolderLock(self.path, "replacing it"):
+            put_in_place(new.path, self.path)
 
     def create(
         self,
@@ -115,19 +147,21 @@ class RunFolder:
                 shutil.rmtree(stale)
         temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
         shutil.rmtree(temporary, ignore_errors=True)
-        (temporary / "checkpoints").mkdir(parents=True)
-        (temporary / "spec.yaml").write_text(spec_text)
-        (temporary / "provenance.json").write_text(json.dumps(provenance, indent=1))
-        (temporary / "metrics.jsonl").touch()
-        put_in_place(temporary, self.path)
+        try:
+            (temporary / "checkpoints").mkdir(parents=True)
+            (temporary / "spec.yaml").write_text(spec_text)
+            (temporary / "provenance.json").write_text(json.dumps(provenance, indent=1))
+            (temporary / "metrics.jsonl").touch()
+            put_in_place(temporary, self.path)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
 
     def update(self, spec_text: str, changed: dict[str, Any]) -> None:
         """Replace the spec of a resumed run, and the `changed` keys of its provenance."""
         record = self.read_provenance() | changed
         for path, text in ((self.spec, spec_text), (self.provenance, json.dumps(record, indent=1))):
-            temporary = path.with_name(f".{path.name}.part")
-            temporary.write_text(text)
-            temporary.replace(path)
+            write_whole(path, text)
 
     def log(self, record: dict[str, Any]) -> None:
         """Append a line to metrics.jsonl."""
@@ -136,14 +170,45 @@ class RunFolder:
 
     def cut_metrics(self, step: int) -> None:
         """Drop records after `step`, which a resumed run writes again, and an unfinished line."""
-        whole = self.metrics.read_text().rpartition("\n")[0]
-        kept = [line for line in whole.splitlines() if json.loads(line)["step"] <= step]
-        temporary = self.metrics.with_suffix(".part")
-        temporary.write_text("".join(line + "\n" for line in kept))
-        temporary.replace(self.metrics)
+        kept = [
+            json.dumps(record) for record in self.read_metrics(StepRecord) if record["step"] <= step
+        ]
+        text = "".join(line + "\n" for line in kept)
+        write_whole(self.metrics, text, self.metrics.with_suffix(".part"))
 
     def read_provenance(self) -> dict[str, Any]:
-        return json.loads(self.provenance.read_text())
+        """provenance.json, checked.
+
+        Raises:
+            HoigsError: it is damaged.
+        """
+        advice = "restore it from a copy, or train again"
+        content = read_json(self.provenance, error=HoigsError, advice=advice)
+        validated(content, Provenance, self.provenance, error=HoigsError, advice=advice)
+        return dict(content)
+
+    def read_metrics(self, record: type[StepRecord] = MetricsRecord) -> list[dict[str, Any]]:
+        """The records of metrics.jsonl; none if the file is absent. An unfinished line is left out.
+
+        Raises:
+            HoigsError: a line is damaged; the message has its number.
+        """
+        try:
+            whole = self.metrics.read_text(encoding="utf-8").rpartition("\n")[0]
+        except FileNotFoundError:
+            return []
+        except ValueError as error:
+            raise HoigsError(f"{self.metrics}: damaged, not text in UTF-8; delete it") from error
+        records = []
+        for number, line in enumerate(whole.splitlines(), 1):
+            place, advice = f"{self.metrics}:{number}", "delete the line"
+            try:
+                content = json.loads(line)
+            except (ValueError, RecursionError) as error:
+                raise HoigsError(f"{place}: damaged, not JSON ({error}); {advice}") from error
+            validated(content, record, place, error=HoigsError, advice=advice)
+            records.append(content)
+        return records
 
     def relative(self, path: Path) -> str:
         """`path` relative to the run folder, so that both can move together."""

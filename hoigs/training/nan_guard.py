@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 
 import torch
 from torch import Tensor, nn
 
 from hoigs.core.errors import NotFiniteError
+from hoigs.core.model.blame import name_of
+from hoigs.core.model.scene import SceneModel, SceneState
 from hoigs.core.values.gaussians import Gaussians
 
 
@@ -37,6 +39,38 @@ def first_not_finite(
     return None
 
 
+def require_finite_outputs(model: SceneModel, state: SceneState) -> None:
+    """Raise where a component computes NaN or infinity from finite parameters.
+
+    A rasterizer may leave such Gaussians out, so that the loss and the gradients stay finite.
+
+    Raises:
+        NotFiniteError: naming the first such component, in the order of computation.
+    """
+    for name, tokens in state.tokens.items():
+        _require_finite(model.entity(name).features, f"features of {name!r}", tokens)
+    for name, residual in state.residuals.items():
+        _require_finite(model.interaction, f"interaction, for {name!r}", residual)
+    for name, gaussians in state.gaussians.items():
+        _require_finite(model.entity(name).deformation, f"deformation of {name!r}", gaussians)
+
+
+def _require_finite(part: nn.Module | None, role: str, output: object) -> None:
+    if part is None or not is_dataclass(output):
+        return
+    for f in fields(output):
+        value = getattr(output, f.name)
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            continue
+        bad = int((~torch.isfinite(value)).sum())
+        if bad and all(bool(torch.isfinite(p).all()) for p in part.parameters()):
+            raise NotFiniteError(
+                f"{role}: {name_of(part)} computed {bad} of {value.numel()} values of {f.name} as "
+                "NaN or infinity from finite parameters; this is a fault of that component or of "
+                "the clip's tracks that it reads"
+            )
+
+
 class NanGuard:
     """Counts skipped steps.
 
@@ -51,6 +85,13 @@ class NanGuard:
 
     def passed(self) -> None:
         self.in_a_row = 0
+
+    def require_any(self, steps: int) -> None:
+        """Raise NotFiniteError if every one of so many steps was skipped."""
+        if steps and len(self.skipped) >= steps:
+            raise NotFiniteError(
+                f"none of {steps} steps could be taken: {self.skipped[0][1]} was not finite"
+            )
 
     def failed(self, step: int, culprit: str) -> None:
         self.skipped.append((step, culprit))

@@ -215,5 +215,11 @@ class GroupedAdam:
                 for key in ("step", "exp_avg", "exp_avg_sq")
                 if f"{name}.{key}" in tensors
             }
+            for key, value in state.items():
+                if key != "step" and value.shape != parameter.shape:
+                    raise ValueError(
+                        f"{key} of {name} has shape {list(value.shape)}, expected "
+                        f"{list(parameter.shape)}"
+                    )
             if state:
                 self.adam.state[parameter] = state

@@ -31,4 +31,7 @@ class EpochSampler:
         return {"queue": list(self.queue)}
 
     def load(self, state: dict[str, Any]) -> None:
+        unknown = sorted(set(state["queue"]) - set(self.positions))
+        if unknown:
+            raise ValueError(f"frames {unknown[:5]} are not among those that are trained on")
         self.queue = list(state["queue"])

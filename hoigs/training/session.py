@@ -13,11 +13,11 @@ from hoigs.core.clip_folder.health import examine
 from hoigs.core.diagnostics import Diagnostic
 from hoigs.core.errors import HoigsError
 from hoigs.core.model.compose import compose, compose_density
-from hoigs.core.registry.registry import default_registry
+from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
 from hoigs.metrics.lpips import Lpips, find_weights
-from hoigs.runs.checkpoint import has_checkpoint, latest_checkpoint, load_checkpoint
+from hoigs.runs.checkpoint import has_checkpoint, load_newest
 from hoigs.runs.choices import pick_device, with_rasterizer
 from hoigs.runs.clip_source import read_clip
 from hoigs.runs.resuming import (
@@ -98,6 +98,33 @@ class Session:
             earlier = run.read_provenance()
         else:
             run.refuse_existing(overwrite, [clip] if clip is not None else [])
+        run.lock("training")
+        try:
+            return cls._locked(
+                clip, spec, run, earlier, registry, device, resume, overwrite, lpips_weights,
+                allow_faults, reader, reader_settings,
+            )  # fmt: skip
+        except BaseException:
+            run.unlock()
+            raise
+
+    @classmethod
+    def _locked(
+        cls,
+        clip: Path | str | None,
+        spec: Spec,
+        run: RunFolder,
+        earlier: dict[str, Any],
+        registry: Registry,
+        device: str,
+        resume: bool,
+        overwrite: bool,
+        lpips_weights: Path | None,
+        allow_faults: bool,
+        reader: str | None,
+        reader_settings: Sequence[str],
+    ) -> Session:
+        """The rest of `open`, with the run folder locked; `earlier` is a resumed run's record."""
         folder, choice = clip_and_reader(clip, run, earlier, registry, reader, reader_settings)
         allow_faults = allow_faults or bool(earlier.get("allow_faults"))
         source = read_clip(
@@ -127,7 +154,7 @@ class Session:
         changes = changes_of(run.spec, spec) if resume else []
         if resume:
             if has_checkpoint(run.checkpoints):
-                trainer.resume(load_checkpoint(latest_checkpoint(run.checkpoints)))
+                trainer.resume(load_newest(run.checkpoints))
             else:  # stopped before its first checkpoint: start again
                 run.cut_metrics(0)
             run.update(spec.dump(), record)
@@ -144,8 +171,11 @@ class Session:
         return cls(spec, source, run, trainer, faults, choice.key, changes)
 
     def train(self, on_step: Callable[[StepReport], None] | None = None) -> None:
-        """`Trainer.train`."""
-        self.trainer.train(on_step)
+        """`Trainer.train`; the run folder is then free for other processes."""
+        try:
+            self.trainer.train(on_step)
+        finally:
+            self.run.unlock()
 
 
 def lpips_term(spec: Spec, weights: Path | None, device: str) -> Lpips | None:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from hoigs.core.clip_folder.health import depth_factor
-from hoigs.core.errors import CheckpointError
+from hoigs.core.errors import CheckpointError, Interrupted
 from hoigs.core.interfaces.deformation import DeformationModel, StepStatistics
 from hoigs.core.interfaces.density import DensityControl, DensityStatistics, check_rasterizer
 from hoigs.core.model.camera_refinement import CameraRefinement, check_camera_gradients
@@ -31,10 +31,16 @@ from hoigs.runs.checkpoint import (
 from hoigs.runs.run_folder import RunFolder
 from hoigs.training.density_update import EntityDensity, evolve
 from hoigs.training.losses.face import unwrap_faces
-from hoigs.training.nan_guard import NanGuard, first_not_finite, gradients_finite
+from hoigs.training.nan_guard import (
+    NanGuard,
+    first_not_finite,
+    gradients_finite,
+    require_finite_outputs,
+)
 from hoigs.training.objective import JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
 from hoigs.training.sampler import EpochSampler
+from hoigs.training.stop_request import StopRequest, resume_command
 
 
 @dataclass(frozen=True)
@@ -123,13 +129,29 @@ class Trainer:
     ) -> None:
         """Train to `spec.steps`, writing metrics and checkpoints.
 
+        With a run folder, the first Ctrl-C or SIGTERM ends the present step and writes a
+        checkpoint; a second one stops at once.
+
         Args:
             until: stop after this step; another call continues. Schedules depend on `spec.steps`
                 alone.
 
         Raises:
             NotFiniteError: see `NanGuard`.
+            Interrupted: stopped by a signal; the message has the command that continues.
         """
+        if self.run is None:
+            self._steps(on_step, until, None)
+            return
+        with StopRequest() as stop:
+            self._steps(on_step, until, stop)
+
+    def _steps(
+        self,
+        on_step: Callable[[StepReport], object] | None,
+        until: int | None,
+        stop: StopRequest | None,
+    ) -> None:
         end = self.spec.steps if until is None else min(until, self.spec.steps)
         self.model.train()
         started = time.perf_counter() - self.elapsed
@@ -143,9 +165,19 @@ class Trainer:
                     self.run.log(report.record())
                 if on_step is not None:
                     on_step(report)
-            last = self.step == self.spec.steps
-            if self.run is not None and (last or self.step % self.spec.checkpoint_every == 0):
+            if self.step == self.spec.steps:
+                self.guard.require_any(self.step)
+            signal = None if stop is None else stop.signal
+            due = self.step == self.spec.steps or self.step % self.spec.checkpoint_every == 0
+            if self.run is not None and (due or signal is not None):
+                self.run.require_lock()
                 self.checkpoint().save(self.run.checkpoints)
+            if self.run is not None and signal is not None and self.step < end:
+                raise Interrupted(
+                    f"stopped at step {self.step} of {self.spec.steps}; continue with: "
+                    f"{resume_command(self.run)}",
+                    signal,
+                )
         self.model.eval()
         self.model.set_progress(self.step / self.spec.steps)
 
@@ -163,6 +195,8 @@ class Trainer:
         frame = self.clip[self.sampler.next()]
         camera = self._camera(frame)
         result = self.objective(frame, camera, self.generator)
+        if self.step in (1, self.spec.steps) or self.step % self.spec.log_every == 0:
+            require_finite_outputs(self.model, result.state)
         self.optimizer.zero_grad()
         result.total.backward()
         if not gradients_finite(self.optimizer.names):
@@ -291,6 +325,16 @@ class Trainer:
                 f"the checkpoint of step {checkpoint.meta['step']} was pruned or compressed: it "
                 "has a model, but no optimizer state to resume with"
             )
+        try:
+            self._restore(checkpoint)
+        except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
+            raise CheckpointError(
+                f"the checkpoint of step {checkpoint.meta['step']} is damaged: {error}"
+            ) from error
+        if self.run is not None:
+            self.run.cut_metrics(self.step)
+
+    def _restore(self, checkpoint: Checkpoint) -> None:
         restore_model(self.model, checkpoint, self.identity["model_hash"])
         restore_cameras(self.cameras, checkpoint)
         self.optimizer.load_tensors(checkpoint.part("optimizer"))
@@ -304,5 +348,3 @@ class Trainer:
         self.sampler.load(checkpoint.meta["sampler"])
         self.step = checkpoint.meta["step"]
         self.elapsed = checkpoint.meta["time_s"]
-        if self.run is not None:
-            self.run.cut_metrics(self.step)

@@ -51,7 +51,8 @@ def evaluate_run(
 
     Args:
         clip, rasterizer, device, plugins: as for `open_run`.
-        lpips_weights: AlexNet LPIPS weights; by default those that $HOIGS_LPIPS_WEIGHTS names.
+        lpips_weights: LPIPS weights; by default those that $HOIGS_LPIPS_WEIGHTS names, or
+            AlexNet's, which are shipped.
         test_pose: body poses of test frames: "given", "interpolated" from training frames, or
             "fitted" to the test images themselves; by default the spec's. test_camera: likewise.
         fit_steps: optimizer steps per "fitted" frame; by default the spec's.
@@ -67,15 +68,10 @@ def evaluate_run(
         {"test_pose": test_pose, "test_camera": test_camera, "fit_steps": fit_steps},
     )
     evaluation = evaluate(
-        loaded.model,
-        loaded.clip,
-        lpips_weights=lpips_weights,
-        held_out=settings.held_out,
-        test_pose=settings.test_pose,
-        test_camera=settings.test_camera,
-        fit_steps=settings.fit_steps,
-        progress=progress,
-    )
+        loaded.model, loaded.clip, lpips_weights=lpips_weights, held_out=settings.held_out,
+        test_pose=settings.test_pose, test_camera=settings.test_camera,
+        fit_steps=settings.fit_steps, progress=progress,
+    )  # fmt: skip
     if settings != loaded.spec.evaluation:
         scores = run / f"evaluation-{settings.test_pose}-{settings.test_camera}.json"
         evaluation.save(scores)

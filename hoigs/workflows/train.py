@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
+import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from hoigs.core.errors import Interrupted
+from hoigs.core.folder_lock import FolderLock
 from hoigs.core.progress import Progress
 from hoigs.core.spec.schema import Spec
 from hoigs.training.session import Session
@@ -78,21 +82,13 @@ def train(
 
     Raises:
         HoigsError: the input is wrong; then nothing has been written.
+        Interrupted: Ctrl-C or SIGTERM; the message has the command that continues.
     """
     session = Session.open(
-        clip,
-        spec,
-        out=out,
-        overrides=overrides,
-        rasterizer=rasterizer,
-        device=device,
-        resume=resume,
-        overwrite=overwrite,
-        plugins=plugins,
-        allow_faults=allow_faults,
-        reader=reader,
-        reader_settings=reader_settings,
-    )
+        clip, spec, out=out, overrides=overrides, rasterizer=rasterizer, device=device,
+        resume=resume, overwrite=overwrite, plugins=plugins, allow_faults=allow_faults,
+        reader=reader, reader_settings=reader_settings,
+    )  # fmt: skip
     if on_start is not None:
         on_start(session)
     session.train(on_step)
@@ -102,6 +98,12 @@ def train(
     report(f"run: {path}")
     if not evaluate:
         return TrainedRun(path, session, None)
-    evaluated = evaluate_run(path, device=device, plugins=plugins, progress=progress)
+    try:
+        with FolderLock(path, "scoring"):
+            evaluated = evaluate_run(path, device=device, plugins=plugins, progress=progress)
+    except KeyboardInterrupt as stop:
+        number = stop.code - 128 if isinstance(stop, Interrupted) else signal.SIGINT
+        rest = f"stopped; {path} is trained, but not scored: hoigs eval {shlex.quote(str(path))}"
+        raise Interrupted(rest, number) from stop
     report(f"report: {evaluated.report}")
     return TrainedRun(path, session, evaluated)

@@ -21,7 +21,9 @@ FUNCTIONS = {
     "prepare": (hoigs.prepare, hoigs.prepare_until),
     "compress": (hoigs.compress,),
     "render": (hoigs.render,),
+    "export": (hoigs.export,),
     "doctor": (hoigs.doctor,),
+    "bug-report": (hoigs.bug_report,),
     "demo": (hoigs.demo,),
 }
 # option -> argument, where the names differ
@@ -30,9 +32,12 @@ RENAMED = {
     "plugin": "plugins",
     "reader_set": "reader_settings",
     "eval": "evaluate",
+    "from": "start",
+    "to": "end",
 }
 # options that choose the function: --auto is hoigs.auto, --stage is hoigs.prepare_until(stage, ...)
-CHOOSING = {("train", "auto"), ("prepare", "stage")}
+# --json is another way to print what hoigs.doctor returns
+CHOOSING = {("train", "auto"), ("prepare", "stage"), ("doctor", "json")}
 # options of a command that the second of its functions is without, and why
 WITHOUT = {
     hoigs.auto: {"reader", "reader_settings"},  # a clip is read by the reader that it looks like
@@ -42,7 +47,7 @@ WITHOUT = {
 }  # fmt: skip
 # arguments that only a Python caller can give: objects and callbacks
 PYTHON = {"on_start", "on_step", "on_found", "progress", "report", "body", "estimators",
-          "positions"}  # fmt: skip
+          "positions", "consent", "announce"}  # fmt: skip
 
 
 def options_of(command: str) -> dict[str, Any]:

@@ -34,7 +34,7 @@ def test_pickled_objects_are_refused(tmp_path):
 def test_headers_are_read_one_at_a_time(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
     np.savez(path, **{f"a{i}": np.zeros((i, 2)) for i in range(5)})
-    inside, header = [], npz._header
+    inside, header = [], npz._parsed
 
     def slow(file):
         inside.append(1)
@@ -43,6 +43,6 @@ def test_headers_are_read_one_at_a_time(tmp_path, monkeypatch):
         inside.pop()
         return header(file)
 
-    monkeypatch.setattr(npz, "_header", slow)
+    monkeypatch.setattr(npz, "_parsed", slow)
     with ThreadPoolExecutor(8) as pool:
         assert all(len(read) == 5 for read in pool.map(load_arrays, [path] * 40))

@@ -144,5 +144,4 @@ def one_thread() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def no_weights(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
     """No LPIPS weights but those that a test names."""
-    monkeypatch.delenv("HOIGS_LPIPS_WEIGHTS", raising=False)
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.setenv("HOIGS_LPIPS_WEIGHTS", str(tmp_path / "none.npz"))

@@ -8,7 +8,7 @@ import torch
 
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.clip import Clip
-from hoigs.evaluation.orbits import orbit_cameras, pivot, turned, world_up
+from hoigs.evaluation.orbits import orbit_cameras, pivot, turned
 
 
 def test_pivot_keeps_its_pixel_and_its_distance(model: SceneModel, clip: Clip) -> None:
@@ -60,4 +60,4 @@ def test_turned_carries_the_camera_about_a_point(clip: Clip) -> None:
 
 
 def test_up_is_against_the_image_rows(clip: Clip) -> None:
-    torch.testing.assert_close(world_up(clip), torch.tensor([0.0, -1.0, 0.0]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(clip.up(), torch.tensor([0.0, -1.0, 0.0]), atol=1e-5, rtol=0)

@@ -21,9 +21,10 @@ from hoigs.core.values.clip import Clip
 from hoigs.evaluation.evaluate import evaluate
 from hoigs.evaluation.report import write_report
 from hoigs.evaluation.report.contact_sheet import contact_sheet
-from hoigs.evaluation.report.curves import read_metrics, smoothed
+from hoigs.evaluation.report.curves import smoothed
 from hoigs.evaluation.report.media import animation, evenly, key_position
 from hoigs.evaluation.report.sections import clock, short
+from hoigs.runs.run_folder import RunFolder
 
 VOID = {"meta", "img", "input", "br"}
 
@@ -54,7 +55,9 @@ class Balance(HTMLParser):
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     (tmp_path / "spec.yaml").write_text("name: toy # <tricky> & $title\n")
-    (tmp_path / "provenance.json").write_text(json.dumps({"versions": {"torch": "9.9.9"}}))
+    (tmp_path / "provenance.json").write_text(
+        json.dumps({"versions": {"torch": "9.9.9"}, "clip": {"path": "../clip"}})
+    )
     lines = []
     for step in range(25, 1001, 25):
         decay = math.exp(-step / 300)
@@ -108,6 +111,13 @@ def test_its_pictures_show_the_clip(run: Path, model: SceneModel, clip: Clip) ->
         pair = np.asarray(moving[0].convert("RGB")).astype(float)
         half = pair.shape[1] // 2
         assert np.abs(pair[:, :half] - pair[:, half:]).mean() < 6
+    player = page[page.index("<div class='player'>") :]
+    player = player[: player.index("</div>")]
+    scored = [f for v in evaluation.views if v.name != "held-out cameras" for f in v.frames]
+    assert player.count("<img") == len(scored) and "hoigs export" in page
+    row = Image.open(io.BytesIO(base64.b64decode(re.findall(r"base64,([^']+)'", player)[0])))
+    video, render, error = np.split(np.asarray(row.convert("RGB")).astype(float), 3, 1)
+    assert np.abs(video - render).mean() < 6 and error.mean() < 40
     cutouts = [p for p in pictures if p.mode == "RGBA" and p not in moving]
     assert len(cutouts) == 3
     opacity = [np.asarray(p)[..., 3].mean() for p in cutouts]
@@ -125,11 +135,18 @@ def test_damaged_metrics_name_the_line_and_leave_no_page(
     run: Path, model: SceneModel, clip: Clip
 ) -> None:
     with (run / "metrics.jsonl").open("a") as file:
-        file.write('{"step": 1025, "lo')
+        file.write('{"step": 1025, "lo\n')
     with pytest.raises(HoigsError, match=r"metrics\.jsonl:41"):
         write_report(run, model, clip, evaluate(model, clip, timing_frames=0))
     assert not (run / "report.html").exists()
-    assert read_metrics(run / "absent.jsonl") == []
+
+
+def test_a_line_that_is_still_being_written_is_left_out(run: Path) -> None:
+    before = RunFolder(run).read_metrics()
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 1025, "lo')
+    assert RunFolder(run).read_metrics() == before != []
+    assert RunFolder(run / "absent").read_metrics() == []
 
 
 def test_key_moment_is_where_man_and_ball_meet(clip: Clip) -> None:

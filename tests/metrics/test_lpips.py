@@ -161,9 +161,9 @@ def test_small_images_are_grown_not_refused() -> None:
     assert lpips.map(x, y).shape == (9, 20)
 
 
-def test_real_weights_rank_damage(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(VARIABLE, str(shared_data / "lpips" / "alex_fp16.npz"))
+def test_shipped_weights_rank_damage() -> None:
     lpips = Lpips.load(find_weights())
+    assert "shipped" in lpips.source
     assert lpips.net == "alex"
     ramp = torch.linspace(0, 1, 64)
     target = torch.stack(
@@ -179,8 +179,8 @@ def test_real_weights_rank_damage(shared_data: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_reasons_when_there_are_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    found = find_weights()
-    assert found.location is None and VARIABLE in found.reason and "alexnet" in found.reason
+    found = find_weights(net="vgg")
+    assert found.location is None and VARIABLE in found.reason and "vgg16" in found.reason
     with pytest.raises(HoigsError, match="no LPIPS weights"):
         Lpips.load(found)
     monkeypatch.setenv(VARIABLE, str(tmp_path / "gone.npz"))
@@ -209,17 +209,17 @@ def test_npz_round_trip_and_damage(tmp_path: Path) -> None:
 def test_torchvision_cache_with_the_heads_of_the_lpips_package(
     nowhere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arrays = random_arrays("alex")
-    torch.save(checkpoint("alex", arrays), nowhere / "alexnet-owt-7be5be79.pth")
-    if not find_weights().location:  # without the package it says so
-        assert "pip install lpips" in find_weights().reason
+    arrays = random_arrays("vgg")
+    torch.save(checkpoint("vgg", arrays), nowhere / "vgg16-397923af.pth")
+    if not find_weights(net="vgg").location:  # without the package it says so
+        assert "pip install lpips" in find_weights(net="vgg").reason
     package = tmp_path / "site" / "lpips" / "weights" / "v0.1"
     package.mkdir(parents=True)
     (tmp_path / "site" / "lpips" / "__init__.py").touch()
     heads = {f"lin{i}.model.1.weight": arrays[f"lin{i}"][None, :, None, None] for i in range(5)}
-    torch.save(heads, package / "alex.pth")
+    torch.save(heads, package / "vgg.pth")
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    found = find_weights()
+    found = find_weights(net="vgg")
     assert found.location is not None and "cache" in found.reason
     x, y = images()
-    torch.testing.assert_close(Lpips.load(found)(x, y), Lpips("alex", arrays)(x, y))
+    torch.testing.assert_close(Lpips.load(found)(x, y), Lpips("vgg", arrays)(x, y))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,9 +36,12 @@ from hoigs.core.clip_folder.format import (
 )
 from hoigs.core.diagnostics import Severity, ranges
 from hoigs.core.errors import ClipError
-from hoigs.core.npz import load_arrays
+from hoigs.core.npz import ArrayHeader, array_headers, load_arrays
 
 ROTATION_TOLERANCE = 1e-3  # of R R^T - I, generous to float16 and text files
+LARGEST = 1e7  # absolute value of any number: float32 has no centimetres left there
+MOST_TEXT = 100_000
+MOST_ABSENT = 10_000  # images; where more are absent, the number of frames is wrong
 _HEADER_FROM = "clip.json comes from `hoigs prepare VIDEO --out FOLDER` or ClipWriter"
 
 
@@ -51,7 +56,7 @@ def check_clip(folder: Path) -> list[FileDiagnostic]:
     header, messages = parse_header(folder / HEADER, ClipHeader)
     if header is None:
         return [wrong(HEADER, message) for message in messages]
-    problems = list(_check_split(header))
+    problems = [*_check_split(header), *_check_truth(folder, header)]
     view = _View("", header.width, header.height, header.frames)
     problems += _check_views(folder, view, header)
     sizes = {"F": header.frames}
@@ -121,10 +126,26 @@ def _check_split(header: ClipHeader) -> Iterator[FileDiagnostic]:
         yield wrong(HEADER, "split.test is empty: nothing to score on")
     outside = sorted({i for i in (*train, *test) if not 0 <= i < header.frames})
     if outside:
-        yield wrong(HEADER, f"split names frames {outside}; the clip has 0..{header.frames - 1}")
+        last = header.frames - 1
+        yield wrong(HEADER, f"split names frames {ranges(outside)}; the clip has 0..{last}")
     both = sorted(set(train) & set(test))
     if both:
-        yield wrong(HEADER, f"split has frames {both} in both train and test")
+        yield wrong(HEADER, f"split has frames {ranges(both)} in both train and test")
+
+
+def _check_truth(folder: Path, header: ClipHeader) -> Iterator[FileDiagnostic]:
+    """The true geometry that synthetic clips name: opened by the evaluation, after training."""
+    name = header.provenance.get("truth")
+    if name is None:
+        return
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        yield wrong(name, "is a link that leaves the clip's folder; copy the file into it")
+    elif path.is_file():  # without it, errors against the truth are not computed
+        try:
+            array_headers(path)
+        except (OSError, ValueError) as error:
+            yield wrong(name, str(error))
 
 
 def _check_views(folder: Path, view: _View, header: ClipHeader) -> list[FileDiagnostic]:
@@ -132,6 +153,10 @@ def _check_views(folder: Path, view: _View, header: ClipHeader) -> list[FileDiag
     root, path = folder / view.folder, view.folder + CAMERAS.pattern
     problems, arrays = _check_arrays(folder, path, CAMERAS, {"F": view.count})
     problems += _check_cameras(path, arrays)
+    present = _files_in(root / "images")
+    if view.count > present + MOST_ABSENT:
+        message = f"{view.count} frames are declared, but images/ holds {present} files"
+        return [*problems, wrong(view.folder + "images", message)]
     problems += _each_frame(root, view, image_path, IMAGE, _image_problem)
     for name in header.entities:
         at = functools.partial(_mask_at, name)
@@ -141,6 +166,12 @@ def _check_views(folder: Path, view: _View, header: ClipHeader) -> list[FileDiag
     if header.depth_kind != "none":
         problems += _each_frame(root, view, depth_path, DEPTH, _depth_problem)
     return problems
+
+
+def _files_in(folder: Path) -> int:
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        return sum(1 for _ in entries)
+    return 0
 
 
 def _mask_at(entity: str, folder: Path, frame: int) -> Path:
@@ -176,7 +207,7 @@ def _image_problem(path: Path, view: _View) -> str | None:
     try:
         with Image.open(path) as image:
             size, mode = image.size, image.mode
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
         return f"not a readable image ({error})"
     if size != (view.width, view.height):
         return f"is {size[0]}x{size[1]}, expected {view.width}x{view.height}"
@@ -198,7 +229,7 @@ def _check_mask_content(root: Path, view: _View, entity: str) -> list[FileDiagno
         try:
             with Image.open(mask_path(root, entity, frame)) as image:
                 brightest = max(brightest, int(np.asarray(image.convert("L")).max()))
-        except OSError as error:
+        except (OSError, ValueError, SyntaxError) as error:
             name = f"{view.folder}masks/{entity}/{frame:05d}.png"
             message = f"cannot be decoded ({error})"
             return [FileDiagnostic("unreadable", message, path=name)]
@@ -213,16 +244,17 @@ def _check_mask_content(root: Path, view: _View, entity: str) -> list[FileDiagno
 
 def _depth_problem(path: Path, view: _View) -> str | FileDiagnostic | None:
     try:
-        arrays = load_arrays(path)
-    except ValueError as error:
+        headers = array_headers(path)
+        header = headers.get("depth")
+        if header is None:
+            return f'has no array "depth"; it has {sorted(headers)[:8]}'
+        if header.shape != (view.height, view.width):
+            return f"depth has shape {list(header.shape)}, expected [{view.height}, {view.width}]"
+        if header.dtype.kind != "f":
+            return f"depth is {header.dtype}, expected float32 or float16 in metres"
+        depth = load_arrays(path, ("depth",))["depth"]
+    except (OSError, ValueError) as error:
         return str(error)
-    if "depth" not in arrays:
-        return f'has no array "depth"; it has {sorted(arrays)}'
-    depth = arrays["depth"]
-    if depth.shape != (view.height, view.width):
-        return f"depth has shape {list(depth.shape)}, expected [{view.height}, {view.width}]"
-    if depth.dtype.kind != "f":
-        return f"depth is {depth.dtype}, expected float32 or float16 in metres"
     for name, count in (
         ("NaN", int(np.isnan(depth).sum())),
         ("infinite", int(np.isinf(depth).sum())),
@@ -242,27 +274,37 @@ def _check_arrays(
     if not (folder / path).is_file():
         return [absent(path, spec.maker)], {}
     try:
-        arrays = load_arrays(folder / path)
-    except ValueError as error:
+        headers = array_headers(folder / path)
+        problems = list(_header_problems(path, spec, headers, sizes))
+        wanted = {a.name for a in spec.arrays} - {p.what.split(" ", 1)[0] for p in problems}
+        arrays = load_arrays(folder / path, wanted)
+    except (OSError, ValueError) as error:
         return [wrong(path, str(error))], {}
-    problems, good = [], {}
-    for array in spec.arrays:
-        if array.name not in arrays:
-            if not array.optional:
-                message = f"has no array {array.name!r} ({array.meaning}); {spec.maker}"
-                problems.append(wrong(path, message))
-            continue
-        got = arrays[array.name]
-        defect = _array_problem(got, array.shape, array.kind, sizes)
+    good = {}
+    for name, values in arrays.items():
+        defect = _content_problem(values)
         if defect:
-            problems.append(wrong(path, f"{array.name} {defect}"))
+            problems.append(wrong(path, f"{name} {defect}"))
         else:
-            good[array.name] = got
+            good[name] = values
     return problems, good
 
 
+def _header_problems(
+    path: str, spec: FileSpec, headers: Mapping[str, ArrayHeader], sizes: dict[str, int]
+) -> Iterator[FileDiagnostic]:
+    """Absent arrays, and shapes and dtypes that are wrong; each message begins with a name."""
+    for array in spec.arrays:
+        if array.name in headers:
+            defect = _array_problem(headers[array.name], array.shape, array.kind, sizes)
+            if defect:
+                yield wrong(path, f"{array.name} {defect}")
+        elif not array.optional:
+            yield wrong(path, f"has no array {array.name!r} ({array.meaning}); {spec.maker}")
+
+
 def _array_problem(
-    got: np.ndarray, shape: tuple[int | str, ...], kind: str, sizes: dict[str, int]
+    got: ArrayHeader, shape: tuple[int | str, ...], kind: str, sizes: dict[str, int]
 ) -> str | None:
     kinds = {"float": "f", "bool": "b", "str": "U"}
     if got.dtype.kind != kinds[kind]:
@@ -275,8 +317,20 @@ def _array_problem(
         frames = bool(shape) and shape[0] == "F" and len(got.shape) == len(shape)
         count = f": {got.shape[0]} entries for {sizes['F']} frames" if frames else ""
         return f"has shape {list(got.shape)}, expected [{named}]{count}"
-    if kind == "float" and not np.isfinite(got).all():
-        return f"has {int((~np.isfinite(got)).sum())} values that are NaN or infinite"
+    if kind == "str" and got.nbytes > MOST_TEXT:
+        return f"is a text of {got.nbytes} bytes, at most {MOST_TEXT} are read"
+    return None
+
+
+def _content_problem(got: np.ndarray) -> str | None:
+    if got.dtype.kind != "f" or not got.size:
+        return None
+    bad = int((~np.isfinite(got)).sum())
+    if bad:
+        return f"has {bad} values that are NaN or infinite"
+    largest = float(np.abs(got).max())
+    if largest > LARGEST:
+        return f"has values up to {largest:.3g}, at most {LARGEST:g} (metres, pixels) make sense"
     return None
 
 

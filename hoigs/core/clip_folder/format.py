@@ -5,18 +5,19 @@ Writer, checker, reader and docs/reference/clip.md all follow these constants.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from hoigs.core.json_file import parse_json, short
 from hoigs.core.names import NAME, RULE
 from hoigs.core.safe_replace import Layout, one_of
 
 FORMAT, VIEWS_FORMAT, VERSION = "hoigs-clip", "hoigs-views", 1
 HEADER, VIEWS = "clip.json", "held_out/views.json"
+MOST_LINES = 20  # about one header
 IMAGE_SUFFIXES = (".png", ".jpg")
 DepthKind = Literal["metric", "affine-disparity", "none"]
 
@@ -51,7 +52,7 @@ class SplitHeader(_Strict):
     test: list[int]
 
 
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=1, le=10**9)]
 
 
 class ClipHeader(_Strict):
@@ -60,7 +61,9 @@ class ClipHeader(_Strict):
     format: Literal["hoigs-clip"] = Field(default="hoigs-clip", description='always "hoigs-clip"')
     version: Literal[1] = Field(default=1, description="of this layout: 1")
     name: str = Field(min_length=1, description="for reports")
-    fps: float = Field(gt=0, strict=False, description="frames per second")
+    fps: float = Field(
+        gt=0, le=1e6, allow_inf_nan=False, strict=False, description="frames per second"
+    )
     width: Count = Field(description="of every image, mask and depth map, pixels")
     height: Count = Field(description="likewise")
     frames: Count = Field(description="F, the number of frames, held-out views not counted")
@@ -85,6 +88,16 @@ class ClipHeader(_Strict):
             if not NAME.fullmatch(name) or name == "scene":
                 raise ValueError(f'entity name {name!r}: {RULE}; "scene" is the implied background')
         return self
+
+    @field_validator("provenance")
+    @classmethod
+    def _truth_is_inside(cls, provenance: dict[str, Any]) -> dict[str, Any]:
+        truth = provenance.get("truth")
+        if truth is not None and not (isinstance(truth, str) and NAME.fullmatch(truth)):
+            raise ValueError(
+                f"truth: {short(truth)} is not the name of a file in the clip's own folder"
+            )
+        return provenance
 
 
 class ViewsHeader(_Strict):
@@ -229,7 +242,7 @@ CLIP = Layout(
         r"clip\.json|cameras\.npz|points\.npz",
         rf"(held_out/)?{_VIEW}|held_out/(views\.json|cameras\.npz)",
         rf"(bodies|objects)/{NAME.pattern}\.npz",
-        r"report\.(json|md|html)|overlay\.mp4|truth\.npz",
+        r"report\.(json|md|html)|overlay\.mp4|object\.jpg|truth\.npz",
         r"colmap/.+",
     ),
     folders=one_of(
@@ -268,7 +281,7 @@ def depth_path(folder: Path, frame: int) -> Path:
 def is_clip_folder(folder: Path) -> bool:
     """Whether clip.json there is that of a clip, complete or not."""
     try:
-        content = json.loads((folder / HEADER).read_text(encoding="utf-8"))
+        content = parse_json(folder / HEADER)
     except (OSError, ValueError):
         return False
     return isinstance(content, dict) and content.get("format") == FORMAT
@@ -280,24 +293,27 @@ Header = TypeVar("Header", ClipHeader, ViewsHeader)
 def parse_header(path: Path, model: type[Header]) -> tuple[Header | None, list[str]]:
     """A header and no messages, or None and what is wrong with it, key by key."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path)
     except (OSError, ValueError) as error:
         return None, [f"not readable as JSON ({error})"]
     if not isinstance(content, dict):
         return None, [f"expected a JSON object, got {type(content).__name__}"]
     expected = model.model_fields["format"].default
     if content.get("format") != expected:
-        return None, [f'"format" is {content.get("format")!r}, expected "{expected}"']
+        return None, [f'"format" is {short(content.get("format"))}, expected "{expected}"']
     if content.get("version") != VERSION:
         return None, [
-            f"version {content.get('version')!r}; this hoigs reads version {VERSION}: "
+            f"version {short(content.get('version'))}; this hoigs reads version {VERSION}: "
             "write the clip again with it, or install the hoigs that wrote it"
         ]
     try:
         return model.model_validate(content), []
     except ValidationError as error:
-        return None, [
-            f"{'.'.join(map(str, e['loc'])) or 'header'}: {e['msg']}"
-            + (f" (got {e['input']!r})" if e["type"] not in ("missing", "value_error") else "")
-            for e in error.errors()
+        found = error.errors()
+        lines = [
+            f"{'.'.join(map(str, e['loc'])) or 'header'}: {e['msg'][:500]}"
+            + (f" (got {short(e['input'])})" if e["type"] not in ("missing", "value_error") else "")
+            for e in found[:MOST_LINES]
         ]
+        left = len(found) - len(lines)
+        return None, [*lines, f"and {left} more"] if left else lines

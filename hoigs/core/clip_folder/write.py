@@ -33,7 +33,7 @@ from hoigs.core.clip_folder.format import (
     stem,
 )
 from hoigs.core.errors import ClipError
-from hoigs.core.safe_replace import require_replaceable
+from hoigs.core.safe_replace import refuse_unwritable, require_replaceable
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, ObjectTrack, uniform_test_split
 
@@ -327,6 +327,7 @@ def refuse_to_overwrite(folder: Path, inputs: Iterable[Path] = ()) -> None:
     Args:
         inputs: what the new clip is made from; it must not be inside the old one.
     """
+    refuse_unwritable(folder, error=ClipError)
     if folder.is_dir() and any(folder.iterdir()) and not is_clip_folder(folder):
         raise ClipError(
             f"{folder} is not empty and holds no {HEADER}: it is not overwritten; "

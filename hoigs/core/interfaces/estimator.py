@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from hoigs.core.environments.managed import ManagedEnvironment
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.progress import Progress, no_progress
 
@@ -35,6 +36,20 @@ class PromptPoint:
 
 
 @dataclass(frozen=True)
+class FramePrompt:
+    """Where an entity is in one frame.
+
+    Attributes:
+        frame: of the video. points: on the entity, or beside it (`inside=False`).
+        box: x0, y0, x1, y1, pixels of the video.
+    """
+
+    frame: int
+    points: tuple[PromptPoint, ...] = ()
+    box: tuple[float, float, float, float] | None = None
+
+
+@dataclass(frozen=True)
 class EntityRequest:
     """One object or person to look for.
 
@@ -43,6 +58,7 @@ class EntityRequest:
         text: what to look for, for estimators that read ("a man", "football"); None: the name.
         points, box: where it is in frame `frame`, pixels of the video; box is x0, y0, x1, y1.
         frame: of the video, in which `points` and `box` are meant.
+        further: where it is in other frames.
     """
 
     name: str
@@ -51,6 +67,14 @@ class EntityRequest:
     points: tuple[PromptPoint, ...] = ()
     box: tuple[float, float, float, float] | None = None
     frame: int = 0
+    further: tuple[FramePrompt, ...] = ()
+
+    @property
+    def prompts(self) -> tuple[FramePrompt, ...]:
+        """Everything that says where it is, one a frame, by frame."""
+        first = FramePrompt(self.frame, self.points, self.box)
+        given = (first,) if self.points or self.box is not None else ()
+        return tuple(sorted((*given, *self.further), key=lambda prompt: prompt.frame))
 
 
 @dataclass(frozen=True)
@@ -68,6 +92,8 @@ class VideoRequest:
         wanted: frames that will be used; an estimator may skip the others. None: all.
         video: the file, for tools that read videos themselves; None when there are only frames.
         fps: frames a second.
+        known: what other estimators have found in this video before: the person's masks and
+            landmarks, for one that looks for objects. None: nothing yet.
     """
 
     frames: int
@@ -81,6 +107,7 @@ class VideoRequest:
     wanted: tuple[int, ...] | None = None
     video: Path | None = None
     fps: float = 30.0
+    known: Estimates | None = None
 
     def frame(self, i: int) -> UInt8[np.ndarray, "H W 3"]:
         """Frame `i` of the video, RGB.
@@ -165,11 +192,17 @@ class EntityMasks:
         entities: name to its masks, a list or LazyFrames. All False: not seen in that frame.
         together: masks of all entities at once, where they are not separated; None if they are.
         provenance: who made them, with what, in a line.
+        confidence: of each entity, how sure its mask is in each frame, 0..1; NaN: not computed.
+        chosen: of each entity that was requested without a prompt, where it was found.
+        notes: sentences for the report, on what is doubtful.
     """
 
     entities: Mapping[str, Frames] = field(default_factory=dict)
     together: Frames | None = None
     provenance: str = ""
+    confidence: Mapping[str, Float[np.ndarray, " F"]] = field(default_factory=dict)
+    chosen: Mapping[str, tuple[FramePrompt, ...]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -223,9 +256,12 @@ class Estimator(Configurable, ABC):
 
     Attributes:
         provides: which of "masks", "landmarks" and "depth" it gives, of every request.
+        environment: of the programs that it runs, where hoigs makes it; None: it runs none, or in
+            an environment of the user's.
     """
 
     provides: ClassVar[frozenset[EstimateKind]] = frozenset()
+    environment: ClassVar[ManagedEnvironment | None] = None
 
     def __init__(self, config: Any = None) -> None:
         """`config`: a `Config`; by default one with its defaults."""
@@ -277,13 +313,13 @@ def checked(estimates: Estimates, video: VideoRequest, estimator: Estimator) -> 
     if masks is not None:
         if not masks.entities and masks.together is None:
             raise ValueError(f"{who} gave no masks: neither of entities nor of all together")
-        masks = EntityMasks(
-            {n: _checked(m, video, bool, f"{who}: mask of {n}") for n, m in masks.entities.items()},
-            None
-            if masks.together is None
-            else _checked(masks.together, video, bool, f"{who}: mask of all together"),
-            masks.provenance,
-        )
+        together = masks.together
+        if together is not None:
+            together = _checked(together, video, bool, f"{who}: mask of all together")
+        entities = {
+            n: _checked(m, video, bool, f"{who}: mask of {n}") for n, m in masks.entities.items()
+        }
+        masks = replace(masks, entities=entities, together=together)
     if depth is not None:
         maps = _checked(depth.maps, video, np.float32, f"{who}: depth")
         depth = DepthMaps(maps, depth.kind, depth.provenance)

@@ -52,6 +52,17 @@ def compose(spec: Spec, clip: Clip, registry: Registry | None = None) -> SceneMo
             return SceneModel(entities, interaction=interaction, rasterizer=rasterizer)
 
 
+def compose_bodies(
+    spec: Spec, clip: Clip, registry: Registry | None = None
+) -> dict[str, BodyModel]:
+    """The body model of each human that `compose` builds, by name.
+
+    Raises:
+        SpecError, PluginError: as `compose`.
+    """
+    return _Builder(spec, clip, registry or default_registry()).bodies()
+
+
 def compose_density(
     spec: Spec, clip: Clip, registry: Registry | None = None
 ) -> dict[str, DensityControl]:

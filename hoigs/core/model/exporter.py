@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from abc import ABC, abstractmethod
@@ -9,15 +10,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 
 from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.moment import Moment
+from hoigs.core.values.tokens import EntityKind
+
+SHEET = "export.json"  # what an export has kept and lost, beside its files
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,8 @@ class ExportRequest:
         moments: at which the scene is exported, times ascending. A format without motion may take
             the first one, and then reports the others in `Exported.omitted`.
         entities: names of the entities to export, in the scene's order; empty for all.
+        bodies: the body model of each human, by entity, where there is one.
+        fps: moments a second in the files, where the format has a clock; 0 for the clip's.
 
     Raises:
         ValueError: no moments, times that do not ascend, or an entity that the scene lacks.
@@ -39,6 +47,8 @@ class ExportRequest:
     clip: Clip
     moments: tuple[Moment, ...]
     entities: tuple[str, ...] = ()
+    bodies: Mapping[str, BodyModel] = field(default_factory=dict)
+    fps: float = 0.0
 
     def __post_init__(self) -> None:
         times = [moment.time for moment in self.moments]
@@ -51,6 +61,12 @@ class ExportRequest:
                 raise ValueError(f'the scene has no entity "{name}"{hint} (it has {known})')
         chosen = tuple(n for n in known if not self.entities or n in self.entities)
         object.__setattr__(self, "entities", chosen)
+        if not self.fps > 0:
+            object.__setattr__(self, "fps", self.clip.fps)
+
+    def of_kind(self, kind: EntityKind) -> list[str]:
+        """The entities to export that are of a kind."""
+        return [name for name in self.entities if self.scene.entity(name).kind == kind]
 
 
 @dataclass(frozen=True)
@@ -76,8 +92,25 @@ class Exporter(Configurable, ABC):
     """One file format.
 
     A subclass writes `write`. Callers use `export`, which makes the folder appear complete or not
-    at all.
+    at all, with a sheet `export.json` that lists what was kept and lost, units and axes.
+
+    Attributes:
+        suffixes: what the name of the file may end with, if an export is one file, the usual one
+            first; empty where it is a folder of files.
+        kinds: kinds of entities that the format can hold; others are left out.
+        moving: whether the files hold more than one moment.
+        reads_gaussians: False if nothing of the Gaussians enters the files, as with a skeleton.
+        axes: of the coordinates in the files. units: of lengths.
+        keeps: what the files hold, to the form it has there.
     """
+
+    suffixes: ClassVar[tuple[str, ...]] = ()
+    kinds: ClassVar[frozenset[EntityKind]] = frozenset({"scene", "human", "object"})
+    moving: ClassVar[bool] = True
+    reads_gaussians: ClassVar[bool] = True
+    axes: str = "the world of the clip; cameras are OpenCV's (x right, y down, z forward)"
+    units: str = "metres"
+    keeps: ClassVar[Mapping[str, str]] = {}
 
     @abstractmethod
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
@@ -106,14 +139,18 @@ class Exporter(Configurable, ABC):
         """
         if out.exists() or out.is_symlink():
             raise HoigsError(f"{out} exists and is not replaced; name another folder to write")
+        omitted = self._unsuited(request)
         unfinished = out.with_name(f".{out.name}.{os.getpid()}.part")
         unfinished.mkdir(parents=True)
         try:
             with torch.no_grad():
-                omitted = dict(self.write(request, unfinished, progress))
+                omitted |= self.write(request, unfinished, progress)
             paths = sorted(path for path in unfinished.rglob("*") if path.is_file())
             if not paths:
                 raise HoigsError(f"{type(self).__name__} wrote no file for {out}")
+            text = json.dumps(self.sheet(request) | {"lost": omitted}, indent=2)
+            (unfinished / SHEET).write_text(text + "\n", encoding="utf-8")
+            paths.append(unfinished / SHEET)
             sizes = {p.relative_to(unfinished).as_posix(): p.stat().st_size for p in paths}
             progress(1.0, "written")
             unfinished.rename(out)
@@ -121,3 +158,37 @@ class Exporter(Configurable, ABC):
             shutil.rmtree(unfinished)
             raise
         return Exported(out, sizes, omitted)
+
+    def _unsuited(self, request: ExportRequest) -> dict[str, str]:
+        """Entities of a kind that the format cannot hold, to the reason.
+
+        Raises:
+            HoigsError: that is all of them.
+        """
+        kinds = {name: request.scene.entity(name).kind for name in request.entities}
+        held = " and ".join(sorted(self.kinds))
+        why = {
+            n: f"the format holds {held}, not {k}" for n, k in kinds.items() if k not in self.kinds
+        }
+        if len(why) == len(kinds):
+            there = ", ".join(f"{name} ({kind})" for name, kind in kinds.items())
+            raise HoigsError(
+                f"{type(self).__name__} exports entities of kind {held}; it was given {there}"
+            )
+        return why
+
+    def sheet(self, request: ExportRequest) -> dict[str, object]:
+        """What `export.json` says of an export, but for what was lost."""
+        last = request.clip.num_frames - 1
+        moments = request.moments if self.moving else request.moments[:1]
+        held = [n for n in request.entities if request.scene.entity(n).kind in self.kinds]
+        return {
+            "exporter": type(self).__name__,
+            "clip": request.clip.name,
+            "entities": {name: request.scene.entity(name).kind for name in held},
+            "frames": [round(moment.time * last, 6) for moment in moments],
+            "fps": request.fps if self.moving else None,
+            "units": self.units,
+            "axes": self.axes,
+            "kept": dict(self.keeps),
+        }

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from hoigs.core.interfaces.interaction import InteractionModule
 from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.model.blame import call
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
@@ -114,12 +115,17 @@ class SceneModel(nn.Module):
         module = self.interaction
         if module is not None and module.reads and self.interaction_enabled:
             for name in self.entities:
-                described = self.entity(name).tokens(moment)
+                features = self.entity(name).features
+                role = f"features of {name!r}"
+                described = call(features, role, self.entity(name).tokens, moment)
                 if described is not None:
                     tokens[name] = described
             roles = {name: self.entity(name).role(moment) for name in self.entities}
-            residuals = module(tokens, roles)
-        gaussians = {n: self.entity(n)(moment, residuals.get(n)) for n in names}
+            residuals = call(module, "interaction", module, tokens, roles)
+        gaussians = {}
+        for name in names:
+            entity, role = self.entity(name), f"deformation of {name!r}"
+            gaussians[name] = call(entity.deformation, role, entity, moment, residuals.get(name))
         return SceneState(gaussians, residuals, tokens)
 
     def render(
@@ -142,7 +148,8 @@ class SceneModel(nn.Module):
         request = request or RenderRequest()
         if background is not None:
             request = request.replace(background=background)
-        return self.rasterizer.render(state.joined(), camera, request)
+        rasterizer = self.rasterizer
+        return call(rasterizer, "rasterizer", rasterizer.render, state.joined(), camera, request)
 
     def set_progress(self, progress: float) -> None:
         """Pass the done share of the training run, in [0, 1], to every deformation."""

@@ -140,10 +140,10 @@ class Clip:
     Attributes:
         name: for reports.
         store: pixels. cameras, moments: one a frame, in order.
-        kinds: entity name to kind; "scene" is implicit.
-        bodies: by human entity. objects: by object entity.
         points, point_colors: scene points (COLMAP, or back-projected depth), metres, RGB [0, 1].
         split: "train" and "test" positions.
+        kinds: entity name to kind; "scene" is implicit.
+        bodies: by human entity. objects: by object entity.
         held_out: the same moments from cameras never trained on, or None.
         fps: frames a second.
         depth_kind: "metric", "affine-disparity" or "none".
@@ -156,12 +156,12 @@ class Clip:
     store: FrameStore
     cameras: Sequence[Camera]
     moments: Sequence[Moment]
-    kinds: Mapping[str, EntityKind]
-    bodies: Mapping[str, BodyTrack]
-    objects: Mapping[str, ObjectTrack]
     points: Float[Tensor, "P 3"]
     point_colors: Float[Tensor, "P 3"]
     split: Mapping[str, Sequence[int]]
+    kinds: Mapping[str, EntityKind] = field(default_factory=dict)
+    bodies: Mapping[str, BodyTrack] = field(default_factory=dict)
+    objects: Mapping[str, ObjectTrack] = field(default_factory=dict)
     held_out: Clip | None = None
     fps: float = 30.0
     depth_kind: str = "none"
@@ -208,6 +208,11 @@ class Clip:
             cameras=[c.resized(*s) for c, s in zip(self.cameras, sizes, strict=True)],
             held_out=self.held_out.resized(width) if self.held_out else None,
         )
+
+    def up(self) -> Float[Tensor, " 3"]:
+        """The mean upward direction of the cameras, unit, as a COLMAP world defines none."""
+        ups = torch.stack([-camera.world_to_camera[1, :3] for camera in self.cameras])
+        return torch.nn.functional.normalize(ups.mean(0), dim=0)
 
     def extent(self) -> float:
         """Scene extent, metres: 1.1 x camera spread (Kerbl et al. 2023, arXiv:2308.04079), but at

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -14,7 +12,6 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from hoigs.core.errors import HoigsError
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.evaluation.scores import ViewScores
 
@@ -37,25 +34,6 @@ STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
 }
 SHOWN_TERMS = 6
-
-
-def read_metrics(file: Path) -> list[dict[str, Any]]:
-    """The records of metrics.jsonl; none if the file is absent.
-
-    Raises:
-        HoigsError: a line is not JSON; the message has its number.
-    """
-    if not file.is_file():
-        return []
-    records = []
-    for number, line in enumerate(file.read_text().splitlines(), 1):
-        try:
-            records.append(json.loads(line))
-        except json.JSONDecodeError as error:
-            raise HoigsError(
-                f"{file}:{number}: not JSON ({error.msg}); if a crash cut the line short, delete it"
-            ) from error
-    return records
 
 
 def loss_curve(records: Sequence[dict[str, Any]]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from html import escape
 from importlib import resources
@@ -14,8 +13,10 @@ import hoigs
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.values.clip import Clip
+from hoigs.core.whole_files import write_whole
 from hoigs.evaluation.report import curves, media, sections
 from hoigs.evaluation.scores import Evaluation, Table, score_table, size_table, timing_table
+from hoigs.runs.run_folder import RunFolder
 
 
 def write_report(
@@ -36,7 +37,7 @@ def write_report(
     """
     folder = Path(run_folder)
     report = progress or no_progress
-    records = curves.read_metrics(folder / "metrics.jsonl")
+    records = RunFolder(folder).read_metrics()
     was_training = model.training
     model.eval()
     body = []
@@ -44,6 +45,7 @@ def write_report(
         ("playback", lambda: _hero(model, clip)),
         ("comparisons", lambda: _compared(model, clip, evaluation)),
         ("orbit", lambda: _space(model, clip)),
+        ("commands", lambda: _further(folder)),
         ("scores", lambda: _scores(evaluation)),
         ("curves", lambda: _training(records)),
         ("cost", lambda: _cost(evaluation)),
@@ -65,9 +67,7 @@ def write_report(
         created=escape(evaluation.created),
     )
     path = folder / "report.html"
-    temporary = folder / ".report.html.part"
-    temporary.write_text(page, encoding="utf-8")
-    temporary.replace(path)
+    write_whole(path, page)
     report(1.0, "")
     return path
 
@@ -93,12 +93,43 @@ def _hero(model: SceneModel, clip: Clip) -> str:
 
 def _compared(model: SceneModel, clip: Clip, evaluation: Evaluation) -> str:
     comparisons = media.comparisons(model, clip, evaluation)
+    if not comparisons:
+        return _section("Frames outside training", "The clip has none.", "")
     unseen = all(view.protocol.split == "test" for view in evaluation.views)
     return _section(
         "Frames outside training" if unseen else "Frame by frame",
         ("None of these images took part in training. " if unseen else "")
         + "Drag the line between them; choose a frame below.",
         sections.comparer(comparisons),
+    ) + _section(
+        "In a row",
+        "The frames that were scored, in their order.",
+        sections.player(media.scored_sequence(model, clip, evaluation)),
+    )
+
+
+def _further(folder: Path) -> str:
+    run = folder.name if folder.is_absolute() else str(folder)
+    return _section(
+        "Look further",
+        "",
+        sections.commands(
+            (
+                (
+                    f"hoigs render {run} --path bullet-time",
+                    "a film: the moment stands still, the camera moves",
+                ),
+                (f"hoigs render {run} --compare", "a film beside the video"),
+                (
+                    f"hoigs export {run} --format ply --out scene.ply",
+                    "one moment for viewers of Gaussians",
+                ),
+                (
+                    f"hoigs export {run} --format usd --out scene.usd",
+                    "all moments for Blender, Houdini and others",
+                ),
+            )
+        ),
     )
 
 
@@ -119,7 +150,7 @@ def _space(model: SceneModel, clip: Clip) -> str:
 
 def _scores(evaluation: Evaluation) -> str:
     tables = "".join(sections.table(score_table(view)) for view in evaluation.views)
-    bars = "".join(curves.frame_bars(view) for view in evaluation.views)
+    bars = "".join(curves.frame_bars(view) for view in evaluation.views if view.frames)
     return _section(
         "Scores",
         "Each number stands with the protocol that it was measured by.",
@@ -149,8 +180,8 @@ def _cost(evaluation: Evaluation) -> str:
 
 def _faults(folder: Path) -> str:
     """The clip's defects with their remedies; empty if there are none."""
-    provenance = folder / "provenance.json"
-    found = json.loads(provenance.read_text()).get("clip_faults") if provenance.is_file() else None
+    run = RunFolder(folder)
+    found = run.read_provenance().get("clip_faults") if run.provenance.is_file() else None
     if not found:
         return ""
     rows = [(fault["what"], fault["do"]) for fault in found]
@@ -165,7 +196,7 @@ def _origin(folder: Path) -> str:
     parts = []
     provenance = folder / "provenance.json"
     if provenance.is_file():
-        parts.append(sections.provenance(json.loads(provenance.read_text())))
+        parts.append(sections.provenance(RunFolder(folder).read_provenance()))
     spec = folder / "spec.yaml"
     if spec.is_file():
         parts.append(

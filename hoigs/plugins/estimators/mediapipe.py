@@ -1,8 +1,8 @@
-"""estimator:mediapipe: MediaPipe Pose, in an environment of its own.
+"""estimator:mediapipe: MediaPipe's landmarks and masks of a person, in an environment of its own.
 
 mediapipe 0.10.21, the last wheel that contains its models, needs numpy below 2, which hoigs does
-not. So the user names a Python that has it; it runs `mediapipe_script.py`, which reads frames from
-standard input and writes one file.
+not. So `mediapipe_script.py` is run by the Python of an environment that hoigs makes, or that the
+user names; it reads frames from standard input and writes one file.
 """
 
 from __future__ import annotations
@@ -13,36 +13,47 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from jaxtyping import Bool
+from PIL import Image
 from pydantic import Field
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import (
+    EntityMasks,
+    EstimateKind,
     Estimates,
     Estimator,
     Landmarks,
+    LazyFrames,
     VideoRequest,
 )
 from hoigs.core.progress import Progress, no_progress
+from hoigs.plugins.estimators.common.environments import HEAVY, MEDIAPIPE
 from hoigs.plugins.estimators.common.subprocess import run_tool, settings_key
 
 SCRIPT = Path(__file__).with_name("mediapipe_script.py")
-INSTALL = (
-    "make an environment for it: `python3.11 -m venv ENV && ENV/bin/pip install "
-    "mediapipe==0.10.21`, and set `python: ENV/bin/python`"
-)
+INSTALL = "run `hoigs estimators install mediapipe` and leave `python` out"
+LONGEST = 1280  # pixels: larger frames are made smaller, which the models do in any case
 
 
 class MediapipeConfig(ComponentConfig):
     """Settings of `estimator:mediapipe`."""
 
-    python: Path = Field(
-        description="the Python of an environment with mediapipe, such as ENV/bin/python; "
-        "relative to the video's folder"
+    python: Path | None = Field(
+        default=None,
+        description="the Python of an environment of your own with mediapipe and OpenCV, such as "
+        "ENV/bin/python, relative to the video's folder; None: that of `hoigs estimators install "
+        "mediapipe`",
     )
     complexity: int = Field(
-        default=1, ge=0, le=2, description="complexity of the model; mediapipe downloads 0 and 2"
+        default=2,
+        ge=0,
+        le=2,
+        description="complexity of the model; 2 is the heavy one, in place of which 1 is used "
+        "where the environment has it not; mediapipe downloads 0 itself",
     )
+    masks: bool = Field(default=True, description="find the person's mask, too")
     smooth: bool = Field(default=True, description="use MediaPipe's filter over time")
     detection_confidence: float = Field(
         default=0.5, ge=0, le=1, description="confidence below which no person is found"
@@ -52,27 +63,50 @@ class MediapipeConfig(ComponentConfig):
     )
 
 
+class _IfMasks:
+    """`provides`: of the class, all that it may give; of an instance, what its settings want."""
+
+    def __get__(
+        self, estimator: MediapipeEstimator | None, owner: type[MediapipeEstimator]
+    ) -> frozenset[EstimateKind]:
+        if estimator is None or estimator.config.masks:
+            return frozenset(("landmarks", "masks"))
+        return frozenset(("landmarks",))
+
+
 class MediapipeEstimator(Estimator):
-    """Landmarks of the one person of a video by MediaPipe Pose.
+    """Landmarks and mask of the one person of a video by MediaPipe, in one pass over it.
 
     It follows a person from frame to frame and loses one that jumps, so it is given every frame
-    up to the last wanted one.
+    up to the last wanted one. Where no landmarks are found it looks again with a border above the
+    frame, and landmarks that are not on the person's mask are dropped. The mask is the mean of the
+    segmentation of the frame, of the person's part of it, and of the pose's own.
     """
 
     Config: ClassVar = MediapipeConfig
     config: MediapipeConfig
-    provides = frozenset({"landmarks"})
+    provides = _IfMasks()
+    environment: ClassVar = MEDIAPIPE
+
+    def _complexity(self) -> int:
+        """The one that there is a model for."""
+        own = self.config.python is not None
+        if self.config.complexity < 2 or own or HEAVY.member not in MEDIAPIPE.lacking():
+            return self.config.complexity
+        return 1
 
     def _settings(self) -> dict[str, int | float]:
         """Arguments of `mediapipe.solutions.pose.Pose`."""
         return {
-            "model_complexity": self.config.complexity,
+            "model_complexity": self._complexity(),
             "smooth_landmarks": self.config.smooth,
             "min_detection_confidence": self.config.detection_confidence,
             "min_tracking_confidence": self.config.tracking_confidence,
         }
 
     def commands(self) -> tuple[str, ...]:
+        if self.config.python is None:
+            return ()
         return (f"{self.config.python} -I {SCRIPT.name}",)
 
     def estimate(self, video: VideoRequest, progress: Progress = no_progress) -> Estimates:
@@ -82,22 +116,31 @@ class MediapipeEstimator(Estimator):
                 f"estimator:mediapipe finds one person, {len(people)} are requested; run it on a "
                 "video of each, or use estimator:landmarks-files"
             )
+        count = max(video.numbers, default=-1) + 1
+        settings = {"pose": self._settings(), "frames": count, "masks": self.config.masks}
+        out = video.work / f"mediapipe-{settings_key(settings)}.npz"
+        if not out.is_file():
+            self._run(self._python(video), out, count, video, progress)
+        with np.load(out, allow_pickle=False) as file:
+            found = {name: file[name] for name in file.files}
+        image, world = (self._spread(found[k], count, video) for k in ("image_xyzv", "world_xyzv"))
+        progress(1.0, "landmarks")
+        text = f"MediaPipe Pose, complexity {self._complexity()}"
+        landmarks = {people[0]: Landmarks(image, world, text)}
+        if not self.config.masks:
+            return Estimates(landmarks=landmarks)
+        person = _frames_of(found["person"], found["size"], video)
+        text = "MediaPipe's segmentation of selfies and of poses; it takes in what is held"
+        return Estimates(EntityMasks({people[0]: person}, None, text), landmarks)
+
+    def _python(self, video: VideoRequest) -> Path:
+        if self.config.python is None:
+            return MEDIAPIPE.python()
         # links are not followed: the place of an environment's python, a link, selects it
         python = video.resolve(self.config.python)
         if not python.exists():
             raise HoigsError(f"estimator:mediapipe: there is no {python}; {INSTALL}")
-        count = max(video.numbers, default=-1) + 1
-        key = settings_key({"pose": self._settings(), "frames": count})
-        out = video.work / f"mediapipe-{key}.npz"
-        if not out.is_file():
-            self._run(python, out, count, video, progress)
-        with np.load(out, allow_pickle=False) as file:
-            image, world = (
-                self._spread(file[k], count, video) for k in ("image_xyzv", "world_xyzv")
-            )
-        progress(1.0, "landmarks")
-        text = f"MediaPipe Pose, complexity {self.config.complexity}"
-        return Estimates(landmarks={people[0]: Landmarks(image, world, text)})
+        return python
 
     def _run(
         self, python: Path, out: Path, count: int, video: VideoRequest, progress: Progress
@@ -105,8 +148,8 @@ class MediapipeEstimator(Estimator):
         out.parent.mkdir(parents=True, exist_ok=True)
         half = out.with_suffix(".part")
         settings = {
-            "width": video.width, "height": video.height, "count": count,
-            "pose": self._settings(), "out": str(half.absolute()),
+            "width": video.width, "height": video.height, "count": count, "longest": LONGEST,
+            "masks": self.config.masks, "pose": self._settings(), "out": str(half.absolute()),
         }  # fmt: skip
         # -I: the script's own folder, where modules of hoigs lie, is not searched for imports
         argv = [str(python.absolute()), "-I", str(SCRIPT), json.dumps(settings)]
@@ -137,3 +180,19 @@ def _frames(video: VideoRequest, count: int, progress: Progress) -> Iterator[np.
     for i in range(count):
         progress(i / count, "landmarks")
         yield video.frame(i)
+
+
+def _frames_of(bits: np.ndarray, size: np.ndarray, video: VideoRequest) -> LazyFrames:
+    """Masks of the video's size from bits; empty ones beyond the last frame that was looked at."""
+    width, height = (video.width, video.height)
+
+    def read(i: int) -> Bool[np.ndarray, "H W"]:
+        if i >= len(bits):
+            return np.zeros((height, width), dtype=bool)
+        mask = np.unpackbits(bits[i], axis=1, count=int(size[0])).astype(bool)
+        if mask.shape == (height, width):
+            return mask
+        large = Image.fromarray(mask.astype(np.uint8) * 255)
+        return np.asarray(large.resize((width, height), Image.Resampling.BILINEAR)) > 127
+
+    return LazyFrames(video.frames, read)

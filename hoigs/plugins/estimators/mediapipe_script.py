@@ -1,7 +1,8 @@
 """Run by the Python of an environment with mediapipe; it imports nothing of hoigs.
 
-Reads RGB frames from standard input, writes image_xyzv and world_xyzv [N, 33, 4] to an .npz file;
-NaN where no person is found.
+Reads RGB frames from standard input and writes one .npz file: image_xyzv and world_xyzv
+[N, 33, 4], NaN where no person is found; and, if masks are wanted, `person`, the bits of boolean
+masks [N, H, ceil(W / 8)], and their `size`.
 """
 
 from __future__ import annotations
@@ -12,31 +13,138 @@ from pathlib import Path
 
 import numpy as np
 
+PADDING = 0.5  # of the height, above: a detector of faces finds people whose head is cut off
+MARGIN = 1.25  # of the person's box, the second look at the person's mask
+CREDIBLE = 0.5  # share of the seen landmarks that have to lie on the person's mask
+TALL = 0.3  # height of the landmarks in heights of the mask, below which they are of something else
+SEEN = 0.5  # visibility
+
 
 def main() -> None:
     try:
+        import cv2
         import mediapipe
     except ImportError as error:
         sys.exit(f"this Python has no mediapipe: {error}")
     settings = json.loads(sys.argv[1])
     width, height, count = settings["width"], settings["height"], settings["count"]
-    image = np.full((count, 33, 4), np.nan, np.float32)
-    world = np.full((count, 33, 4), np.nan, np.float32)
-    size = np.array([width, height, width, 1.0])  # z is in the scale of x
-    with mediapipe.solutions.pose.Pose(**settings["pose"]) as pose:
-        for i in range(count):
-            pixels = sys.stdin.buffer.read(height * width * 3)
-            if len(pixels) != height * width * 3:
-                sys.exit(f"frame {i} of {count} did not come")
-            found = pose.process(np.frombuffer(pixels, np.uint8).reshape(height, width, 3))
-            if found.pose_landmarks is not None:
-                image[i] = points_of(found.pose_landmarks) * size
-                world[i] = points_of(found.pose_world_landmarks)
+    factor = min(1.0, settings["longest"] / max(width, height))
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    finder = Finder(cv2, mediapipe.solutions, settings)
+    for i in range(count):
+        pixels = sys.stdin.buffer.read(height * width * 3)
+        if len(pixels) != height * width * 3:
+            sys.exit(f"frame {i} of {count} did not come")
+        image = np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
+        if factor < 1:
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        finder.add(np.ascontiguousarray(image))
     with Path(settings["out"]).open("wb") as out:
-        np.savez(out, image_xyzv=image, world_xyzv=world)
+        np.savez_compressed(out, size=np.array(size), **finder.arrays(width / size[0]))
 
 
-def points_of(found) -> np.ndarray:
+class Finder:
+    """Landmarks and masks, frame by frame."""
+
+    def __init__(self, cv2, solutions, settings) -> None:
+        self.cv2, self.masks = cv2, settings["masks"]
+        pose = {**settings["pose"], "enable_segmentation": self.masks, "smooth_segmentation": False}
+        self.whole, self.padded = solutions.pose.Pose(**pose), solutions.pose.Pose(**pose)
+        self.selfie = self.close = None
+        if self.masks:
+            self.selfie = solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
+            self.close = solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
+        self.rows = {"image_xyzv": [], "world_xyzv": []}
+        self.person = []
+
+    def add(self, image) -> None:
+        wide = None if self.selfie is None else self.selfie.process(image).segmentation_mask
+        image_xyzv, world_xyzv, own = self.landmarks(image, wide)
+        self.rows["image_xyzv"].append(image_xyzv)
+        self.rows["world_xyzv"].append(world_xyzv)
+        if wide is None:
+            return
+        near = self.near(image, wide > 0.5)
+        mean = wide if near is None else (wide + near) / 2
+        person = mean if own is None else (2 * mean + own) / 3
+        self.person.append(np.packbits(person > 0.5, axis=1))
+
+    def landmarks(self, image, wide):
+        """In the image and in space, and the mask of their person; looked for a second time with a
+        border above the image where they are not found, as with a head out of view."""
+        height, width = image.shape[:2]
+        border = round(PADDING * height)
+        for pose, above in ((self.whole, 0), (self.padded, border)):
+            padded = self.cv2.copyMakeBorder(
+                image, above, 0, 0, 0, self.cv2.BORDER_REPLICATE
+            )  # fmt: skip
+            found = pose.process(padded)
+            if found.pose_landmarks is None:
+                continue
+            # z is in the scale of x
+            points = points_of(found.pose_landmarks) * [width, height + above, width, 1.0]
+            points[:, 1] -= above
+            if not credible(points, wide):
+                pose.reset()
+                continue
+            own = found.segmentation_mask
+            own = None if own is None else own[above:]
+            return points, points_of(found.pose_world_landmarks), own
+        nothing = np.full((33, 4), np.nan)
+        return nothing, nothing, None
+
+    def near(self, image, inside):
+        """The mask of a picture of the person alone, which shows more detail."""
+        box = box_of(inside, MARGIN)
+        if box is None:
+            return None
+        x0, y0, x1, y1 = box
+        part = np.zeros(inside.shape, np.float32)
+        cut = np.ascontiguousarray(image[y0:y1, x0:x1])
+        part[y0:y1, x0:x1] = self.close.process(cut).segmentation_mask
+        return part
+
+    def arrays(self, scale):
+        """What is written; `scale`: pixels of the video a pixel of the images here."""
+        rows = {name: np.array(found, np.float32) for name, found in self.rows.items()}
+        rows["image_xyzv"][..., :3] *= scale
+        if self.masks:
+            rows["person"] = np.array(self.person)
+        return rows
+
+
+def credible(points, wide) -> bool:
+    """Whether landmarks are of the masked person: most of those seen are on it, and not on a small
+    thing, such as a mug, that was taken for a person."""
+    if wide is None:
+        return True
+    rows = np.flatnonzero((wide > 0.5).any(1))
+    if not len(rows):
+        return True
+    seen = points[points[:, 3] > SEEN, :2]
+    inside = seen[(seen >= 0).all(1) & (seen[:, 0] < wide.shape[1]) & (seen[:, 1] < wide.shape[0])]
+    if len(inside) < 4:
+        return False
+    x, y = inside.astype(int).T
+    tall = np.ptp(inside[:, 1]) >= TALL * (rows[-1] - rows[0])
+    return bool(tall and (wide[y, x] > 0.5).mean() >= CREDIBLE)
+
+
+def box_of(mask, margin):
+    """x0, y0, x1, y1 of a square about a mask, within the image; None if it is empty."""
+    if not mask.any():
+        return None
+    ys, xs = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    half = margin * max(np.ptp(ys), np.ptp(xs), 8) / 2
+    x, y = (xs[0] + xs[-1]) / 2, (ys[0] + ys[-1]) / 2
+    height, width = mask.shape
+    return (
+        int(max(0, x - half)), int(max(0, y - half)),
+        int(min(width, x + half + 1)), int(min(height, y + half + 1)),
+    )  # fmt: skip
+
+
+def points_of(found):
     return np.array([[p.x, p.y, p.z, p.visibility] for p in found.landmark])
 
 

@@ -15,6 +15,7 @@ from hoigs.core.maths.skinning import skin
 from hoigs.core.values.camera import Camera, pinhole_pixels
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit_start import Start, first_guess
+from hoigs.preparation.body.ground_scale import ground_scale
 from hoigs.preparation.body.joint_limits import limit_penalty
 from hoigs.preparation.body.landmarks import (
     BONES,
@@ -24,7 +25,6 @@ from hoigs.preparation.body.landmarks import (
     points_of,
 )
 from hoigs.preparation.body.mask_fit import MaskFit
-from hoigs.preparation.scene.scale import ground_scale
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ class CameraTrack:
 
     @property
     def static(self) -> bool:
-        return self.model is None
+        return not len(self.points)  # only a camera that moves has measured any
 
 
 def static_cameras(video: Frames, focal: float, how: str = "given") -> CameraTrack:

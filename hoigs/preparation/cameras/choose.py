@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from hoigs.preparation.body.person import RawLandmarks
 from hoigs.preparation.cameras.camera_track import CameraTrack, colmap_cameras, static_cameras
+from hoigs.preparation.cameras.given_cameras import given_cameras
 from hoigs.preparation.cameras.motion import background_motion
 from hoigs.preparation.cameras.sfm import structure_from_motion
 from hoigs.preparation.cameras.static_focal import static_focal
-from hoigs.preparation.masks.entity_masks import GivenMasks
+from hoigs.preparation.given import GivenMasks, RawLandmarks
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames
 
@@ -33,16 +33,20 @@ def choose_cameras(
     options: PrepareOptions,
     folder: Path,
     progress: Callable[[float], None],
+    given: Path | None = None,
 ) -> ChosenCameras:
     """Cameras as `options.camera` requests them.
 
     Args:
         landmarks, masks: of the raw frames. model: a COLMAP model that is there already, or None.
+        given: cameras.npz, or None.
         folder: to work in; it may be removed when the result has been kept.
 
     Raises:
         SourceError: the model does not fit, or structure from motion fails.
     """
+    if options.camera not in {"static", "sfm"} and given is not None:
+        return ChosenCameras(given_cameras(video, given))
     if options.camera not in {"static", "sfm"} and model is not None:
         return ChosenCameras(colmap_cameras(video, model))
     if options.camera == "static":

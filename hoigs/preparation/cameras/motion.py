@@ -10,7 +10,7 @@ from PIL import Image
 from scipy import ndimage
 
 from hoigs.preparation.cameras.colmap_log import quiet_colmap
-from hoigs.preparation.masks.entity_masks import GivenMasks
+from hoigs.preparation.given import GivenMasks
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.resizing import shrink, shrink_mask
 

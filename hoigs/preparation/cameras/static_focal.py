@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from hoigs.preparation.body.person import RawLandmarks
 from hoigs.preparation.cameras.camera_track import ASSUMED_FOCAL
 from hoigs.preparation.cameras.focal import FocalCurve, focal_curve
 from hoigs.preparation.cameras.focal_metadata import focal_of_metadata
+from hoigs.preparation.given import RawLandmarks
 from hoigs.preparation.video.frames import Frames
 
 

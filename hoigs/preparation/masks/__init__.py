@@ -1,7 +1,6 @@
 """Masks of the person and the object.
 
-- `entity_masks`: `entity_masks`, the entry.
-- `separate`: one mask of both, separated by the fitted body and by colour.
+- `separate`: `separate`, the entry: one mask of both, separated by the fitted body and by colour.
 - `mask_stack`: the masks of all frames, kept as bits.
 - `outlines`: middle, length and direction of a mask.
 """

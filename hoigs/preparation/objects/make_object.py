@@ -1,15 +1,17 @@
-"""The object's track with colours: of a ball, or of something held."""
+"""The object's track with colours: of a ball, of something held, or of an outline alone."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.preparation.masks.mask_stack import MaskStack
@@ -17,6 +19,9 @@ from hoigs.preparation.masks.separate import Images
 from hoigs.preparation.objects.ball import BallTrack, ball_centers
 from hoigs.preparation.objects.shape import ColorSampler, sphere_points
 from hoigs.preparation.objects.track import held_object
+from hoigs.preparation.objects.tracked import ObjectConfidence, UntrackableError, tracked_object
+
+ObjectWay = Literal["auto", "outline"]
 
 COLOR_FRAMES = 24  # a median over more changes nothing visible
 
@@ -41,22 +46,57 @@ def ball_object(
     return track, points / radius, ball.jitter
 
 
+@dataclass(frozen=True)
+class MadeObject:
+    """The object's track with sampled colours.
+
+    Attributes:
+        spread: of its apparent over its expected size, relative.
+        confidence: how far poses and shape may be trusted.
+    """
+
+    track: ObjectTrack
+    spread: float
+    confidence: ObjectConfidence
+
+
 def make_object(
     ball: BallTrack | None,
     masks: MaskStack,
+    humans: MaskStack,
     cameras: Sequence[Camera],
-    wrists: Float[Tensor, "F 2 3"],
+    joints: Float[Tensor, "F J 3"],
     images: Images,
     *,
+    way: ObjectWay,
     radius: float,
     count: int,
-) -> tuple[ObjectTrack, float]:
-    """The object's track with sampled colours, and its scale's spread."""
+    fps: float,
+    progress: Callable[[float], None],
+) -> MadeObject:
+    """A ball's track, or that of something held by its texture; by its outline where that cannot
+    be, and the confidence names why.
+
+    Args:
+        joints: of the body, world, metres. radius: of a ball, metres. count: of points.
+    """
     if ball is not None:
         track, normals, spread = ball_object(ball, cameras, radius, count)
+        confidence = ObjectConfidence.none("ball", len(cameras), "a ball's spin is not tracked")
     else:
-        track, normals, spread = held_object(masks, list(cameras), wrists, count)
-    return replace(track, colors=_colors(track, normals, masks, cameras, images)), spread
+        try:
+            if way == "outline":
+                raise UntrackableError("object_track is outline")
+            track, normals, confidence = tracked_object(
+                masks, humans, cameras, joints, images, count, fps, progress
+            )
+            spread = float(np.nanmean(confidence.outline) / track.points.norm(dim=-1).mean())
+        except UntrackableError as reason:
+            wrists = joints[:, [LEFT_WRIST, RIGHT_WRIST]]
+            track, normals, spread = held_object(masks, list(cameras), wrists, count)
+            confidence = ObjectConfidence.none("outline", len(cameras), str(reason))
+    track = replace(track, colors=_colors(track, normals, masks, cameras, images))
+    return MadeObject(track, spread, confidence)
 
 
 def _colors(

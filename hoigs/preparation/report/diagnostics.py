@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from hoigs.core.diagnostics import Diagnostic, Severity
 from hoigs.preparation.report.measures import Measures
 
+AGREES = 0.5  # correlation of textures from which the object's rotation is trusted
 BLURRED = 0.5  # of the median sharpness: a frame below it is blurred
 
 
@@ -116,14 +117,16 @@ def _tracks(report: Measures) -> Iterator[MeasureDiagnostic]:
         "look at overlay.mp4: if the landmarks jump, use another estimator (estimators.landmarks); "
         "if all of the body is off, the focal length or the cameras are",
     )
-    yield _judged(
-        "object's apparent size",
-        f"± {100 * report.object_scale_spread:.1f} %",
-        "over its expected size; its depth is as uncertain",
-        _judge(report.object_scale_spread, 0.05, 0.15),
-        "the object's masks grow and shrink, or it turns: mend the masks, or give its shape as a "
-        "mesh (initializer:mesh)",
-    )
+    if report.object_scale_spread is not None:
+        yield _judged(
+            "object's apparent size",
+            f"± {100 * report.object_scale_spread:.1f} %",
+            "over its expected size; its depth is as uncertain",
+            _judge(report.object_scale_spread, 0.05, 0.15),
+            "the object's masks grow and shrink, or it turns: mend the masks, or give its shape as "
+            "a mesh (initializer:mesh)",
+        )
+    yield from _object(report)
     if report.depth_residual is not None:
         yield _judged(
             "depth",
@@ -132,6 +135,52 @@ def _tracks(report: Measures) -> Iterator[MeasureDiagnostic]:
             _judge(report.depth_residual, 0.05, 0.1),
             "the depth network misjudges this scene: try another, or leave its loss out "
             "(--set train.loss.depth=0)",
+        )
+
+
+def _object(report: Measures) -> Iterator[MeasureDiagnostic]:
+    """The object's rotation and shape, and the hands on it."""
+    if report.object_way == "outline":
+        yield _judged(
+            "object's rotation",
+            "not tracked",
+            f"only its roll in the image is known: {report.object_reason}",
+            "bad",
+            "training has to find rotation and shape: film the object larger, sharper and whole, "
+            "mend its masks, or choose a spec whose object deforms",
+        )
+    if report.object_way != "texture and hands":
+        return
+    known = [v for v in report.object_agreement if v is not None]
+    trusted = sum(v >= AGREES for v in known) / max(1, len(report.object_agreement))
+    middle = sorted(known)[len(known) // 2] if known else 0.0
+    yield _judged(
+        "object's rotation",
+        f"{100 * trusted:.0f} % of the frames",
+        f"its texture agrees there with that of other frames (correlation {middle:.2f}, median)",
+        _judge(1 - trusted, 0.1, 0.3),
+        "the others follow their neighbours and the hands. Where the object is hidden nothing can "
+        "be done; where it is blurred or small, take sharper frames",
+    )
+    off = [1000 * v for v in report.object_outline_m if v is not None]
+    worst = sorted(off)[int(0.95 * (len(off) - 1))]
+    yield _judged(
+        "object's shape",
+        f"{sum(off) / len(off):.0f} mm",
+        f"between its outline and the mask's ({worst:.0f} mm in the worst twentieth of the frames)",
+        _judge(report.object_scale_spread or 0.0, 0.05, 0.15),
+        "it is not rigid, or its masks are off: a spec whose object deforms may fit better",
+    )
+    palms = [1000 * v for v in report.hand_distance_m if v is not None]
+    if palms:
+        middle = sorted(palms)[len(palms) // 2]
+        yield _judged(
+            "hands on the object",
+            f"{middle:.0f} mm",
+            f"from the nearest palm to its surface, median of {len(palms)} frames in which hands "
+            f"move it; deepest inside {max(0.0, -min(palms)):.0f} mm",
+            _judge(abs(middle), 60, 120),
+            "body and object are at different distances: look at both in overlay.mp4",
         )
 
 

@@ -19,7 +19,8 @@ class Measures:
         body: whatever else the body fit reports.
         scene_scale: metres a COLMAP unit; 1 for a static camera.
         object_scale_spread: standard deviation over frames of the object's apparent over its
-            expected size: 0.05 means that its depth is uncertain by about 5 %.
+            expected size: 0.05 means that its depth is uncertain by about 5 %; None
+            without an object.
         object_observed: part of the frames in which the object was seen.
         scene_points: number of points that start the background.
         provenance: what each part was made from, and how weak it is.
@@ -33,6 +34,14 @@ class Measures:
         body_residual_m: `body_residual_px` at the person's distance.
         depth_residual: typical relative error of the depth estimator once it is in metres, against
             `depth_against`; depth_residuals: of each frame. None without such an estimator.
+        object_way: how the object's poses were found: "texture and hands", "outline" or "ball";
+            object_reason: why not better.
+        object_agreement: of each frame, correlation of the object's texture with that of the other
+            frames; None where it shows too little. object_outline_m: metres between the mask's
+            outline and the shape's.
+        object_held, object_rests: parts of the frames in which hands move it, and it rests.
+        hand_distance_m: of each frame, from the nearest palm to its surface while held; negative
+            inside.
         omega, big_omega: effective multi-view factors (`multiview`).
     """
 
@@ -47,8 +56,8 @@ class Measures:
     coverage: dict[str, list[float]]
     body_residual_px: float
     scene_scale: float
-    object_scale_spread: float
-    object_observed: float
+    object_scale_spread: float | None
+    object_observed: float | None
     scene_points: int
     body: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, str] = field(default_factory=dict)
@@ -63,5 +72,12 @@ class Measures:
     depth_residual: float | None = None
     depth_residuals: list[float | None] = field(default_factory=list)
     depth_against: str = ""
+    object_way: str = ""
+    object_reason: str = ""
+    object_agreement: list[float | None] = field(default_factory=list)
+    object_outline_m: list[float | None] = field(default_factory=list)
+    object_held: float = 0.0
+    object_rests: float = 0.0
+    hand_distance_m: list[float | None] = field(default_factory=list)
     omega: float | None = None
     big_omega: float | None = None

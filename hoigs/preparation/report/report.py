@@ -30,10 +30,15 @@ class PrepareReport(Measures):
             ("camera", self.camera, f"parallax {self.parallax_degrees:.1f} degrees"),
             ("body", f"{self.body_residual_px:.1f} px", "median distance from the landmarks"),
             ("scene scale", f"{self.scene_scale:.4g}", "metres a unit of the source"),
-            ("object seen", f"{100 * self.object_observed:.0f} %", "of the frames"),
-            ("object scale spread", f"{100 * self.object_scale_spread:.1f} %", "so its depth's"),
-            ("scene points", f"{self.scene_points}", ""),
         ]
+        if self.object_observed is None or self.object_scale_spread is None:
+            rows.append(("object", "none", ""))
+        else:
+            spread = f"{100 * self.object_scale_spread:.1f} %"
+            rows.append(("object seen", f"{100 * self.object_observed:.0f} %", "of the frames"))
+            rows.append(("object scale spread", spread, "so its depth's"))
+            rows.append(("object's poses", self.object_way, self.object_reason))
+        rows.append(("scene points", f"{self.scene_points}", ""))
         if self.depth_residual is not None:
             rows.append(
                 ("depth", f"{100 * self.depth_residual:.1f} %", f"off {self.depth_against}")
@@ -63,7 +68,11 @@ class PrepareReport(Measures):
         (folder / "report.json").write_text(self.to_json(), encoding="utf-8")
         (folder / "report.md").write_text(self.to_markdown(), encoding="utf-8")
         page = report_page(
-            self, self.diagnostics(), self.rows(), overlay=(folder / "overlay.mp4").is_file()
+            self,
+            self.diagnostics(),
+            self.rows(),
+            overlay=(folder / "overlay.mp4").is_file(),
+            object_picture=(folder / "object.jpg").is_file(),
         )
         (folder / "report.html").write_text(page, encoding="utf-8")
 

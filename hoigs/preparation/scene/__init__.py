@@ -4,5 +4,4 @@
 - `dense_points`: more points between those of COLMAP.
 - `background_points`: a floor and a wall for a camera that never moves.
 - `depth`: `fit_depth`, an estimator's depth in metres.
-- `scale`: metres a unit, from the ground at the feet.
 """

@@ -2,7 +2,6 @@
 
 - `plan`: their order, and what each depends on.
 - `work_folder`: WorkFolder, which keeps their results.
-- `saved`: results as JSON and arrays, and back.
 - `progress`: their times and one progress number.
 - `cleanup`: removes what a killed run left.
 """

@@ -26,12 +26,13 @@ class Stage:
 
 PLAN = {
     "frames": Stage(2, (), ("width", "every", "fps", "max_frames", "pick", "folder_fps")),
-    "evidence": Stage(4, ("frames",), ("human", "object", "prompts")),
+    "evidence": Stage(30, ("frames",), ("human", "object"), slow=True),
+    "object_masks": Stage(30, ("evidence",), (), slow=True),
     "cameras": Stage(3, ("frames", "evidence"), ("camera", "focal")),
-    "inputs": Stage(6, ("evidence", "cameras")),
+    "inputs": Stage(6, ("evidence", "cameras"), ("find_object",)),
     "body": Stage(40, ("inputs",), ("body", "fit_steps"), slow=True),
-    "masks": Stage(10, ("inputs", "body"), ("keep_black",), slow=True),
-    "object": Stage(4, ("masks",), ("ball_radius", "object_points"), slow=True),
+    "masks": Stage(10, ("inputs", "body", "object_masks"), ("keep_black",), slow=True),
+    "object": Stage(40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True),
     "depth": Stage(4, ("masks",), ("prompts",), slow=True),
     "scene": Stage(6, ("masks", "depth"), ("scene_points", "backdrop"), slow=True),
     "writing": Stage(40, ("object", "scene")),

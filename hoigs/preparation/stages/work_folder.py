@@ -21,11 +21,12 @@ from typing import Any
 import numpy as np
 
 from hoigs.core.errors import ClipError
+from hoigs.core.folder_lock import FolderLock
 from hoigs.core.npz import load_arrays
 
 TEMPORARY = "."  # names that begin with it are not read, and are removed at the start
 UNFINISHED = "unfinished-"
-RESULT, ARRAYS, LOCK = "result.json", "arrays.npz", "lock"
+RESULT, ARRAYS = "result.json", "arrays.npz"
 
 
 @dataclass(frozen=True)
@@ -58,17 +59,9 @@ class WorkFolder:
         self.root = Path(root)
 
     def __enter__(self) -> WorkFolder:
-        from filelock import FileLock, Timeout
-
         self.new = not self.root.exists()
-        self.root.mkdir(parents=True, exist_ok=True)
-        self._lock = FileLock(self.root / LOCK)
-        try:
-            self._lock.acquire(timeout=0)
-        except Timeout as error:
-            raise ClipError(
-                f"{self.root}: another `hoigs prepare` is at work there; wait for it or stop it"
-            ) from error
+        self._lock = FolderLock(self.root, "hoigs prepare", ClipError).acquire()
+        self.root.mkdir(exist_ok=True)
         for path in self.root.iterdir():
             if path.name.startswith(TEMPORARY):
                 _remove(path)
@@ -133,8 +126,8 @@ class WorkFolder:
 
     def discard(self) -> None:
         """Removes the whole folder."""
-        self._lock.release()
         shutil.rmtree(self.root)
+        self._lock.release()
 
 
 def _remove(path: Path) -> None:

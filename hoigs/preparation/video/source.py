@@ -14,6 +14,7 @@ from hoigs.core.spec.schema import ComponentSpec
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 LANDMARKS = "pose_mediapipe.npz"
+CAMERAS = "cameras.npz"
 FRAME_FOLDERS = ("frames", "images")  # where a folder of frames may keep them
 _COLMAP_FILES = ("cameras", "images", "points3D")
 _LAYOUT = """  FOLDER/
@@ -22,7 +23,8 @@ _LAYOUT = """  FOLDER/
     hoi_mask/00000.png   person and object together, 0/255, one file a video frame,
                          from a video segmenter; or masks/human/ and masks/object/ apart
     depth/               depth maps as .npz, in an array named metric_depth or disparity
-    sparse/              a COLMAP model, if you have one; else hoigs checks whether the camera
+    sparse/              a COLMAP model, or cameras.npz (K, world_to_camera, points, in metres),
+                         if you have one; else hoigs checks whether the camera
                          moves, and then runs structure from motion itself
     ball_track.npz       xyr [F, 3] pixels, if the object is a ball: centre and radius"""
 
@@ -41,7 +43,9 @@ class Source:
             gives.
         masked: entities whose masks `beside` reads.
         colmap: folder of a COLMAP model, or None.
-        ball: ball_track.npz, or None.
+        cameras: cameras.npz, or None. ball: ball_track.npz, or None.
+        absent: which of "landmarks", "masks" (the person's) and "object" (the object's masks, or
+            its track) are not there and given by no other estimator.
     """
 
     video: Path
@@ -49,7 +53,9 @@ class Source:
     beside: dict[EstimateKind, ComponentSpec] = field(default_factory=dict)
     masked: tuple[str, ...] = ()
     colmap: Path | None = None
+    cameras: Path | None = None
     ball: Path | None = None
+    absent: frozenset[str] = frozenset()
 
 
 def find_source(
@@ -59,10 +65,13 @@ def find_source(
     object_name: str = "object",
     given: Collection[str] = (),
     own_cameras: bool = False,
+    complete: bool = True,
 ) -> Source:
     """The inputs in a folder, or beside a video file.
 
     Args:
+        complete: landmarks and masks have to be there; False: `Source.absent` names those that are
+            not.
         given: "masks", "landmarks" or "depth" that estimators give: no files are needed for them.
         own_cameras: cameras are made from the video: no COLMAP model is looked for.
 
@@ -78,21 +87,34 @@ def find_source(
     if video is not None and video.is_file() and not video.stat().st_size:
         raise SourceError(f"{video} is empty: 0 bytes; copy it again")
     beside: dict[EstimateKind, ComponentSpec] = {}
+    absent: set[str] = set()
     if (folder / LANDMARKS).is_file():
         beside["landmarks"] = _files("landmarks", LANDMARKS)
+    elif "landmarks" not in given and not complete:
+        absent.add("landmarks")
     elif "landmarks" not in given:
         missing.append(
             "pose_mediapipe.npz: body landmarks, from MediaPipe Pose (`pip install mediapipe` in "
-            "an environment of its own), arrays image_xyzv and world_xyzv [F, 33, 4]; or name "
-            "an estimator: --set estimators.landmarks.use=estimator:mediapipe"
+            "an environment of its own), arrays image_xyzv and world_xyzv [F, 33, 4]; or let hoigs "
+            "find them: --estimators offline"
         )
     masked: tuple[str, ...] = ()
+    ball = folder / "ball_track.npz"
     if "masks" not in given:
-        beside["masks"], masked = _find_masks(folder, human, object_name, missing)
+        lacking: list[str] = []
+        spec, masked = _find_masks(folder, human, object_name, lacking)
+        if masked or complete:
+            beside["masks"] = spec
+        if complete:
+            missing += lacking
+        else:
+            absent |= {"masks"} if human not in masked else set()
+    if object_name not in masked and not ball.is_file():
+        absent.add("object")
     if (folder / "depth").is_dir():
         beside["depth"] = _files("depth", "depth")
-    ball = folder / "ball_track.npz"
     colmap = None if own_cameras else _find_colmap(folder, missing)
+    cameras = folder / CAMERAS
     if missing:
         lines = "\n".join(f"  - {line}" for line in missing)
         raise SourceError(
@@ -102,7 +124,16 @@ def find_source(
         )
     assert video is not None
     beside = {kind: spec for kind, spec in beside.items() if kind not in given}
-    return Source(video, folder, beside, masked, colmap, ball if ball.is_file() else None)
+    return Source(
+        video,
+        folder,
+        beside,
+        masked,
+        colmap,
+        cameras if cameras.is_file() and not own_cameras else None,
+        ball if ball.is_file() else None,
+        frozenset(absent - set(given)),
+    )
 
 
 def _files(kind: EstimateKind, path: str, **settings: Any) -> ComponentSpec:

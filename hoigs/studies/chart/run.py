@@ -71,9 +71,9 @@ def measured(job: Job) -> dict[str, Any]:
 
 def curve_of(folder: Path) -> tuple[CurvePoint, ...]:
     """PSNR of the previews of test frames, from metrics.jsonl."""
-    from hoigs.evaluation.report.curves import read_metrics
+    from hoigs.runs.run_folder import RunFolder
 
-    records: Sequence[dict[str, Any]] = read_metrics(folder / "metrics.jsonl")
+    records: Sequence[dict[str, Any]] = RunFolder(folder).read_metrics()
     return tuple(
         (int(r["step"]), float(r["time_s"]), float(r["psnr"]["test"]))
         for r in records

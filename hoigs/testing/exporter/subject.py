@@ -17,8 +17,10 @@ from hoigs.core.model.exporter import Exported, Exporter, ExportRequest
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.tokens import EntityKind
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.testing.checks import CheckList, ComponentSubject
+from hoigs.testing.material.body import TinyBody
 from hoigs.testing.material.clip import HUMAN, OBJECT, moment_at, tiny_clip
 from hoigs.testing.material.motion import TinyMotion
 
@@ -39,10 +41,11 @@ class ExporterSubject(ComponentSubject[Exporter]):
     def request(self, *entities: str) -> ExportRequest:
         """Three moments of a scene with a human and an object, or some of these."""
         scene = SceneModel(
-            {name: _entity(seed) for seed, name in enumerate((HUMAN, OBJECT))},
+            {HUMAN: _entity(0, "human"), OBJECT: _entity(1, "object")},
             rasterizer=TorchRasterizer(),
         )
-        return ExportRequest(scene, tiny_clip(), tuple(map(moment_at, TIMES)), entities)
+        bodies = {HUMAN: TinyBody()}
+        return ExportRequest(scene, tiny_clip(), tuple(map(moment_at, TIMES)), entities, bodies)
 
     def export(
         self,
@@ -53,10 +56,10 @@ class ExporterSubject(ComponentSubject[Exporter]):
         return self.exporter().export(request or self.request(), out, progress)
 
 
-def _entity(seed: int) -> Entity:
+def _entity(seed: int, kind: EntityKind) -> Entity:
     generator = torch.Generator().manual_seed(seed)
     points = torch.randn(COUNT, 3, generator=generator) * 0.2 + torch.tensor((0.0, 0.0, 3.0))
-    return Entity(Gaussians.from_points(points, opacity=0.5, sh_degree=1), TinyMotion())
+    return Entity(Gaussians.from_points(points, opacity=0.5, sh_degree=1), TinyMotion(), kind=kind)
 
 
 @contextlib.contextmanager

@@ -15,7 +15,6 @@ import torch
 
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.progress import Progress, no_progress
-from hoigs.evaluation.orbits import world_up
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.html.packing import packed
 from hoigs.viewing.html.tracks import Track, track_of
@@ -215,7 +214,7 @@ def _page(
         "fps": clip.fps,
         "stride": stride,
         "tracks": list(heads),
-        "up": world_up(clip).tolist(),
+        "up": clip.up().tolist(),
         "distance": distance_to_subject(clip),
         "cameras": [
             {

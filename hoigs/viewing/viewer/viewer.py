@@ -14,7 +14,6 @@ from jaxtyping import UInt8
 
 from hoigs.core.values.between import camera_between, frame_of, moment_between
 from hoigs.core.values.camera import Camera
-from hoigs.evaluation.orbits import world_up
 from hoigs.viewing.viewer import takes
 from hoigs.viewing.viewer.bodies import PosedBody
 from hoigs.viewing.viewer.clock import Clock
@@ -54,7 +53,7 @@ class Viewer:
     ) -> None:
         self.server, self.drawings = server, list(drawings)
         first, clip = drawings[0], drawings[0].clip
-        self.clip, self.up = clip, world_up(clip).double().numpy()
+        self.clip, self.up = clip, clip.up().double().numpy()
         self.clock = Clock(clip.num_frames, clip.fps)
         self.settings = Settings.initial(first.modes, first.names)
         if len(drawings) > 1:

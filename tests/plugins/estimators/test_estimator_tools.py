@@ -26,6 +26,7 @@ from hoigs.plugins.estimators.mediapipe import MediapipeEstimator
 # what is bright, and writes down that it ran
 TOOL = """
 import sys
+from dataclasses import replace
 from pathlib import Path
 import numpy as np
 from PIL import Image
@@ -163,24 +164,34 @@ def test_a_video_file_is_given_if_there_is_one(tmp_path, tool):
 # landmarks tell what it saw and how it was called
 FAKE = """
 from types import SimpleNamespace as Box
+class Selfie:
+    def __init__(self, **settings):
+        pass
+    def process(self, image):
+        return Box(segmentation_mask=(image[..., 0] > 127).astype("float32"))
 class Pose:
     def __init__(self, **settings):
         self.settings = settings
         self.seen = 0
-    def __enter__(self):
-        return self
-    def __exit__(self, *args):
+    def reset(self):
         pass
     def process(self, image):
         self.seen += 1
-        if self.seen == 2:
+        if self.seen == 2 or image.shape[0] > 24:
             return Box(pose_landmarks=None, pose_world_landmarks=None)
         mean = float(image.mean())
-        point = Box(x=0.5, y=0.25, z=-0.1, visibility=mean / 255)
+        points = [Box(x=0.5, y=0.25 + k / 64, z=-0.1, visibility=mean / 255) for k in range(33)]
         world = Box(x=float(self.settings["model_complexity"]), y=0.0, z=1.0, visibility=1.0)
-        return Box(pose_landmarks=Box(landmark=[point] * 33),
+        own = (image[..., 0] > 127).astype("float32")
+        return Box(segmentation_mask=own, pose_landmarks=Box(landmark=points),
                    pose_world_landmarks=Box(landmark=[world] * 33))
-solutions = Box(pose=Box(Pose=Pose))
+solutions = Box(pose=Box(Pose=Pose), selfie_segmentation=Box(SelfieSegmentation=Selfie))
+"""
+FAKE_CV2 = """
+import numpy
+BORDER_REPLICATE = "edge"
+def copyMakeBorder(image, above, below, left, right, kind):
+    return numpy.pad(image, ((above, below), (left, right), (0, 0)), kind)
 """
 
 
@@ -190,6 +201,7 @@ def fake_python(tmp_path) -> Path:
     package = tmp_path / "site" / "mediapipe"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text(FAKE)
+    (package.parent / "cv2.py").write_text(FAKE_CV2)
     start = f"import sys, runpy; sys.path.insert(0, {str(package.parent)!r}); "
     start += "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
     path = tmp_path / "python"
@@ -204,7 +216,7 @@ def test_mediapipe_gets_all_frames_to_the_last_wanted_one_and_its_landmarks_come
     tmp_path, fake_python
 ):
     video = request(tmp_path, wanted=(0, 3))
-    estimator = mediapipe_estimator(python=fake_python, complexity=2)
+    estimator = mediapipe_estimator(python=fake_python, complexity=2, masks=False)
     track = checked(estimator.estimate(video), video, estimator).landmarks["human"]
     found = np.isfinite(track.image_xyzv).all((1, 2)).tolist()
     assert found == [True, False, True, True, False]  # in 1 nobody was found, 4 it did not see
@@ -212,16 +224,34 @@ def test_mediapipe_gets_all_frames_to_the_last_wanted_one_and_its_landmarks_come
     assert track.image_xyzv[3, 7, 3] == pytest.approx(video.frame(3).mean() / 255)
     assert track.world_xyzv[0, 0].tolist() == [2, 0, 1, 1]
     fake_python.write_text("#!/bin/sh\nexit 1\n")
-    again = mediapipe_estimator(python=fake_python, complexity=2).estimate(video).landmarks["human"]
+    again = estimator.estimate(video).landmarks["human"]
     np.testing.assert_array_equal(again.image_xyzv, track.image_xyzv)
     with pytest.raises(HoigsError, match="ended with code 1"):
         mediapipe_estimator(python=fake_python, complexity=1).estimate(video)
 
 
+def test_mediapipe_masks_the_person_and_drops_landmarks_beside_them(tmp_path, fake_python):
+    def frame(i: int) -> np.ndarray:
+        image = np.full((24, 32, 3), 100, np.uint8)
+        image[4:22, 10 : 22 - i] = 250  # the fake takes what is bright for the person
+        return image if i < 3 else np.where(image > 200, 100, 250).astype(np.uint8)
+
+    video = replace(request(tmp_path, entities=HUMAN), read=frame)
+    estimator = mediapipe_estimator(python=fake_python, complexity=1)
+    found = checked(estimator.estimate(video), video, estimator)
+    for i in range(FRAMES):
+        mask = found.masks.entities["human"][i]
+        np.testing.assert_array_equal(mask, frame(i)[..., 0] > 127)
+    seen = np.isfinite(found.landmarks["human"].image_xyzv[:, 0, 0])
+    assert seen.tolist() == [True, False, True, False, False], "from 3 on they are beside the mask"
+
+
 def test_a_python_without_mediapipe_is_told_how_to_get_it(tmp_path):
-    with pytest.raises(HoigsError, match=r"(?s)has no mediapipe.*pip install mediapipe==0\.10\.21"):
+    with pytest.raises(
+        HoigsError, match=r"(?s)has no mediapipe.*hoigs estimators install mediapipe"
+    ):
         mediapipe_estimator(python=sys.executable).estimate(request(tmp_path))
-    with pytest.raises(HoigsError, match=r"there is no .*nowhere.*pip install"):
+    with pytest.raises(HoigsError, match=r"there is no .*nowhere.*estimators install"):
         mediapipe_estimator(python="nowhere/bin/python").estimate(request(tmp_path))
     two = (EntityRequest("anna", "human"), EntityRequest("ben", "human"))
     with pytest.raises(HoigsError, match="finds one person, 2 are requested"):

@@ -18,11 +18,11 @@ from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.body.fit import fit_body
 from hoigs.preparation.body.fit_problem import BodyFit, FitOptions
+from hoigs.preparation.body.ground_scale import ground_scale
 from hoigs.preparation.body.joint_limits import limit_penalty
 from hoigs.preparation.body.landmarks import LandmarkTrack, points_of
 from hoigs.preparation.body.limb_start import limb_pose
 from hoigs.preparation.report.mesh_overlay import overlay_frame
-from hoigs.preparation.scene.scale import ground_scale
 
 FRAMES, WIDTH, HEIGHT, FOCAL = 9, 640, 480, 600.0
 QUICK = FitOptions(steps=60)

@@ -10,11 +10,10 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from hoigs.preparation.body.person import RawLandmarks
 from hoigs.preparation.cameras.choose import choose_cameras
 from hoigs.preparation.cameras.motion import background_motion
 from hoigs.preparation.cameras.sfm import structure_from_motion
-from hoigs.preparation.masks.entity_masks import GivenMasks
+from hoigs.preparation.given import GivenMasks, RawLandmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames, open_frames

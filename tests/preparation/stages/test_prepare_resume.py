@@ -10,14 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from filelock import FileLock
 
 from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.errors import ClipError, HoigsError
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until, work_folder
 from hoigs.preparation.stages.plan import PLAN, with_dependents
-from hoigs.preparation.stages.work_folder import LOCK, Result, WorkFolder, digest, fingerprint
+from hoigs.preparation.stages.work_folder import Result, WorkFolder, digest, fingerprint
 
 OPTIONS = PrepareOptions(fit_steps=3, overlay_width=0, max_frames=6)
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -32,7 +31,7 @@ def made(out: Path) -> dict[str, int]:
 def test_stages_are_taken_up_and_redone(tiny_source: Path, tmp_path: Path) -> None:
     out, body = tmp_path / "clip", AnnyBody()
     seconds = prepare_until("body", tiny_source, out, body=body, options=OPTIONS)
-    assert list(seconds) == ["frames", "evidence", "cameras", "inputs", "body"] == list(made(out))
+    assert list(seconds) == list(made(out)) == list(PLAN)[:6]
     assert not out.exists()
     first = made(out)
     report = prepare(tiny_source, out, body=body, options=OPTIONS)
@@ -82,11 +81,9 @@ def test_unknown_and_last_stages(tiny_source: Path, tmp_path: Path) -> None:
 
 def test_one_process_at_a_time(tiny_source: Path, tmp_path: Path) -> None:
     out = tmp_path / "clip"
-    work_folder(out).mkdir()
-    with (
-        FileLock(work_folder(out) / LOCK),
-        pytest.raises(ClipError, match="another `hoigs prepare` is at work"),
-    ):
+    held = {"work": "hoigs prepare", "host": "elsewhere", "pid": 1, "token": "its"}
+    (tmp_path / ".clip.prepare.lock").write_text(json.dumps(held))
+    with pytest.raises(ClipError, match=r"another process \(hoigs prepare, pid 1 on elsewhere"):
         prepare(tiny_source, out, body=AnnyBody(), options=OPTIONS)
 
 

@@ -81,7 +81,7 @@ def test_a_killed_chart_goes_on_and_a_cell_is_reproduced(tmp_path: Path) -> None
                     ("test frames", "human_object", "psnr")]  # fmt: skip
         assert cell["values"]["psnr_human_object"] == score["value"]
         assert cell["values"]["train_s"] > 0 and cell["values"]["parameters"] > 0
-        assert "no LPIPS weights" in cell["values"]["lpips_full"]["not_computed"]
+        assert "HOIGS_LPIPS_WEIGHTS" in cell["values"]["lpips_full"]["not_computed"]
         assert "1 core;" in cell["machine"] and cell["protocol"][0].startswith("2 frames of split")
         assert [step for step, _, _ in cell["curve"]] == [1, 2, 3, 4, 5, 6]
     sizes = {c["spec"]: c["values"]["parameters"] for c in cells}

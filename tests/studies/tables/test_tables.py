@@ -89,7 +89,7 @@ def test_markdown_csv_and_json_say_the_same(done, tmp_path: Path) -> None:
         assert float(row["mean"]) == pytest.approx(score["value"])
         assert f"{score['value']:.2f}" in text
     assert "| wrong | not computed:" in text and text.count("nobody has it") == 1
-    assert "LPIPS ↓, test frames: not computed: no LPIPS weights" in text
+    assert "LPIPS ↓, test frames: not computed: HOIGS_LPIPS_WEIGHTS names" in text
     assert "Geometry: not computed: the model has no separate object" in text
     # the paper's numbers stand apart, with table and data, and its own average where it differs
     mine, _, theirs = text.partition("**on other data**")

@@ -3,56 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool
 from scipy import ndimage
 
-from hoigs.preparation.cameras.camera_track import CameraTrack
+from hoigs.preparation.given import GivenMasks
 from hoigs.preparation.masks.mask_stack import MaskStack, largest_parts
 from hoigs.preparation.masks.separate import Images, separate
 from hoigs.preparation.objects.ball import BallTrack
-
-
-@dataclass(frozen=True)
-class GivenMasks:
-    """Masks as the source has them: together, or the person's and perhaps the object's apart."""
-
-    together: MaskStack | None = None
-    human: MaskStack | None = None
-    object: MaskStack | None = None
-
-    def named(self) -> dict[str, MaskStack]:
-        """Those that there are, by the name of the field."""
-        return {f.name: m for f in fields(self) if (m := getattr(self, f.name)) is not None}
-
-    def moving(self, frame: int) -> Bool[np.ndarray, "H W"]:
-        """Everything masked in a frame: what does not stand still with the scene."""
-        return np.logical_or.reduce([stack[frame] for stack in self.named().values()])
-
-    def persons(self, ball: BallTrack | None) -> MaskStack | None:
-        """The person's, or the nearest to it that is known before the body is fitted: with what
-        they hold, but without a tracked ball. None where only the object is masked."""
-        if self.human is not None or self.together is None:
-            return self.human
-        stack = MaskStack()
-        for frame, mask in enumerate(self.together):
-            if self.object is not None:
-                mask = mask & ~self.object[frame]
-            if ball is not None:
-                mask = mask & ~ball.disc(frame, mask.shape[1], mask.shape[0])
-            stack.append(mask)
-        return stack
-
-    def undistorted(self, track: CameraTrack) -> GivenMasks:
-        """On the cameras' undistorted images, without the frames that have no camera."""
-        return GivenMasks(
-            **{
-                name: MaskStack(track.undistort.mask(stack[i]) for i in track.positions)
-                for name, stack in self.named().items()
-            }
-        )
 
 
 @dataclass(frozen=True)
@@ -87,6 +47,8 @@ def entity_masks(
         return human, given.object, "given for each entity; the object's win where they overlap"
     together = given.together or given.human
     assert together is not None  # EstimateReader requires one or the other
+    if ball is None and given.together is None:
+        return together, MaskStack(np.zeros_like(m) for m in together), "given; there is no object"
     if ball is not None:
         human, objects = _disc_masks(together, ball)
         return human, objects, "ball: its disc; person: the given mask without the disc"

@@ -1,4 +1,4 @@
-"""The person: landmarks in the frames' pixels, the body fitted to them, and what follows."""
+"""The person: the body fitted to landmarks and masks, and what follows from it."""
 
 from __future__ import annotations
 
@@ -20,8 +20,6 @@ from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.body.silhouette import posed
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.video.frames import Frames
-from hoigs.preparation.video.source import SourceError
 
 POOR_FIT = 0.02  # of the image's longer side: a fit that misses by more deserves a warning
 
@@ -59,55 +57,6 @@ class FittedBody:
         """Median depth of the pelvis, metres."""
         depths = [c.to_camera(p)[2] for c, p in zip(cameras, self.joints[:, PELVIS], strict=True)]
         return float(torch.stack(depths).median())
-
-
-@dataclass(frozen=True)
-class RawLandmarks:
-    """Landmarks of the chosen frames, distortion still in; NaN where they were not found.
-
-    Attributes:
-        image: x, y, relative depth (pixels of the frames) and visibility. world: metres about the
-            hips' middle, and visibility; NaN if the estimator sees the image only.
-        source: for the report.
-    """
-
-    image: Float[np.ndarray, "F 33 4"]
-    world: Float[np.ndarray, "F 33 4"]
-    source: str = "MediaPipe"
-
-    def undistorted(self, track: CameraTrack) -> LandmarkTrack:
-        """On the cameras' undistorted images, without the frames that have no camera."""
-        rows = list(track.positions)
-        image = self.image[rows].copy()
-        image[..., :2] = track.undistort.pixels(image[..., :2])
-        return LandmarkTrack.from_mediapipe(image, self.world[rows])
-
-
-def chosen_landmarks(
-    image: Float[np.ndarray, "T 33 4"],
-    world: Float[np.ndarray, "T 33 4"] | None,
-    video: Frames,
-    what: str,
-    source: str = "MediaPipe",
-) -> RawLandmarks:
-    """Landmarks of a whole video, in its own pixels, as those of the chosen frames.
-
-    Args:
-        world: None if the estimator sees the image only.
-
-    Raises:
-        SourceError: no person is found in them; `what` names where they come from.
-    """
-    image = image[video.indices].astype(np.float64)
-    image[..., :3] *= video.width / video.native_width
-    if world is None:
-        places = np.full_like(image, np.nan)
-    else:
-        places = world[video.indices].astype(np.float64)
-    raw = RawLandmarks(image, places, source)
-    if not LandmarkTrack.from_mediapipe(raw.image, raw.world).found.any():
-        raise SourceError(f"{what}: no person was found in the {len(image)} chosen frames")
-    return raw
 
 
 def fit_person(

@@ -20,13 +20,16 @@ from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.lens import Lens
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.landmarks import LandmarkTrack
-from hoigs.preparation.body.person import FittedBody, RawLandmarks
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.cameras.choose import ChosenCameras
-from hoigs.preparation.estimates import RawEstimates, UndistortedEstimates
-from hoigs.preparation.masks.entity_masks import EntityMasks, GivenMasks
+from hoigs.preparation.entity_masks import EntityMasks
+from hoigs.preparation.estimates import FoundObject, RawEstimates, UndistortedEstimates
+from hoigs.preparation.given import GivenMasks, RawLandmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack
+from hoigs.preparation.objects.make_object import MadeObject
+from hoigs.preparation.objects.tracked import ObjectConfidence
+from hoigs.preparation.person import FittedBody
 from hoigs.preparation.scene.depth import DepthFit
 from hoigs.preparation.scene.scene_points import ScenePoints
 from hoigs.preparation.stages.work_folder import Result
@@ -36,8 +39,8 @@ CLASSES = {
     found.__name__: found
     for found in (
         BallTrack, BodyPose, CameraTrack, ChosenCameras, DepthFit, EntityMasks, FittedBody,
-        FrameList, GivenMasks, LandmarkTrack, Lens, ObjectTrack, RawEstimates, RawLandmarks,
-        ScenePoints, UndistortedEstimates,
+        FoundObject, FrameList, GivenMasks, LandmarkTrack, Lens, MadeObject, ObjectConfidence,
+        ObjectTrack, RawEstimates, RawLandmarks, ScenePoints, UndistortedEstimates,
     )
 }  # fmt: skip
 

@@ -1,0 +1,120 @@
+"""The one place where the commands turn failures into a message and an exit code.
+
+2 is a mistake that the user can mend, 130 and 143 are Ctrl-C and SIGTERM. Mistakes in hoigs keep
+their traceback, and so does everything under HOIGS_TRACEBACK=1.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, NoReturn
+
+from typer.core import TyperGroup
+
+from hoigs.core.errors import HoigsError, Interrupted
+from hoigs.core.names import printable
+
+# what a user does about the error of a system call
+ADVICE = {
+    errno.ENOSPC: "the disk is full; make room, or write to another disk",
+    errno.EDQUOT: "the disk quota is used up; make room, or write to another disk",
+    errno.EROFS: "this disk can only be read; write to another one",
+    errno.EACCES: "this user may not; change the permissions, or name another place",
+    errno.EPERM: "this user may not; change the permissions, or name another place",
+    errno.ENOENT: "no such file or folder, and none can be made there",
+    errno.ENOTDIR: "a part of this path is a file, not a folder",
+    errno.EEXIST: "there is something of this name already",
+    errno.EISDIR: "this is a folder, expected a file",
+    errno.ENAMETOOLONG: "the name is too long for this disk",
+    errno.EMFILE: "too many open files; raise the limit with `ulimit -n`",
+    errno.ELOOP: "symbolic links that point at each other",
+}
+TOO_LARGE = (
+    "there is not enough memory; reduce what is held at once (--set train.width=320, "
+    "--set model.human.points=5000, a shorter clip), or stop other programs"
+)
+ALLOCATORS = ("DefaultCPUAllocator", "out of memory", "Failed to allocate", "Storage size calc")
+
+
+class GuardedGroup(TyperGroup):
+    """Commands whose failures are messages; typer itself would name some of them wrongly."""
+
+    def invoke(self, ctx: Any) -> Any:
+        with failures_as_messages():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def failures_as_messages() -> Iterator[None]:
+    """Turn failures of the block into a message on stderr and SystemExit."""
+    before = _stop_on_sigterm()
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        print(str(stop) or "stopped", file=sys.stderr)
+        sys.exit(stop.code if isinstance(stop, Interrupted) else 128 + signal.SIGINT)
+    except Exception as error:
+        message = message_of(error)
+        if message is None or os.environ.get("HOIGS_TRACEBACK", "0") not in ("", "0"):
+            raise
+        print(f"error: {printable(message)}", file=sys.stderr)
+        sys.exit(2)
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGTERM, before)
+
+
+def message_of(error: Exception) -> str | None:
+    """The message of a failure that a user can mend; None of a mistake in hoigs."""
+    if isinstance(error, HoigsError):
+        return str(error)
+    if isinstance(error, MemoryError) or is_out_of_memory(error):
+        return f"{TOO_LARGE} ({_first_line(error)})"
+    if type(error).__name__ == "DecompressionBombError":  # Pillow's, which is not imported here
+        return f"an image is too large to be opened safely: {_first_line(error)}"
+    if isinstance(error, OSError) and error.errno not in (None, errno.EPIPE):
+        return _of_system(error)
+    return None
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Whether torch, which has no class of its own for it on a CPU, could not allocate."""
+    return isinstance(error, RuntimeError) and any(word in str(error) for word in ALLOCATORS)
+
+
+def _of_system(error: OSError) -> str:
+    number = error.errno or 0
+    reason = ADVICE.get(number, os.strerror(number))
+    places = [os.fsdecode(p) if isinstance(p, bytes) else str(p)
+              for p in (error.filename, error.filename2) if p is not None]  # fmt: skip
+    return f"{' -> '.join(places) or 'a file'}: {reason} ({os.strerror(number)})"
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+
+
+def _stop_on_sigterm() -> Any:
+    """Let SIGTERM end the command as Ctrl-C does, so that temporary files are removed.
+
+    Returns:
+        the handler before, or None where none was replaced.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return None
+    before = signal.getsignal(signal.SIGTERM)
+    if before is not signal.SIG_DFL:
+        return None
+    signal.signal(signal.SIGTERM, _stop)
+    return before
+
+
+def _stop(number: int, _: FrameType | None) -> NoReturn:
+    raise Interrupted("stopped", number)

@@ -1,0 +1,205 @@
+"""An environment for one tool: pinned with hashes, made once, usable only when it is whole.
+
+Packages are first downloaded into a folder that later runs use again, then installed from there
+into an environment under a temporary name; it gets its own name when a trial run has passed. A
+process that is killed leaves downloads, which the next one continues, and nothing that is used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+
+from hoigs.core.environments.cache import cache_folder
+from hoigs.core.environments.interpreters import find_python
+from hoigs.core.environments.npm_file import NpmFile
+from hoigs.core.errors import HoigsError
+from hoigs.core.progress import Progress, no_progress
+
+MARKER = "hoigs.json"
+TAIL = 12  # last lines of a failed program's output that a message shows
+
+
+class EnvironmentAbsentError(HoigsError):
+    """An environment that has to be installed first; the message has the command."""
+
+
+@dataclass(frozen=True)
+class ManagedEnvironment:
+    """One environment.
+
+    Attributes:
+        name: as in `hoigs estimators install NAME`. summary: what it is for, its size and licences.
+        requirements: a file of pip's with one exact version and its hashes a package, all of them.
+        pythons: versions of Python that it can have, the best first: "3.12".
+        trial: Python code that fails if the environment is unusable.
+        files: files to put beside the packages; it can be used without them.
+    """
+
+    name: str
+    summary: str
+    requirements: Path
+    pythons: tuple[str, ...]
+    trial: str
+    files: tuple[NpmFile, ...] = ()
+
+    @property
+    def folder(self) -> Path:
+        """Where it lies, or will: another file of requirements is another folder."""
+        return self._root / self._digest
+
+    @property
+    def installed(self) -> bool:
+        return (self.folder / MARKER).is_file()
+
+    def python(self) -> Path:
+        """Its interpreter.
+
+        Raises:
+            EnvironmentAbsentError: it is not installed.
+        """
+        if not self.installed:
+            raise EnvironmentAbsentError(
+                f"the environment {self.name} is not installed ({self.summary}); run "
+                f"`hoigs estimators install {self.name}`, or the same command with --yes"
+            )
+        return _python_of(self.folder)
+
+    def lacking(self) -> dict[str, str]:
+        """Files that could not be had, and why."""
+        return dict(self._marker().get("lacking", {}))
+
+    def description(self) -> dict[str, Any]:
+        """What the marker of an installed environment says: versions, date."""
+        return self._marker()
+
+    def install(self, progress: Progress = no_progress) -> None:
+        """Makes it, or fetches only the files that an earlier installation could not get.
+
+        Raises:
+            HoigsError: no Python fits, or a package cannot be had; what was downloaded is kept.
+        """
+        self._root.mkdir(parents=True, exist_ok=True)
+        with FileLock(self._root / "lock"):
+            if not self.installed:
+                self._make(progress)
+            elif self.lacking():
+                self._write_marker(self.folder, self._marker(), progress)
+            self._remove_others()
+        progress(1.0, f"{self.name} installed")
+
+    def remove(self) -> bool:
+        """Removes it with its downloads; False: there was nothing."""
+        if not self._root.is_dir():
+            return False
+        with FileLock(self._root / "lock"):
+            if self.folder.is_dir():
+                self.folder.rename(self._part)  # unusable at once, whatever happens next
+        shutil.rmtree(self._root)
+        return True
+
+    @property
+    def _root(self) -> Path:
+        return cache_folder() / "environments" / self.name
+
+    @property
+    def _digest(self) -> str:
+        return hashlib.sha256(self.requirements.read_bytes()).hexdigest()[:12]
+
+    @property
+    def _part(self) -> Path:
+        return self._root / f".{self._digest}.part"
+
+    def _marker(self) -> dict[str, Any]:
+        path = self.folder / MARKER
+        if not path.is_file():
+            return {}
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return content
+
+    def _make(self, progress: Progress) -> None:
+        python = find_python(self.pythons)
+        part, packages = self._part, self._root / "packages"
+        shutil.rmtree(part, ignore_errors=True)
+        what = f"installing {self.name}"
+        progress(0.02, f"{what}: making an environment with {python}")
+        _run([str(python), "-I", "-m", "venv", str(part)], f"{what}: venv")
+        pip = [str(_python_of(part)), "-I", "-m", "pip", "--disable-pip-version-check"]
+        pinned = ["--require-hashes", "--no-deps", "--only-binary", ":all:", "-r"]
+        progress(0.1, f"{what}: downloading packages")
+        _run([*pip, "download", "-q", "-d", str(packages), *pinned, str(self.requirements)],
+             f"{what}: downloading")  # fmt: skip
+        progress(0.6, f"{what}: unpacking packages")
+        found = ["--no-index", "--find-links", str(packages)]
+        _run([*pip, "install", "-q", *found, *pinned, str(self.requirements)], what)
+        progress(0.85, f"{what}: trying it")
+        versions = _run([str(_python_of(part)), "-I", "-c", self.trial], f"{what}: its trial run")
+        marker = {"made": date.today().isoformat(), "versions": versions.strip()}
+        self._write_marker(part, marker, progress)
+        part.rename(self.folder)
+        shutil.rmtree(packages, ignore_errors=True)
+
+    def _write_marker(self, folder: Path, marker: dict[str, Any], progress: Progress) -> None:
+        """Fetches the files, then says that all is there, and what is not."""
+        lacking = {}
+        for file in self.files:
+            target = _site_packages(folder) / file.to
+            if target.is_file():
+                continue
+            progress(0.9, f"installing {self.name}: {file.member}")
+            try:
+                content = file.fetch()
+            except HoigsError as error:
+                lacking[file.member] = f"{error}; {file.without}"
+                continue
+            half = target.with_suffix(".part")
+            half.write_bytes(content)
+            half.replace(target)
+        path = folder / MARKER
+        half = path.with_suffix(".part")
+        half.write_text(json.dumps({**marker, "lacking": lacking}, indent=1), encoding="utf-8")
+        half.replace(path)
+
+    def _remove_others(self) -> None:
+        """Environments of older requirements, and what killed processes left."""
+        for path in self._root.iterdir():
+            if path.is_dir() and path not in (self.folder, self._root / "packages"):
+                shutil.rmtree(path, ignore_errors=True)
+
+
+def _python_of(folder: Path) -> Path:
+    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def _site_packages(folder: Path) -> Path:
+    if os.name == "nt":
+        return folder / "Lib" / "site-packages"
+    return next((folder / "lib").glob("python*")) / "site-packages"
+
+
+def _run(argv: Sequence[str], what: str) -> str:
+    """Standard output of a program; HoigsError with its last lines if it fails."""
+    try:
+        done = subprocess.run(
+            list(argv), capture_output=True, text=True, stdin=subprocess.DEVNULL, check=False
+        )
+    except OSError as error:
+        raise HoigsError(f"{what}: cannot run {argv[0]}: {error}") from error
+    if done.returncode:
+        lines = (done.stdout + done.stderr).strip().splitlines()[-TAIL:]
+        said = "\n".join(f"  {line}" for line in lines)
+        raise HoigsError(
+            f"{what} failed with code {done.returncode}; what was downloaded is kept, and the "
+            f"same command goes on from there:\n{said}"
+        )
+    return done.stdout

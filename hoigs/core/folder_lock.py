@@ -1,0 +1,216 @@
+"""FolderLock: one process at a time writes a folder, on local and on network disks.
+
+The lock is a file beside the folder, since the folder itself may be replaced. It is created
+exclusively and removed by rename, which NFS does atomically where flock may do nothing. It names
+its process, and a thread renews its time: a lock whose process is dead on this machine, or that was
+not renewed for two minutes on another one, is taken over.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import tempfile
+import threading
+import uuid
+import weakref
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from hoigs.core.errors import HoigsError
+
+HEARTBEAT_S = 15.0
+STALE_S = 120.0
+SUFFIX = ".lock"
+
+
+class FolderLock:
+    """The right to write `folder`, from `acquire` to `release`, or as a context.
+
+    A process may take its own lock again: the newer one counts.
+
+    Args:
+        folder: it need not exist; missing parents are made, and removed again if they stay empty.
+        work: of the holder, for the message of others: "training". error: class of these messages.
+    """
+
+    def __init__(self, folder: Path, work: str, error: type[HoigsError] = HoigsError) -> None:
+        self.folder = folder.absolute()
+        self.path = self.folder.with_name(f".{self.folder.name}{SUFFIX}")
+        self.work, self.error = work, error
+        self._token = ""
+        self._ended = threading.Event()
+        self._made: list[Path] = []
+
+    def acquire(self) -> FolderLock:
+        """Take the lock.
+
+        Raises:
+            HoigsError: another process holds it.
+        """
+        self._make_parents()
+        token = uuid.uuid4().hex
+        record = {"work": self.work, "token": token, **_this_process()}
+        for _ in range(3):  # a stale lock may be taken over by another process first
+            if _create(self.path, json.dumps(record)):
+                break
+            self._take_over_stale()
+        else:
+            raise self.error(f"{self.folder}: other processes are about to write it; try again")
+        self._token, self._ended = token, threading.Event()
+        _Heartbeat(self.path, token, self._ended).start()
+        weakref.finalize(self, _release, self.path, token, self._ended, list(self._made))
+        return self
+
+    def release(self) -> None:
+        """Give the lock back; nothing happens where this process does not hold it any more."""
+        if self._token:
+            _release(self.path, self._token, self._ended, self._made)
+        self._token = ""
+
+    def require_held(self) -> None:
+        """Raise HoigsError if another process took the lock over, as after a long suspension."""
+        if self._token and _read(self.path).get("token") != self._token:
+            raise HoigsError(
+                f"{self.folder}: another process took this folder over, since this one was "
+                "suspended or its disk did not answer; nothing more is written"
+            )
+
+    def __enter__(self) -> FolderLock:
+        return self.acquire()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        self.release()
+
+    def _make_parents(self) -> None:
+        missing, parent = [], self.path.parent
+        while not parent.exists():
+            missing.append(parent)
+            parent = parent.parent
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._made = missing  # the innermost first
+
+    def _take_over_stale(self) -> None:
+        """Move a stale lock away.
+
+        Raises:
+            HoigsError: it is not stale.
+        """
+        holder = _read(self.path)
+        age = _age(self.path)
+        if age is None:
+            return  # released meanwhile
+        if not _is_stale(holder, age):
+            raise self.error(
+                f"{self.folder} is being written by another process ({holder.get('work', '?')}, "
+                f"pid {holder.get('pid', '?')} on {holder.get('host', '?')}, alive {age:.0f} s "
+                f"ago): wait for it, stop it, or name another folder; if it cannot be there any "
+                f"more, remove {self.path}"
+            )
+        moved = self.path.with_name(f"{self.path.name}.{uuid.uuid4().hex[:8]}.part")
+        try:
+            self.path.rename(moved)
+        except FileNotFoundError:
+            return
+        if _read(moved).get("token") != holder.get("token"):  # another one was quicker
+            with contextlib.suppress(OSError):
+                os.link(moved, self.path)  # unlike rename, never over a third one
+        moved.unlink(missing_ok=True)
+
+
+class _Heartbeat(threading.Thread):
+    """Renews the time of a lock until it has ended or belongs to another."""
+
+    def __init__(self, path: Path, token: str, ended: threading.Event) -> None:
+        super().__init__(name="hoigs-lock", daemon=True)
+        self._path, self._token, self._ended_event = path, token, ended
+
+    def run(self) -> None:
+        while not self._ended_event.wait(HEARTBEAT_S):
+            with contextlib.suppress(OSError):  # a disk that does not answer now may do so later
+                if _read(self._path).get("token") != self._token:
+                    return
+                os.utime(self._path)
+
+
+def _create(path: Path, text: str) -> bool:
+    """Make a file with `text` unless there is one."""
+    try:
+        file = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
+    except FileExistsError:
+        return False
+    with os.fdopen(file, "w", encoding="utf-8") as stream:
+        stream.write(text)
+    return True
+
+
+def _release(path: Path, token: str, ended: threading.Event, made: list[Path]) -> None:
+    ended.set()
+    with contextlib.suppress(OSError):
+        if _read(path).get("token") == token:
+            path.unlink()
+        for parent in made:
+            parent.rmdir()  # fails where something was written
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The record of a lock; {} where it is absent, or is being written just now."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _age(path: Path) -> float | None:
+    """Seconds since a lock was renewed, by the clock of its disk; None if it is gone."""
+    try:
+        renewed = path.stat().st_mtime
+        with tempfile.NamedTemporaryFile(prefix=f"{path.name}.", suffix=".part",
+                                         dir=path.parent) as probe:  # fmt: skip
+            now = os.fstat(probe.fileno()).st_mtime
+    except FileNotFoundError:
+        return None
+    return max(0.0, now - renewed)
+
+
+def _is_stale(holder: dict[str, Any], age: float) -> bool:
+    here = _this_process()
+    pid = holder.get("pid")
+    if holder.get("host") != here["host"] or not isinstance(pid, int):
+        return age > STALE_S
+    if pid == here["pid"]:
+        return True  # this process itself, or one that had its number before
+    if not _alive(pid):
+        return True
+    began = _began(pid)
+    # the number may have gone to another process since
+    return began is not None and holder.get("began") not in (None, began)
+
+
+def _this_process() -> dict[str, Any]:
+    return {"pid": os.getpid(), "host": socket.gethostname(), "began": _began(os.getpid())}
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _began(pid: int) -> str | None:
+    """When a process began, in clock ticks since the machine did; None where that is not known."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+        return f"{Path('/proc/sys/kernel/random/boot_id').read_text().strip()[:8]}/{fields[19]}"
+    except (OSError, IndexError, ValueError):
+        return None

@@ -1,0 +1,29 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def written_whole(path: Path, temporary: Path | None = None) -> Iterator[Path]:
+    """A temporary name to write to, renamed to `path` after the block and removed if it fails.
+
+    Args:
+        temporary: by default ".NAME.part" beside it.
+    """
+    temporary = temporary or path.with_name(f".{path.name}.part")
+    try:
+        yield temporary
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def write_whole(path: Path, content: str | bytes, temporary: Path | None = None) -> None:
+    """Write a file through a temporary name; text as UTF-8."""
+    with written_whole(path, temporary) as part:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)

@@ -1,0 +1,11 @@
+"""estimator:object-tracker: an object's masks from clicks, or from its motion, without a network.
+
+Entry point: `estimator`. In the order in which they work:
+
+- `footage`: the frames, reduced. `camera_motion`: how the picture of the scene moves.
+- `scene`: which pixels differ from the scene behind.
+- `proposal`: what moves and is not the person, where nothing was clicked.
+- `prompts`: the mask in a clicked frame. `colors`, `walker`: what it is made with.
+- `path`: where the object is in each frame. `tracker`: its masks there, by `transfer` of labels
+  between `windows`.
+"""

@@ -1,0 +1,306 @@
+"""ObjectTrackerEstimator: masks of objects from clicks, boxes or motion."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hoigs.core.config import ComponentConfig
+from hoigs.core.errors import HoigsError
+from hoigs.core.interfaces.estimator import (
+    EntityMasks,
+    EntityRequest,
+    Estimates,
+    Estimator,
+    FramePrompt,
+    LazyFrames,
+    PromptPoint,
+    VideoRequest,
+)
+from hoigs.core.progress import Progress, no_progress
+from hoigs.plugins.estimators.common.subprocess import settings_key
+from hoigs.plugins.estimators.object_tracker.camera_motion import is_static
+from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage
+from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, prompted_mask
+from hoigs.plugins.estimators.object_tracker.proposal import WRISTS, proposed
+from hoigs.plugins.estimators.object_tracker.scene import Scene, moving_scene, static_scene
+from hoigs.plugins.estimators.object_tracker.tracker import Track, color_model, tracked
+
+VERSION = 1  # of what is kept in `work`; raised when masks change
+WEAK = 0.6  # confidence below which a frame is named in a note
+
+
+class ObjectTrackerConfig(ComponentConfig):
+    """Settings of `estimator:object-tracker`."""
+
+    size: int = Field(
+        default=640, ge=64, description="pixels of the longer side at which objects are tracked"
+    )
+
+
+class ObjectTrackerEstimator(Estimator):
+    """Masks of objects through a video from one click, box or a few of them, without a network.
+
+    It needs the person's masks (`VideoRequest.known`) to tell the object from the person, and does
+    what it can without. An object without a prompt is proposed: what moves, is not the person
+    and is nearest to the hands.
+    """
+
+    Config: ClassVar = ObjectTrackerConfig
+    config: ObjectTrackerConfig
+    provides = frozenset({"masks"})
+
+    def estimate(self, video: VideoRequest, progress: Progress = no_progress) -> Estimates:
+        wanted = [e for e in video.entities if e.kind == "object"]
+        wanted = wanted or [EntityRequest("object")]
+        file = video.work / f"object-tracker-{self._key(video, wanted)}.npz"
+        if not file.is_file():
+            self._track(video, wanted, file, progress)
+        progress(1.0, "object")
+        return Estimates(_read(file, video, [e.name for e in wanted]))
+
+    def _key(self, video: VideoRequest, wanted: Sequence[EntityRequest]) -> str:
+        """Of everything that masks depend on; the person's by a few frames of them."""
+        person = _person(video)
+        digest = hashlib.sha256()
+        for i in video.numbers[:: max(1, len(video.numbers) // 8)] if person is not None else ():
+            digest.update(np.packbits(person[i]).tobytes())
+        return settings_key({
+            "version": VERSION, "settings": self.config.model_dump(), "frames": video.numbers,
+            "objects": [[e.name, repr(e.prompts)] for e in wanted], "static": video.static_camera,
+            "person": digest.hexdigest(),
+        })  # fmt: skip
+
+    def _track(
+        self, video: VideoRequest, wanted: Sequence[EntityRequest], file: Path, progress: Progress
+    ) -> None:
+        also = sorted({p.frame for e in wanted for p in e.prompts})
+        for number in also:
+            if not 0 <= number < video.frames:
+                raise HoigsError(
+                    f"estimator:object-tracker: a prompt is in frame {number}; the video has "
+                    f"frames 0 to {video.frames - 1}"
+                )
+        footage = read_footage(
+            video, _person(video), also, self.config.size, lambda x: progress(0.3 * x, "frames")
+        )
+        still = video.static_camera or is_static(footage)
+        scene: Scene = static_scene(footage) if still else moving_scene(footage)
+        progress(0.35, "object")
+        hands = _hands(video, footage)
+        tracks: dict[str, Track | None] = {}
+        notes: list[str] = []
+        chosen: dict[str, list[FramePrompt]] = {}
+        for k, entity in enumerate(wanted):
+            start, share = 0.35 + 0.65 * k / len(wanted), 0.65 / len(wanted)
+            masks, proposal = self._prompted(entity, footage, scene, hands, tracks, notes)
+            if proposal is not None:
+                chosen[entity.name] = [proposal]
+            tracks[entity.name] = (
+                tracked(footage, scene, masks, _part(progress, start, share)) if masks else None
+            )
+        notes += _doubts(tracks, footage)
+        _write(file, video, footage, tracks, chosen, notes)
+
+    def _prompted(
+        self,
+        entity: EntityRequest,
+        footage: Footage,
+        scene: Scene,
+        hands: np.ndarray | None,
+        others: dict[str, Track | None],
+        notes: list[str],
+    ) -> tuple[list[PromptedMask], FramePrompt | None]:
+        """Masks of the entity's prompts, or of a proposal, which is returned too."""
+        if not entity.prompts:
+            return self._proposed(entity, footage, scene, hands, others, notes)
+        masks: list[PromptedMask] = []
+        for prompt in entity.prompts:
+            i = footage.numbers.index(prompt.frame)
+            known = color_model(footage, {m.frame: m.soft for m in masks}) if masks else None
+            found = prompted_mask(footage, scene, i, prompt, known)
+            if not (found.soft > 0.5).any():
+                raise HoigsError(_nothing_there(entity, prompt, footage, i))
+            if found.on_person:
+                notes.append(
+                    f"{entity.name}: the click in frame {prompt.frame} lies on the person's mask; "
+                    "if the person was meant, click on the object"
+                )
+            masks.append(found)
+        return masks, None
+
+    def _proposed(
+        self,
+        entity: EntityRequest,
+        footage: Footage,
+        scene: Scene,
+        hands: np.ndarray | None,
+        others: dict[str, Track | None],
+        notes: list[str],
+    ) -> tuple[list[PromptedMask], FramePrompt | None]:
+        taken = [t.soft > 127 for t in others.values() if t is not None]
+        click = proposed(footage, scene, hands, np.any(taken, axis=0) if taken else None)
+        if click is None:
+            notes.append(
+                f"{entity.name}: nothing was found that moves and is not the person; click on it, "
+                "such as --object 640,402@0"
+            )
+            return [], None
+        s = 1 / footage.scale
+        native = FramePrompt(
+            footage.numbers[click.frame],
+            tuple(PromptPoint(round(p.x * s), round(p.y * s)) for p in click.points),
+        )
+        found = prompted_mask(footage, scene, click.frame, native)
+        y, x = np.nonzero(found.soft > 0.5)
+        box = tuple(round(float(v) * s) for v in (x.min(), y.min(), x.max() + 1, y.max() + 1))
+        return [found], FramePrompt(native.frame, native.points, box)  # type: ignore[arg-type]
+
+
+def _part(progress: Progress, start: float, share: float) -> Callable[[float], None]:
+    """Progress of one object among several."""
+    return lambda done: progress(start + share * done, "object")
+
+
+def _person(video: VideoRequest) -> Sequence[Any] | None:
+    """Masks of all people together, by frame of the video; None where there are none."""
+    masks = None if video.known is None else video.known.masks
+    if masks is None or not masks.entities:
+        return None
+    each = list(masks.entities.values())
+    if len(each) == 1:
+        return each[0]
+    return LazyFrames(video.frames, lambda i: np.any([m[i] for m in each], axis=0))
+
+
+def _hands(video: VideoRequest, footage: Footage) -> np.ndarray | None:
+    """x, y of the wrists [F, 2 a person, 2] in the footage; None where no landmarks are known."""
+    if video.known is None or not video.known.landmarks:
+        return None
+    numbers = list(footage.numbers)
+    wrists = [
+        np.where(track.image_xyzv[numbers][:, WRISTS, 3:] > 0.3,
+                 track.image_xyzv[numbers][:, WRISTS, :2], np.nan)
+        for track in video.known.landmarks.values()
+    ]  # fmt: skip
+    return np.concatenate(wrists, 1) * footage.scale
+
+
+def _nothing_there(entity: EntityRequest, prompt: FramePrompt, footage: Footage, i: int) -> str:
+    """What lies under a prompt from which no mask grows."""
+    point = next((p for p in prompt.points if p.inside), None)
+    where = f"{point.x:g},{point.y:g}" if point else f"the box {prompt.box}"
+    there = "the person" if footage.person[i].mean() > 0.5 else "a surface without an outline"
+    if point is not None:
+        h, w = footage.shape
+        x, y = int(point.x * footage.scale), int(point.y * footage.scale)
+        if 0 <= x < w and 0 <= y < h and footage.blank[i, y, x]:
+            there = "a black border of the video"
+    return (
+        f"estimator:object-tracker: no {entity.name} was found at {where} in frame {prompt.frame}: "
+        f"there is {there}; click on the middle of the object in a frame that shows it well"
+    )
+
+
+def _doubts(tracks: dict[str, Track | None], footage: Footage) -> list[str]:
+    """A sentence for each object on the frames that were not done, or not well."""
+    notes = []
+    for name, track in tracks.items():
+        if track is None:
+            continue
+        seen = (track.soft > 127).any((1, 2))
+        lost = [n for n, s in zip(footage.numbers, seen) if not s]
+        weak = [n for n, s, c in zip(footage.numbers, seen, track.confidence) if s and c < WEAK]
+        if lost:
+            notes.append(f"{name}: not seen in {_ranges(lost)}")
+        if weak:
+            notes.append(
+                f"{name}: its mask is doubtful in {_ranges(weak)}; a click there corrects it"
+            )
+    return notes
+
+
+def _ranges(numbers: Sequence[int]) -> str:
+    """Numbers of frames as "3 frames (10-12)", the first few ranges."""
+    runs: list[list[int]] = []
+    for n in numbers:
+        if runs and n - runs[-1][1] <= 2:
+            runs[-1][1] = n
+        else:
+            runs.append([n, n])
+    texts = [f"{a}" if a == b else f"{a}-{b}" for a, b in runs[:6]]
+    more = ", …" if len(runs) > 6 else ""
+    return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
+
+
+def _write(
+    file: Path,
+    video: VideoRequest,
+    footage: Footage,
+    tracks: dict[str, Track | None],
+    chosen: dict[str, list[FramePrompt]],
+    notes: list[str],
+) -> None:
+    """Everything that `_read` needs, under a temporary name first."""
+    arrays: dict[str, np.ndarray] = {}
+    none = np.zeros(footage.lab.shape[:3], np.uint8)
+    soft = {n: none if t is None else t.soft for n, t in tracks.items()}
+    strongest = np.max(list(soft.values()), axis=0)
+    for name, track in tracks.items():
+        arrays[f"soft {name}"] = np.where(soft[name] == strongest, soft[name], 0)
+        confidence = np.full(video.frames, np.nan, np.float32)
+        confidence[list(footage.numbers)] = 0.0 if track is None else track.confidence
+        arrays[f"confidence {name}"] = confidence
+    about = {
+        "numbers": footage.numbers,
+        "notes": notes,
+        "chosen": {
+            n: [[p.frame, [[q.x, q.y, q.inside] for q in p.points], p.box] for p in prompts]
+            for n, prompts in chosen.items()
+        },
+    }
+    file.parent.mkdir(parents=True, exist_ok=True)
+    half = file.with_suffix(".part")
+    with half.open("wb") as out:
+        np.savez_compressed(out, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
+    half.replace(file)
+
+
+def _read(file: Path, video: VideoRequest, names: Sequence[str]) -> EntityMasks:
+    with np.load(file, allow_pickle=False) as saved:
+        about = json.loads(str(saved["about"]))
+        soft = {n: saved[f"soft {n}"] for n in names}
+        confidence = {n: saved[f"confidence {n}"] for n in names}
+    row = {number: k for k, number in enumerate(about["numbers"])}
+    masks = {
+        n: LazyFrames(video.frames, lambda i, n=n: _enlarged(soft[n], row.get(i), video))
+        for n in names
+    }
+    chosen = {
+        n: tuple(
+            FramePrompt(frame, tuple(PromptPoint(*p) for p in points), tuple(box) if box else None)
+            for frame, points, box in prompts
+        )
+        for n, prompts in about["chosen"].items()
+    }
+    return EntityMasks(
+        masks, None, "object tracker without a network", confidence, chosen, tuple(about["notes"])
+    )
+
+
+def _enlarged(soft: np.ndarray, row: int | None, video: VideoRequest) -> np.ndarray:
+    """A mask at the video's size; empty in frames that were not wanted."""
+    from PIL import Image
+
+    if row is None or not soft[row].any():
+        return np.zeros((video.height, video.width), bool)
+    image = Image.fromarray(soft[row]).resize(
+        (video.width, video.height), Image.Resampling.BILINEAR
+    )
+    return np.asarray(image) > 127

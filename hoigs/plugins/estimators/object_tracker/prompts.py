@@ -1,0 +1,196 @@
+"""The object's mask in a frame that has clicks, scribbles or a box."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from hoigs.core.interfaces.estimator import FramePrompt
+from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram, odds_of
+from hoigs.plugins.estimators.object_tracker.footage import Footage
+from hoigs.plugins.estimators.object_tracker.scene import Scene
+from hoigs.plugins.estimators.object_tracker.walker import walked
+from hoigs.plugins.estimators.object_tracker.windows import Window
+
+RADII = (0.025, 0.04, 0.06, 0.09, 0.13, 0.19)  # of the object, in diagonals of the image
+ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class PromptedMask:
+    """A mask at one frame.
+
+    Attributes:
+        soft: probability of each pixel of the frame. quality: how well it is set off, 0 to 1.
+        on_person: the click lies on the person's mask.
+    """
+
+    frame: int
+    soft: Float[np.ndarray, "h w"]
+    quality: float
+    on_person: bool
+
+
+def prompted_mask(
+    footage: Footage, scene: Scene, i: int, prompt: FramePrompt, known: ColorModel | None = None
+) -> PromptedMask:
+    """The best of masks grown from the prompt at several sizes."""
+    inside, outside, box = _scaled(prompt, footage)
+    seed = _disc(footage.shape, inside, max(1.5, 0.005 * footage.diagonal))
+    away = scene.difference(i)
+    on_person = bool(footage.person[i][seed].mean() > 0.5) if seed.any() else False
+    at_rest = not np.nanmedian(np.append(away[seed], np.nan)) > 4 if seed.any() else True
+    fixed = _evidence(footage.person[i], away, on_person, at_rest)
+    fixed[_disc(footage.shape, outside, max(1.5, 0.008 * footage.diagonal))] = -9
+    fixed[footage.blank[i]] = -9
+    fixed[seed] = 6
+    if box is not None:
+        spread = [max(box[2] - box[0], box[3] - box[1]) / 2]
+        center = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
+        if not len(inside):
+            inside = np.array([center])
+    else:
+        center = tuple(inside.mean(0))
+        reach = float(np.hypot(*(inside - center).T).max())
+        spread = [reach + r * footage.diagonal for r in RADII]
+    tried = [_grown(footage, i, fixed, center, s, inside, box, known) for s in spread]
+    tried = [t for t in tried if t is not None]
+    if not tried:
+        return PromptedMask(i, np.zeros(footage.shape, np.float32), 0.0, on_person)
+    masks = [soft > 0.5 for _, soft in tried]
+    new = np.ones(len(masks)) if on_person else _novelty(masks, away, footage.diagonal)
+    scores = [
+        score * (0.4 + 0.6 * _steadiness(masks, k)) * _plausible(footage, i, masks[k], on_person)
+        for k, (score, _) in enumerate(tried)
+    ]
+    scores = [score * n for score, n in zip(scores, new)]
+    best = int(np.argmax(scores))
+    return PromptedMask(i, tried[best][1], scores[best], on_person)
+
+
+def _steadiness(masks: list[np.ndarray], k: int) -> float:
+    """How little a mask changes when it is grown at the next size."""
+    near = [masks[j] for j in (k - 1, k + 1) if 0 <= j < len(masks)]
+    return max((overlap(masks[k], m) for m in near), default=1.0)
+
+
+def _novelty(masks: list[np.ndarray], away: np.ndarray, diagonal: float) -> np.ndarray:
+    """From 0.3 to 1: less for masks that take in more of the unchanged scene than others do."""
+    changed = np.nan_to_num(away, nan=0.0) > 4
+    # the inside of a plain thing that moves little looks unchanged: only its rim differs
+    filled = ndimage.binary_closing(changed, iterations=max(1, round(0.012 * diagonal)))
+    share = np.array([(filled & m).sum() / max(m.sum(), 1) for m in masks])
+    if share.max() < 0.3:
+        return np.ones(len(masks))
+    return 0.3 + 0.7 * np.minimum(1, share / (0.8 * share.max()))
+
+
+def overlap(a: np.ndarray, b: np.ndarray) -> float:
+    """Intersection over union; 1 where both are empty."""
+    union = int((a | b).sum())
+    return float((a & b).sum() / union) if union else 1.0
+
+
+def _plausible(footage: Footage, i: int, mask: np.ndarray, on_person: bool) -> float:
+    """Less for huge masks, and those that spill onto the person though the prompt is not on one."""
+    fits = min(1.0, (0.1 * mask.size / max(mask.sum(), 1)) ** 0.5)
+    if on_person:  # the person's mask took the object in: a mask of the person is no object's
+        return fits * float(1 - (mask & footage.person[i]).sum() / footage.person[i].sum()) ** 2
+    return fits * float(1 - (mask & footage.person[i]).sum() / max(mask.sum(), 1)) ** 2
+
+
+def _scaled(prompt: FramePrompt, footage: Footage):
+    """Points inside and outside, and the box, in pixels of the footage."""
+    s = footage.scale
+    inside = np.array([(p.x * s, p.y * s) for p in prompt.points if p.inside]).reshape(-1, 2)
+    outside = np.array([(p.x * s, p.y * s) for p in prompt.points if not p.inside]).reshape(-1, 2)
+    return inside, outside, None if prompt.box is None else np.array(prompt.box) * s
+
+
+def _disc(shape: tuple[int, int], points: np.ndarray, radius: float) -> Bool[np.ndarray, "h w"]:
+    y, x = np.mgrid[: shape[0], : shape[1]] + 0.5
+    found = np.zeros(shape, bool)
+    for px, py in points:
+        found |= np.hypot(x - px, y - py) <= radius
+    return found
+
+
+def _evidence(person: np.ndarray, away: np.ndarray, on_person: bool, at_rest: bool) -> np.ndarray:
+    """Log-odds from the person's mask and from the scene.
+
+    A thing that rests where it is clicked is part of the scene, which then says nothing of it.
+    """
+    odds = np.where(person, -0.3 if on_person else -2.5, 0.0)
+    if not at_rest:
+        changed = np.nan_to_num(2.0 * np.tanh((away - 5) / 3), nan=0.0)
+        # on the person everything has changed, which says nothing of an object there
+        odds = odds + (np.minimum(changed, 0) if on_person else changed)
+    return odds.astype(np.float32)
+
+
+def _grown(
+    footage: Footage, i: int, fixed: np.ndarray, center, spread: float, seeds, box, known
+) -> tuple[float, np.ndarray] | None:
+    """Score and soft mask at one size: colours and mask in turns, as in GrabCut (Rother 2004)."""
+    window = Window.around(*center, 1.6 * spread + 4)
+    colors = window.cut(footage.colors(i))
+    valid = window.inside(footage.shape)
+    bins = bins_of(colors)
+    fixed_here = np.where(valid, window.cut(fixed), -9)
+    y, x = np.mgrid[: window.n, : window.n] + 0.5
+    if box is None:
+        cx, cy = window.cells(*np.asarray(seeds, float).T)
+        distance = np.min([np.hypot(x - a, y - b) for a, b in zip(cx, cy)], 0)
+        # a seed's own surroundings count, so that a line of clicks marks a long thing
+        space = 1.5 * (1 - (distance * window.step / spread) ** 2).clip(-2.5, 1)
+    else:
+        x0, y0 = window.cells(box[0], box[1])
+        x1, y1 = window.cells(box[2], box[3])
+        space = np.where((x > x0) & (x < x1) & (y > y0) & (y < y1), 0.6, -8.0)
+    soft = 1 / (1 + np.exp(-(space + fixed_here)))
+    if box is None:
+        soft = soft * (space > 0.4)
+    whole = histogram(bins_of(footage.colors(i)[::3, ::3]), np.ones_like(fixed[::3, ::3]))
+    for _ in range(ROUNDS):
+        near = histogram(bins, (soft < 0.5) * valid * 1.0)
+        inner = histogram(bins, np.where(soft > 0.5, soft, 0) + 1e-9)
+        if known is not None:
+            inner = 0.5 * (inner + known.inside)
+        odds = 0.8 * odds_of(inner, 0.7 * near + 0.3 * whole)[bins] + space + fixed_here
+        soft = walked(np.where(valid, odds, -9), colors)
+    mask = _connected(soft > 0.5, window, seeds)
+    if mask.sum() < 9:
+        return None
+    score = _set_off(mask, colors, bins, valid)
+    soft = np.where(ndimage.binary_dilation(mask, iterations=2), soft, 0)
+    return score * spread**0.1, window.paste(soft, footage.shape) / np.float32(255)
+
+
+def _connected(mask: np.ndarray, window: Window, seeds: np.ndarray) -> np.ndarray:
+    """The parts of a mask that hold a seed, holes filled."""
+    labels, _ = ndimage.label(mask)
+    cells = [np.asarray(window.cells(*s)).astype(int).clip(0, window.n - 1) for s in seeds]
+    wanted = {int(labels[c[1], c[0]]) for c in cells} - {0}
+    kept = np.isin(labels, list(wanted))
+    return ndimage.binary_fill_holes(kept) if kept.any() else kept
+
+
+def _set_off(mask: np.ndarray, colors: np.ndarray, bins: np.ndarray, valid: np.ndarray) -> float:
+    """How well a mask's rim is an edge and its colours are not those around it, 0 to 1."""
+    grown, shrunk = (
+        ndimage.binary_dilation(mask, iterations=3) & valid,
+        ndimage.binary_erosion(mask, iterations=3),
+    )
+    rim = ndimage.binary_dilation(mask) & ~ndimage.binary_erosion(mask)
+    smooth = ndimage.gaussian_filter(colors, (1, 1, 0))
+    edge = np.sqrt(sum(ndimage.sobel(smooth, a)[..., :] ** 2 for a in (0, 1)).sum(-1)) / 8
+    here = edge[rim & valid]
+    border = (rim & ~ndimage.binary_erosion(valid, iterations=2)).sum() / max(rim.sum(), 1)
+    crisp = float(np.mean(here / (here + 2.0))) if len(here) else 0.0
+    ring = histogram(bins, (grown & ~mask) * 1.0)
+    inner = histogram(bins, (mask & ~shrunk) * 1.0)
+    apart = 1 - float(np.sqrt(ring * inner).sum())
+    return float((0.5 * crisp + 0.5 * apart) * (1 - 0.5 * border))

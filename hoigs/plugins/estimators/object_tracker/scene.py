@@ -1,0 +1,141 @@
+"""Which pixels differ from the scene behind: of a static camera, and of a moving one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
+
+from hoigs.plugins.estimators.object_tracker.camera_motion import chained, homographies
+from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
+
+SAMPLES = 48  # frames of which the median is taken
+NEIGHBOURS = (-24, -16, -10, -6, 6, 10, 16, 24)  # frames that a moving camera's are compared with
+
+
+class Scene(Protocol):
+    """The scene without person and object."""
+
+    def difference(self, i: int) -> Float[np.ndarray, "h w"]:
+        """How far frame i is from the scene, in units of its noise; NaN where that is not known."""
+        ...
+
+
+@dataclass(frozen=True)
+class StaticScene:
+    """The median colour of each pixel while the person is elsewhere, and its spread."""
+
+    footage: Footage
+    median: Float[np.ndarray, "h w 3"]
+    spread: Float[np.ndarray, "h w"]
+
+    def difference(self, i: int) -> Float[np.ndarray, "h w"]:
+        return shadowless(self.footage.colors(i) - self.median, self.median) / self.spread
+
+
+def static_scene(footage: Footage, exclude: np.ndarray | None = None) -> StaticScene:
+    """`exclude`: pixels [F, h, w] that show no scene beside the person's, such as the object's."""
+    picks = np.unique(np.linspace(0, len(footage) - 1, SAMPLES).astype(int))
+    hidden = footage.person[picks] | footage.blank[picks]
+    if exclude is not None:
+        hidden |= exclude[picks]
+    for row in range(len(picks)):
+        hidden[row] = ndimage.binary_dilation(hidden[row], iterations=4)
+    median, spread = np.empty((*footage.shape, 3), np.float32), np.empty(footage.shape, np.float32)
+    for y in range(footage.shape[0]):  # a row of pixels at a time, which fits the cache
+        median[y], spread[y] = _median_and_spread(footage.lab[picks, y], hidden[:, y])
+    return StaticScene(footage, to_features(median), spread)
+
+
+def _median_and_spread(
+    colors: UInt8[np.ndarray, "S w 3"], hidden: Bool[np.ndarray, "S w"]
+) -> tuple[Float[np.ndarray, "w 3"], Float[np.ndarray, "w"]]:
+    """Over samples that are not hidden; NaN where fewer than 4 are left."""
+    count = (~hidden).sum(0)
+    at = np.maximum(count - 1, 0) // 2
+
+    def middle(values: np.ndarray) -> np.ndarray:
+        ordered = np.sort(np.where(hidden, 255, values).T, axis=-1).T  # hidden ones go last
+        return np.take_along_axis(ordered, at[None], 0)[0]
+
+    median = np.stack([middle(colors[..., c]) for c in range(3)], -1).astype(np.float32)
+    away = np.abs(to_features(colors) - to_features(median)).max(-1)
+    spread = 1.5 * middle(np.minimum(away, 254).astype(np.uint8))
+    median[count < 4] = np.nan
+    return median, np.maximum(spread, 1.5).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class MovingScene:
+    """The scene as other frames saw it, carried over by homographies.
+
+    What stands out of the plane (parallax) is allowed for by taking the most similar of nearby
+    pixels.
+    """
+
+    footage: Footage
+    steps: Float[np.ndarray, "F 3 3"]
+
+    def difference(self, i: int) -> Float[np.ndarray, "h w"]:
+        here = self.footage.colors(i)
+        found = []
+        for offset in NEIGHBOURS:
+            j = i + offset
+            if 0 <= j < len(self.footage):
+                found.append(self._against(here, i, j))
+        if not found:
+            return np.full(here.shape[:2], np.nan, np.float32)
+        stack = np.sort(np.stack(found), axis=0)  # NaN goes last
+        count = np.isfinite(stack).sum(0)
+        at = np.maximum(count - 1, 0) // 2
+        away = np.take_along_axis(stack, at[None], 0)[0]
+        away[count < 2] = np.nan
+        known = away[np.isfinite(away)]
+        noise = max(1.5, 1.5 * float(np.median(known))) if len(known) else 1.5
+        return away / noise
+
+    def _against(self, here: np.ndarray, i: int, j: int) -> np.ndarray:
+        h = chained(self.steps, i, j)
+        rows, columns = self.footage.shape
+        y, x = np.mgrid[:rows, :columns].astype(np.float32)
+        w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+        u = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w
+        v = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+        ui, vi = np.rint(u).astype(int), np.rint(v).astype(int)
+        inside = (ui >= 0) & (ui < columns) & (vi >= 0) & (vi < rows)
+        ui, vi = ui.clip(0, columns - 1), vi.clip(0, rows - 1)
+        there = to_features(self.footage.lab[j])
+        best = np.full(here.shape[:2], np.inf, np.float32)
+        for dy, dx in (
+            (0, 0),
+            (0, 2),
+            (0, -2),
+            (2, 0),
+            (-2, 0),
+            (1, 1),
+            (-1, -1),
+            (1, -1),
+            (-1, 1),
+        ):
+            warped = there[(vi + dy).clip(0, rows - 1), (ui + dx).clip(0, columns - 1)]
+            best = np.minimum(best, np.sqrt(((warped - here) ** 2).sum(-1)))
+        hidden = ndimage.binary_dilation(
+            self.footage.person[j] | self.footage.blank[j], iterations=3
+        )
+        best[~inside | hidden[vi, ui] | self.footage.blank[i]] = np.nan
+        return best
+
+
+def moving_scene(footage: Footage) -> MovingScene:
+    return MovingScene(footage, homographies(footage))
+
+
+def shadowless(away: np.ndarray, scene: np.ndarray) -> Float[np.ndarray, "h w"]:
+    """Length of a difference of colours, less where only lightness falls, as in a shadow."""
+    light, chroma = away[..., 0], np.hypot(away[..., 1], away[..., 2])
+    share = light / np.maximum(scene[..., 0], 1.0)
+    shade = (share < 0) & (share > -0.45)
+    return np.hypot(np.where(shade, 0.4 * light, light), chroma)

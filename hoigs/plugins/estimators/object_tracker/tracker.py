@@ -1,0 +1,290 @@
+"""One object through the whole video: path, then masks outwards from the prompted frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
+
+from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram
+from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
+from hoigs.plugins.estimators.object_tracker.path import Path, center_of, found_path
+from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
+from hoigs.plugins.estimators.object_tracker.scene import Scene
+from hoigs.plugins.estimators.object_tracker.transfer import shift_of, transferred
+from hoigs.plugins.estimators.object_tracker.walker import walked
+from hoigs.plugins.estimators.object_tracker.windows import Window
+
+SURE = 0.35  # confidence below which the object counts as not seen
+
+
+@dataclass(frozen=True)
+class Track:
+    """The result: soft masks as uint8 at the footage's size, and how sure each is."""
+
+    soft: UInt8[np.ndarray, "F h w"]
+    confidence: Float[np.ndarray, "F"]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """The object in one frame, cut out by a window."""
+
+    window: Window
+    colors: Float[np.ndarray, "n n 3"]
+    soft: Float[np.ndarray, "n n"]
+
+
+def tracked(
+    footage: Footage,
+    scene: Scene,
+    prompts: Sequence[PromptedMask],
+    progress: Callable[[float], None] = lambda share: None,
+) -> Track:
+    """Masks of every frame from those of the prompted ones."""
+    known = {p.frame: p.soft > 0.5 for p in prompts}
+    colors = color_model(footage, {p.frame: p.soft for p in prompts})
+    rests = at_rest(scene, known)
+    used = None if rests else scene
+    path = found_path(footage, used, colors, known, lambda x: progress(0.3 * x))
+    unchanged = 1.2 if stands_out(footage, used, path, known) else 0.1
+    soft = np.zeros(footage.lab.shape[:3], np.uint8)
+    confidence = np.zeros(len(footage))
+    for p in prompts:
+        soft[p.frame], confidence[p.frame] = np.rint(p.soft * 255), 1.0
+    walks = _walks(sorted(known), len(footage))
+    done = 0
+    for start, frames in walks:
+        first = next(p for p in prompts if p.frame == start)
+        walk = _Walk(footage, used, colors, path, first, unchanged)
+        for i in frames:
+            confidence[i], soft[i] = walk.step(i)
+            done += 1
+            progress(0.3 + 0.7 * done / max(len(footage) - len(known), 1))
+    return Track(soft, confidence)
+
+
+def at_rest(scene: Scene, known: dict[int, Bool[np.ndarray, "h w"]]) -> bool:
+    """Whether the prompted object looks like a part of the scene in any prompted frame."""
+    away = [np.nanmedian(np.append(scene.difference(i)[m], np.nan)) for i, m in known.items()]
+    return not min(away) > 4
+
+
+def stands_out(
+    footage: Footage, scene: Scene | None, path: Path, known: dict[int, Bool[np.ndarray, "h w"]]
+) -> bool:
+    """Whether the object differs from the scene nearly everywhere on its path.
+
+    It does not where it rests so long that it became part of the scene, or where it is plain and
+    moves little before a moving camera.
+    """
+    if scene is None:
+        return False
+    half = max(1, int(0.5 * np.sqrt(np.mean([m.sum() for m in known.values()]) / np.pi)))
+    seen = np.flatnonzero(path.seen)
+    middle = []
+    for i in seen[:: max(1, len(seen) // 24)]:
+        x, y = (max(int(v), 0) for v in path.centers[i])
+        part = scene.difference(i)[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1]
+        middle.append(np.nanmedian(part) if np.isfinite(part).any() else np.nan)
+    return bool(np.nanpercentile([*middle, np.nan, 99.0], 15) > 3)
+
+
+def color_model(footage: Footage, masks: dict[int, Float[np.ndarray, "h w"]]) -> ColorModel:
+    """Colours of the object in the given frames, and of all else in these and in others."""
+    inside, outside = [], []
+    for i, soft in masks.items():
+        bins = bins_of(footage.colors(i))
+        inside.append(histogram(bins, np.where(soft > 0.5, soft, 0)))
+        outside.append(histogram(bins, (soft < 0.3) * 1.0))
+    return ColorModel(np.mean(inside, 0), np.mean(outside, 0))
+
+
+def _walks(known: list[int], count: int) -> list[tuple[int, range]]:
+    """Frames to go through from each prompted one: to the ends, and half way to the next."""
+    walks = [(known[0], range(known[0] - 1, -1, -1))]
+    for a, b in pairwise(known):
+        middle = (a + b) // 2
+        walks += [(a, range(a + 1, middle + 1)), (b, range(b - 1, middle, -1))]
+    return [*walks, (known[-1], range(known[-1] + 1, count))]
+
+
+class _Walk:
+    """Masks from frame to frame, away from a prompted one."""
+
+    def __init__(
+        self,
+        footage: Footage,
+        scene: Scene | None,
+        colors: ColorModel,
+        path: Path,
+        start: PromptedMask,
+        unchanged: float,
+    ) -> None:
+        self.footage, self.scene, self.colors, self.path = footage, scene, colors, path
+        self.unchanged = unchanged  # log-odds by which a pixel that shows the scene is not ours
+        window = _window_of(start.soft > 0.5)
+        self.first = self._sighting(start.frame, window, window.cut(start.soft))
+        self.last = self.first
+        self.center = np.array(window.center)  # of the last window
+        self.off = self.center - path.centers[start.frame]  # of windows from the path
+        self.velocity = np.zeros(2)
+        self.unseen = 0
+        mask = start.soft > 0.5
+        self.area = float(mask.sum())
+
+    def _sighting(self, i: int, window: Window, soft: np.ndarray) -> Sighting:
+        return Sighting(window, self._colors(i, window), soft)
+
+    def step(self, i: int) -> tuple[float, np.ndarray]:
+        """Confidence and soft mask (uint8) of frame `i`, next to the one before."""
+        nothing = np.zeros(self.footage.shape, np.uint8)
+        if not self.path.seen[i]:
+            self.unseen += 1
+            return 0.0, nothing
+        away = None if self.scene is None else self.scene.difference(i)
+        window = self._aligned(i, away)
+        soft, prior = self._segmented(i, window, away)
+        mask = self._kept(soft > 0.5, prior, window.step)
+        soft = np.where(ndimage.binary_dilation(mask, iterations=2), soft, 0)
+        confidence = self._confidence(mask, soft, self._colors(i, window))
+        if confidence < SURE:
+            self.unseen += 1
+            return confidence, nothing
+        pasted = window.paste(soft, self.footage.shape)
+        self._remember(i, pasted, window, confidence)
+        return confidence, pasted
+
+    def _colors(self, i: int, window: Window) -> np.ndarray:
+        return to_features(window.cut(self.footage.lab[i]))
+
+    def _aligned(self, i: int, away: np.ndarray | None) -> Window:
+        """The last sighting's window moved to where it fits best near the path."""
+        last, step = self.last, self.last.window.step
+        reach = self.path.centers[i] + self.off
+        guesses = [reach] if self.unseen else [reach, self.center + self.velocity]
+        slack = max(4, int(0.22 * last.window.n))
+        n = last.window.n + 2 * slack
+        best = None
+        for x, y in guesses:
+            wide = Window(round(x - n * step / 2), round(y - n * step / 2), n, step)
+            colors = self._colors(i, wide)
+            odds = self._odds(i, wide, colors, away)
+            odds = np.where(wide.inside(self.footage.shape), odds, -3)
+            dx, dy, error = shift_of(colors, last.colors, last.soft, odds, slack)
+            place = np.array(wide.center) + np.array((dx, dy)) * step
+            # a place far from the path is unlikely
+            error += 0.5 * (np.hypot(*(place - reach)) / (last.window.n * step / 2)) ** 2
+            if best is None or error < best[0]:
+                best = (error, place)
+        assert best is not None
+        return last.window.at(*best[1])
+
+    def _segmented(
+        self, i: int, window: Window, away: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Soft mask, and what other frames alone say of it."""
+        colors = self._colors(i, window)
+        known = [(self.last.colors, self.last.soft)]
+        if self.first is not self.last and self.first.window.n == window.n:
+            known.append((self.first.colors, self.first.soft))
+        prior, similar = transferred(colors, known)
+        valid = window.inside(self.footage.shape)
+        near = histogram(bins_of(colors), (prior < 0.3) * valid * 1.0)
+        shape = np.log((prior + 0.03) / (1.03 - prior)) * (0.4 + 0.6 * similar)
+        odds = shape + self._odds(i, window, colors, away, near, prior)
+        odds = np.where(valid, odds, -9)
+        return walked(odds, colors), prior
+
+    def _odds(
+        self,
+        i: int,
+        window: Window,
+        colors: np.ndarray,
+        away: np.ndarray | None,
+        near: np.ndarray | None = None,
+        prior: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Log-odds of a window's pixels by colour, person's mask and scene.
+
+        near: colours around the object in this frame. prior: where other frames put it.
+        """
+        odds = 0.6 * self.colors.odds(bins_of(colors), near)
+        person = window.cut(self.footage.person[i])
+        # a person's mask that takes in most of what is known to be the object says little
+        taken = 0.5 if prior is None else float((prior * person).sum() / max(prior.sum(), 1e-6))
+        odds -= 2.0 * max(0.0, 1 - 1.3 * taken) * person
+        if away is not None:
+            changed = np.nan_to_num(1.2 * np.tanh((away - 4) / 3), nan=0.0)
+            odds += window.cut(np.maximum(changed, -self.unchanged))
+        return odds
+
+    def _kept(self, mask: np.ndarray, prior: np.ndarray, step: int) -> np.ndarray:
+        """The part of a mask that the labels of other frames support, holes filled.
+
+        Where it is larger than the object was, what hangs on by a narrow bridge is cut off.
+        """
+        kept = _supported(mask, prior)
+        for width in (1, 2, 3, 4, 6):
+            if kept.sum() * step**2 < 1.2 * self.area:
+                break
+            core = ndimage.binary_erosion(kept, iterations=width)
+            part = ndimage.binary_dilation(_supported(core, prior), iterations=width) & kept
+            if part.sum() * step**2 < 0.6 * self.area:
+                break
+            kept = part
+        filled = ndimage.binary_fill_holes(kept)
+        holes, _ = ndimage.label(filled & ~kept)
+        big = np.bincount(holes.ravel()) > 0.03 * kept.sum()
+        big[0] = True
+        return kept | ((holes > 0) & ~big[holes])
+
+    def _confidence(self, mask: np.ndarray, soft: np.ndarray, colors: np.ndarray) -> float:
+        """By colours like the object's, decided pixels, and a size like that before."""
+        if mask.sum() < 6:
+            return 0.0
+        seen = histogram(bins_of(colors), mask * 1.0)
+        decided = float(np.abs(2 * soft[mask] - 1).mean()) ** 0.5
+        area = float(mask.sum()) * self.last.window.step**2
+        ratio = min(area, self.area) / max(area, self.area)
+        return self.colors.likeness(seen) ** 0.5 * decided * min(1.0, 2.0 * ratio**0.5)
+
+    def _remember(self, i: int, pasted: np.ndarray, window: Window, confidence: float) -> None:
+        mask = pasted > 127
+        fresh = _window_of(mask) if mask.any() else window
+        # the size changes slowly, so that windows of neighbouring frames can be compared
+        if not 0.8 < fresh.n * fresh.step / (window.n * window.step) < 1.25:
+            window = fresh
+        else:
+            window = window.at(*center_of(mask)) if mask.any() else window
+        center = np.array(window.center)
+        self.velocity = center - self.center if self.unseen == 0 else np.zeros(2)
+        self.center, self.unseen = center, 0
+        self.off = 0.7 * self.off + 0.3 * (center - self.path.centers[i])
+        self.last = self._sighting(i, window, window.cut(pasted.astype(np.float32) / 255))
+        self.area = 0.9 * self.area + 0.1 * float(mask.sum())
+        if confidence > 0.75:  # it turns, and other sides of it have other colours
+            seen = histogram(bins_of(self.last.colors), np.where(self.last.soft > 0.5, 1.0, 0.0))
+            self.colors = self.colors.blended(seen, 0.04)
+
+
+def _supported(mask: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """The part of a mask with most support, and others whose own is strong."""
+    labels, count = ndimage.label(mask)
+    if count < 2:
+        return mask
+    rows = np.arange(1, count + 1)
+    sums, means = (f(prior, labels, rows) for f in (ndimage.sum_labels, ndimage.mean))
+    kept = (sums == sums.max()) | ((sums > 0.1 * sums.max()) & (means > 0.7))
+    return np.isin(labels, rows[kept])
+
+
+def _window_of(mask: Bool[np.ndarray, "h w"]) -> Window:
+    """A window with room about a mask."""
+    y, x = np.nonzero(mask)
+    half = 0.5 * max(np.ptp(x), np.ptp(y)) + 1
+    return Window.around((x.min() + x.max() + 1) / 2, (y.min() + y.max() + 1) / 2, 1.5 * half + 8)

@@ -1,0 +1,206 @@
+"""When hands hold an object, and the poses that this gives it: it turns and moves with them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from torch import Tensor
+
+from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST
+from hoigs.core.maths.series import fill_gaps, smooth
+from hoigs.core.values.camera import Camera
+from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.masks.outlines import Outlines
+from hoigs.preparation.objects.track import hand_depths
+
+HAND_JOINTS = 30  # the last joints of a body: fifteen of each hand, three a finger, index first
+MIDDLE, INDEX, LITTLE = 3, 0, 6  # first joints of these fingers within a hand
+REACH = 0.13  # metres in the image between a palm and what it holds
+STILL = 0.07  # metres a second: an object that moves less rests
+SHORTEST = 0.2  # seconds of a grasp or a rest
+STEADY = 0.45  # seconds over which the hands' noise is smoothed
+
+
+@dataclass(frozen=True)
+class HandMotion:
+    """What the hands say of the object.
+
+    Attributes:
+        held: frames in which a hand is at the object and it moves. rests: it does not move.
+        rotations: of the frame that the hands span, turned so that it never jumps between frames
+            that follow each other in a grasp or a rest; constant while the object rests.
+        depths: of the hands along the view, metres, interpolated where they do not hold it.
+        palms: left and right, world, metres. near: which of them are at the object.
+        pieces: number of each frame's piece: within one the rotations are known against each
+            other, between two they are not (a flight lies between them).
+    """
+
+    held: Bool[np.ndarray, " F"]
+    rests: Bool[np.ndarray, " F"]
+    rotations: Float[np.ndarray, "F 3 3"]
+    depths: Float[np.ndarray, " F"]
+    palms: Float[np.ndarray, "F 2 3"]
+    near: Bool[np.ndarray, "F 2"]
+    pieces: np.ndarray
+
+    @property
+    def free(self) -> Bool[np.ndarray, " F"]:
+        """Frames in which it neither rests nor is held."""
+        return ~(self.held | self.rests)
+
+
+def hand_motion(
+    joints: Float[Tensor, "F J 3"],
+    masks: MaskStack,
+    outlines: Outlines,
+    cameras: Sequence[Camera],
+    fps: float,
+) -> HandMotion:
+    """Grasps and rests of the object, and the frame that the hands span.
+
+    A hand is at the object where its palm is within `REACH` of the mask, measured in the image at
+    the palm's depth. The object rests where its middle moves in the image as a point that stands
+    still in the world does.
+    """
+    window = max(5, round(STEADY * fps) | 1)
+    places = smooth(joints.double().numpy(), window)
+    first = places.shape[1] - HAND_JOINTS
+    wrists = places[:, [LEFT_WRIST, RIGHT_WRIST]]
+    middle = places[:, [first + MIDDLE, first + HAND_JOINTS // 2 + MIDDLE]]
+    palms = (wrists + middle) / 2
+    away = _palm_distances(palms, masks, cameras)
+    near = _cleaned(away < REACH, round(SHORTEST * fps))
+    depths = hand_depths(masks, cameras, joints[:, [LEFT_WRIST, RIGHT_WRIST]])
+    depths = smooth(depths, window)
+    rests = _cleaned(_rests(outlines, depths, cameras, fps)[:, None], round(SHORTEST * fps))[:, 0]
+    held = near.any(1) & ~rests
+    frames = _hand_frames(places, near, first)
+    rotations, pieces = _chained(frames, near, held, rests)
+    known = near.any(1)
+    palm_depths = _depths_of(palms, near, depths, cameras)
+    if known.any():
+        depths = fill_gaps(palm_depths, known)
+    return HandMotion(held, rests, rotations, depths, palms, near, pieces)
+
+
+def _palm_distances(
+    palms: Float[np.ndarray, "F 2 3"], masks: MaskStack, cameras: Sequence[Camera]
+) -> Float[np.ndarray, "F 2"]:
+    """Metres in the image from each palm to the mask; infinite where there is none."""
+    import torch
+
+    away = np.full((len(masks), 2), np.inf)
+    for i, (mask, camera) in enumerate(zip(masks, cameras, strict=True)):
+        xy, depth = camera.project(torch.from_numpy(palms[i]).float())
+        if not mask.any() or bool((depth <= 0).any()):
+            continue
+        # the mask may be cut by the hands themselves: outside is measured from its filled outline
+        rows, columns = np.nonzero(mask & ~ndimage.binary_erosion(mask))
+        edge = np.stack((columns, rows), -1) + 0.5
+        pixels = np.linalg.norm(xy.numpy()[:, None] - edge[None], axis=-1).min(1)
+        column, row = np.clip(xy.numpy().astype(int), 0, [mask.shape[1] - 1, mask.shape[0] - 1]).T
+        pixels[mask[row, column]] = 0
+        away[i] = pixels * depth.numpy() / float(camera.K[0, 0])
+    return away
+
+
+def _rests(
+    outlines: Outlines,
+    depths: Float[np.ndarray, " F"],
+    cameras: Sequence[Camera],
+    fps: float,
+) -> Bool[np.ndarray, " F"]:
+    """Frames around which the mask's middle follows a point that stands still in the world."""
+    import torch
+
+    count, step = len(cameras), max(1, round(SHORTEST * fps / 2))
+    speed = np.full(count, np.inf)
+    for i in range(count):
+        found = []
+        for j in (i - step, i + step):
+            if not 0 <= j < count or not (outlines.whole[i] and outlines.whole[j]):
+                continue
+            pixel = torch.tensor(outlines.centers[i], dtype=torch.float32)
+            point = cameras[i].unproject(pixel, torch.tensor(float(depths[i])))
+            xy, depth = cameras[j].project(point[None])
+            moved = float(np.linalg.norm(xy[0].numpy() - outlines.centers[j]))
+            metres = moved * float(depth[0]) / float(cameras[j].K[0, 0])
+            found.append(metres * fps / abs(j - i))
+        speed[i] = min(found, default=np.inf)
+    return speed < STILL
+
+
+def _cleaned(flags: Bool[np.ndarray, "F N"], shortest: int) -> Bool[np.ndarray, "F N"]:
+    """Without runs and gaps shorter than `shortest` frames."""
+    structure = np.ones((max(1, shortest), 1), dtype=bool)
+    padded = np.pad(flags, ((len(structure), len(structure)), (0, 0)), mode="edge")
+    closed = ndimage.binary_closing(padded, structure)
+    opened = ndimage.binary_opening(closed, structure)
+    return opened[len(structure) : -len(structure)]
+
+
+def _hand_frames(
+    places: Float[np.ndarray, "F J 3"], near: Bool[np.ndarray, "F 2"], first: int
+) -> dict[tuple[bool, bool], Float[np.ndarray, "F 3 3"]]:
+    """Frames spanned by both hands, by the left and by the right one."""
+    wrists = places[:, [LEFT_WRIST, RIGHT_WRIST]]
+    fingers = [
+        places[:, [first + f, first + HAND_JOINTS // 2 + f]] for f in (MIDDLE, INDEX, LITTLE)
+    ]
+    forward = fingers[0] - wrists
+    across = fingers[2] - fingers[1]
+    return {
+        (True, True): _frame(wrists[:, 1] - wrists[:, 0], forward.sum(1)),
+        (True, False): _frame(forward[:, 0], across[:, 0]),
+        (False, True): _frame(forward[:, 1], across[:, 1]),
+    }
+
+
+def _frame(x: Float[np.ndarray, "F 3"], y: Float[np.ndarray, "F 3"]) -> Float[np.ndarray, "F 3 3"]:
+    """Rotations whose first axis is x, and whose second lies towards y."""
+    x = x / np.linalg.norm(x, axis=-1, keepdims=True)
+    z = np.cross(x, y)
+    z = z / np.maximum(np.linalg.norm(z, axis=-1, keepdims=True), 1e-9)
+    return np.stack((x, np.cross(z, x), z), -1)
+
+
+def _chained(
+    frames: dict[tuple[bool, bool], Float[np.ndarray, "F 3 3"]],
+    near: Bool[np.ndarray, "F 2"],
+    held: Bool[np.ndarray, " F"],
+    rests: Bool[np.ndarray, " F"],
+) -> tuple[Float[np.ndarray, "F 3 3"], np.ndarray]:
+    """The turns of the hands while they hold it, one after another; none while it rests."""
+    count = len(held)
+    rotations, pieces = np.tile(np.eye(3), (count, 1, 1)), np.zeros(count, int)
+    for i in range(1, count):
+        both = held[i] and held[i - 1]
+        hands = tuple((near[i] & near[i - 1]).tolist()) if both else (False, False)
+        turn = np.eye(3)
+        if hands in frames:
+            turn = frames[hands][i] @ frames[hands][i - 1].T
+        rotations[i] = turn @ rotations[i - 1]
+        known = held[i] or rests[i]
+        pieces[i] = pieces[i - 1] + int(known and not (held[i - 1] or rests[i - 1]))
+    return rotations, pieces
+
+
+def _depths_of(
+    palms: Float[np.ndarray, "F 2 3"],
+    near: Bool[np.ndarray, "F 2"],
+    otherwise: Float[np.ndarray, " F"],
+    cameras: Sequence[Camera],
+) -> Float[np.ndarray, " F"]:
+    """Mean depth of the palms at the object."""
+    import torch
+
+    depths = otherwise.copy()
+    for i, camera in enumerate(cameras):
+        if near[i].any():
+            points = torch.from_numpy(palms[i][near[i]]).float()
+            depths[i] = float(camera.to_camera(points)[:, 2].mean())
+    return depths

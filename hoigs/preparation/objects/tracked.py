@@ -1,0 +1,277 @@
+"""An object's track from hands, outlines and texture together, and how far it may be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hoigs.core.maths.rotations import matrices_to_quats, quats_to_matrices, slerp
+from hoigs.core.maths.series import fill_gaps
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import ObjectTrack
+from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.masks.outlines import Outlines, outlines_of
+from hoigs.preparation.masks.separate import Images
+from hoigs.preparation.objects.alignment import (
+    LEVELS,
+    Aligned,
+    Held,
+    Level,
+    Poses,
+    Surface,
+    align,
+)
+from hoigs.preparation.objects.crops import make_crops
+from hoigs.preparation.objects.hands import HandMotion, hand_motion
+from hoigs.preparation.objects.search import placed_by_texture
+from hoigs.preparation.objects.surface import hull, with_samples
+
+FEWEST = 8  # frames that show the object whole
+SMALLEST = 10  # pixels across, median
+AGREES = 0.5  # correlation of textures from which a pose is trusted
+SIDE = 96  # of the crops, pixels
+SAMPLES = 1200
+
+
+class UntrackableError(Exception):
+    """Why an object's rotation cannot be found from its texture."""
+
+
+@dataclass(frozen=True)
+class ObjectConfidence:
+    """How far an object's track may be trusted.
+
+    Attributes:
+        way: "texture and hands", "outline" or "ball": how its poses were found.
+        agreement: of each frame, correlation of its texture with that of the other frames; NaN
+            where it does not show enough of it. Under `AGREES` its rotation is a guess.
+        outline: of each frame, metres between the mask's outline and the shape's; NaN if not seen.
+        held, rests: parts of the frames in which hands move it, and in which it rests.
+        hand_distance: of each frame, metres from the nearest palm to the surface while held,
+            negative inside; NaN while not held.
+        reason: why the better way was not taken; empty if it was.
+    """
+
+    way: str
+    agreement: Float[np.ndarray, " F"]
+    outline: Float[np.ndarray, " F"]
+    held: float = 0.0
+    rests: float = 0.0
+    hand_distance: Float[np.ndarray, " F"] = field(default_factory=lambda: np.zeros(0))
+    reason: str = ""
+
+    @staticmethod
+    def none(way: str, frames: int, reason: str) -> ObjectConfidence:
+        unknown = np.full(frames, np.nan)
+        return ObjectConfidence(way, unknown, unknown, hand_distance=unknown, reason=reason)
+
+
+def tracked_object(
+    masks: MaskStack,
+    humans: MaskStack,
+    cameras: Sequence[Camera],
+    joints: Float[Tensor, "F J 3"],
+    images: Images,
+    count: int,
+    fps: float,
+    progress: Callable[[float], None],
+    levels: Sequence[Level] = LEVELS,
+) -> tuple[ObjectTrack, Float[Tensor, "P 3"], ObjectConfidence]:
+    """Poses and shape by `align`, started from the hands.
+
+    Returns:
+        the track (grey: colours are sampled afterwards), the points' outward normals, and how far
+        it may be trusted.
+
+    Raises:
+        UntrackableError: too few frames, too small, always cut by the border, or textures that
+            do not agree.
+    """
+    outlines = outlines_of(masks)
+    _check(outlines)
+    hands = hand_motion(joints, masks, outlines, cameras, fps)
+    shown = outlines.observed
+    crops = make_crops(images, masks, humans, cameras, shown, SIDE)
+    start = _start(hands, outlines, cameras, shown)
+    radius = _radius(outlines, hands, cameras)
+    held = _held(hands, shown)
+    known, others = _pieces(hands, shown)
+    if others.any():
+        part = np.flatnonzero(known)
+        surface = hull(crops.rows(part), start.rows(part), radius, SAMPLES)
+        first = align(
+            crops.rows(part), surface, start.rows(part), held.rows(part), fps, levels=levels,
+            progress=_share(0, progress),
+        )  # fmt: skip
+        start = placed_by_texture(crops, surface, first, start, hands, fps)
+        surface = replace(surface, rest=first.vertices)
+        found = align(
+            crops, surface, start, held, fps, levels=levels[1:], progress=_share(1, progress)
+        )
+    else:
+        surface = hull(crops, start, radius, SAMPLES)
+        found = align(crops, surface, start, held, fps, levels=levels, progress=progress)
+    agreement = _over_frames(found.agreement, shown)
+    typical = float(np.nanmedian(found.agreement)) if np.isfinite(found.agreement).any() else 0.0
+    if typical < AGREES:
+        raise UntrackableError(
+            f"what the frames show of its texture agrees by {typical:.2f} only (correlation; "
+            f"{AGREES} is needed): it has hardly any texture, is not rigid, or its masks are off"
+        )
+    return _result(found, surface, hands, outlines, agreement, count)
+
+
+def _pieces(
+    hands: HandMotion, shown: Bool[np.ndarray, " F"]
+) -> tuple[Bool[np.ndarray, " C"], Bool[np.ndarray, " C"]]:
+    """Frames of the longest piece whose rotations are known against each other; the others."""
+    tied = ~hands.free & shown
+    if tied.sum() < FEWEST:  # never held, never at rest: one piece, from no rotation at all
+        every = np.ones(int(shown.sum()), bool)
+        return every, ~every
+    longest = np.bincount(hands.pieces[tied]).argmax()
+    known = (tied & (hands.pieces == longest))[shown]
+    return known, ~known
+
+
+def _share(half: int, progress: Callable[[float], None]) -> Callable[[float], None]:
+    return lambda done: progress((half + done) / 2)
+
+
+def _check(outlines: Outlines) -> None:
+    whole = int(outlines.whole.sum())
+    if whole < FEWEST:
+        raise UntrackableError(
+            f"{whole} frames show it whole, and {FEWEST} are needed: it is seen too briefly, or "
+            "the border of the image cuts it"
+        )
+    across = float(np.median(np.sqrt(outlines.areas[outlines.whole])))
+    if across < SMALLEST:
+        raise UntrackableError(f"it is {across:.0f} pixels across, and {SMALLEST} are needed")
+
+
+def _start(
+    hands: HandMotion,
+    outlines: Outlines,
+    cameras: Sequence[Camera],
+    shown: Bool[np.ndarray, " F"],
+) -> Poses:
+    pixels = torch.from_numpy(outlines.centers).float()
+    places = [
+        c.unproject(p, torch.tensor(float(z)))
+        for c, p, z in zip(cameras, pixels, hands.depths, strict=True)
+    ]
+    return Poses(torch.from_numpy(hands.rotations[shown]).float(), torch.stack(places)[shown])
+
+
+def _radius(outlines: Outlines, hands: HandMotion, cameras: Sequence[Camera]) -> float:
+    """Metres within which the object lies, from the largest extent of its outlines."""
+    rows = np.flatnonzero(outlines.whole)
+    metres = [
+        outlines.lengths[i] * hands.depths[i] / float(cameras[i].K[0, 0]) for i in rows.tolist()
+    ]
+    return 0.9 * float(np.quantile(metres, 0.95))
+
+
+def _held(hands: HandMotion, shown: Bool[np.ndarray, " F"]) -> Held:
+    grasps = np.where(hands.near & hands.held[:, None], hands.pieces[:, None], -1)
+    starts = np.diff(hands.rests.astype(int), prepend=0) == 1
+    rests = np.where(hands.rests, np.cumsum(starts), -1)
+    return Held(
+        torch.from_numpy(hands.palms[shown]).float(),
+        torch.from_numpy(grasps[shown]),
+        torch.from_numpy(rests[shown]),
+    )
+
+
+def _over_frames(
+    values: Float[np.ndarray, " C"], shown: Bool[np.ndarray, " F"]
+) -> Float[np.ndarray, " F"]:
+    found = np.full(len(shown), np.nan)
+    found[shown] = values
+    return found
+
+
+def _result(
+    found: Aligned,
+    surface: Surface,
+    hands: HandMotion,
+    outlines: Outlines,
+    agreement: Float[np.ndarray, " F"],
+    count: int,
+) -> tuple[ObjectTrack, Float[Tensor, "P 3"], ObjectConfidence]:
+    shown = outlines.observed
+    dense = with_samples(found.vertices, surface.faces, count)
+    points, normals = dense.points(found.vertices), dense.normals(found.vertices)
+    middle = (points.max(0).values + points.min(0).values) / 2
+    rotations, translations = _between(found.poses, middle, shown)
+    points = points - middle
+    distance = np.full(len(shown), np.nan)
+    for i in np.flatnonzero(hands.held).tolist():
+        palms = torch.from_numpy(hands.palms[i][hands.near[i]]).float()
+        distance[i] = min(_signed_distances(palms, points, normals, rotations[i], translations[i]))
+    known = np.isfinite(agreement) & (agreement >= AGREES)
+    off = found.outline.mean()
+    return (
+        ObjectTrack(
+            points=points,
+            colors=torch.full_like(points, 0.5),
+            rotations=rotations,
+            translations=translations,
+            observed=torch.from_numpy(shown),
+            provenance=(
+                f"texture, outlines and hands of all frames together: rotation known in "
+                f"{int(known.sum())} of {len(shown)} frames, the others follow their neighbours; "
+                f"distance from the hands that hold it ({int(hands.held.sum())} frames); shape "
+                f"from outlines and texture, {1000 * off:.0f} mm off the masks' outlines, sides "
+                "never seen closed over"
+            ),
+        ),
+        normals,
+        ObjectConfidence(
+            "texture and hands",
+            agreement,
+            _over_frames(found.outline, shown),
+            float(hands.held.mean()),
+            float(hands.rests.mean()),
+            distance,
+        ),
+    )
+
+
+def _between(
+    poses: Poses, middle: Float[Tensor, " 3"], shown: Bool[np.ndarray, " F"]
+) -> tuple[Float[Tensor, "F 3 3"], Float[Tensor, "F 3"]]:
+    """Poses of all frames about the object's middle; frames that do not show it interpolate."""
+    places = poses.translations + poses.rotations @ middle
+    filled = np.zeros((len(shown), 3))
+    filled[shown] = places.numpy()
+    translations = torch.from_numpy(fill_gaps(filled, shown)).float()
+    quats, rows = matrices_to_quats(poses.rotations), np.flatnonzero(shown)
+    frames = np.arange(len(shown))
+    after = np.searchsorted(rows, frames).clip(0, len(rows) - 1)
+    before = np.where(rows[after] == frames, after, (after - 1).clip(0))
+    gap = np.maximum(rows[after] - rows[before], 1)
+    part = ((frames - rows[before]) / gap).clip(0, 1)
+    mixed = slerp(quats[before], quats[after], torch.from_numpy(part).float()[:, None])
+    return quats_to_matrices(mixed), translations
+
+
+def _signed_distances(
+    palms: Float[Tensor, "N 3"],
+    points: Float[Tensor, "P 3"],
+    normals: Float[Tensor, "P 3"],
+    rotation: Float[Tensor, "3 3"],
+    translation: Float[Tensor, " 3"],
+) -> list[float]:
+    """Metres from palms to the surface, negative inside."""
+    local = (palms - translation) @ rotation
+    away = torch.cdist(local, points)
+    nearest = away.argmin(-1)
+    outwards = ((local - points[nearest]) * normals[nearest]).sum(-1)
+    return (away.gather(1, nearest[:, None])[:, 0] * outwards.sign()).tolist()

@@ -1,0 +1,109 @@
+"""`--object`: clicks, boxes and words that say where, or what, an entity is."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from hoigs.core.errors import SpecError
+from hoigs.preparation.options import PrepareOptions, Prompt, PromptAt
+from hoigs.preparation.video.frames import FrameList
+
+_NUMBER = r"\d+(?:\.\d+)?"
+_PLACE = re.compile(rf"\s*([-!]?)\s*({_NUMBER}(?:\s*,\s*{_NUMBER})+)\s*(?:@\s*(\d+))?\s*")
+NONE = "none"
+HOW = (
+    '"640,402" is a point on it in frame 0, "640,402@120" in frame 120, "-700,380" a point that is '
+    'not on it, "600,350,700,450" its box x0,y0,x1,y1, "none" that there is no object'
+)
+
+
+def parse_prompts(texts: Sequence[str], what: str = "--object") -> Prompt:
+    """One prompt from all of an entity's clicks, boxes or words.
+
+    Raises:
+        SpecError: a text is neither, two boxes or two descriptions are given, or a frame has
+            points beside the entity only.
+    """
+    by_frame: dict[int, PromptAt] = {}
+    words = None
+    for text in texts:
+        found = _PLACE.fullmatch(text)
+        if found is None:
+            words = _words(text, words, what)
+            continue
+        sign, numbers, frame = found[1], [float(n) for n in found[2].split(",")], int(found[3] or 0)
+        at = by_frame.get(frame, PromptAt(frame=frame))
+        if len(numbers) == 2:
+            point = (numbers[0], numbers[1], not sign)
+            by_frame[frame] = at.model_copy(update={"points": [*at.points, point]})
+        elif len(numbers) == 4 and not sign:
+            by_frame[frame] = _boxed(at, numbers, text, what)
+        else:
+            raise SpecError(f"{what} {text!r} is neither a point nor a box; {HOW}")
+    for at in by_frame.values():
+        if at.box is None and not any(inside for _, _, inside in at.points) and len(by_frame) == 1:
+            raise SpecError(
+                f"{what}: only points that are not on it are given; add one that is: {HOW}"
+            )
+    first, *further = [by_frame[frame] for frame in sorted(by_frame)] or [PromptAt()]
+    return Prompt(
+        text=words, points=first.points, box=first.box, frame=first.frame, further=further
+    )
+
+
+def _words(text: str, words: str | None, what: str) -> str:
+    if not any(c.isalpha() for c in text) or "@" in text:
+        raise SpecError(f"{what} {text!r} is neither a point, a box nor words; {HOW}")
+    if words is not None:
+        raise SpecError(f"{what} is described twice: {words!r} and {text!r}; give one description")
+    return text.strip()
+
+
+def _boxed(at: PromptAt, numbers: list[float], text: str, what: str) -> PromptAt:
+    x0, y0, x1, y1 = numbers
+    if at.box is not None:
+        raise SpecError(f"{what} {text!r}: frame {at.frame} has a box already; one a frame")
+    if x1 <= x0 or y1 <= y0:
+        raise SpecError(
+            f"{what} {text!r}: a box is x0,y0,x1,y1 with x0 < x1 and y0 < y1, in pixels"
+        )
+    return at.model_copy(update={"box": (x0, y0, x1, y1)})
+
+
+def with_prompts(
+    options: PrepareOptions, texts: str | Sequence[str], preset: object = None
+) -> PrepareOptions:
+    """Options with the object's prompt from texts, and a preset if `preset` is the name of one."""
+    texts = [texts] if isinstance(texts, str) else list(texts)
+    update: dict[str, object] = {"preset": preset} if isinstance(preset, str) else {}
+    if NONE in texts:
+        if len(texts) > 1:
+            raise SpecError("--object none says that there is no object: leave the others out")
+        update["find_object"] = False
+    elif texts:
+        update["prompts"] = {**options.prompts, options.object: parse_prompts(texts)}
+    return PrepareOptions.model_validate({**options.model_dump(), **update}) if update else options
+
+
+def check_prompts(options: PrepareOptions, found: FrameList) -> None:
+    """That clicks and boxes lie in the picture, and in frames that there are.
+
+    Raises:
+        SpecError: naming the first that does not.
+    """
+    width, height = found.native_width, found.native_height
+    for name, prompt in options.prompts.items():
+        for at in prompt.places():
+            if at.frame >= found.total:
+                raise SpecError(
+                    f"the prompt of {name} is in frame {at.frame}; the frames of the video that "
+                    f"are used are 0 to {found.total - 1}"
+                )
+            corners = [] if at.box is None else [at.box[:2], at.box[2:]]
+            for x, y in [*((x, y) for x, y, _ in at.points), *corners]:
+                if not (0 <= x <= width and 0 <= y <= height):
+                    raise SpecError(
+                        f"the prompt of {name}, {x:g},{y:g} in frame {at.frame}, is outside of the "
+                        f"picture, which is {width}x{height} (as displayed, x to the right, y down)"
+                    )

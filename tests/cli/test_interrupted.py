@@ -1,0 +1,60 @@
+"""Ctrl-C and SIGTERM: the step is finished, a checkpoint written, and the next command printed."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+from small_clip import small_clip
+
+from hoigs.cli.display import Display
+from hoigs.core.clip_folder.write import write_clip
+
+SMALL = ["--device", "cpu", "--set", "train.steps=9", "--set", "train.preview_every=0",
+         "--set", "train.log_every=1"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clips") / "small"
+    small = small_clip()
+    small.split["test"].append(small.split["train"].pop())
+    write_clip(small, folder)
+    return folder
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_training_keeps_its_steps(hoigs, clip, tmp_path, monkeypatch, number, code):
+    run, before = tmp_path / "run", signal.getsignal(number)
+    monkeypatch.setattr(
+        Display, "step", lambda _, report: report.step == 3 and signal.raise_signal(number)
+    )
+    stopped = hoigs("train", clip, "--spec", "static", "--out", run, *SMALL)
+    assert stopped.code == code, stopped.err
+    assert "stopped at step 3 of 9" in stopped.err
+    assert f"hoigs train --resume --out {run}" in stopped.err
+    assert [p.name for p in (run / "checkpoints").glob("*.json")] == ["step_000003.json"]
+    assert signal.getsignal(number) is before
+    assert hoigs("train", "--resume", "--out", run, "--no-eval", "--device", "cpu").code == 0
+    assert (run / "checkpoints" / "step_000009.json").is_file()
+
+
+def test_a_second_signal_stops_within_the_step(hoigs, clip, tmp_path, monkeypatch):
+    def twice(_, report):
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(Display, "step", twice)
+    run = tmp_path / "run"
+    stopped = hoigs("train", clip, "--spec", "static", "--out", run, *SMALL)
+    assert (stopped.code, stopped.err.splitlines()[-1]) == (143, "stopped")
+    assert not list((run / "checkpoints").iterdir())
+
+
+def test_a_trained_run_that_is_not_yet_scored(hoigs, clip, tmp_path, monkeypatch):
+    def stop(*_: object, **__: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("hoigs.workflows.train.evaluate_run", stop)
+    stopped = hoigs("train", clip, "--spec", "static", "--out", tmp_path / "run", *SMALL)
+    assert stopped.code == 130 and f"hoigs eval {tmp_path / 'run'}" in stopped.err

@@ -1,0 +1,94 @@
+"""FolderLock: one writer at a time; what dead processes and silent machines left is taken over."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from hoigs.core.errors import HoigsError
+from hoigs.core.folder_lock import STALE_S, FolderLock
+
+SCRIPT = """
+import sys, time
+from pathlib import Path
+from hoigs.core.errors import HoigsError
+from hoigs.core.folder_lock import FolderLock
+try:
+    with FolderLock(Path(sys.argv[1]), "racing"):
+        time.sleep(1.0)
+        print("held")
+except HoigsError:
+    print("refused")
+"""
+
+
+def lock_of(folder: Path, age: float = 0, **record: object) -> Path:
+    """A lock that another process has made."""
+    path = folder.with_name(f".{folder.name}.lock")
+    text = {"work": "training", "token": "its", "host": socket.gethostname(), "pid": os.getppid()}
+    path.write_text(json.dumps(text | record))
+    os.utime(path, (path.stat().st_atime, path.stat().st_mtime - age))
+    return path
+
+
+def test_a_lock_is_gone_with_the_parents_that_it_made(tmp_path):
+    with FolderLock(tmp_path / "a" / "b" / "run", "training"):
+        assert (tmp_path / "a" / "b" / ".run.lock").is_file()
+    assert not list(tmp_path.iterdir())
+    with FolderLock(tmp_path / "a" / "run", "training"):
+        (tmp_path / "a" / "run").mkdir()
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("record", [{}, {"host": "elsewhere", "pid": 1}])
+def test_a_living_process_keeps_its_lock(tmp_path, record):
+    path = lock_of(tmp_path / "run", **record)
+    with pytest.raises(HoigsError, match=r"being written by another process \(training, pid"):
+        FolderLock(tmp_path / "run", "training").acquire()
+    assert json.loads(path.read_text())["token"] == "its"
+    assert [p.name for p in tmp_path.iterdir()] == [".run.lock"]
+
+
+@pytest.mark.parametrize(
+    ("age", "record"),
+    [
+        (STALE_S + 5, {"host": "elsewhere"}),
+        (STALE_S + 5, {"host": None, "pid": "?"}),
+        (0, {"pid": 2**22 + 1}),  # beyond every pid
+        (0, {"began": "another-boot/1"}),  # the number belongs to another process now
+    ],
+)
+def test_a_stale_lock_is_taken_over(tmp_path, age, record):
+    lock_of(tmp_path / "run", age, **record)
+    with FolderLock(tmp_path / "run", "training"):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_holder_whose_lock_was_taken_over_finds_out(tmp_path):
+    lock = FolderLock(tmp_path / "run", "training").acquire()
+    path = lock_of(tmp_path / "run")
+    with pytest.raises(HoigsError, match="another process took this folder over"):
+        lock.require_held()
+    lock.release()
+    assert path.is_file()  # it is the other one's
+
+
+def test_of_processes_at_the_same_time_one_gets_a_stale_lock(tmp_path):
+    lock_of(tmp_path / "run", STALE_S + 5, host="elsewhere")
+    command = [sys.executable, "-c", SCRIPT, str(tmp_path / "run")]
+
+    def race(_: int) -> str:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    with ThreadPoolExecutor(4) as pool:
+        # one that starts after the others have ended may get it too
+        assert "held" in (outcomes := list(pool.map(race, range(4))))
+    assert set(outcomes) <= {"held", "refused"} and not list(tmp_path.iterdir())

@@ -1,0 +1,124 @@
+"""A painted box between two hands, whose turning is found from its texture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.values.camera import Camera
+from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.masks.outlines import outlines_of
+from hoigs.preparation.objects.hands import hand_motion
+from hoigs.preparation.objects.make_object import make_object
+from hoigs.preparation.objects.tracked import UntrackableError, tracked_object
+
+FRAMES, SIZE, FPS = 12, 96, 12.0
+HALF = torch.tensor([0.17, 0.12, 0.13])
+CAMERA = Camera(torch.tensor([[170.0, 0, 48], [0, 170, 48], [0, 0, 1]]), torch.eye(4), SIZE, SIZE)
+
+
+def poses(angle: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """A swing about the vertical by `angle` radians to either side, 2 m away."""
+    phase = torch.linspace(-1, 1, FRAMES)
+    turns = torch.stack((0.2 * phase, angle * phase, 0 * phase), -1)
+    places = torch.stack((0.15 * phase, 0.05 * phase, 2 + 0 * phase), -1)
+    return axis_angle_to_matrices(turns), places
+
+
+def picture(rotation: torch.Tensor, place: torch.Tensor, contrast: float):
+    """Image and mask of the box, ray-cast: each face is painted with its own waves."""
+    rays = torch.linalg.solve(
+        CAMERA.K, torch.cat((CAMERA.pixel_grid(), torch.ones(SIZE, SIZE, 1)), -1)[..., None]
+    )[..., 0]
+    origin, rays = -place @ rotation, rays @ rotation
+    near, far = (-HALF - origin) / rays, (HALF - origin) / rays
+    enter = torch.minimum(near, far).amax(-1)
+    mask = enter < torch.maximum(near, far).amin(-1)
+    at = origin + rays * enter[..., None]
+    waves = torch.stack([torch.sin(at @ w) for w in WAVES], -1)
+    color = (0.5 + contrast * waves).clamp(0, 1)
+    image = torch.where(mask[..., None], color, torch.tensor([0.1, 0.3, 0.1]))
+    return (255 * image).byte().numpy(), mask.numpy()
+
+
+WAVES = 20 * torch.randn(3, 3, 3, generator=torch.Generator().manual_seed(0)).sum(0)
+
+
+def filmed(angle: float = 0.7, contrast: float = 0.35):
+    """Images, masks of object and person, and joints of a body whose palms are at its sides."""
+    rotations, places = poses(angle)
+    shown = [picture(r, t, contrast) for r, t in zip(rotations, places, strict=True)]
+    joints = torch.zeros(FRAMES, 52, 3) + torch.tensor([0, 0, 2.5])
+    for side, wrist, first in ((-1.0, 20, 22), (1.0, 21, 37)):
+        for joint, forward in ((wrist, 0.0), (first, 0.1), (first + 3, 0.1), (first + 6, 0.1)):
+            local = torch.tensor([side * (HALF[0] + 0.02), 0.02, 0.05 - forward])
+            joints[:, joint] = (rotations @ local) + places
+    images = np.stack([image for image, _ in shown])
+    objects = MaskStack(mask for _, mask in shown)
+    humans = MaskStack(np.zeros_like(mask) for _, mask in shown)
+    return images, objects, humans, joints
+
+
+def angles(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    return torch.rad2deg(torch.acos((((a * b).sum((-1, -2)) - 1) / 2).clamp(-1, 1)))
+
+
+def test_turning_and_shape_of_a_held_box() -> None:
+    images, objects, humans, joints = filmed()
+    joints = joints + 0.02 * torch.randn(joints.shape, generator=torch.Generator().manual_seed(1))
+    track, normals, confidence = tracked_object(
+        objects,
+        humans,
+        [CAMERA] * FRAMES,
+        joints,
+        lambda: iter(images),
+        800,
+        FPS,
+        lambda _: None,
+        levels=((5.0, 6, 60), (2.0, 2, 60)),
+    )
+    rotations, places = poses(0.7)
+    off = angles(track.rotations @ track.rotations[0].mT, rotations @ rotations[0].mT)
+    assert float(off.median()) < 4
+    assert float((track.translations - places).norm(dim=-1).mean()) < 0.06
+    outwards = (normals * track.points).sum(-1) > 0
+    assert float(outwards.float().mean()) > 0.95
+    assert np.nanmedian(confidence.agreement) > 0.8 and confidence.held > 0.6
+    assert np.nanmedian(np.abs(confidence.hand_distance)) < 0.06
+
+
+def test_what_has_no_texture_is_refused() -> None:
+    images, objects, humans, joints = filmed(contrast=0.0)
+    rng = np.random.default_rng(0)
+    noisy = np.clip(images + rng.normal(size=images.shape) * 4, 0, 255).astype(np.uint8)
+    with pytest.raises(UntrackableError, match="hardly any texture"):
+        tracked_object(
+            objects, humans, [CAMERA] * FRAMES, joints, lambda: iter(noisy), 99, FPS,
+            lambda _: None, levels=((5.0, 6, 20), (2.0, 2, 20)),
+        )  # fmt: skip
+
+
+def test_what_is_seen_briefly_goes_the_old_way_by_name() -> None:
+    images, objects, humans, joints = filmed()
+    brief = MaskStack(m if i < 5 else np.zeros_like(m) for i, m in enumerate(objects))
+    made = make_object(
+        None, brief, humans, [CAMERA] * FRAMES, joints, lambda: iter(images), way="auto",
+        radius=0.1, count=200, fps=FPS, progress=lambda _: None,
+    )  # fmt: skip
+    assert made.confidence.way == "outline" and "5 frames" in made.confidence.reason
+    assert "roll" in made.track.provenance
+
+
+def test_hands_turn_what_they_hold_and_nothing_else() -> None:
+    _, objects, _, joints = filmed()
+    cameras = [CAMERA] * FRAMES
+    held = hand_motion(joints, objects, outlines_of(objects), cameras, FPS)
+    rotations, _ = poses(0.7)
+    assert held.near.all()
+    inside = slice(2, FRAMES - 2)  # smoothing is weak at the ends
+    turned = torch.from_numpy(held.rotations).float()[inside]
+    assert float(angles(turned @ turned[0].mT, (rotations[inside] @ rotations[2].mT)).max()) < 6
+    away = hand_motion(joints + 1.0, objects, outlines_of(objects), cameras, FPS)
+    assert not away.held.any() and np.allclose(away.rotations, np.eye(3))
