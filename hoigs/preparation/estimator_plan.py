@@ -13,9 +13,10 @@ from hoigs.preparation.options import Place, PrepareOptions
 from hoigs.preparation.video.header import video_header
 from hoigs.preparation.video.source import Source, numbered_frames
 
-# seconds a frame of 1280x720 on two cores, measured by benchmarks/prepare_alone.py
+# seconds of a processor a frame of 1280x720, about, as benchmarks/prepare_alone.py measures them;
+# those of networks are guesses
 COST = {
-    "estimator:mediapipe": 0.25,
+    "estimator:mediapipe": 0.15,
     "estimator:object-tracker": 0.25,
     "estimator:transformers-sam2": 4.0,
     "estimator:transformers-pose": 0.6,

@@ -45,6 +45,7 @@ def write_report(
         ("playback", lambda: _hero(model, clip)),
         ("comparisons", lambda: _compared(model, clip, evaluation)),
         ("orbit", lambda: _space(model, clip)),
+        ("commands", lambda: _further(folder)),
         ("scores", lambda: _scores(evaluation)),
         ("curves", lambda: _training(records)),
         ("cost", lambda: _cost(evaluation)),
@@ -100,6 +101,35 @@ def _compared(model: SceneModel, clip: Clip, evaluation: Evaluation) -> str:
         ("None of these images took part in training. " if unseen else "")
         + "Drag the line between them; choose a frame below.",
         sections.comparer(comparisons),
+    ) + _section(
+        "In a row",
+        "The frames that were scored, in their order.",
+        sections.player(media.scored_sequence(model, clip, evaluation)),
+    )
+
+
+def _further(folder: Path) -> str:
+    run = folder.name if folder.is_absolute() else str(folder)
+    return _section(
+        "Look further",
+        "",
+        sections.commands(
+            (
+                (
+                    f"hoigs render {run} --path bullet-time",
+                    "a film: the moment stands still, the camera moves",
+                ),
+                (f"hoigs render {run} --compare", "a film beside the video"),
+                (
+                    f"hoigs export {run} --format ply --out scene.ply",
+                    "one moment for viewers of Gaussians",
+                ),
+                (
+                    f"hoigs export {run} --format usd --out scene.usd",
+                    "all moments for Blender, Houdini and others",
+                ),
+            )
+        ),
     )
 
 
