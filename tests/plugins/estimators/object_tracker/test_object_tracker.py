@@ -22,7 +22,7 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.plugins.estimators.object_tracker.estimator import ObjectTrackerEstimator
 from hoigs.plugins.estimators.object_tracker.footage import lab_of
 
-H, W, RADIUS, COUNT = 96, 128, 9, 16
+H, W, RADIUS, COUNT = 72, 108, 8, 14
 
 
 def texture(seed: int, color: tuple[int, int, int], shape=(H, W + 60)) -> np.ndarray:
@@ -32,7 +32,7 @@ def texture(seed: int, color: tuple[int, int, int], shape=(H, W + 60)) -> np.nda
 
 def places() -> list[tuple[float, float]]:
     """Of the disc: it swings past the person."""
-    return [(26 + 4.5 * i, 50 + 16 * np.sin(i / 3)) for i in range(COUNT)]
+    return [(16 + 5.2 * i, 40 + 14 * np.sin(i / 3)) for i in range(COUNT)]
 
 
 def world(pan: float = 0.0, hidden: range = range(0)):
@@ -42,7 +42,7 @@ def world(pan: float = 0.0, hidden: range = range(0)):
     frames, people, discs = [], [], []
     for i, (cx, cy) in enumerate(places()):
         image = wall[:, round(pan * i) :][:, :W].copy()
-        person = (np.abs(x - 64 - 3 * np.sin(i)) < 8) & (y > 20)
+        person = (np.abs(x - 50 - 3 * np.sin(i)) < 8) & (y > 14)
         disc = np.hypot(x - cx, y - cy) < RADIUS
         image[person] = (70, 80, 150)
         rolled = np.roll(ball[:, :W], (round(cy), round(cx)), (0, 1))
@@ -117,21 +117,21 @@ def test_a_still_video_without_a_prompt_has_no_object(tmp_path: Path) -> None:
 
 
 def test_a_click_on_the_person_is_noted(tmp_path: Path) -> None:
-    found = masks_of(request(tmp_path, world(), (click(0, 64, 80),)))
+    found = masks_of(request(tmp_path, world(), (click(0, 50, 66),)))
     assert "lies on the person's mask" in found.notes[0]
 
 
 def test_a_click_on_a_black_border_is_an_error_that_says_so(tmp_path: Path) -> None:
     frames, people, discs = world()
     for frame in frames:
-        frame[:, 100:] = 0
-    with pytest.raises(HoigsError, match=r"at 120,40 in frame 2: there is a black border"):
-        masks_of(request(tmp_path, (frames, people, discs), (click(2, 120, 40),)))
+        frame[:, 84:] = 0
+    with pytest.raises(HoigsError, match=r"at 100,30 in frame 2: there is a black border"):
+        masks_of(request(tmp_path, (frames, people, discs), (click(2, 100, 30),)))
 
 
 def test_a_prompt_beyond_the_end_is_an_error(tmp_path: Path) -> None:
     prompt = FramePrompt(99, (PromptPoint(5, 5),))
-    with pytest.raises(HoigsError, match="frame 99; the video has frames 0 to 15"):
+    with pytest.raises(HoigsError, match="frame 99; the video has frames 0 to 13"):
         masks_of(request(tmp_path, world(), (prompt,)))
 
 
