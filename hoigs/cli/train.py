@@ -91,8 +91,7 @@ def train(
             made = train_auto(named, spec, on_found=print_needs, **given)
             run = made.run
         else:
-            more = {"reader": reader, "reader_settings": reader_set or ()}
-            run = train_spec(clip, spec, **more, **given)
+            run = train_spec(clip, spec, reader=reader, reader_settings=reader_set or (), **given)
     if auto:
         _print_after(made.after)
     if run.evaluated is not None:
