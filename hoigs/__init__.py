@@ -61,6 +61,7 @@ _PUBLIC = {
     "WarpRasterizer": "hoigs.rasterizers.warp",
     # work: the commands as functions, then what they are made of
     "auto": "hoigs.studies.needs.auto",
+    "bug_report": "hoigs.workflows.bug_report",
     "compress": "hoigs.studies.needs.pruning.compact_run",
     "demo": "hoigs.workflows.demo",
     "doctor": "hoigs.workflows.doctor",

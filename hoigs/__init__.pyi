@@ -60,6 +60,7 @@ from hoigs.training.trainer import Trainer as Trainer
 from hoigs.viewing.films import render as render
 from hoigs.viewing.playback import Playback as Playback
 from hoigs.viewing.view import view as view
+from hoigs.workflows.bug_report import bug_report as bug_report
 from hoigs.workflows.demo import demo as demo
 from hoigs.workflows.doctor import doctor as doctor
 from hoigs.workflows.evaluate_run import evaluate_run as evaluate_run

@@ -18,6 +18,11 @@ def tiny_run() -> Path:
     from hoigs.training.session import Session
 
     out = Path(mkdtemp(prefix="hoigs-run-")) / "run"
-    small = ["train.steps=4", "train.preview_every=0", "train.log_every=1"]
+    small = [
+        "model.human.points=1500",
+        "train.steps=4",
+        "train.preview_every=0",
+        "train.log_every=1",
+    ]
     Session.open(TINY, "hoigs", out=out, overrides=small).train()
     return out

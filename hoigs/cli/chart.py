@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from pathlib import Path
 from typing import Annotated
@@ -20,6 +19,7 @@ from hoigs.cli.common import (
     print_table,
 )
 from hoigs.cli.evaluate import LpipsOption
+from hoigs.core.cpus import available_cpus
 from hoigs.runs.choices import pick_device
 
 
@@ -73,7 +73,7 @@ def chart(
     chart.csv, chart.json, and chart-CLIP.png and .svg with training curves beside them. With
     --rerun, the exit code is 1 if a PSNR differs by more than 0.05 dB on the same machine.
     """
-    each = threads or max(1, (os.cpu_count() or 1) // jobs)
+    each = threads or max(1, available_cpus() // jobs)
     before = signal.signal(signal.SIGTERM, _stop)  # so that SIGTERM ends the runs too
     try:
         if rerun is not None:

@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
+from hoigs.core.names import printable
+
 SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", help="Set one key of the spec: train.steps=500. Repeatable."),
@@ -44,6 +46,9 @@ AllowFaultsOption = Annotated[
         help="Continue without masks, images and depth that are missing or broken.",
     ),
 ]
+OverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="Replace what hoigs wrote to --out before.")
+]
 PluginOption = Annotated[
     list[Path] | None,
     typer.Option(
@@ -65,7 +70,9 @@ def print_table(
     for i, column in enumerate(columns):
         table.add_column(column, justify="left" if i == 0 else "right")
     for row in rows:
-        table.add_row(*(escape(str(cell)) for cell in row))  # "hoigs[gsplat]" is no markup
+        table.add_row(
+            *(escape(printable(str(cell))) for cell in row)
+        )  # "hoigs[gsplat]" is no markup
     console.print(table)
     for note in notes:
         console.print(f"[dim]{note}[/dim]", highlight=False)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from hoigs.cli.common import Bar, print_table, progress_bar
+from hoigs.core.names import printable
 
 if TYPE_CHECKING:
     from hoigs.training.session import Session
@@ -39,7 +40,7 @@ class Display:
     def line(self, text: str) -> None:
         """`report`: a line on stdout."""
         self._end_bar()
-        typer.echo(text)
+        typer.echo(printable(text))
 
     def started(self, session: Session) -> None:
         """`on_start`: print the training and the faults of the clip, and start a bar."""
@@ -51,14 +52,14 @@ class Display:
                 f"train.width={width} is wider than the clip: its {camera.width} pixels are kept"
             )
         typer.echo(
-            f"training {session.spec.name} on {session.clip.name} ({session.reader}): "
+            f"training {session.spec.name} on {printable(session.clip.name)} ({session.reader}): "
             f"{self._steps} steps, {len(session.clip.split['train'])} frames of "
             f"{camera.width}x{camera.height}"
         )
         for change in session.changes:
             typer.echo(f"changed on resuming: {change}")
         for fault in session.faults:
-            typer.echo(f"warning: {fault}", err=True)
+            typer.echo(printable(f"warning: {fault}"), err=True)
         self._psnr = {}
         self._bar = self._bars.enter_context(progress_bar("training", self._steps))
 

@@ -54,17 +54,9 @@ def evaluate(
 
     with Display() as show:
         done = evaluate_run(
-            run,
-            clip=clip,
-            rasterizer=rasterizer,
-            lpips_weights=lpips_weights,
-            device=device,
-            test_pose=test_pose,
-            test_camera=test_camera,
-            fit_steps=fit_steps,
-            report=report,
-            plugins=plugin or (),
-            progress=show.fraction,
-        )
+            run, clip=clip, rasterizer=rasterizer, lpips_weights=lpips_weights, device=device,
+            test_pose=test_pose, test_camera=test_camera, fit_steps=fit_steps, report=report,
+            plugins=plugin or (), progress=show.fraction,
+        )  # fmt: skip
     print_scores(done)
     typer.echo(f"report: {done.report}" if done.report else f"scores: {done.scores}")

@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 from typer.core import TyperGroup
 
 from hoigs.core.errors import HoigsError, Interrupted
+from hoigs.core.names import printable
 
 # what a user does about the error of a system call
 ADVICE = {
@@ -98,13 +99,6 @@ def _of_system(error: OSError) -> str:
 
 def _first_line(error: Exception) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
-
-
-def printable(text: str) -> str:
-    """`text` without control characters but line breaks: names may hold escape sequences."""
-    return "".join(
-        c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text
-    )
 
 
 def _stop_on_sigterm() -> Any:

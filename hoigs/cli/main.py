@@ -6,6 +6,7 @@ import typer
 
 from hoigs import __version__
 from hoigs.cli import (
+    bug_report,
     chart,
     compress,
     demo,
@@ -24,6 +25,7 @@ from hoigs.cli import (
     view,
 )
 from hoigs.cli.failures import GuardedGroup, failures_as_messages
+from hoigs.core.cpus import share_processors
 
 app = typer.Typer(
     name="hoigs",
@@ -49,6 +51,7 @@ app.add_typer(plugins.app, name="plugins")
 app.add_typer(spec.app, name="spec")
 app.add_typer(estimators.app, name="estimators")
 app.command("doctor")(doctor.doctor)
+app.command("bug-report")(bug_report.bug_report)
 
 
 def _version(show: bool) -> None:
@@ -68,6 +71,7 @@ def _options(
 
 def main() -> None:
     """Entry point: what goes wrong becomes one message on stderr and an exit code."""
+    share_processors()
     with failures_as_messages():
         app()
 

@@ -10,6 +10,7 @@ import typer
 from hoigs.cli.common import (
     AllowFaultsOption,
     DeviceOption,
+    OverwriteOption,
     PluginOption,
     RasterizerOption,
     SetOption,
@@ -55,9 +56,7 @@ def needs(
     settings: SetOption = None,
     rasterizer: RasterizerOption = None,
     device: DeviceOption = "auto",
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the answer in --out.")
-    ] = False,
+    overwrite: OverwriteOption = False,
     allow_faults: AllowFaultsOption = False,
     plugin: PluginOption = None,
 ) -> None:
@@ -70,21 +69,11 @@ def needs(
 
     with Display() as show:
         found = find(
-            clip,
-            spec,
-            out=out,
-            criterion=criterion,
-            least=least,
-            share=share,
-            search_spaces=search_spaces,
-            overrides=settings or (),
-            rasterizer=rasterizer,
-            device=device,
-            overwrite=overwrite,
-            allow_faults=allow_faults,
-            plugins=plugin or (),
+            clip, spec, out=out, criterion=criterion, least=least, share=share,
+            search_spaces=search_spaces, overrides=settings or (), rasterizer=rasterizer,
+            device=device, overwrite=overwrite, allow_faults=allow_faults, plugins=plugin or (),
             report=show.line,
-        )
+        )  # fmt: skip
     print_needs(found)
     answer = (out or needs_folder(clip)) / "spec.yaml"
     typer.echo(f"train it: hoigs train {clip} --spec {answer}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from pathlib import Path
 from typing import Annotated
@@ -18,6 +17,7 @@ from hoigs.cli.common import (
     SetOption,
     ThreadsOption,
 )
+from hoigs.core.cpus import available_cpus
 from hoigs.runs.choices import pick_device
 
 
@@ -78,7 +78,7 @@ def stress(
         device=pick_device(device),
         plugins=tuple(p.resolve() for p in plugin or ()),
     )
-    each = threads or max(1, (os.cpu_count() or 1) // jobs)
+    each = threads or max(1, available_cpus() // jobs)
 
     def report(job: Job, word: str) -> None:
         typer.echo(f"{job.clip_label}/{job.folder.name}: {word}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from pathlib import Path
 from typing import Annotated
@@ -19,6 +18,7 @@ from hoigs.cli.common import (
     ThreadsOption,
 )
 from hoigs.cli.evaluate import LpipsOption
+from hoigs.core.cpus import available_cpus
 from hoigs.runs.choices import pick_device
 
 
@@ -74,7 +74,7 @@ def tables(
         lpips_weights=lpips_weights.resolve() if lpips_weights else None,
         plugins=tuple(p.resolve() for p in plugin or ()),
     )
-    each = threads or max(1, (os.cpu_count() or 1) // jobs)
+    each = threads or max(1, available_cpus() // jobs)
     ended = 0
 
     def report(job: Job, word: str) -> None:

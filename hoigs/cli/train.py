@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hoigs.cli.common import (
     AllowFaultsOption,
     DeviceOption,
+    OverwriteOption,
     PluginOption,
     RasterizerOption,
     SetOption,
@@ -48,9 +49,7 @@ def train(
         bool,
         typer.Option("--resume", help="Continue the run in --out, with its own spec and clip."),
     ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the run in --out.")
-    ] = False,
+    overwrite: OverwriteOption = False,
     allow_faults: AllowFaultsOption = False,
     reader: Annotated[
         str | None,
@@ -80,49 +79,21 @@ def train(
     from hoigs.studies.needs.auto import auto as train_auto
     from hoigs.workflows.train import train as train_spec
 
+    with Display() as show:
+        given: dict[str, Any] = {
+            "out": out, "overrides": settings or (), "rasterizer": rasterizer, "device": device,
+            "resume": resume, "overwrite": overwrite, "allow_faults": allow_faults,
+            "evaluate": evaluate, "plugins": plugin or (), "on_start": show.started,
+            "on_step": show.step, "progress": show.fraction, "report": show.line,
+        }  # fmt: skip
+        if auto:
+            named = _clip_for_auto(clip, reader, reader_set)
+            made = train_auto(named, spec, on_found=print_needs, **given)
+            run = made.run
+        else:
+            run = train_spec(clip, spec, reader=reader, reader_settings=reader_set or (), **given)
     if auto:
-        with Display() as show:
-            made = train_auto(
-                _clip_for_auto(clip, reader, reader_set),
-                spec,
-                out=out,
-                overrides=settings or (),
-                rasterizer=rasterizer,
-                device=device,
-                resume=resume,
-                overwrite=overwrite,
-                allow_faults=allow_faults,
-                evaluate=evaluate,
-                plugins=plugin or (),
-                on_found=print_needs,
-                on_start=show.started,
-                on_step=show.step,
-                progress=show.fraction,
-                report=show.line,
-            )
-        run = made.run
         _print_after(made.after)
-    else:
-        with Display() as show:
-            run = train_spec(
-                clip,
-                spec,
-                out=out,
-                overrides=settings or (),
-                rasterizer=rasterizer,
-                device=device,
-                resume=resume,
-                overwrite=overwrite,
-                allow_faults=allow_faults,
-                reader=reader,
-                reader_settings=reader_set or (),
-                evaluate=evaluate,
-                plugins=plugin or (),
-                on_start=show.started,
-                on_step=show.step,
-                progress=show.fraction,
-                report=show.line,
-            )
     if run.evaluated is not None:
         print_scores(run.evaluated)
 

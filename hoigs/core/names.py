@@ -11,3 +11,10 @@ RULE = "use letters, digits, _, - and . , a letter or digit first"
 def name_from(text: str, otherwise: str) -> str:
     """`text` with "-" for each run of characters that no name has; `otherwise` if none is left."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("_.-") or otherwise
+
+
+def printable(text: str) -> str:
+    """`text` for a terminal, without control characters but line breaks: names from files may hold
+    escape sequences."""
+    shown = (c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text)
+    return "".join(shown)

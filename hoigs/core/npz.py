@@ -94,7 +94,15 @@ def load_array(path: Path) -> np.ndarray:
 
 
 def _unreadable(what: str, error: Exception) -> ValueError:
-    return ValueError(f"not a readable {what} without pickled objects ({error or 'it is empty'})")
+    return ValueError(f"not a readable {what} without pickled objects ({plain_reason(error)})")
+
+
+def plain_reason(error: Exception) -> str:
+    """The message of numpy's error, without its advice to allow pickles, which could run code."""
+    text = str(error)
+    if "allow_pickle=" in text or "pickle.load" in text:
+        return "it holds pickled objects, or is no such file"
+    return text.split("\n", 1)[0] or "it is empty"
 
 
 def _check_size(path: Path, size: int) -> None:

@@ -23,7 +23,7 @@ def written_whole(path: Path, temporary: Path | None = None) -> Iterator[Path]:
         raise
 
 
-def write_whole(path: Path, text: str, temporary: Path | None = None) -> None:
-    """Write a text file through a temporary name."""
+def write_whole(path: Path, content: str | bytes, temporary: Path | None = None) -> None:
+    """Write a file through a temporary name; text as UTF-8."""
     with written_whole(path, temporary) as part:
-        part.write_text(text, encoding="utf-8")
+        part.write_bytes(content.encode() if isinstance(content, str) else content)

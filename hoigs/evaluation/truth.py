@@ -67,6 +67,36 @@ class Truth:
         return skin(points, transforms, weights).numpy(), self.dressed_faces
 
 
+SHAPES = {
+    "vertices": "V3", "faces": "F3", "rotations": "T33", "translations": "T3", "bend": "T",
+    "dressed": "W3", "dressed_faces": "G3", "weights": "WJ", "transforms": "TJ44",
+}  # fmt: skip
+INDICES = {"faces": "vertices", "dressed_faces": "dressed"}
+
+
+def _check(path: Path, arrays: dict[str, Array], frames: int) -> None:
+    """ClipError unless all arrays fit each other: they are used after a long training."""
+    sizes: dict[str, int] = {}
+    for field, form in SHAPES.items():
+        got, kind = arrays[field], "iu" if field in INDICES else "f"
+        expected = [int(s) if s.isdigit() else sizes.setdefault(s, n)
+                    for s, n in zip(form, got.shape)]  # fmt: skip
+        if got.dtype.kind not in kind or got.ndim != len(form) or list(got.shape) != expected:
+            named = ", ".join(f"{s}={sizes[s]}" if s in sizes else s for s in form)
+            raise ClipError(
+                f"{path}: {FIELDS[field]} is {got.dtype} of shape {list(got.shape)}, expected "
+                f"[{named}]; make the clip again"
+            )
+        if kind == "f" and not np.isfinite(got).all():
+            raise ClipError(f"{path}: {FIELDS[field]} is not finite; make the clip again")
+    if sizes["T"] < frames:
+        raise ClipError(f"{path}: of {sizes['T']} frames, the clip has {frames}")
+    for field, of in INDICES.items():
+        faces, count = arrays[field], len(arrays[of])
+        if faces.size and not 0 <= int(faces.min()) <= int(faces.max()) < count:
+            raise ClipError(f"{path}: {FIELDS[field]} names vertices that are not there")
+
+
 def read_truth(clip: Clip) -> Truth | NotComputed:
     """The truth that a clip's provenance names, or why there is none.
 
@@ -86,5 +116,6 @@ def read_truth(clip: Clip) -> Truth | NotComputed:
         arrays = {field: file[key] for field, key in FIELDS.items()}
     except (OSError, ValueError, KeyError) as error:
         raise ClipError(f"{path} cannot be read ({error}); make the clip again") from error
+    _check(path, arrays, 1 + max(moment.index for moment in clip.moments))
     return Truth(**{k: v.astype(np.float64 if v.dtype.kind == "f" else np.int64)
                     for k, v in arrays.items()})  # fmt: skip

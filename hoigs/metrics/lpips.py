@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.npz import load_arrays
 
 Net = Literal["alex", "vgg"]
 VARIABLE = "HOIGS_LPIPS_WEIGHTS"
@@ -204,8 +204,7 @@ def _keys(stack: _Stack) -> list[str]:
 
 def _read_npz(file: Path) -> dict[str, Tensor]:
     try:
-        with np.load(file, allow_pickle=False) as arrays:
-            return {key: torch.from_numpy(arrays[key]) for key in arrays.files}
+        return {key: torch.from_numpy(values) for key, values in load_arrays(file).items()}
     except (OSError, ValueError) as error:
         raise HoigsError(f"LPIPS weights {file} cannot be read: {error}") from error
 

@@ -15,6 +15,7 @@ from hoigs.preparation.cameras.camera_track import parallax
 from hoigs.preparation.cameras.multiview import angular_factor, full_factor
 from hoigs.preparation.objects.tracked import ObjectConfidence
 from hoigs.preparation.pipeline import Pipeline
+from hoigs.preparation.report.object_picture import save_object_picture, shown_frame
 from hoigs.preparation.report.overlay import OverlayVideo
 from hoigs.preparation.report.report import PrepareReport
 from hoigs.preparation.stages.cleanup import Cleanup
@@ -53,6 +54,7 @@ def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
 
 def _write_frames(made: Pipeline, writer: ClipWriter) -> None:
     options = made.options
+    picture = _object_picture(made)
     overlay = OverlayVideo(
         writer.root / "overlay.mp4", made.video.fps, options.overlay_width, made.body.faces
     )
@@ -71,7 +73,19 @@ def _write_frames(made: Pipeline, writer: ClipWriter) -> None:
                 points = made.object.points @ made.object.rotations[i].mT
                 points = points + made.object.translations[i]
             writer.add_frame(image, camera, masks, made.metres(i), blank)
+            if i == picture:
+                save_object_picture(writer.root, image, object_mask)
             overlay.add(image, camera, vertices, human, object_mask, points)
+
+
+def _object_picture(made: Pipeline) -> int | None:
+    """Position of the frame that shows which object was taken; None where nobody had to choose."""
+    if made.object is None or made.found_object is None:
+        return None
+    prompt = made.options.prompts.get(made.options.object)
+    prompted = [at.frame for at in prompt.places()] if prompt else []
+    coverage = made.masks.object.coverage().tolist()
+    return shown_frame(made.video.indices, made.found_object.boxes, prompted, coverage)
 
 
 def _report(made: Pipeline, name: str) -> PrepareReport:

@@ -13,21 +13,23 @@ from hoigs.preparation.options import Place, PrepareOptions
 from hoigs.preparation.video.header import video_header
 from hoigs.preparation.video.source import Source, numbered_frames
 
-# seconds a frame of 1280x720 on two cores, measured by benchmarks/prepare_alone.py
+# seconds of a processor a frame of 1280x720, about, as benchmarks/prepare_alone.py measures them;
+# those of networks are guesses
 COST = {
-    "estimator:mediapipe": 0.25,
+    "estimator:mediapipe": 0.15,
     "estimator:object-tracker": 0.25,
     "estimator:transformers-sam2": 4.0,
     "estimator:transformers-pose": 0.6,
     "estimator:transformers-depth": 1.5,
 }
 STAGES_COST = 0.35  # of all other stages, likewise
-WHAT = {
+WHAT: dict[Place, str] = {
     "landmarks": "person's landmarks",
     "masks": "person's mask",
     "object": "object's mask",
     "depth": "depth",
 }
+PERSON_ONLY = ("estimator:mediapipe",)  # give no masks of objects
 _OFFLINE: dict[Place, ComponentSpec] = {
     "landmarks": ComponentSpec(use="estimator:mediapipe"),
     "masks": ComponentSpec(use="estimator:mediapipe"),
@@ -126,11 +128,10 @@ def plan_estimators(
     """
     found: dict[Place, Choice] = {}
     for place in WHAT:
-        assert place in ("landmarks", "masks", "object", "depth")
         choice = _choose(place, source, options, given)
         if choice is not None:
             found[place] = choice
-    _check_words(found, options)
+    _check_prompt(found, options)
     return EstimatorPlan(found, _frames(source.video, options))
 
 
@@ -171,7 +172,8 @@ def _object(source: Source, options: PrepareOptions, given: Collection[str]) -> 
         return Choice("object", source.ball.name, "lies beside the video", 0.0)
     if options.object in source.masked:
         return Choice("object", "with the person's mask", "both lie beside the video", 0.0)
-    if "masks" in given:
+    named = options.estimators.get("masks")
+    if "masks" in given and (named is None or named.use not in PERSON_ONLY):
         return Choice("object", "with the person's mask", "your estimator of masks gives both")
     if options.preset == "files":
         return Choice("object", "none", "there is no file of it beside the video", 0.0)
@@ -189,7 +191,8 @@ def _of_preset(place: Place, options: PrepareOptions) -> Choice:
     if place == "object":
         prompt = options.prompts.get(options.object)
         where = prompt.places() if prompt else []
-        why = f"{len(where)} frames with --object" if where else "proposed: moves, near the hands"
+        frames = ", ".join(str(at.frame) for at in where)
+        why = f"--object in frame {frames}" if where else "proposed: moves, near the hands"
         if prompt is not None and prompt.text:
             why = f'"{prompt.text}"'
         if not _installed(spec.use):
@@ -205,13 +208,18 @@ def _installed(key: str) -> bool:
     return True
 
 
-def _check_words(found: Mapping[Place, Choice], options: PrepareOptions) -> None:
+def _check_prompt(found: Mapping[Place, Choice], options: PrepareOptions) -> None:
     prompt = options.prompts.get(options.object)
     choice = found.get("object")
-    if prompt is None or prompt.text is None or choice is None or choice.spec is None:
+    if prompt is None or choice is None or choice.spec is None:
         return
-    if choice.use == _OFFLINE["object"].use and not prompt.places():
+    if choice.use == _OFFLINE["object"].use and prompt.text is not None:
         raise SpecError(
             f'--object "{prompt.text}": words need a network that reads them; point at it, such as '
             "--object 640,402, or use --estimators hub"
+        )
+    if choice.use == _HUB["object"].use and len(prompt.places()) > 1:
+        raise SpecError(
+            "--object: SAM 2 takes points and a box of one frame; give those of one, or use "
+            "--estimators offline"
         )

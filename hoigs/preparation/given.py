@@ -61,7 +61,10 @@ def chosen_landmarks(
         places = world[video.indices].astype(np.float64)
     raw = RawLandmarks(image, places, source)
     if not LandmarkTrack.from_mediapipe(raw.image, raw.world).found.any():
-        raise SourceError(f"{what}: no person was found in the {len(image)} chosen frames")
+        raise SourceError(
+            f"{what}: no person was found in the {len(image)} chosen frames; the body of a person "
+            "whose shoulders, hips and some of the limbs are in the picture can be fitted"
+        )
     return raw
 
 

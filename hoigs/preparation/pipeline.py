@@ -46,8 +46,9 @@ from hoigs.preparation.scene.scene_points import ScenePoints, colmap_scene, stat
 from hoigs.preparation.stages.plan import PLAN
 from hoigs.preparation.stages.progress import Stages
 from hoigs.preparation.stages.work_folder import Result, WorkFolder, digest, fingerprint
-from hoigs.preparation.video.blank import blank_pixels
+from hoigs.preparation.video.blank import blank_pixels, require_pictures
 from hoigs.preparation.video.frames import FrameList, open_frames
+from hoigs.preparation.video.header import uneven_times
 from hoigs.preparation.video.source import Source
 
 FORMAT = 5  # of what the stages keep; another number makes older results unread
@@ -147,6 +148,9 @@ class Pipeline:
                 path, options.width, options.every, options.max_frames, fps=options.fps,
                 pick=options.pick, rate=options.folder_fps,
             )  # fmt: skip
+            require_pictures(frames)
+            if path.is_file():
+                self.warnings += uneven_times(path, frames.fps)
             return frames.list
 
         found = self._stage("frames", make, fingerprint([path]))

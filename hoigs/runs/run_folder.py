@@ -44,7 +44,8 @@ RUN = Layout(
         rf"\.{_WRITTEN_WHOLE}\.part",
         r"metrics\.(jsonl|part)",
         r"checkpoints/step_\d+\.((safetensors|json)(\.part)?|\d+\.part)",
-        r"renders/((playback|orbit)\.mp4|\.(playback|orbit)\.mp4\.part)",
+        r"renders/[\w-]+\.(mp4|webm|mov|gif)",
+        r"renders/\.[\w-]+\.(mp4|webm|mov|gif)\.part",
     ),
     folders=one_of("checkpoints", "renders"),
 )

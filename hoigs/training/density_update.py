@@ -35,13 +35,9 @@ class EntityDensity:
         loss: torch.Tensor,
     ) -> None:
         self.statistics.add(
-            screen_gradient,
-            radii,
-            width,
-            height,
-            absolute_gradient=absolute_gradient,
+            screen_gradient, radii, width, height, absolute_gradient=absolute_gradient,
             loss=loss.detach(),
-        )
+        )  # fmt: skip
 
     def refine(
         self, current: Gaussians, optimizer: GroupedAdam, step: int, total_steps: int

@@ -1,31 +1,35 @@
-"""render: a trained run as an mp4, drawn by `Playback`."""
+"""render: a trained run as a film, drawn by `Playback`."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from fractions import Fraction
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
+from hoigs.core.values.between import frame_numbers
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.moment import Moment
-from hoigs.evaluation.orbits import orbit_cameras
-from hoigs.evaluation.report.draw import picture
+from hoigs.core.video_files import SUFFIXES, WITH_ALPHA, write_video
 from hoigs.runs.loaded_run import LoadedRun
+from hoigs.viewing.frames import dithered, fitted, read_background, source_frame
+from hoigs.viewing.paths import OLDER, View, film_path, frames_shown
 from hoigs.viewing.playback import Mode, Playback
 
-CameraPath = Literal["playback", "orbit"]
 VIEWS = 8  # frames of a film, evenly spread, that a Playback is made from
+TRANSPARENT = "transparent"
+
+__all__ = ["Film", "film_views", "playback_of", "render", "write_video"]
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class Film:
     """A video that was written.
 
     Attributes:
-        path: the mp4. frames: their number. width, height: pixels of the renders.
+        path: the video. frames: their number. width, height: pixels of the renders.
         draw_s: seconds of rendering, without preparing Playback and without encoding.
         total_s: seconds of rendering and encoding.
         mode, reason: `Playback.mode` ("graph" if CUDA graphs rendered it) and `Playback.reason`.
@@ -65,112 +69,147 @@ def render(
     run: Path | str,
     *,
     out: Path | str | None = None,
-    path: CameraPath = "playback",
+    path: str = "video",
+    entities: Sequence[str] = (),
     only: Sequence[str] = (),
+    compare: bool = False,
+    background: str | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    start: float | None = None,
+    end: float | None = None,
+    fps: float | None = None,
+    slow: float = 1.0,
+    at: float | None = None,
     clip: Path | str | None = None,
     rasterizer: str | None = None,
     device: str = "auto",
     plugins: Sequence[Path | str] = (),
     progress: Progress | None = None,
 ) -> Film:
-    """Draw a run to an mp4.
+    """Draw a run to a video.
 
     Args:
-        out: the video; by default RUN/renders/PATH.mp4.
-        path: "playback" follows the clip's cameras, "orbit" moves around while the clip plays.
-        only: names of the entities to draw; all by default.
+        out: the video: .mp4, .webm, .mov (ProRes 4444) or .gif; by default RUN/renders/PATH.mp4.
+        path: "video" follows the clip's cameras, "orbit" moves around while the clip plays,
+            "bullet-time" stands still at a moment while the camera moves, "spiral" circles before
+            the middle camera, "follow human" and "follow object" go along with it; or a JSON file
+            of keyed cameras, also nerfstudio's camera_path.json.
+        entities: names of those to draw; all by default. only: an older name of it.
+        compare: draw beside the frame of the video.
+        background: a colour ("white", "#20242a"), an image file, or "transparent"; black by
+            default.
+        width, height: pixels; by default those of training. One alone keeps the aspect, both
+            cut what does not fit.
+        start, end: first and last frame number. fps: pictures a second, by default the clip's.
+        slow: how many times slower than the clip it plays; moments between frames are computed.
+        at: frame number at which bullet-time stands still; by default where the objects move
+            fastest.
         clip, rasterizer, device, plugins: as for `open_run`.
         progress: called with the share done, in [0, 1], and the work.
 
     Raises:
-        HoigsError: this is no run, its clip is not there, or an entity or a path is unknown.
+        HoigsError: this is no run, its clip is not there, or an entity, a path, a background, a
+            size or a kind of file is unknown.
     """
-    run = Path(run)
-    known = get_args(CameraPath)
-    if path not in known:
-        raise HoigsError(f"path {path!r}: expected one of {known}{did_you_mean(path, known)}")
+    run, chosen = Path(run), [*entities, *only]
+    name = OLDER.get(path, path)
+    stem = Path(name).stem if name.endswith(".json") else name.replace(" ", "-")
+    suffix = ".webm" if background == TRANSPARENT else ".mp4"
+    target = Path(out) if out is not None else run / "renders" / f"{stem}{suffix}"
+    _check_target(target, background)
     loaded = LoadedRun.open(run, clip=clip, rasterizer=rasterizer, device=device, plugins=plugins)
     names = list(loaded.model.entities)
-    for name in only:
-        if name not in names:
-            raise HoigsError(f"only {name!r}: this run has {names}{did_you_mean(name, names)}")
-    film = film_views(loaded.model, loaded.clip, path)
-    play = playback_of(loaded.model, film, only)
+    for entity in chosen:
+        if entity not in names:
+            raise HoigsError(
+                f"entity {entity!r}: this run has {names}{did_you_mean(entity, names)}"
+            )
+    numbers, rate = frame_numbers(loaded.clip, start, end, fps, slow)
+    film = [
+        (moment, fitted(camera, width, height))
+        for moment, camera in film_path(loaded.model, loaded.clip, name, numbers, rate, at)
+    ]
+    return _draw(
+        loaded, film, target, rate, only=chosen, compare=compare, background=background,
+        report=progress or no_progress,
+    )  # fmt: skip
+
+
+def _check_target(target: Path, background: str | None) -> None:
+    """Refuse what would fail after the drawing."""
+    clear = background == TRANSPARENT
+    kinds = WITH_ALPHA if clear else SUFFIXES
+    if target.suffix.lower() not in kinds:
+        what = "transparent videos" if clear else "videos"
+        raise HoigsError(f"{target}: {what} end with {', '.join(kinds)}")
+
+
+def _draw(
+    loaded: LoadedRun,
+    film: Sequence[View],
+    target: Path,
+    fps: float,
+    *,
+    only: Sequence[str],
+    compare: bool,
+    background: str | None,
+    report: Progress,
+) -> Film:
+    camera, clear = film[0][1], background == TRANSPARENT
+    behind = None if clear or background is None else read_background(background, camera)
+    play = playback_of(loaded.model, film, only, behind)
+    shown = frames_shown(loaded.clip, film) if compare else []
     drawn, draw_s = 0, 0.0
-    report = progress or no_progress
 
-    def frames() -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    def frames() -> Iterator[UInt8[np.ndarray, "H W C"]]:
         nonlocal drawn, draw_s
-        for moment, camera in film:
+        for moment, view in film:
             began = time.perf_counter()
-            color = play(moment, camera).color
-            if color.is_cuda:
-                torch.cuda.synchronize(color.device)
+            output = play(moment, view)
+            if output.color.is_cuda:
+                torch.cuda.synchronize(output.color.device)
             draw_s += time.perf_counter() - began
+            picture = dithered(_with_alpha(output) if clear else output.color, drawn)
+            if compare:
+                source = source_frame(loaded.clip, shown[drawn], view, picture.shape[2])
+                picture = np.concatenate((source, picture), 1)
             drawn += 1
-            report(drawn / len(film), "rendering")
-            yield picture(color)
+            report(drawn / len(film), f"frame {drawn} of {len(film)}")
+            yield picture
 
-    target = Path(out) if out is not None else run / "renders" / f"{path}.mp4"
     began = time.perf_counter()
-    write_video(target, frames(), fps=loaded.clip.fps)
+    try:
+        write_video(target, frames(), fps=fps)
+    except OSError as error:
+        raise HoigsError(f"{target} cannot be written: {error.strerror or error}") from error
     total_s = time.perf_counter() - began
-    camera = film[0][1]
     return Film(
         target, drawn, camera.width, camera.height, draw_s, total_s, play.mode, play.reason
     )  # fmt: skip
 
 
-def film_views(model: SceneModel, clip: Clip, path: CameraPath) -> list[tuple[Moment, Camera]]:
+def _with_alpha(output: RenderOutput) -> Float[Tensor, "H W 4"]:
+    """Straight colours and opacity of a picture over black."""
+    alpha = output.alpha.clamp(0, 1)[..., None]
+    return torch.cat((output.color / alpha.clamp_min(1e-3), alpha), -1)
+
+
+def film_views(model: SceneModel, clip: Clip, path: str) -> list[tuple[Moment, Camera]]:
     """The moment and camera of every frame of a film over the whole clip."""
-    turned = orbit_cameras(clip, model, len(clip)) if path == "orbit" else list(clip.cameras)
-    return list(zip(clip.moments, turned, strict=True))
+    numbers, fps = frame_numbers(clip)
+    return film_path(model, clip, path, numbers, fps)
 
 
 def playback_of(
-    model: SceneModel, film: Sequence[tuple[Moment, Camera]], only: Sequence[str] = ()
+    model: SceneModel,
+    film: Sequence[View],
+    only: Sequence[str] = (),
+    background: Tensor | None = None,
 ) -> Playback:
     """A Playback made from a few frames of a film; an empty `only` draws all entities."""
     some = film[:: max(1, len(film) // VIEWS)]
-    return Playback(model, some, only=list(only) or None)
-
-
-def write_video(
-    path: Path | str, frames: Iterable[UInt8[np.ndarray, "H W 3"]], *, fps: float = 30.0
-) -> Path:
-    """Encode RGB frames as H.264 (yuv420p), under a temporary name until complete.
-
-    Odd sizes lose their last row or column, as the format needs even ones.
-
-    Raises:
-        ValueError: there are no frames, or their sizes differ.
-    """
-    import av
-
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.part")
-    count = 0
-    try:
-        with av.open(str(temporary), "w", format="mp4") as container:
-            stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
-            stream.pix_fmt = "yuv420p"
-            stream.options = {"crf": "18", "preset": "medium"}
-            for count, frame in enumerate(frames, 1):
-                frame = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
-                if count == 1:
-                    stream.height, stream.width = frame.shape[:2]
-                elif frame.shape[:2] != (stream.height, stream.width):
-                    raise ValueError(
-                        f"frame {count - 1} is {frame.shape[1]}x{frame.shape[0]}, the first was "
-                        f"{stream.width}x{stream.height}"
-                    )
-                image = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
-                container.mux(stream.encode(image))
-            if count == 0:
-                raise ValueError("a video needs at least one frame")
-            container.mux(stream.encode())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
+    request = RenderRequest()
+    if background is not None:
+        request = replace(request, background=background.to(model.device))
+    return Playback(model, some, only=list(only) or None, request=request)

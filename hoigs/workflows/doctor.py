@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 
+from hoigs.core.cpus import available_cpus
 from hoigs.core.errors import PluginError
 from hoigs.core.interfaces.rasterizer import Rasterizer
 from hoigs.core.registry.manager import Offer, Status
@@ -44,7 +48,11 @@ def doctor() -> list[Inspected]:
 
 
 def _devices() -> list[Inspected]:
-    rows = [Inspected("cpu", "ok", f"{torch.get_num_threads()} torch threads")]
+    threads = f"{torch.get_num_threads()} torch threads for {available_cpus()} processors"
+    waiting = os.environ.get("OMP_WAIT_POLICY", "not set").lower()
+    rows = [Inspected("cpu", "ok", f"{threads}; OMP_WAIT_POLICY {waiting}")]
+    free = shutil.disk_usage(Path.cwd()).free / 1e9
+    rows.append(Inspected("disk", "ok" if free > 1 else "failed: nearly full", f"{free:.1f} GB"))
     if torch.cuda.is_available():
         rows.append(Inspected("cuda", "ok", torch.cuda.get_device_name(0)))
     else:

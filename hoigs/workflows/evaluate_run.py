@@ -68,15 +68,10 @@ def evaluate_run(
         {"test_pose": test_pose, "test_camera": test_camera, "fit_steps": fit_steps},
     )
     evaluation = evaluate(
-        loaded.model,
-        loaded.clip,
-        lpips_weights=lpips_weights,
-        held_out=settings.held_out,
-        test_pose=settings.test_pose,
-        test_camera=settings.test_camera,
-        fit_steps=settings.fit_steps,
-        progress=progress,
-    )
+        loaded.model, loaded.clip, lpips_weights=lpips_weights, held_out=settings.held_out,
+        test_pose=settings.test_pose, test_camera=settings.test_camera,
+        fit_steps=settings.fit_steps, progress=progress,
+    )  # fmt: skip
     if settings != loaded.spec.evaluation:
         scores = run / f"evaluation-{settings.test_pose}-{settings.test_camera}.json"
         evaluation.save(scores)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
+import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,14 +15,14 @@ from hoigs.core.model.compose import compose_bodies
 from hoigs.core.model.exporter import SHEET, Exported, Exporter, ExportRequest
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.registry.registry import Registry, default_registry
-from hoigs.core.values.between import moment_between
+from hoigs.core.values.between import frame_numbers, moment_between
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.moment import Moment
 from hoigs.runs.given_settings import parse_settings, validated
 from hoigs.runs.loaded_run import LoadedRun
 
 KIND = "exporter"
-MOST_MOMENTS = 100_000
+ZIP = ".zip"
 
 
 def export(
@@ -109,28 +109,9 @@ def make_exporter(format: str, settings: Sequence[str], registry: Registry) -> t
 def export_moments(
     clip: Clip, start: float | None, end: float | None, fps: float | None, slow: float
 ) -> tuple[list[Moment], float]:
-    """Moments from frame `start` to frame `end`, evenly spaced, and how many a second there are.
-
-    Raises:
-        HoigsError: frames that the clip has not, or a rate that is not positive.
-    """
-    last = clip.num_frames - 1
-    first, final = (0.0 if start is None else start), (float(last) if end is None else end)
-    if not 0 <= first <= final <= last:
-        raise HoigsError(f"frames {first:g} to {final:g}: expected 0 <= from <= to <= {last}")
-    rate = clip.fps if fps is None else fps
-    if not (0 < rate < math.inf and 0 < slow < math.inf):
-        raise HoigsError(f"fps {rate:g} and slow {slow:g}: expected positive numbers")
-    step = clip.fps / (rate * slow)
-    count = math.floor((final - first) / step + 1e-6) + 1
-    if count > MOST_MOMENTS:
-        raise HoigsError(f"{count} moments are more than {MOST_MOMENTS}; lower fps or slow")
-    return [moment_between(clip, _whole(first + i * step)) for i in range(count)], rate
-
-
-def _whole(frame: float) -> float:
-    """A frame number that rounding took off a whole one, back on it."""
-    return float(round(frame)) if abs(frame - round(frame)) < 1e-6 else frame
+    """The moments of `frame_numbers`, and how many a second there are; errors as it has them."""
+    frames, rate = frame_numbers(clip, start, end, fps, slow)
+    return [moment_between(clip, frame) for frame in frames], rate
 
 
 def refuse_existing(target: Path) -> None:
@@ -147,15 +128,33 @@ def refuse_existing(target: Path) -> None:
 def write_to(
     exporter: Exporter, request: ExportRequest, target: Path, progress: Progress
 ) -> Exported:
-    """Export to a folder, or where `target` ends as the format's files do, to that file."""
-    if not target.name.lower().endswith(tuple(exporter.suffixes) or ("\0",)):
+    """Export to a folder, or where `target` ends as the format's files do, to that file.
+
+    A zip holds the folder.
+
+    Raises:
+        HoigsError: `target` ends as files of other formats do, or it is one file, and the export
+            has several; or as `Exporter.export`.
+    """
+    suffixes = (*exporter.suffixes, ZIP)
+    if not target.name.lower().endswith(suffixes):
+        if target.suffix and exporter.suffixes:
+            ends = ", ".join(suffixes)
+            raise HoigsError(f"{target}: files of this format end with {ends}, or name a folder")
         return exporter.export(request, target, progress)
     folder = target.with_name(f".{target.name}.{os.getpid()}.folder")
     try:
         done = exporter.export(request, folder, progress)
+        if target.suffix.lower() == ZIP:
+            write_zip(folder, folder / ZIP)
+            (folder / ZIP).rename(target)
+            return replace(done, folder=target.parent, files={target.name: target.stat().st_size})
         files = [name for name in done.files if name != SHEET]
         if len(files) != 1:
-            raise HoigsError(f"{target}: the export has {len(files)} files; name a folder")
+            raise HoigsError(
+                f"{target}: the export has {len(files)} files; name a folder, "
+                f"{target.stem}.zip, or one of the entities with --entities"
+            )
         (folder / SHEET).rename(_sheet_of(target))
         (folder / files[0]).rename(target)
     except BaseException:
@@ -166,6 +165,15 @@ def write_to(
         shutil.rmtree(folder, ignore_errors=True)
     sizes = {p.name: p.stat().st_size for p in (target, _sheet_of(target))}
     return replace(done, folder=target.parent, files=sizes)
+
+
+def write_zip(folder: Path, path: Path) -> None:
+    """All files of a folder, without dates: the same files give the same bytes."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in sorted(p for p in folder.rglob("*") if p.is_file() and p != path):
+            archive.writestr(
+                zipfile.ZipInfo(file.relative_to(folder).as_posix()), file.read_bytes()
+            )
 
 
 def _sheet_of(target: Path) -> Path:

@@ -85,19 +85,10 @@ def train(
         Interrupted: Ctrl-C or SIGTERM; the message has the command that continues.
     """
     session = Session.open(
-        clip,
-        spec,
-        out=out,
-        overrides=overrides,
-        rasterizer=rasterizer,
-        device=device,
-        resume=resume,
-        overwrite=overwrite,
-        plugins=plugins,
-        allow_faults=allow_faults,
-        reader=reader,
-        reader_settings=reader_settings,
-    )
+        clip, spec, out=out, overrides=overrides, rasterizer=rasterizer, device=device,
+        resume=resume, overwrite=overwrite, plugins=plugins, allow_faults=allow_faults,
+        reader=reader, reader_settings=reader_settings,
+    )  # fmt: skip
     if on_start is not None:
         on_start(session)
     session.train(on_step)

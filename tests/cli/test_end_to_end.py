@@ -37,7 +37,7 @@ def test_train_evaluate_and_render_from_python(hoigs, tiny_clip, tmp_path):
     assert again.evaluation.score("full", "psnr") == pytest.approx(first, abs=1e-3)
 
     loaded = h.open_run(run, device="cpu")
-    for path in ("playback", "orbit"):
+    for path in ("video", "orbit"):
         views = film_views(loaded.model, loaded.clip, path)
         play = playback_of(loaded.model, views)
         for moment, camera in views[::3]:
@@ -46,7 +46,7 @@ def test_train_evaluate_and_render_from_python(hoigs, tiny_clip, tmp_path):
             torch.testing.assert_close(play(moment, camera).color, wanted, atol=1e-5, rtol=0)
 
     film = h.render(run, only=["human", "scene"], device="cpu")
-    assert film.path == run / "renders" / "playback.mp4" and film.frames == 12
+    assert film.path == run / "renders" / "video.mp4" and film.frames == 12
     assert film.fps > 0 and film.mode == "cached" and "CUDA" in film.reason
 
     video = tmp_path / "orbit.mp4"

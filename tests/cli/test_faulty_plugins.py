@@ -20,7 +20,7 @@ class Faulty(DeformationModel):
 
 @hookimpl
 def hoigs_components():
-    yield Component("deformation:faulty", __name__ + ":Faulty", summary="fails")
+    yield Component("deformation:{name}", __name__ + ":Faulty", summary="fails")
 """
 
 
@@ -33,11 +33,12 @@ def hoigs_components():
     ],
 )
 def test_a_faulty_deformation(hoigs, tiny_clip, tmp_path, body, words):
-    file = tmp_path / "faulty.py"
-    file.write_text(SOURCE.format(body=body))
+    name = f"faulty{len(body)}"  # plugin files stay loaded
+    file = tmp_path / f"{name}.py"
+    file.write_text(SOURCE.format(body=body, name=name))
     outcome = hoigs("train", tiny_clip, "--spec", "hoigs", "--out", tmp_path / "run",
                     "--plugin", file, "--device", "cpu", "--no-eval",
-                    "--set", "model.object.deformation.use=deformation:faulty",
+                    "--set", f"model.object.deformation.use=deformation:{name}",
                     "--set", "model.object.features=null", "--set", "model.human.points=300",
                     "--set", "model.scene.points=300", "--set", "interaction.use=interaction:none",
                     "--set", "train.steps=3", "--set", "train.preview_every=0")  # fmt: skip

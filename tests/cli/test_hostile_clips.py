@@ -35,12 +35,12 @@ def refused(hoigs, clip, *words):
 @pytest.mark.parametrize("frames", [10**7, 10**12])
 def test_as_many_frames_as_one_likes(hoigs, clip_copy, frames):
     header(clip_copy, frames=frames)
-    refused(hoigs, clip_copy, "clip.json" if frames > 10**9 else "images/ holds 6 files")
+    refused(hoigs, clip_copy, "clip.json" if frames > 10**9 else "images/ holds 12 files")
 
 
 def test_a_split_of_a_million_entries(hoigs, clip_copy):
     header(clip_copy, split={"train": list(range(10**6)), "test": [1, 2]})
-    refused(hoigs, clip_copy, "split names frames 6-999999")
+    refused(hoigs, clip_copy, "split names frames 12-999999")
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ def test_a_run_with_all_that_hoigs_writes_into_it(hoigs, train, tmp_path):
     run, compact = tmp_path / "run", tmp_path / "run-compact"
     assert train().code == 0
     assert hoigs("eval", run, "--test-camera", "interpolated", "--device", "cpu").code == 0
-    for path in ("playback", "orbit"):
+    for path in ("video", "bullet-time"):
         assert hoigs("render", run, "--path", path, "--device", "cpu").code == 0
     for _ in range(2):
         assert hoigs("compress", run, "--overwrite", "--device", "cpu").code == 0

@@ -23,6 +23,7 @@ FUNCTIONS = {
     "render": (hoigs.render,),
     "export": (hoigs.export,),
     "doctor": (hoigs.doctor,),
+    "bug-report": (hoigs.bug_report,),
     "demo": (hoigs.demo,),
 }
 # option -> argument, where the names differ
@@ -35,7 +36,8 @@ RENAMED = {
     "to": "end",
 }
 # options that choose the function: --auto is hoigs.auto, --stage is hoigs.prepare_until(stage, ...)
-CHOOSING = {("train", "auto"), ("prepare", "stage")}
+# --json is another way to print what hoigs.doctor returns
+CHOOSING = {("train", "auto"), ("prepare", "stage"), ("doctor", "json")}
 # options of a command that the second of its functions is without, and why
 WITHOUT = {
     hoigs.auto: {"reader", "reader_settings"},  # a clip is read by the reader that it looks like
@@ -45,7 +47,7 @@ WITHOUT = {
 }  # fmt: skip
 # arguments that only a Python caller can give: objects and callbacks
 PYTHON = {"on_start", "on_step", "on_found", "progress", "report", "body", "estimators",
-          "positions"}  # fmt: skip
+          "positions", "consent", "announce"}  # fmt: skip
 
 
 def options_of(command: str) -> dict[str, Any]:

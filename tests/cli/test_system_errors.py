@@ -7,7 +7,8 @@ import sys
 
 import pytest
 
-from hoigs.cli.failures import message_of, printable
+from hoigs.cli.failures import message_of
+from hoigs.core.names import printable
 
 SMALL = ["--device", "cpu", "--set", "train.steps=2", "--set", "train.preview_every=0", "--no-eval"]
 

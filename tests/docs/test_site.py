@@ -56,7 +56,7 @@ def test_every_command_and_option_is_there(made):
     for command in ("train", "prepare", "plugins new", "plugins show", "spec check", "tables"):
         assert f"## hoigs {command}\n" in page
     assert "| `--resume` | Continue the run in --out, with its own spec and clip. |  |" in page
-    assert "| `--path` | The clip's own cameras, or an orbit around it. | `playback` |" in page
+    assert "| `--slow` | Play this many times slower, with moments between. | `1.0` |" in page
 
 
 def test_the_schema_page_has_every_key(made):

@@ -111,6 +111,13 @@ def test_its_pictures_show_the_clip(run: Path, model: SceneModel, clip: Clip) ->
         pair = np.asarray(moving[0].convert("RGB")).astype(float)
         half = pair.shape[1] // 2
         assert np.abs(pair[:, :half] - pair[:, half:]).mean() < 6
+    player = page[page.index("<div class='player'>") :]
+    player = player[: player.index("</div>")]
+    scored = [f for v in evaluation.views if v.name != "held-out cameras" for f in v.frames]
+    assert player.count("<img") == len(scored) and "hoigs export" in page
+    row = Image.open(io.BytesIO(base64.b64decode(re.findall(r"base64,([^']+)'", player)[0])))
+    video, render, error = np.split(np.asarray(row.convert("RGB")).astype(float), 3, 1)
+    assert np.abs(video - render).mean() < 6 and error.mean() < 40
     cutouts = [p for p in pictures if p.mode == "RGBA" and p not in moving]
     assert len(cutouts) == 3
     opacity = [np.asarray(p)[..., 3].mean() for p in cutouts]

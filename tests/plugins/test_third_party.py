@@ -127,7 +127,6 @@ def clip() -> Clip:
         cameras=[Camera(K, torch.eye(4), 16, 16)] * frames,
         moments=[Moment(i / (frames - 1), i) for i in range(frames)],
         kinds={"cup": "object"},
-        bodies={},
         objects={"cup": cup},
         points=torch.tensor([[0.0, 0, 4]] * 5) + torch.arange(5)[:, None] * 0.1,
         point_colors=torch.rand(5, 3),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import signal
 import sys
 import threading
 import time
@@ -72,6 +74,54 @@ def watched() -> Iterator[Watched]:
         threading.Thread.start = start  # type: ignore[method-assign]
         seen.printed = caught.getvalue()
         seen.heavy = [name for name in HEAVY if name in sys.modules and name not in loaded]
+
+
+class TooLong(BaseException):
+    """An import that did not end in time; no plugin that catches Exception can go on with it."""
+
+
+@contextmanager
+def limited(what: str, block: str, seconds: float | None = None) -> Iterator[None]:
+    """Raise TooLong in an import that does not end, and name it on stderr before that.
+
+    Python can end what waits or loops in the main thread. Elsewhere, and in compiled code that
+    does not return, `what` is named, and the rest is left to the user.
+
+    Args:
+        what: is imported. block: the value of HOIGS_BLOCK that leaves it out.
+        seconds: by default $HOIGS_IMPORT_TIMEOUT, or 60.
+    """
+    seconds = seconds or _timeout()
+    advice = f"HOIGS_BLOCK={block} leaves it out, HOIGS_IMPORT_TIMEOUT=SECONDS waits longer"
+
+    def name_it() -> None:
+        print(f"hoigs: still waiting for {what}; {advice}", file=sys.__stderr__, flush=True)
+
+    def stop(*_: object) -> None:
+        raise TooLong(f"its import did not end in {seconds:g} s; {advice}")
+
+    notice = threading.Timer(seconds / 4, name_it)
+    notice.daemon = True
+    main = threading.current_thread() is threading.main_thread()
+    alarm = main and hasattr(signal, "setitimer") and signal.getitimer(signal.ITIMER_REAL)[0] == 0
+    before = signal.signal(signal.SIGALRM, stop) if alarm else None
+    notice.start()
+    if alarm:
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        notice.cancel()
+        if alarm:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, before)
+
+
+def _timeout() -> float:
+    try:
+        return max(0.1, float(os.environ.get("HOIGS_IMPORT_TIMEOUT", "60")))
+    except ValueError:
+        return 60.0
 
 
 def traceback_tail(error: BaseException) -> str:

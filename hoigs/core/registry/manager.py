@@ -13,6 +13,7 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from enum import StrEnum
 from importlib import metadata
@@ -25,7 +26,7 @@ from hoigs.core.errors import PluginError, did_you_mean
 from hoigs.core.registry import hookspecs
 from hoigs.core.registry.component import API, Component
 from hoigs.core.registry.extras import declared_extras, missing_requirements
-from hoigs.core.registry.import_watch import traceback_tail, watched
+from hoigs.core.registry.import_watch import limited, traceback_tail, watched
 
 GROUP = "hoigs"
 HOOK = "hoigs_components"
@@ -135,7 +136,9 @@ class PluginManager(pluggy.PluginManager):
             if reason:
                 plugin.fail(Status.BLOCKED, reason)
                 continue
-            with watched() as seen:
+            what = f"plugin {plugin.name} of {plugin.dist} ({plugin.module})"
+            guard = nullcontext() if plugin.builtin else limited(what, plugin.dist)
+            with guard, watched() as seen:
                 self._load(plugin, entry)
             plugin.seconds = seen.seconds
             plugin.remarks = [] if plugin.builtin else seen.remarks()

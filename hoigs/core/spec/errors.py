@@ -10,6 +10,8 @@ from pydantic import BaseModel, ValidationError
 from hoigs.core.errors import did_you_mean
 from hoigs.core.spec.loader import Document, Place
 
+FORMER_KEYS = {"priors": "estimators"}  # of options files, before they were renamed
+
 
 def explain(
     error: ValidationError, model: type[BaseModel], document: Document, place: Place
@@ -32,7 +34,9 @@ def _line(problem: Any, model: type[BaseModel], document: Document, place: Place
     path = ".".join(str(part) for part in full) or "the whole file"
     if problem["type"] == "extra_forbidden":
         valid = list(_fields(model, inside[:-1]))
-        near = did_you_mean(str(inside[-1]), valid)
+        key = str(inside[-1])
+        present = FORMER_KEYS.get(key)
+        near = f'; today it is "{present}"' if present in valid else did_you_mean(key, valid)
         hint = near or (f" (valid: {', '.join(valid)})" if valid else " (it has no settings)")
         return f"{document.where(full, key=True)} {path}: unknown key{hint}"
     if problem["type"] == "missing":

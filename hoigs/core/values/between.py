@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from hoigs.core.errors import HoigsError
 from hoigs.core.maths.rotations import (
     axis_angle_to_quats,
     matrices_to_quats,
@@ -18,6 +20,43 @@ from hoigs.core.maths.rotations import (
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.moment import BodyPose, Moment
+
+MOST_MOMENTS = 100_000
+
+
+def frame_numbers(
+    clip: Clip,
+    start: float | None = None,
+    end: float | None = None,
+    fps: float | None = None,
+    slow: float = 1.0,
+) -> tuple[list[float], float]:
+    """Frame numbers from `start` to `end`, evenly spaced, and how many a second there are.
+
+    Args:
+        start, end: by default the first and the last. fps: by default the clip's.
+        slow: how many times slower than the clip they play.
+
+    Raises:
+        HoigsError: frames that the clip has not, or a rate that is not positive.
+    """
+    last = clip.num_frames - 1
+    first, final = (0.0 if start is None else start), (float(last) if end is None else end)
+    if not 0 <= first <= final <= last:
+        raise HoigsError(f"frames {first:g} to {final:g}: expected 0 <= from <= to <= {last}")
+    rate = clip.fps if fps is None else fps
+    if not (0 < rate < math.inf and 0 < slow < math.inf):
+        raise HoigsError(f"fps {rate:g} and slow {slow:g}: expected positive numbers")
+    step = clip.fps / (rate * slow)
+    count = math.floor((final - first) / step + 1e-6) + 1
+    if count > MOST_MOMENTS:
+        raise HoigsError(f"{count} moments are more than {MOST_MOMENTS}; lower fps or slow")
+    return [_whole(first + i * step) for i in range(count)], rate
+
+
+def _whole(frame: float) -> float:
+    """A frame number that rounding took off a whole one, back on it."""
+    return float(round(frame)) if abs(frame - round(frame)) < 1e-6 else frame
 
 
 def frame_of(clip: Clip, moment: Moment) -> float:

@@ -140,10 +140,10 @@ class Clip:
     Attributes:
         name: for reports.
         store: pixels. cameras, moments: one a frame, in order.
-        kinds: entity name to kind; "scene" is implicit.
-        bodies: by human entity. objects: by object entity.
         points, point_colors: scene points (COLMAP, or back-projected depth), metres, RGB [0, 1].
         split: "train" and "test" positions.
+        kinds: entity name to kind; "scene" is implicit.
+        bodies: by human entity. objects: by object entity.
         held_out: the same moments from cameras never trained on, or None.
         fps: frames a second.
         depth_kind: "metric", "affine-disparity" or "none".
@@ -156,12 +156,12 @@ class Clip:
     store: FrameStore
     cameras: Sequence[Camera]
     moments: Sequence[Moment]
-    kinds: Mapping[str, EntityKind]
-    bodies: Mapping[str, BodyTrack]
-    objects: Mapping[str, ObjectTrack]
     points: Float[Tensor, "P 3"]
     point_colors: Float[Tensor, "P 3"]
     split: Mapping[str, Sequence[int]]
+    kinds: Mapping[str, EntityKind] = field(default_factory=dict)
+    bodies: Mapping[str, BodyTrack] = field(default_factory=dict)
+    objects: Mapping[str, ObjectTrack] = field(default_factory=dict)
     held_out: Clip | None = None
     fps: float = 30.0
     depth_kind: str = "none"

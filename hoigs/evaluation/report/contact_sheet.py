@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.clip import Clip
+from hoigs.core.whole_files import written_whole
 from hoigs.evaluation.report.draw import draw, picture
 
 INK, PAPER, QUIET = (28, 30, 34), (250, 249, 246), (120, 120, 118)
@@ -59,9 +60,8 @@ def contact_sheet(
         sheet.paste(render_tile, (left, top + tile_height + GAP))
     path = Path(out_png)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.part")
-    sheet.save(temporary, format="PNG", optimize=True)
-    temporary.replace(path)
+    with written_whole(path) as part:
+        sheet.save(part, format="PNG", optimize=True)
     return path
 
 

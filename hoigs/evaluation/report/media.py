@@ -30,6 +30,10 @@ Item = TypeVar("Item")
 
 PLAYBACK_FRAMES, ORBIT_FRAMES, COMPARED, HELD_OUT = 48, 36, 6, 3
 PANEL_WIDTH, COMPARE_WIDTH = 400, 720
+SEQUENCE, SEQUENCE_WIDTH = (
+    24,
+    360,
+)  # frames of the player, and the width of each of its three panels
 PLAYBACK_BYTES, ORBIT_BYTES = 2_000_000, 1_200_000
 
 
@@ -125,6 +129,21 @@ def _compare(model: SceneModel, frame: Frame, scored: FrameScores, name: str) ->
         error=still(error_picture(output.color, frame.rgb), COMPARE_WIDTH, 65),
         thumb=still(render, 120, 70),
     )
+
+
+def scored_sequence(model: SceneModel, clip: Clip, evaluation: Evaluation) -> list[tuple[str, str]]:
+    """The scored frames of the video in order: label, and video | render | error as a data URI."""
+    frames = [
+        f for view in evaluation.views if view.name != "held-out cameras" for f in view.frames
+    ]
+    made = []
+    for scored in evenly(sorted(frames, key=lambda f: f.index), SEQUENCE):
+        frame = clip[scored.position]
+        color = draw(model, frame.moment, frame.camera).color
+        panels = (frame.image.numpy(), picture(color), error_picture(color, frame.rgb))
+        row = np.concatenate(panels, 1)
+        made.append((f"frame {scored.index}", still(row, 3 * SEQUENCE_WIDTH, 70)))
+    return made
 
 
 def key_position(clip: Clip, samples: int = 24) -> int:

@@ -14,3 +14,28 @@ for (const comparer of document.querySelectorAll(".comparer")) {
     });
   }
 }
+
+for (const player of document.querySelectorAll(".player")) {
+  const images = [...player.querySelectorAll("img")];
+  const [button, slider, label] = ["button", "input", "output"].map((s) => player.querySelector(s));
+  const show = (index) => {
+    images.forEach((image, i) => image.classList.toggle("on", i === index));
+    slider.value = index;
+    label.textContent = images[index].alt;
+  };
+  let timer = 0;
+  const stop = () => {
+    clearInterval(timer);
+    timer = 0;
+    button.textContent = "Play";
+  };
+  button.addEventListener("click", () => {
+    if (timer) return stop();
+    button.textContent = "Pause";
+    timer = setInterval(() => show((Number(slider.value) + 1) % images.length), 250);
+  });
+  slider.addEventListener("input", () => {
+    stop();
+    show(Number(slider.value));
+  });
+}

@@ -52,6 +52,29 @@ def pair(image: str, left: str, right: str, alt: str) -> str:
     )
 
 
+def player(frames: Sequence[tuple[str, str]]) -> str:
+    """Pictures of a sequence with a play button and a slider; each is labelled."""
+    pictures = "".join(
+        f"<img class='{'on' if i == 0 else ''}' src='{image}' alt='{escape(label, quote=True)}'>"
+        for i, (label, image) in enumerate(frames)
+    )
+    return (
+        f"<div class='player'><figure>{pictures}<figcaption><span>The video</span>"
+        "<span>The reconstruction</span><span>Error</span></figcaption></figure>"
+        "<p><button type='button'>Play</button>"
+        f"<input type='range' min='0' max='{len(frames) - 1}' value='0' aria-label='frame'>"
+        f"<output>{escape(frames[0][0])}</output></p></div>"
+    )
+
+
+def commands(lines: Sequence[tuple[str, str]]) -> str:
+    """Commands to copy, each with what it does."""
+    rows = "".join(
+        f"<dt><code>{escape(line)}</code></dt><dd>{escape(text)}</dd>" for line, text in lines
+    )
+    return f"<dl class='commands'>{rows}</dl>"
+
+
 def comparer(comparisons: Sequence[Comparison]) -> str:
     """Video and render under a slider, the error beside them, and thumbnails to choose a frame."""
     stages, thumbs = [], []

@@ -13,6 +13,7 @@ import hoigs
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.values.clip import Clip
+from hoigs.core.whole_files import write_whole
 from hoigs.evaluation.report import curves, media, sections
 from hoigs.evaluation.scores import Evaluation, Table, score_table, size_table, timing_table
 from hoigs.runs.run_folder import RunFolder
@@ -44,6 +45,7 @@ def write_report(
         ("playback", lambda: _hero(model, clip)),
         ("comparisons", lambda: _compared(model, clip, evaluation)),
         ("orbit", lambda: _space(model, clip)),
+        ("commands", lambda: _further(folder)),
         ("scores", lambda: _scores(evaluation)),
         ("curves", lambda: _training(records)),
         ("cost", lambda: _cost(evaluation)),
@@ -65,9 +67,7 @@ def write_report(
         created=escape(evaluation.created),
     )
     path = folder / "report.html"
-    temporary = folder / ".report.html.part"
-    temporary.write_text(page, encoding="utf-8")
-    temporary.replace(path)
+    write_whole(path, page)
     report(1.0, "")
     return path
 
@@ -101,6 +101,35 @@ def _compared(model: SceneModel, clip: Clip, evaluation: Evaluation) -> str:
         ("None of these images took part in training. " if unseen else "")
         + "Drag the line between them; choose a frame below.",
         sections.comparer(comparisons),
+    ) + _section(
+        "In a row",
+        "The frames that were scored, in their order.",
+        sections.player(media.scored_sequence(model, clip, evaluation)),
+    )
+
+
+def _further(folder: Path) -> str:
+    run = folder.name if folder.is_absolute() else str(folder)
+    return _section(
+        "Look further",
+        "",
+        sections.commands(
+            (
+                (
+                    f"hoigs render {run} --path bullet-time",
+                    "a film: the moment stands still, the camera moves",
+                ),
+                (f"hoigs render {run} --compare", "a film beside the video"),
+                (
+                    f"hoigs export {run} --format ply --out scene.ply",
+                    "one moment for viewers of Gaussians",
+                ),
+                (
+                    f"hoigs export {run} --format usd --out scene.usd",
+                    "all moments for Blender, Houdini and others",
+                ),
+            )
+        ),
     )
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.npz import plain_reason
 from hoigs.core.values.clip import BodyTrack
 
 Layout = Mapping[str, tuple[int | str, ...]]
@@ -46,8 +47,10 @@ def read_model(key: str, path: Path, layout: Layout, where: str) -> dict[str, np
                 )
             optional = ("hands_meanl", "hands_meanr")
             arrays = {k: file[k] for k in (*layout, *optional) if k in file.files}
-    except (ValueError, zipfile.BadZipFile) as error:  # pickles are refused with a ValueError
-        raise HoigsError(f"{path} is not an {name} .npz file ({error}); {where}") from error
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+        # pickles are refused with a ValueError
+        reason = plain_reason(error)
+        raise HoigsError(f"{path} is not an {name} .npz file ({reason}); {where}") from error
     _check_shapes(path, arrays, layout, name, where)
     return arrays
 

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float
 from pydantic import BaseModel, Field
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError, did_you_mean
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.rotations import axis_angle_to_matrices
@@ -21,6 +20,7 @@ from hoigs.core.model.smpl_params import pose_from_smplx
 from hoigs.core.values.clip import BodyTrack, Clip, ObjectTrack, uniform_test_split
 from hoigs.core.values.lens import Lens
 from hoigs.core.values.tokens import EntityKind
+from hoigs.plugins.readers.common.config import ReaderConfig
 from hoigs.plugins.readers.common.frame_order import image_files, video_moments
 from hoigs.plugins.readers.common.json_file import load_json, parse_json_map
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
@@ -43,7 +43,7 @@ FPS = 30.0
 BEHIND = (1.0, 4.0)  # scene points start within these times the object's distance
 
 
-class ArcticConfig(ComponentConfig):
+class ArcticConfig(ReaderConfig):
     """Settings of reader:arctic."""
 
     view: int | None = Field(
@@ -53,7 +53,6 @@ class ArcticConfig(ComponentConfig):
     count: int | None = Field(default=None, ge=2, description="frames; by default all (HOLD: 300)")
     masks: bool = Field(default=True, description="False reads only the scene")
     points: int = Field(default=20_000, ge=1, description="scene points to start from")
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class ArcticReader(ClipReader):
@@ -63,9 +62,6 @@ class ArcticReader(ClipReader):
     metres; hands are flat_hand_mean=True; the body is the subject's own template on the model of
     its gender, which `body:smplx` then requires. The top of an object is placed at its median
     angle, which suits "grab" sequences, and is marked as the moving part.
-
-    Args:
-        view, start, count, masks, points, cache_mb: see ArcticConfig.
     """
 
     Config: ClassVar = ArcticConfig

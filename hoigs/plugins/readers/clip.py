@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
-from pydantic import Field
 from torch import Tensor
 
 from hoigs.core.clip_folder.check import usable_clip
@@ -26,7 +25,6 @@ from hoigs.core.clip_folder.format import (
     mask_path,
     parse_header,
 )
-from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.npz import load_arrays
@@ -34,13 +32,12 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind
+from hoigs.plugins.readers.common.config import ReaderConfig
 from hoigs.plugins.readers.common.pixel_cache import PixelCache
 
 
-class ClipFolderReaderConfig(ComponentConfig):
+class ClipFolderReaderConfig(ReaderConfig):
     """Settings of reader:clip."""
-
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class ClipFolderReader(ClipReader):

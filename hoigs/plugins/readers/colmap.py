@@ -8,11 +8,11 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.values.clip import Clip, uniform_test_split
 from hoigs.core.values.tokens import EntityKind
 from hoigs.plugins.readers.common.colmap_model import model_folder, read_sparse, sparse_needs
+from hoigs.plugins.readers.common.config import VideoReaderConfig
 from hoigs.plugins.readers.common.frame_order import image_files, video_moments
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, lens_for
 from hoigs.plugins.readers.common.listing import Need, require_files
@@ -22,7 +22,7 @@ MASK_MAKER = "your segmenter makes masks/ENTITY/, 0/255, one for each image; or 
 NO_POSES = "a COLMAP folder holds none; `hoigs prepare` fits a body to landmarks"
 
 
-class ColmapConfig(ComponentConfig):
+class ColmapConfig(VideoReaderConfig):
     """Settings of reader:colmap."""
 
     factor: int = Field(default=1, ge=1, description="2 reads images_2/, and so on")
@@ -31,8 +31,6 @@ class ColmapConfig(ComponentConfig):
         ge=2,
         description="every n-th image is for tests, from the first on (3DGS: 8); else 16, evenly",
     )
-    fps: float = Field(default=30.0, gt=0, description="of the video that the images come from")
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class ColmapReader(ClipReader):
@@ -42,9 +40,6 @@ class ColmapReader(ClipReader):
     but keeps its time. `masks/NAME/` holds the masks of an entity: a human if NAME starts with
     "human" or "person", else an object. Mask files directly in `masks/` are COLMAP's own
     (pixels without features) and are not read.
-
-    Args:
-        factor, test_every, fps, cache_mb: see ColmapConfig.
     """
 
     Config: ClassVar = ColmapConfig
@@ -92,8 +87,6 @@ class ColmapReader(ClipReader):
             cameras=cameras,
             moments=video_moments([order[p] for p in images], len(files)),
             kinds=masks,
-            bodies={},
-            objects={},
             points=model.points,
             point_colors=model.colors,
             split=split_of(len(images), self.config.test_every),

@@ -11,12 +11,12 @@ import torch
 from PIL import Image
 from pydantic import Field
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip, uniform_test_split
 from hoigs.core.values.tokens import EntityKind
+from hoigs.plugins.readers.common.config import VideoReaderConfig
 from hoigs.plugins.readers.common.frame_order import image_files, video_moments
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
 from hoigs.plugins.readers.common.listing import Need, require_files
@@ -31,7 +31,7 @@ VOID = 255  # DAVIS's index of pixels that are not scored
 SPAN = (1.0, 5.0)  # depths of the points to start from, in units of their own
 
 
-class DavisConfig(ComponentConfig):
+class DavisConfig(VideoReaderConfig):
     """Settings of reader:davis."""
 
     people: list[int] = Field(
@@ -42,7 +42,6 @@ class DavisConfig(ComponentConfig):
     )
     points: int = Field(default=20_000, ge=1, description="scene points to start from")
     fps: float = Field(default=24.0, gt=0, description="of the video (DAVIS: 24)")
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class DavisReader(ClipReader):
@@ -52,9 +51,6 @@ class DavisReader(ClipReader):
     masks for each object (DreamScene4D). There are no cameras, so a static one at the origin is
     assumed. There is no depth, so the scene has no unit. Objects have no track, so a spec names an
     initializer for each.
-
-    Args:
-        people, focal, points, fps, cache_mb: see DavisConfig.
     """
 
     Config: ClassVar = DavisConfig
@@ -111,8 +107,6 @@ class DavisReader(ClipReader):
             cameras=cameras,
             moments=video_moments(range(len(images)), len(images)),
             kinds=kinds,
-            bodies={},
-            objects={},
             points=points,
             point_colors=colors,
             split=uniform_test_split(len(images)),

@@ -5,19 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import numpy as np
-import torch
 from pydantic import Field
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.values.clip import Clip
+from hoigs.plugins.readers.common.config import ReaderConfig
 from hoigs.plugins.readers.common.frame_order import timed_moments
 from hoigs.plugins.readers.common.json_file import parse_json
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames
 from hoigs.plugins.readers.common.listing import Need, require_files
 from hoigs.plugins.readers.common.point_file import Points, read_points
 from hoigs.plugins.readers.common.poses import opengl_to_world_to_camera
+from hoigs.plugins.readers.common.start_points import points_in_box
 from hoigs.plugins.readers.common.transforms import TransformFrame, Transforms, lens_of
 
 LAYOUT = "a D-NeRF scene (transforms_train.json …)"
@@ -26,7 +25,7 @@ POINT_FILES = ("fused.ply", "points3d.ply", "points3D.ply")
 COLORS = {"white": (255, 255, 255), "black": (0, 0, 0)}
 
 
-class DnerfConfig(ComponentConfig):
+class DnerfConfig(ReaderConfig):
     """Settings of reader:dnerf."""
 
     background: Literal["white", "black"] = Field(
@@ -37,7 +36,6 @@ class DnerfConfig(ComponentConfig):
         default=2000, ge=1, description="random points to start from where no file has any (4DGS)"
     )
     box: float = Field(default=1.3, gt=0, description="their coordinates are between -box and box")
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class DnerfReader(ClipReader):
@@ -45,9 +43,6 @@ class DnerfReader(ClipReader):
 
     Images keep their own size, times are the files' (divided by the largest if that exceeds 1).
     The scene has no unit. Test frames have cameras and mostly times of their own.
-
-    Args:
-        background, points, box, cache_mb: see DnerfConfig.
     """
 
     Config: ClassVar = DnerfConfig
@@ -104,9 +99,6 @@ class DnerfReader(ClipReader):
             ),
             cameras=cameras,
             moments=timed_moments(times, split["train"]),
-            kinds={},
-            bodies={},
-            objects={},
             points=points,
             point_colors=colors,
             split=split,
@@ -122,10 +114,9 @@ class DnerfReader(ClipReader):
         for name in POINT_FILES:
             if (folder / name).is_file():
                 return (*read_points(folder / name), name)
-        rng, count, box = np.random.default_rng(0), self.config.points, self.config.box
-        points = torch.from_numpy(rng.uniform(-box, box, (count, 3))).float()
+        count, box = self.config.points, self.config.box
         origin = f"{count} at random within ±{box:g} (4DGaussians, readNerfSyntheticInfo)"
-        return points, torch.full_like(points, 0.5), origin
+        return (*points_in_box(count, box), origin)
 
 
 def image_names(frame: TransformFrame) -> tuple[str, ...]:

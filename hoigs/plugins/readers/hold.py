@@ -10,15 +10,14 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from PIL import Image
-from pydantic import Field
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip, ObjectTrack, uniform_test_split
 from hoigs.core.values.tokens import EntityKind
+from hoigs.plugins.readers.common.config import VideoPointsConfig
 from hoigs.plugins.readers.common.frame_order import image_files, video_moments
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
 from hoigs.plugins.readers.common.listing import Need, require_files
@@ -37,12 +36,8 @@ NO_POSES = (
 Array = np.ndarray
 
 
-class HoldConfig(ComponentConfig):
+class HoldConfig(VideoPointsConfig):
     """Settings of reader:hold."""
-
-    points: int = Field(default=20_000, ge=1, description="scene points to start from")
-    fps: float = Field(default=30.0, gt=0, description="of the video; the layout has none")
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class HoldReader(ClipReader):
@@ -51,9 +46,6 @@ class HoldReader(ClipReader):
     The world is HOLD's before `scale_mat` shrinks it into the unit sphere. Entities are "object"
     and "hand_right", "hand_left", which have masks and no body poses. Poses of frames that SfM
     could not place were filled by HOLD's slerp; the data does not mark which ones.
-
-    Args:
-        points, fps, cache_mb: see HoldConfig.
     """
 
     Config: ClassVar = HoldConfig
@@ -98,7 +90,6 @@ class HoldReader(ClipReader):
             cameras=cameras,
             moments=video_moments(range(len(images)), len(images)),
             kinds=kinds,
-            bodies={},
             objects={"object": track},
             points=points,
             point_colors=colors,

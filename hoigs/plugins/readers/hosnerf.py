@@ -14,14 +14,15 @@ from PIL import Image
 from pydantic import Field
 from torch import Tensor
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.core.model.smpl_params import betas_of_joints, pose_from_smpl
+from hoigs.core.npz import load_array
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, uniform_test_split
 from hoigs.core.values.lens import Lens
 from hoigs.core.values.tokens import EntityKind
+from hoigs.plugins.readers.common.config import VideoPointsConfig
 from hoigs.plugins.readers.common.frame_order import image_files, video_moments
 from hoigs.plugins.readers.common.json_file import load_json
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
@@ -42,15 +43,12 @@ NO_POSES = (
 Array = np.ndarray
 
 
-class HosnerfConfig(ComponentConfig):
+class HosnerfConfig(VideoPointsConfig):
     """Settings of reader:hosnerf."""
 
     smpl: Path | None = Field(
         default=None, description="your SMPL model as .npz (body:smpl); without it, no body poses"
     )
-    points: int = Field(default=20_000, ge=1, description="scene points to start from")
-    fps: float = Field(default=30.0, gt=0, description="of the video; the layout has none")
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class HosnerfReader(ClipReader):
@@ -60,9 +58,6 @@ class HosnerfReader(ClipReader):
     are of person and object together: entity "human"; put masks of the object alone into
     `object_masks/` to have both. There is neither a point cloud nor depth: scene points start
     along the rays, between the bounds of poses_bounds.npy.
-
-    Args:
-        smpl, points, fps, cache_mb: see HosnerfConfig.
     """
 
     Config: ClassVar = HosnerfConfig
@@ -119,19 +114,11 @@ class HosnerfReader(ClipReader):
         if states.is_file():
             provenance["transitions"] = [float(s["time"]) for s in load_json(states).values()]
         return Clip(
-            name=folder.resolve().name,
-            store=store,
-            cameras=cameras,
-            moments=video_moments(range(len(images)), len(images), bodies),
-            kinds=kinds,
-            bodies=bodies,
-            objects={},
-            points=points,
-            point_colors=colors,
-            split=published_split(len(images)),
-            fps=self.config.fps,
-            provenance=provenance,
-        )
+            name=folder.resolve().name, store=store, cameras=cameras,
+            moments=video_moments(range(len(images)), len(images), bodies), kinds=kinds,
+            bodies=bodies, points=points, point_colors=colors, split=published_split(len(images)),
+            fps=self.config.fps, provenance=provenance,
+        )  # fmt: skip
 
 
 def published_split(count: int) -> dict[str, list[int]]:
@@ -213,7 +200,10 @@ def _bounds(
         ClipError: the number of rows is wrong, or rows are rotated differently from the cameras,
             as they are if rows and images are paired wrongly.
     """
-    rows = np.load(path, allow_pickle=False)
+    try:
+        rows = load_array(path)
+    except (OSError, ValueError) as error:
+        raise ClipError(f"{path} cannot be read ({error}); write it again") from error
     if rows.shape != (len(images), 17):
         raise ClipError(
             f"{path} has shape {list(rows.shape)}, expected [{len(images)}, 17], "

@@ -9,12 +9,12 @@ from typing import ClassVar
 import numpy as np
 from pydantic import BaseModel, Field
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.lens import Lens
 from hoigs.core.values.moment import Moment
+from hoigs.plugins.readers.common.config import VideoReaderConfig
 from hoigs.plugins.readers.common.frame_order import natural
 from hoigs.plugins.readers.common.json_file import parse_json, parse_json_map
 from hoigs.plugins.readers.common.lazy_frames import (
@@ -78,7 +78,7 @@ class CameraJson(BaseModel):
     tangential_distortion: tuple[float, float] = (0.0, 0.0)
 
 
-class HypernerfConfig(ComponentConfig):
+class HypernerfConfig(VideoReaderConfig):
     """Settings of reader:hypernerf."""
 
     factor: int | None = Field(
@@ -87,7 +87,6 @@ class HypernerfConfig(ComponentConfig):
         description="reads rgb/FACTORx; by default 2 if there, else the smallest",
     )
     fps: float = Field(default=15.0, gt=0, description="of the capture")
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class HypernerfReader(ClipReader):
@@ -96,9 +95,6 @@ class HypernerfReader(ClipReader):
     The world is (x - center) * scale of scene.json, for cameras, points and depth alike. With no
     val_ids every fourth image trains and the one two later tests, as 4DGaussians does it;
     covisible/ (DyCheck) marks what of a test image can be known, the rest is ignored.
-
-    Args:
-        factor, fps, cache_mb: see HypernerfConfig.
     """
 
     Config: ClassVar = HypernerfConfig
@@ -145,9 +141,6 @@ class HypernerfReader(ClipReader):
             ),
             cameras=cameras,
             moments=[Moment(metadata[n].step / last, metadata[n].step) for n in ids],
-            kinds={},
-            bodies={},
-            objects={},
             points=points,
             point_colors=colors,
             split=split,

@@ -6,21 +6,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
 import torch
 from pydantic import Field
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip, uniform_test_split
 from hoigs.core.values.moment import Moment
+from hoigs.plugins.readers.common.config import VideoReaderConfig
 from hoigs.plugins.readers.common.frame_order import natural, timed_moments, video_moments
 from hoigs.plugins.readers.common.json_file import parse_json
 from hoigs.plugins.readers.common.lazy_frames import DepthFiles, LazyFrames, MaskFiles, dark
 from hoigs.plugins.readers.common.listing import Need, require_files
 from hoigs.plugins.readers.common.point_file import Points, read_points
 from hoigs.plugins.readers.common.poses import opengl_to_world_to_camera
+from hoigs.plugins.readers.common.start_points import points_in_box
 from hoigs.plugins.readers.common.transforms import TransformFrame, Transforms, lens_of
 
 LAYOUT = "a nerfstudio capture (transforms.json)"
@@ -30,7 +30,7 @@ DEPTH_MAKER = "your capture app or depth network makes it; or remove depth_file_
 RANDOM_BOX = 5.0  # times the largest camera coordinate: splatfacto's random_scale of 10
 
 
-class NerfstudioConfig(ComponentConfig):
+class NerfstudioConfig(VideoReaderConfig):
     """Settings of reader:nerfstudio."""
 
     factor: int = Field(default=1, ge=1, description="2 reads images_2/, and so on")
@@ -38,8 +38,6 @@ class NerfstudioConfig(ComponentConfig):
     points: int = Field(
         default=50_000, ge=1, description="random points to start from where there is no PLY"
     )
-    fps: float = Field(default=30.0, gt=0, description="of the video that the images come from")
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class NerfstudioReader(ClipReader):
@@ -48,9 +46,6 @@ class NerfstudioReader(ClipReader):
     The world is the file's, divided by its `applied_scale`, which restores the metres of
     capture apps. Masks are nerfstudio's: black pixels are ignored. Depth is in metres. Frames
     without "time" are evenly spaced.
-
-    Args:
-        factor, depth_unit, points, fps, cache_mb: see NerfstudioConfig.
     """
 
     Config: ClassVar = NerfstudioConfig
@@ -91,9 +86,6 @@ class NerfstudioReader(ClipReader):
             ),
             cameras=cameras,
             moments=_moments(frames, split["train"]),
-            kinds={},
-            bodies={},
-            objects={},
             points=points,
             point_colors=colors,
             split=split,
@@ -131,14 +123,10 @@ class NerfstudioReader(ClipReader):
         centers = torch.stack([camera.center for camera in cameras])
         middle = centers.mean(0)
         reach = RANDOM_BOX * max(float((centers - middle).abs().max()), 1e-6)
-        rng = np.random.default_rng(0)
-        points = (
-            middle + torch.from_numpy(rng.uniform(-reach, reach, (self.config.points, 3))).float()
-        )
-        origin = (
-            f"{self.config.points} at random within ±{reach:.3g} of the cameras, as splatfacto does"
-        )
-        return points, torch.full_like(points, 0.5), origin
+        count = self.config.points
+        points, colors = points_in_box(count, reach)
+        origin = f"{count} at random within ±{reach:.3g} of the cameras, as splatfacto does"
+        return middle + points, colors, origin
 
 
 def _problems(file: Transforms, frames: Sequence[TransformFrame]) -> list[str]:

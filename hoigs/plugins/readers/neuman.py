@@ -12,13 +12,13 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.core.model.smpl_params import pose_from_smpl
 from hoigs.core.values.clip import BodyTrack, Clip
 from hoigs.plugins.readers.common.colmap_model import SparseModel, View, read_sparse, sparse_needs
+from hoigs.plugins.readers.common.config import VideoReaderConfig
 from hoigs.plugins.readers.common.frame_order import image_files, video_moments
 from hoigs.plugins.readers.common.joblib_file import load_joblib
 from hoigs.plugins.readers.common.lazy_frames import (
@@ -50,14 +50,12 @@ NO_POSES = (
 Array = np.ndarray
 
 
-class NeumanConfig(ComponentConfig):
+class NeumanConfig(VideoReaderConfig):
     """Settings of reader:neuman."""
 
     smpl: Path | None = Field(
         default=None, description="your neutral SMPL model as .npz; without it, no body poses"
     )
-    fps: float = Field(default=30.0, gt=0, description="of the video; the layout has none")
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class NeumanReader(ClipReader):
@@ -67,9 +65,6 @@ class NeumanReader(ClipReader):
     of their scales turns COLMAP's unit into metres. Where a frame's scale differs, its body
     keeps its size and moves along the line from the camera, so that it looks as it did. Shape is
     the median of the frames' betas.
-
-    Args:
-        smpl, fps, cache_mb: see NeumanConfig.
     """
 
     Config: ClassVar = NeumanConfig
@@ -123,7 +118,6 @@ class NeumanReader(ClipReader):
             moments=video_moments([order[name] for name in names], len(files), bodies),
             kinds={"human": "human"},
             bodies=bodies,
-            objects={},
             points=model.points / unit,
             point_colors=model.colors,
             split={use: _listed(folder, use, names) for use in SPLITS},

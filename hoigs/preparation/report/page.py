@@ -20,8 +20,10 @@ def report_page(
     rows: Sequence[Sequence[str]],
     *,
     overlay: bool,
+    object_picture: bool = False,
 ) -> str:
-    """The page; `rows` are what, value and note of each measure, `overlay` links overlay.mp4."""
+    """The page; `rows` are what, value and note of each measure, `overlay` links overlay.mp4 and
+    `object_picture` object.jpg."""
     page = (resources.files(__package__) / "page.html").read_text(encoding="utf-8")
     camera = "a camera that stands still" if report.camera == "static" else "a moving camera"
     return Template(page).substitute(
@@ -30,7 +32,7 @@ def report_page(
             f"{report.frames} frames of {report.video}, {report.width}×{report.height} at "
             f"{report.fps:g} a second, from {camera}."
         ),
-        video=_video() if overlay else "",
+        video=(_video() if overlay else "") + (_object() if object_picture else ""),
         diagnostics="\n".join(map(_diagnostic, diagnostics)),
         plots=_plots(report),
         rows=_rows(rows),
@@ -44,6 +46,15 @@ def _video() -> str:
         "<video src='overlay.mp4' controls loop muted playsinline></video><p class='note'>The "
         "fitted body in blue, the masks' outlines in green and yellow, points of the object in "
         "magenta. If the body does not lie on the person here, nothing after it will be right.</p>"
+    )
+
+
+def _object() -> str:
+    return (
+        "<img src='object.jpg' alt='the object in one frame' width='100%'><p class='note'>What was "
+        "taken for the object. If it is something else, run the same command with <code>--object "
+        "X,Y@FRAME</code>, a point on it in pixels of the video: only what depends on the object "
+        "is made again.</p>"
     )
 
 

@@ -68,7 +68,11 @@ class PrepareReport(Measures):
         (folder / "report.json").write_text(self.to_json(), encoding="utf-8")
         (folder / "report.md").write_text(self.to_markdown(), encoding="utf-8")
         page = report_page(
-            self, self.diagnostics(), self.rows(), overlay=(folder / "overlay.mp4").is_file()
+            self,
+            self.diagnostics(),
+            self.rows(),
+            overlay=(folder / "overlay.mp4").is_file(),
+            object_picture=(folder / "object.jpg").is_file(),
         )
         (folder / "report.html").write_text(page, encoding="utf-8")
 

@@ -10,10 +10,14 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from scipy import ndimage
 
+from hoigs.preparation.video.frames import Frames
+from hoigs.preparation.video.source import SourceError
+
 BLACK = 2  # of 255: a lens and a codec never leave a real surface this dark and this flat
 NEARLY_BLACK = 16  # the codec's ringing at the border of what was painted
 SMALLEST = 5e-4  # of the image
 MARGIN = 2  # pixels that the border mixes
+PROBES = 5  # frames, one of which must show something
 
 
 def blank_pixels(
@@ -31,3 +35,21 @@ def blank_pixels(
     around = (darkness <= NEARLY_BLACK) & ~moving
     grown = ndimage.binary_propagation(patches, mask=around | patches)
     return ndimage.binary_dilation(grown, iterations=MARGIN) & ~moving if grown.any() else grown
+
+
+def require_pictures(frames: Frames) -> None:
+    """That a video shows something.
+
+    Raises:
+        SourceError: some frames from all over it are all black.
+    """
+    places = np.linspace(0, len(frames) - 1, min(PROBES, len(frames))).round().astype(int)
+    brightest = 0
+    for place in places.tolist():  # the first one settles it for nearly every video
+        brightest = max(brightest, int(np.quantile(frames.read(frames.indices[place]), 0.99)))
+        if brightest > NEARLY_BLACK:
+            return
+    raise SourceError(
+        f"{frames.path} is black: in {len(places)} frames from all over it nothing is brighter "
+        f"than {brightest} of 255"
+    )

@@ -62,15 +62,11 @@ def _settings(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> S
         f"{camera.width}x{camera.height} pixels with {channels} feature channels",
     )
     return Settings(
-        width=camera.width,
-        height=camera.height,
+        width=camera.width, height=camera.height,
         active_bases=stored if degree is None else min(stored, (degree + 1) ** 2),
-        near=request.near,
-        low_pass=request.low_pass,
-        max_alpha=request.max_alpha,
-        min_alpha=request.min_alpha,
-        min_transmittance=request.min_transmittance,
-    )
+        near=request.near, low_pass=request.low_pass, max_alpha=request.max_alpha,
+        min_alpha=request.min_alpha, min_transmittance=request.min_transmittance,
+    )  # fmt: skip
 
 
 def _tensors(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> list[Tensor]:

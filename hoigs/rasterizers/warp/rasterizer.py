@@ -20,25 +20,17 @@ from hoigs.rasterizers.warp.input_validation import InputValidation
 class WarpConfig(ComponentConfig):
     """Settings of WarpRasterizer."""
 
-    cpu_kernels: Literal["auto", "native", "portable"] = Field(
-        default="auto",
-        description="native are fast, portable those of CUDA; auto: native where they compile",
-    )
+    cpu_kernels: Literal["auto", "native", "portable"] = "auto"
     """"native": vectorised; "portable": the kernels of CUDA as scalar code, about ten times slower,
     also for testing them without a GPU; "auto": native where they compile, else portable with a
     warning."""
-    scheduler: Literal["threads", "openmp", "auto", "serial"] = Field(
-        default="threads",
-        description="how CPU work is spread over cores; serial is the calling thread",
-    )
+    scheduler: Literal["threads", "openmp", "auto", "serial"] = "threads"
     """How CPU work is spread over cores. "threads": Python threads. "openmp": torch's own pool, 5
     to 15 % faster where nothing else runs (more for small images) and slower where other processes
     use the cores, since its workers wait by spinning; it uses private parts of Warp, which a trial
     run checks. "auto": openmp where the trial passes, else threads. "serial": the calling thread.
     `WarpRasterizer.backend_report()` says which is used, and why."""
-    threads: int | None = Field(
-        default=None, ge=1, description="CPU cores to use; torch.get_num_threads() if None"
-    )
+    threads: int | None = Field(default=None, ge=1)
     """CPU cores to use; torch.get_num_threads() when None."""
 
 

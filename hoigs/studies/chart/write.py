@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hoigs.core.whole_files import write_whole
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.studies.chart.data import (
     ACCURACY,
@@ -58,15 +59,14 @@ def write_chart(
     for clip, points in sheets.items():
         files |= _figures(clip, points, mix_machines)
     for name, content in files.items():
-        temporary = out / f".{name}.part"
-        temporary.write_bytes(content)
-        temporary.replace(out / name)
+        write_whole(out / name, content)
     return [out / name for name in files]
 
 
 def _figures(clip: str, points: Sequence[Point], mix_machines: bool) -> dict[str, bytes]:
     from hoigs.studies.chart.curves import curve_chart
     from hoigs.studies.chart.panels import accuracy_chart
+    from hoigs.studies.plotting.files import figure_files
 
     stem = f"chart-{slug(clip)}"
     drawn = accuracy_chart(points, f"{clip}: accuracy against cost", mix_machines=mix_machines)
@@ -74,20 +74,8 @@ def _figures(clip: str, points: Sequence[Point], mix_machines: bool) -> dict[str
     found: dict[str, bytes] = {}
     for name, figure in ((stem, drawn), (f"{stem}-curves", curves)):
         if figure is not None:
-            found[f"{name}.png"] = _saved(figure, "png", {"Software": None})
-            found[f"{name}.svg"] = _saved(figure, "svg", {"Date": None, "Creator": None})
+            found |= figure_files(name, figure)
     return found
-
-
-def _saved(figure: Any, kind: str, metadata: dict[str, None]) -> bytes:
-    import matplotlib
-
-    from hoigs.studies.plotting.style import STYLE
-
-    buffer = io.BytesIO()
-    with matplotlib.rc_context(STYLE):
-        figure.savefig(buffer, format=kind, metadata=metadata)
-    return buffer.getvalue()
 
 
 def slug(name: str) -> str:

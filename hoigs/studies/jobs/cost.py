@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hoigs.core.whole_files import write_whole
 from hoigs.evaluation.protocol import NotComputed, Value
 from hoigs.studies.jobs.energy import EnergyMeter, energy_meter, spent
 from hoigs.studies.jobs.job import Job
@@ -96,6 +97,4 @@ def read_cost(folder: Path) -> Cost:
 
 
 def _write(path: Path, record: dict[str, Any]) -> None:
-    temporary = path.with_name(f".{path.name}.part")
-    temporary.write_text(json.dumps(record, indent=1, allow_nan=False))
-    temporary.replace(path)
+    write_whole(path, json.dumps(record, indent=1, allow_nan=False))

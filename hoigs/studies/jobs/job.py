@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self
 
 from hoigs.core.errors import CheckpointError
 from hoigs.core.spec.schema import Spec
+from hoigs.core.whole_files import write_whole
 
 RECORD = "job.json"
 SCORES = "evaluation.json"
@@ -141,6 +142,4 @@ def digest_folder(folder: Path) -> str:
 
 def write_record(folder: Path, identity: Mapping[str, str]) -> None:
     """Mark a run folder as this job's."""
-    temporary = folder / f".{RECORD}.part"
-    temporary.write_text(json.dumps(dict(identity)))
-    temporary.replace(folder / RECORD)
+    write_whole(folder / RECORD, json.dumps(dict(identity)))

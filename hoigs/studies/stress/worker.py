@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from hoigs.core.whole_files import write_whole
 from hoigs.studies.jobs.job import SCORES
 from hoigs.studies.jobs.worker import main, train_job
 from hoigs.studies.stress.job import StressJob
@@ -25,9 +26,7 @@ def run_job(job: StressJob, runs_at_once: int = 1) -> None:
         clip = read_clip(Path(job.scoring_clip), width=loaded.spec.train.width)
     evaluation = evaluate(loaded.model, clip, held_out=True, timing_frames=0)
     found = evaluation.to_dict() | {STRESS: observe(loaded.model, clip, evaluation.geometry)}
-    temporary = job.folder / f".{SCORES}.part"
-    temporary.write_text(json.dumps(found, indent=1, allow_nan=False))
-    temporary.replace(job.folder / SCORES)
+    write_whole(job.folder / SCORES, json.dumps(found, indent=1, allow_nan=False))
 
 
 if __name__ == "__main__":

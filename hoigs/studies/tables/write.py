@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from hoigs.core.whole_files import write_whole
 from hoigs.evaluation.geometry import GEOMETRY
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.evaluation.scores import DIGITS, TITLES
@@ -48,9 +49,7 @@ def write_tables(results: Sequence[TableResult], out: Path, about: dict[str, Any
         "tables.json": json.dumps(as_dict(results, about), indent=1, allow_nan=False),
     }
     for name, text in texts.items():
-        temporary = out / f".{name}.part"
-        temporary.write_text(text)
-        temporary.replace(out / name)
+        write_whole(out / name, text)
     return [out / name for name in texts]
 
 

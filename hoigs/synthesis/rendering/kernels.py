@@ -202,16 +202,10 @@ def corner_dimming(lights: Lights, point: wp.vec3, normal: wp.vec3):
 
 @wp.func
 def shade(
-    surface: Surface,
-    things: wp.uint64,
-    texels: wp.array(dtype=wp.vec3),
-    levels: wp.array(dtype=wp.vec3i, ndim=2),
-    lights: Lights,
-    view: View,
-    ray: wp.vec3,
-    hit: Hit,
+    surface: Surface, things: wp.uint64, texels: wp.array(dtype=wp.vec3),
+    levels: wp.array(dtype=wp.vec3i, ndim=2), lights: Lights, view: View, ray: wp.vec3, hit: Hit,
     sample: int,
-):
+):  # fmt: skip
     corner = 3 * hit.face
     smooth = surface.normals[corner] * hit.u + surface.normals[corner + 1] * hit.v
     smooth = wp.normalize(smooth + surface.normals[corner + 2] * (1.0 - hit.u - hit.v))
@@ -247,16 +241,10 @@ def shade(
 
 @wp.func
 def radiance(
-    shell: Surface,
-    things: Surface,
-    texels: wp.array(dtype=wp.vec3),
-    levels: wp.array(dtype=wp.vec3i, ndim=2),
-    lights: Lights,
-    view: View,
-    ray: wp.vec3,
-    hit: Hit,
+    shell: Surface, things: Surface, texels: wp.array(dtype=wp.vec3),
+    levels: wp.array(dtype=wp.vec3i, ndim=2), lights: Lights, view: View, ray: wp.vec3, hit: Hit,
     sample: int,
-):
+):  # fmt: skip
     if hit.layer == 0:
         return shade(shell, things.mesh, texels, levels, lights, view, ray, hit, sample)
     if hit.layer == 1:
@@ -271,19 +259,12 @@ def direction(view: View, x: float, y: float):
 
 @wp.kernel
 def render(
-    shell: Surface,
-    things: Surface,
-    texels: wp.array(dtype=wp.vec3),
-    levels: wp.array(dtype=wp.vec3i, ndim=2),
-    lights: Lights,
-    view: View,
-    offsets: wp.array(dtype=wp.vec2),
-    samples: int,
-    edge_samples: int,
-    color: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=wp.float32),
+    shell: Surface, things: Surface, texels: wp.array(dtype=wp.vec3),
+    levels: wp.array(dtype=wp.vec3i, ndim=2), lights: Lights, view: View,
+    offsets: wp.array(dtype=wp.vec2), samples: int, edge_samples: int,
+    color: wp.array(dtype=wp.vec3), depth: wp.array(dtype=wp.float32),
     entity: wp.array(dtype=wp.int32),
-):
+):  # fmt: skip
     pixel = wp.tid()
     column = float(pixel % view.width)
     row = float(pixel // view.width)

@@ -27,7 +27,7 @@ def packed(tracks: Sequence[Track]) -> tuple[list[dict[str, Any]], bytes]:
         head, data = _track(track)
         heads.append(head)
         parts.append(data)
-    return heads, gzip.compress(b"".join(parts), 9, mtime=0)
+    return heads, gzip.compress(b"".join(parts), 6, mtime=0)
 
 
 def _track(track: Track) -> tuple[dict[str, Any], bytes]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,11 @@ from hoigs.viewing.viewer.drawing import RunDrawing
 from hoigs.viewing.viewer.takes import distance_to_subject
 
 EYES = 8  # cameras whose views of a colour are averaged
-STRIDES = (1, 2, 3, 4)  # of moving entities, tried before Gaussians are dropped
+STRIDES = (1, 2, 4)  # of moving entities, tried before Gaussians are dropped
+_ORDINAL = {2: "second", 4: "fourth"}
 FEWEST = 0.02  # share of the Gaussians below which a size is refused
-SEARCHES = 6  # halvings of the share of Gaussians that is kept
+SEARCHES = 3  # tries to find the share of Gaussians that is kept
+Made = tuple[list[Track], list[dict[str, Any]], bytes]  # tracks, and as they are packed
 
 
 @dataclass(frozen=True)
@@ -110,42 +113,58 @@ def _fitting(
     """Tracks, stride and page of the fullest file within the budget."""
     shell = len(_page(loaded, [], b"", [], 1))
 
-    def attempt(share: float, stride: int) -> tuple[list[Track], list[dict[str, Any]], bytes]:
+    def attempt(share: float, stride: int) -> Made:
         thinned = [_thinned(t, share).every(stride) for t in tracks]
         return thinned, *packed(thinned)
 
-    def size(made: tuple[list[Track], list[dict[str, Any]], bytes]) -> int:
+    def size(made: Made) -> int:
         return shell + len(json.dumps(made[1])) + 4 * (len(made[2]) + 2) // 3 + 1000
 
     share, stride = 1.0, 1
     made = attempt(share, stride)
     if budget is not None and size(made) > budget:
         for stride in STRIDES[1:]:
-            report(0.7, f"every {stride}th frame")
+            report(0.7, f"every {_ORDINAL[stride]} frame")
             made = attempt(share, stride)
             if size(made) <= budget:
                 break
         else:
-            low, high, best = 0.0, 1.0, None
-            for i in range(SEARCHES):
-                share = (low + high) / 2
-                report(0.75 + 0.04 * i, f"{100 * share:.0f} % of the Gaussians")
-                made = attempt(share, stride)
-                if size(made) <= budget:
-                    low, best = share, (share, made)
-                else:
-                    high = share
-            if best is None or best[0] < FEWEST:
-                least = size(attempt(FEWEST, stride)) / 1e6
-                raise HoigsError(
-                    f"--max-mb {budget / 1e6:g}: with {100 * FEWEST:.0f} % of the Gaussians and "
-                    f"every {stride}th frame the file still has {least:.1f} MB; allow more, or "
-                    "give fewer --entities"
-                )
-            share, made = best
+            made = _fewer(partial(attempt, stride=stride), size, made, budget, report)
     thinned, heads, data = made
     text = _page(loaded, heads, data, _left_out(loaded, tracks, thinned, stride), stride)
     return thinned, stride, text
+
+
+def _fewer(
+    attempt: Callable[[float], Made],
+    size: Callable[[Made], int],
+    whole: Made,
+    budget: int,
+    report: Progress,
+) -> Made:
+    """The fullest attempt within the budget that few tries find: a size is nearly linear in the
+    share of the Gaussians.
+
+    Raises:
+        HoigsError: even the fewest are too large.
+    """
+    low, best = FEWEST, attempt(FEWEST)
+    least = size(best)
+    if least > budget:
+        raise HoigsError(
+            f"--max-mb {budget / 1e6:g}: with {100 * FEWEST:.0f} % of the Gaussians the file still "
+            f"has {least / 1e6:.2f} MB; allow more, or give fewer --entities"
+        )
+    high, most = 1.0, size(whole)
+    for i in range(SEARCHES):
+        share = low + (high - low) * 0.99 * (budget - least) / (most - least)
+        report(0.8 + 0.05 * i, f"{100 * share:.0f} % of the Gaussians")
+        made = attempt(share)
+        if size(made) <= budget:
+            low, least, best = share, size(made), made
+        else:
+            high, most = share, size(made)
+    return best
 
 
 def _thinned(track: Track, share: float) -> Track:
@@ -171,7 +190,9 @@ def _left_out(
     else:
         sentences.append(f"All {total:,} Gaussians.")
     if stride > 1 and any(t.motion == "moving" for t in kept):
-        sentences.append(f"Of what moves every {stride}th frame: between them it is interpolated.")
+        sentences.append(
+            f"Of what moves every {_ORDINAL[stride]} frame: between them it is interpolated."
+        )
     missing = [n for n in loaded.model.entities if n not in {t.name for t in kept}]
     if missing:
         sentences.append(f"Without {', '.join(missing)}.")

@@ -7,7 +7,7 @@ const $ = (id) => document.getElementById(id);
 const H = JSON.parse($("header").textContent);
 const ROW = 256;      // splats in a row of the texture; entities begin at a row
 const TEXELS = 4;     // of a splat: position and opacity, quaternion, scales, colour
-const LOW_PASS = 0.3; // square pixels, of a video's pixel
+const LOW_PASS = 0.3; // square pixels
 
 const fail = (text) => { $("message").textContent = text; $("message").hidden = false; $("message").style.display = ""; };
 
@@ -255,7 +255,7 @@ function draw() {
   gl.uniform2f(uniforms.focal, camera.K[0], camera.K[1]);
   gl.uniform2f(uniforms.center, camera.K[2], camera.K[3]);
   gl.uniform2f(uniforms.size, width, height);
-  gl.uniform1f(uniforms.blur, LOW_PASS * Math.max(1, camera.zoom * camera.zoom));
+  gl.uniform1f(uniforms.blur, LOW_PASS);
   gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
 }
 
@@ -288,13 +288,13 @@ function posed(at, forward, down) {
 
 function current(width, height) {
   const v = videoCamera();
-  const scale = Math.min(width / v.size[0], height / v.size[1]);
   if (ofVideo) {
+    const scale = Math.min(width / v.size[0], height / v.size[1]);
     const left = (width - scale * v.size[0]) / 2, top = (height - scale * v.size[1]) / 2;
-    return { pose: posed(v.eye, v.forward, v.down), zoom: scale, K: [v.K[0] * scale, v.K[1] * scale, v.K[2] * scale + left, v.K[3] * scale + top] };
+    return { pose: posed(v.eye, v.forward, v.down), K: [v.K[0] * scale, v.K[1] * scale, v.K[2] * scale + left, v.K[3] * scale + top] };
   }
   const f = focus * height;
-  return { pose: posed(eye, unit(sub(target, eye)), mul(UP, -1)), zoom: scale, K: [f, f, width / 2, height / 2] };
+  return { pose: posed(eye, unit(sub(target, eye)), mul(UP, -1)), K: [f, f, width / 2, height / 2] };
 }
 
 function leaveVideo() {

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import tempfile
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,10 +19,6 @@ from hoigs.viewing.viewer.drawing import Drawing, RunDrawing
 from hoigs.viewing.viewer.fitting import nearest_position
 from hoigs.viewing.viewer.views import Vector, View
 
-if TYPE_CHECKING:
-    from hoigs.viewing.viewer.eyes import Eye
-    from hoigs.viewing.viewer.viewer import Viewer
-
 FILM_FPS = 30
 
 
@@ -33,6 +27,15 @@ class Path:
     """Views with the frame number at which each was taken, in order."""
 
     keys: list[tuple[float, View]] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        frames = ", ".join(f"{frame:.1f}" for frame, _ in self.keys)
+        more = "" if len(self.keys) > 1 else " A film needs two or more."
+        return (
+            f"Views on the path: {len(self.keys)}"
+            + (f", at frames {frames}." if frames else ".")
+            + more
+        )
 
     def at(self, share: float) -> tuple[float, View]:
         """Frame number and view at a share of the path, in [0, 1].
@@ -55,48 +58,37 @@ class Path:
         return frame_a + (frame_b - frame_a) * r, view
 
 
-def act(viewer: Viewer, action: str, eye: Eye) -> None:
-    """Do what a button says. Runs in the drawing thread."""
-    controls, now = viewer.controls, time.monotonic()
-    frame = viewer.clock.frame(now)
-    if action == "screenshot":
-        image = viewer.picture(eye.canvas, viewer.settings, frame, eye.view).image
-        eye.client.send_file_download(
-            f"hoigs_{frame:07.2f}.png", _png(image), save_immediately=True
-        )
-        return
-    if action == "add key":
-        viewer.path.keys.append((frame, eye.view))
-    elif action == "clear keys":
-        viewer.path.keys.clear()
-    elif action == "film" and len(viewer.path.keys) >= 2:
-        _film(viewer, eye)
-    frames = ", ".join(f"{f:.1f}" for f, _ in viewer.path.keys)
-    count = len(viewer.path.keys)
-    more = "" if count >= 2 else " A film needs two or more."
-    controls.keys.content = (
-        f"Views on the path: {count}" + (f", at frames {frames}." if count else ".") + more
-    )
+def film(
+    path: Path,
+    seconds: float,
+    draw: Callable[[float, View], UInt8[np.ndarray, "H W 3"]],
+    report: Callable[[str], None],
+) -> bytes:
+    """The path as an mp4.
 
-
-def _film(viewer: Viewer, eye: Eye) -> None:
-    """Draw the path to an mp4, which the browser downloads."""
-    count = max(2, round(viewer.controls.seconds.value * FILM_FPS))
-    settings = replace(viewer.settings, video=False, overlays=set())
-    if settings.needs_video:
-        settings = replace(settings, layout="one", mode="colour")
-    width, height = (x // 2 * 2 for x in eye.resolution.size(eye.canvas, moving=False))
+    Args:
+        draw: a picture at a frame number from a view; all of one even size.
+        report: receives lines on the progress.
+    """
+    count = max(2, round(seconds * FILM_FPS))
 
     def frames() -> Iterator[UInt8[np.ndarray, "H W 3"]]:
         for i in range(count):
             if i % 10 == 0:
-                viewer.controls.keys.content = f"Filming: {100 * i // count} %"
-            frame, view = viewer.path.at(i / (count - 1))
-            yield viewer.picture((width, height), settings, frame, view).image
+                report(f"Filming: {100 * i // count} %")
+            yield draw(*path.at(i / (count - 1)))
 
     with tempfile.TemporaryDirectory() as folder:
-        film = write_video(FilePath(folder) / "path.mp4", frames(), fps=FILM_FPS)
-        eye.client.send_file_download("hoigs_path.mp4", film.read_bytes(), save_immediately=True)
+        return write_video(FilePath(folder) / "path.mp4", frames(), fps=FILM_FPS).read_bytes()
+
+
+def png(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
+    """An image as the bytes of a PNG file."""
+    from PIL import Image
+
+    buffer = BytesIO()
+    Image.fromarray(image).save(buffer, "png")
+    return buffer.getvalue()
 
 
 def distance_to_subject(clip: Clip) -> float:
@@ -136,11 +128,3 @@ def _catmull_rom(a: Vector, b: Vector, c: Vector, d: Vector, r: float) -> Vector
     m, n = (c - a) / 2, (d - b) / 2
     s, t = r * r, r * r * r
     return (2 * t - 3 * s + 1) * b + (t - 2 * s + r) * m + (3 * s - 2 * t) * c + (t - s) * n
-
-
-def _png(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
-    from PIL import Image
-
-    buffer = BytesIO()
-    Image.fromarray(image).save(buffer, "png")
-    return buffer.getvalue()

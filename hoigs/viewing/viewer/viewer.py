@@ -239,8 +239,41 @@ class Viewer:
         """A button was pressed: the drawing thread does the work."""
         eye = self._eyes.get(client.client_id) if client is not None else None
         if eye is not None:
-            self._jobs.put(lambda: takes.act(self, action, eye))
+            self._jobs.put(lambda: self._take(action, eye))
             self._wake.set()
+
+    def _take(self, action: str, eye: Eye) -> None:
+        """Do what a button says, in the drawing thread."""
+        frame = self.clock.frame(time.monotonic())
+        if action == "screenshot":
+            image = self.picture(eye.canvas, self.settings, frame, eye.view).image
+            eye.client.send_file_download(
+                f"hoigs_{frame:07.2f}.png", takes.png(image), save_immediately=True
+            )
+            return
+        if action == "add key":
+            self.path.keys.append((frame, eye.view))
+        elif action == "clear keys":
+            self.path.keys.clear()
+        elif action == "film" and len(self.path.keys) > 1:
+            self._film(eye)
+        self.controls.keys.content = str(self.path)
+
+    def _film(self, eye: Eye) -> None:
+        """Draw the path to an mp4, which the browser downloads."""
+        settings = replace(self.settings, video=False, overlays=set())
+        if settings.needs_video:  # which a path leaves
+            settings = replace(settings, layout="one", mode="colour")
+        width, height = (n // 2 * 2 for n in eye.resolution.size(eye.canvas, moving=False))
+
+        def draw(frame: float, view: View) -> UInt8[np.ndarray, "H W 3"]:
+            return self.picture((width, height), settings, frame, view).image
+
+        def report(text: str) -> None:
+            self.controls.keys.content = text
+
+        data = takes.film(self.path, self.controls.seconds.value, draw, report)
+        eye.client.send_file_download("hoigs_path.mp4", data, save_immediately=True)
 
 
 def _thinned(depth: np.ndarray) -> np.ndarray:

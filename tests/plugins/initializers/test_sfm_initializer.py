@@ -71,7 +71,6 @@ def clip() -> Clip:
         cameras=cameras,
         moments=[Moment(i / (FRAMES - 1), i) for i in range(FRAMES)],
         kinds={"ball": "object"},
-        bodies={},
         objects={"ball": track},
         points=torch.cat((CENTER + RADIUS * on_ball, wall)),
         point_colors=torch.rand(900, 3, generator=g),

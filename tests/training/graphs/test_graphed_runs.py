@@ -59,8 +59,6 @@ def trainer(device: str = "cpu", graphs: Any = "auto") -> Trainer:
         cameras,
         [at(f) for f in range(FRAMES)],
         kinds={"human": "human", "object": "object"},
-        bodies={},
-        objects={},
         points=torch.rand(9, 3),
         point_colors=torch.rand(9, 3),
         split={"train": [0, 1, 3, 4], "test": [2, 5]},

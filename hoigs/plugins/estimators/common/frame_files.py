@@ -11,6 +11,7 @@ import numpy as np
 
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.interfaces.estimator import VideoRequest
+from hoigs.core.npz import plain_reason
 
 _NUMBER = re.compile(r"\d+")
 SHOWN = 8  # frames or files named in a message; the rest are counted
@@ -155,7 +156,7 @@ def image_size(path: Path, problems: FileDiagnostics) -> tuple[int, int] | None:
     try:
         with Image.open(path) as image:
             return image.size
-    except (OSError, SyntaxError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         problems.add(f"{path} is no readable image: {error}")
         return None
 
@@ -165,7 +166,7 @@ def load_array(path: Path, problems: FileDiagnostics) -> np.ndarray | None:
     try:
         return np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        problems.add(f"{path} is no readable .npy file: {error}")
+        problems.add(f"{path} is no readable .npy file: {plain_reason(error)}")
         return None
 
 
@@ -180,7 +181,7 @@ def npz_shapes(
                 with archive.open(name) as stream:
                     shape, _, dtype = _read_header(stream)
                 found[name.removesuffix(".npy")] = (shape, dtype)
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         problems.add(f"{path} is no readable .npz file: {error}")
     return found
 

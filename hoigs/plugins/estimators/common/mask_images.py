@@ -10,6 +10,7 @@ from jaxtyping import Bool, Int
 from PIL import Image
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.npz import load_array
 from hoigs.plugins.estimators.common.frame_files import FileDiagnostics
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -44,7 +45,7 @@ def read_mask(path: Path, inside: Inside) -> Bool[np.ndarray, "H W"]:
             an image of labels.
     """
     if path.suffix.lower() == ".npy":
-        values = np.load(path, allow_pickle=False)
+        values = _npy(path)
         counts = values.dtype == bool or values.max(initial=0) <= 1
     else:
         with _open(path) as image:
@@ -65,6 +66,13 @@ def read_mask(path: Path, inside: Inside) -> Bool[np.ndarray, "H W"]:
     return bright
 
 
+def _npy(path: Path) -> np.ndarray:
+    try:
+        return load_array(path)
+    except (OSError, ValueError) as error:
+        raise HoigsError(f"{path} cannot be read ({error}); write it again") from error
+
+
 def read_labels(path: Path) -> Int[np.ndarray, "H W"]:
     """Numbers of entities in a label image: palette indices (DAVIS), grey values (HOLD), or the
     colours of the palette that PASCAL VOC, DAVIS and SAM 2 share.
@@ -73,7 +81,7 @@ def read_labels(path: Path) -> Int[np.ndarray, "H W"]:
         HoigsError: unreadable, of a format that loses values, or of colours from elsewhere.
     """
     if path.suffix.lower() == ".npy":
-        return np.load(path, allow_pickle=False).astype(np.int64)
+        return _npy(path).astype(np.int64)
     if path.suffix.lower() in LOSSY:
         raise HoigsError(f"{path}: compression blurs labels; they come as .png or .npy")
     with _open(path) as image:

@@ -1,6 +1,8 @@
-"""How the picture of the scene moves from frame to frame: a homography each, from matched blocks."""
+"""How the picture of the scene moves between frames: homographies, from matched blocks."""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,7 +27,7 @@ def is_static(footage: Footage, samples: int = 16) -> bool:
     """Whether the picture of the scene stays where it is, by blocks of frames across the video."""
     picks = np.unique(np.linspace(0, len(footage) - 1, samples).astype(int))
     moved = []
-    for a, b in zip(picks, picks[1:]):
+    for a, b in pairwise(picks):
         hidden = footage.person[a] | footage.person[b] | footage.blank[a] | footage.blank[b]
         at, shift, weight = _matches(_grey(footage, a), _grey(footage, b), hidden)
         if len(at):

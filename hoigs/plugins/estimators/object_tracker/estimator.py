@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -103,9 +103,7 @@ class ObjectTrackerEstimator(Estimator):
             if proposal is not None:
                 chosen[entity.name] = [proposal]
             tracks[entity.name] = (
-                tracked(footage, scene, masks, lambda x: progress(start + share * x, "object"))
-                if masks
-                else None
+                tracked(footage, scene, masks, _part(progress, start, share)) if masks else None
             )
         notes += _doubts(tracks, footage)
         _write(file, video, footage, tracks, chosen, notes)
@@ -163,6 +161,11 @@ class ObjectTrackerEstimator(Estimator):
         y, x = np.nonzero(found.soft > 0.5)
         box = tuple(round(float(v) * s) for v in (x.min(), y.min(), x.max() + 1, y.max() + 1))
         return [found], FramePrompt(native.frame, native.points, box)  # type: ignore[arg-type]
+
+
+def _part(progress: Progress, start: float, share: float) -> Callable[[float], None]:
+    """Progress of one object among several."""
+    return lambda done: progress(start + share * done, "object")
 
 
 def _person(video: VideoRequest) -> Sequence[Any] | None:

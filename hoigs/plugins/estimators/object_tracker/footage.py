@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -25,7 +25,6 @@ class Footage:
         lab: CIE L*a*b*, as uint8: L* times 2.55, a* and b* plus 128.
         person: pixels that the person's mask covers; all False where there is none.
         blank: pixels that show nothing, such as the black corners of a stabilised video.
-        read_native: position in `numbers` to RGB at the video's own size.
     """
 
     numbers: tuple[int, ...]
@@ -33,7 +32,6 @@ class Footage:
     lab: UInt8[np.ndarray, "F h w 3"]
     person: Bool[np.ndarray, "F h w"]
     blank: Bool[np.ndarray, "F h w"]
-    read_native: Callable[[int], UInt8[np.ndarray, "H W 3"]]
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -50,9 +48,6 @@ class Footage:
     def colors(self, i: int) -> Float[np.ndarray, "h w 3"]:
         """L*a*b* of one frame as float32, with lightness at half weight, as shadows change it."""
         return to_features(self.lab[i])
-
-    def without_person(self) -> Footage:
-        return replace(self, person=np.zeros_like(self.person))
 
 
 def to_features(lab: np.ndarray) -> Float[np.ndarray, "... 3"]:
@@ -91,9 +86,7 @@ def read_footage(
             covered[i] = _reduced(person[nearest].astype(np.uint8) * 255, size) > 127
         progress((i + 1) / len(numbers))
     blank &= _is_border(blank)
-    return Footage(
-        numbers, size[1] / video.width, lab, covered, blank, lambda i: video.frame(numbers[i])
-    )
+    return Footage(numbers, size[1] / video.width, lab, covered, blank)
 
 
 def lab_of(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

@@ -33,7 +33,8 @@ def object_odds(
     odds = colors.odds(bins_of(footage.colors(i)))
     odds = odds - 0.7 * footage.person[i]
     if scene is not None:
-        odds = odds + np.nan_to_num(np.tanh((scene.difference(i) - 4) / 3), nan=0.0)
+        changed = np.nan_to_num(np.tanh((scene.difference(i) - 4) / 3), nan=0.0)
+        odds = odds + np.maximum(changed, -0.3)  # a plain or resting thing may look unchanged
     odds[footage.blank[i]] = -6
     return odds
 
@@ -72,7 +73,7 @@ def _candidates(
     small = odds[::step, ::step]
     p = 1 / (1 + np.exp(-small))
     r = size / step
-    best, scale = None, None
+    best = None
     for factor in (0.75, 1.15):
         s = r * factor / 1.5
         inner = ndimage.gaussian_filter(p, s, mode="constant", truncate=2.5)
@@ -102,12 +103,12 @@ def _likeness(bins: np.ndarray, colors: ColorModel, place: np.ndarray, size: flo
 def _cheapest(frames: list, size: float, known: list[int]) -> Path:
     """Viterbi's path over candidates and absence; an absence keeps the place it began at."""
     # state: row of x, y of the last sighting, its age, whether it is seen now
-    spots, costs, back, aged = [], [], [], []
+    spots, costs, back = [], [], []
     for i, (places, unary) in enumerate(frames):
         here = [(p, 0) for p in places]
         if i == 0:
-            total = list(unary) + [ABSENT]
-            state = here + [(None, 1)]
+            total = [*unary, ABSENT]
+            state = [*here, (None, 1)]
             parent = [-1] * len(total)
         else:
             total, parent, state = [], [], []

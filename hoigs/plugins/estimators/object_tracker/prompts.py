@@ -61,10 +61,12 @@ def prompted_mask(
     if not tried:
         return PromptedMask(i, np.zeros(footage.shape, np.float32), 0.0, on_person)
     masks = [soft > 0.5 for _, soft in tried]
+    new = np.ones(len(masks)) if on_person else _novelty(masks, away, footage.diagonal)
     scores = [
         score * (0.4 + 0.6 * _steadiness(masks, k)) * _plausible(footage, i, masks[k], on_person)
         for k, (score, _) in enumerate(tried)
     ]
+    scores = [score * n for score, n in zip(scores, new)]
     best = int(np.argmax(scores))
     return PromptedMask(i, tried[best][1], scores[best], on_person)
 
@@ -75,6 +77,17 @@ def _steadiness(masks: list[np.ndarray], k: int) -> float:
     return max((overlap(masks[k], m) for m in near), default=1.0)
 
 
+def _novelty(masks: list[np.ndarray], away: np.ndarray, diagonal: float) -> np.ndarray:
+    """From 0.3 to 1: less for masks that take in more of the unchanged scene than others do."""
+    changed = np.nan_to_num(away, nan=0.0) > 4
+    # the inside of a plain thing that moves little looks unchanged: only its rim differs
+    filled = ndimage.binary_closing(changed, iterations=max(1, round(0.012 * diagonal)))
+    share = np.array([(filled & m).sum() / max(m.sum(), 1) for m in masks])
+    if share.max() < 0.3:
+        return np.ones(len(masks))
+    return 0.3 + 0.7 * np.minimum(1, share / (0.8 * share.max()))
+
+
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
     """Intersection over union; 1 where both are empty."""
     union = int((a | b).sum())
@@ -82,10 +95,11 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _plausible(footage: Footage, i: int, mask: np.ndarray, on_person: bool) -> float:
-    """Less for masks that spill onto the person though the prompt is not on one."""
-    if on_person:
-        return 1.0
-    return float(1 - (mask & footage.person[i]).sum() / max(mask.sum(), 1)) ** 2
+    """Less for huge masks, and those that spill onto the person though the prompt is not on one."""
+    fits = min(1.0, (0.1 * mask.size / max(mask.sum(), 1)) ** 0.5)
+    if on_person:  # the person's mask took the object in: a mask of the person is no object's
+        return fits * float(1 - (mask & footage.person[i]).sum() / footage.person[i].sum()) ** 2
+    return fits * float(1 - (mask & footage.person[i]).sum() / max(mask.sum(), 1)) ** 2
 
 
 def _scaled(prompt: FramePrompt, footage: Footage):
@@ -109,9 +123,11 @@ def _evidence(person: np.ndarray, away: np.ndarray, on_person: bool, at_rest: bo
 
     A thing that rests where it is clicked is part of the scene, which then says nothing of it.
     """
-    odds = np.where(person, -0.4 if on_person else -2.5, 0.0)
+    odds = np.where(person, -0.3 if on_person else -2.5, 0.0)
     if not at_rest:
-        odds = odds + np.nan_to_num(2.0 * np.tanh((away - 5) / 3), nan=0.0)
+        changed = np.nan_to_num(2.0 * np.tanh((away - 5) / 3), nan=0.0)
+        # on the person everything has changed, which says nothing of an object there
+        odds = odds + (np.minimum(changed, 0) if on_person else changed)
     return odds.astype(np.float32)
 
 

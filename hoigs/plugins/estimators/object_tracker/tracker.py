@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram
-from hoigs.plugins.estimators.object_tracker.footage import Footage
-from hoigs.plugins.estimators.object_tracker.path import Path, center_of, found_path, object_odds
+from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
+from hoigs.plugins.estimators.object_tracker.path import Path, center_of, found_path
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
 from hoigs.plugins.estimators.object_tracker.scene import Scene
 from hoigs.plugins.estimators.object_tracker.transfer import shift_of, transferred
@@ -50,6 +51,7 @@ def tracked(
     rests = at_rest(scene, known)
     used = None if rests else scene
     path = found_path(footage, used, colors, known, lambda x: progress(0.3 * x))
+    unchanged = 1.2 if stands_out(footage, used, path, known) else 0.1
     soft = np.zeros(footage.lab.shape[:3], np.uint8)
     confidence = np.zeros(len(footage))
     for p in prompts:
@@ -57,7 +59,8 @@ def tracked(
     walks = _walks(sorted(known), len(footage))
     done = 0
     for start, frames in walks:
-        walk = _Walk(footage, used, colors, path, next(p for p in prompts if p.frame == start))
+        first = next(p for p in prompts if p.frame == start)
+        walk = _Walk(footage, used, colors, path, first, unchanged)
         for i in frames:
             confidence[i], soft[i] = walk.step(i)
             done += 1
@@ -69,6 +72,26 @@ def at_rest(scene: Scene, known: dict[int, Bool[np.ndarray, "h w"]]) -> bool:
     """Whether the prompted object looks like a part of the scene in any prompted frame."""
     away = [np.nanmedian(np.append(scene.difference(i)[m], np.nan)) for i, m in known.items()]
     return not min(away) > 4
+
+
+def stands_out(
+    footage: Footage, scene: Scene | None, path: Path, known: dict[int, Bool[np.ndarray, "h w"]]
+) -> bool:
+    """Whether the object differs from the scene nearly everywhere on its path.
+
+    It does not where it rests so long that it became part of the scene, or where it is plain and
+    moves little before a moving camera.
+    """
+    if scene is None:
+        return False
+    half = max(1, int(0.5 * np.sqrt(np.mean([m.sum() for m in known.values()]) / np.pi)))
+    seen = np.flatnonzero(path.seen)
+    middle = []
+    for i in seen[:: max(1, len(seen) // 24)]:
+        x, y = (max(int(v), 0) for v in path.centers[i])
+        part = scene.difference(i)[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1]
+        middle.append(np.nanmedian(part) if np.isfinite(part).any() else np.nan)
+    return bool(np.nanpercentile([*middle, np.nan, 99.0], 15) > 3)
 
 
 def color_model(footage: Footage, masks: dict[int, Float[np.ndarray, "h w"]]) -> ColorModel:
@@ -84,7 +107,7 @@ def color_model(footage: Footage, masks: dict[int, Float[np.ndarray, "h w"]]) ->
 def _walks(known: list[int], count: int) -> list[tuple[int, range]]:
     """Frames to go through from each prompted one: to the ends, and half way to the next."""
     walks = [(known[0], range(known[0] - 1, -1, -1))]
-    for a, b in zip(known, known[1:]):
+    for a, b in pairwise(known):
         middle = (a + b) // 2
         walks += [(a, range(a + 1, middle + 1)), (b, range(b - 1, middle, -1))]
     return [*walks, (known[-1], range(known[-1] + 1, count))]
@@ -100,8 +123,10 @@ class _Walk:
         colors: ColorModel,
         path: Path,
         start: PromptedMask,
+        unchanged: float,
     ) -> None:
         self.footage, self.scene, self.colors, self.path = footage, scene, colors, path
+        self.unchanged = unchanged  # log-odds by which a pixel that shows the scene is not ours
         window = _window_of(start.soft > 0.5)
         self.first = self._sighting(start.frame, window, window.cut(start.soft))
         self.last = self.first
@@ -109,10 +134,11 @@ class _Walk:
         self.off = self.center - path.centers[start.frame]  # of windows from the path
         self.velocity = np.zeros(2)
         self.unseen = 0
-        self.area = float((start.soft > 0.5).sum())
+        mask = start.soft > 0.5
+        self.area = float(mask.sum())
 
     def _sighting(self, i: int, window: Window, soft: np.ndarray) -> Sighting:
-        return Sighting(window, window.cut(self.footage.colors(i)), soft)
+        return Sighting(window, self._colors(i, window), soft)
 
     def step(self, i: int) -> tuple[float, np.ndarray]:
         """Confidence and soft mask (uint8) of frame `i`, next to the one before."""
@@ -120,69 +146,82 @@ class _Walk:
         if not self.path.seen[i]:
             self.unseen += 1
             return 0.0, nothing
-        image = self.footage.colors(i)
-        odds = object_odds(self.footage, self.scene, self.colors, i)
-        window = self._aligned(i, image, odds)
-        soft, prior = self._segmented(i, window, image)
+        away = None if self.scene is None else self.scene.difference(i)
+        window = self._aligned(i, away)
+        soft, prior = self._segmented(i, window, away)
         mask = self._kept(soft > 0.5, prior, window.step)
         soft = np.where(ndimage.binary_dilation(mask, iterations=2), soft, 0)
-        confidence = self._confidence(mask, soft, window, image)
+        confidence = self._confidence(mask, soft, self._colors(i, window))
         if confidence < SURE:
             self.unseen += 1
             return confidence, nothing
         pasted = window.paste(soft, self.footage.shape)
-        self._remember(i, pasted, window)
+        self._remember(i, pasted, window, confidence)
         return confidence, pasted
 
-    def _aligned(self, i: int, image: np.ndarray, odds: np.ndarray) -> Window:
+    def _colors(self, i: int, window: Window) -> np.ndarray:
+        return to_features(window.cut(self.footage.lab[i]))
+
+    def _aligned(self, i: int, away: np.ndarray | None) -> Window:
         """The last sighting's window moved to where it fits best near the path."""
-        last = self.last
-        size = last.window.n * last.window.step
-        guesses = [self.path.centers[i] + self.off]
-        if self.unseen == 0:
-            guesses.append(self.center + self.velocity)
+        last, step = self.last, self.last.window.step
+        reach = self.path.centers[i] + self.off
+        guesses = [reach] if self.unseen else [reach, self.center + self.velocity]
         slack = max(4, int(0.22 * last.window.n))
+        n = last.window.n + 2 * slack
         best = None
-        for guess in guesses:
-            wide = Window.around(*guess, size / 2)
-            n = last.window.n + 2 * slack
-            wide = Window(
-                round(guess[0] - n * last.window.step / 2), round(guess[1] - n * last.window.step / 2),
-                n, last.window.step,
-            )  # fmt: skip
-            dx, dy, error = shift_of(
-                wide.cut(image), last.colors, last.soft, wide.cut(odds, -3), slack
-            )
-            x, y = wide.center
-            place = (x + dx * last.window.step, y + dy * last.window.step)
+        for x, y in guesses:
+            wide = Window(round(x - n * step / 2), round(y - n * step / 2), n, step)
+            colors = self._colors(i, wide)
+            odds = self._odds(i, wide, colors, away)
+            odds = np.where(wide.inside(self.footage.shape), odds, -3)
+            dx, dy, error = shift_of(colors, last.colors, last.soft, odds, slack)
+            place = np.array(wide.center) + np.array((dx, dy)) * step
             # a place far from the path is unlikely
-            far = np.hypot(*(np.array(place) - guesses[0])) / (size / 2)
-            error += 0.5 * far**2
+            error += 0.5 * (np.hypot(*(place - reach)) / (last.window.n * step / 2)) ** 2
             if best is None or error < best[0]:
                 best = (error, place)
         assert best is not None
         return last.window.at(*best[1])
 
     def _segmented(
-        self, i: int, window: Window, image: np.ndarray
+        self, i: int, window: Window, away: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Soft mask, and what other frames alone say of it."""
-        colors = window.cut(image)
+        colors = self._colors(i, window)
         known = [(self.last.colors, self.last.soft)]
         if self.first is not self.last and self.first.window.n == window.n:
             known.append((self.first.colors, self.first.soft))
         prior, similar = transferred(colors, known)
-        bins = bins_of(colors)
         valid = window.inside(self.footage.shape)
-        near = histogram(bins, (prior < 0.3) * valid * 1.0)
+        near = histogram(bins_of(colors), (prior < 0.3) * valid * 1.0)
         shape = np.log((prior + 0.03) / (1.03 - prior)) * (0.4 + 0.6 * similar)
-        odds = shape + 0.6 * self.colors.odds(bins, near)
-        odds -= 0.8 * window.cut(self.footage.person[i])
-        if self.scene is not None:
-            away = self.scene.difference(i)
-            odds += window.cut(np.nan_to_num(1.2 * np.tanh((away - 4) / 3), nan=0.0))
+        odds = shape + self._odds(i, window, colors, away, near, prior)
         odds = np.where(valid, odds, -9)
         return walked(odds, colors), prior
+
+    def _odds(
+        self,
+        i: int,
+        window: Window,
+        colors: np.ndarray,
+        away: np.ndarray | None,
+        near: np.ndarray | None = None,
+        prior: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Log-odds of a window's pixels by colour, person's mask and scene.
+
+        near: colours around the object in this frame. prior: where other frames put it.
+        """
+        odds = 0.6 * self.colors.odds(bins_of(colors), near)
+        person = window.cut(self.footage.person[i])
+        # a person's mask that takes in most of what is known to be the object says little
+        taken = 0.5 if prior is None else float((prior * person).sum() / max(prior.sum(), 1e-6))
+        odds -= 2.0 * max(0.0, 1 - 1.3 * taken) * person
+        if away is not None:
+            changed = np.nan_to_num(1.2 * np.tanh((away - 4) / 3), nan=0.0)
+            odds += window.cut(np.maximum(changed, -self.unchanged))
+        return odds
 
     def _kept(self, mask: np.ndarray, prior: np.ndarray, step: int) -> np.ndarray:
         """The part of a mask that the labels of other frames support, holes filled.
@@ -204,16 +243,17 @@ class _Walk:
         big[0] = True
         return kept | ((holes > 0) & ~big[holes])
 
-    def _confidence(self, mask, soft, window: Window, image: np.ndarray) -> float:
+    def _confidence(self, mask: np.ndarray, soft: np.ndarray, colors: np.ndarray) -> float:
+        """By colours like the object's, decided pixels, and a size like that before."""
         if mask.sum() < 6:
             return 0.0
-        seen = histogram(bins_of(window.cut(image)), mask * 1.0)
+        seen = histogram(bins_of(colors), mask * 1.0)
         decided = float(np.abs(2 * soft[mask] - 1).mean()) ** 0.5
-        area = float(mask.sum()) * window.step**2
+        area = float(mask.sum()) * self.last.window.step**2
         ratio = min(area, self.area) / max(area, self.area)
         return self.colors.likeness(seen) ** 0.5 * decided * min(1.0, 2.0 * ratio**0.5)
 
-    def _remember(self, i: int, pasted: np.ndarray, window: Window) -> None:
+    def _remember(self, i: int, pasted: np.ndarray, window: Window, confidence: float) -> None:
         mask = pasted > 127
         fresh = _window_of(mask) if mask.any() else window
         # the size changes slowly, so that windows of neighbouring frames can be compared
@@ -227,6 +267,9 @@ class _Walk:
         self.off = 0.7 * self.off + 0.3 * (center - self.path.centers[i])
         self.last = self._sighting(i, window, window.cut(pasted.astype(np.float32) / 255))
         self.area = 0.9 * self.area + 0.1 * float(mask.sum())
+        if confidence > 0.75:  # it turns, and other sides of it have other colours
+            seen = histogram(bins_of(self.last.colors), np.where(self.last.soft > 0.5, 1.0, 0.0))
+            self.colors = self.colors.blended(seen, 0.04)
 
 
 def _supported(mask: np.ndarray, prior: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-REACH, STRIDE, PATCH = 8, 2, 5  # cells that patches are searched in, their grid, their side
+REACH, STRIDE, PATCH = 6, 2, 5  # cells that patches are searched in, their grid, their side
 
 
 def transferred(
@@ -38,7 +38,11 @@ def transferred(
                 away = (padded[..., y : y + n, x : x + m] - here).pow(2).sum(1)
                 costs.append(away + 0.15 * (dy * dy + dx * dx))
                 labels.append(soft[0, :, y : y + n, x : x + m])
-    cost = F.avg_pool2d(torch.stack(costs, 1), PATCH, 1, PATCH // 2, count_include_pad=False)[0]
+    cost = torch.stack(costs, 1)
+    for size in ((PATCH, 1), (1, PATCH)):  # a square's mean, one axis after the other
+        half = tuple(side // 2 for side in size)
+        cost = F.avg_pool2d(cost, size, 1, half, count_include_pad=False)
+    cost = cost[0]
     label = torch.cat(labels)
     least = cost.min(0).values
     weight = torch.exp(-(cost - least) / softness)

@@ -1,4 +1,4 @@
-"""Square windows around the object, at a size of at most about 144 pixels a side."""
+"""Square windows around the object, at a size of at most about 120 pixels a side."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SIDE = 144
+SIDE = 120
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ import hashlib
 import math
 import os
 import tempfile
-import zipfile
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
@@ -25,6 +24,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.initializer import ObjectInitializer
 from hoigs.core.interfaces.rasterizer import Rasterizer
+from hoigs.core.npz import load_arrays
 from hoigs.core.values.clip import Clip, ObjectTrack
 from hoigs.plugins.initializers.alignment import AlignmentConfig, PlacingConfig, align, most_seen
 from hoigs.plugins.initializers.sds.diffusion import Denoiser
@@ -192,8 +192,8 @@ def _save(path: Path, points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"]
 
 def _load(path: Path) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            points, colors = (torch.from_numpy(file[k]).float() for k in ("points", "colors"))
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        file = load_arrays(path, ("points", "colors"))
+        points, colors = (torch.from_numpy(file[k]).float() for k in ("points", "colors"))
+    except (OSError, ValueError, KeyError) as error:
         raise HoigsError(f"{path} is damaged ({error}); delete it and run again") from error
     return points, colors

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.model.smpl_params import pose_from_smplh, same_betas
@@ -21,6 +20,7 @@ from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack, uni
 from hoigs.core.values.tokens import EntityKind
 from hoigs.plugins.readers.behave.calibration import Calibration, KinectPose, SequenceInfo
 from hoigs.plugins.readers.behave.fits import Fits, read_fits
+from hoigs.plugins.readers.common.config import ReaderConfig
 from hoigs.plugins.readers.common.frame_order import video_moments
 from hoigs.plugins.readers.common.json_file import parse_json
 from hoigs.plugins.readers.common.lazy_frames import DepthFiles, LazyFrames, MaskFiles
@@ -41,7 +41,7 @@ SPAN = (1.0, 6.0)  # metres from a Kinect, where a sequence has no depth
 GENDERS = {f"Sub{i:02d}": "male" if i < 6 else "female" for i in range(1, 9)}  # data/const.py
 
 
-class BehaveConfig(ComponentConfig):
+class BehaveConfig(ReaderConfig):
     """Settings of reader:behave."""
 
     kinect: int = Field(default=1, ge=0, le=3, description="the one that is trained on")
@@ -49,7 +49,6 @@ class BehaveConfig(ComponentConfig):
     masks: bool = Field(default=True, description="False reads frames without masks: scene only")
     points: int = Field(default=20_000, ge=1, description="scene points to start from")
     object_points: int = Field(default=5_000, ge=4, description="on the object's template")
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class BehaveReader(ClipReader):
@@ -59,9 +58,6 @@ class BehaveReader(ClipReader):
     smpl_fit_all.npz and object_fit_all.npz (30 fps) with the same frame_times. A frame without a
     registration is left out. The object is its simplified template about the mean of its vertices.
     Kinect 1's world is tilted against the floor: no axis is up.
-
-    Args:
-        kinect, held_out, masks, points, object_points, cache_mb: see BehaveConfig.
     """
 
     Config: ClassVar = BehaveConfig

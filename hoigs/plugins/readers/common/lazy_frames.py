@@ -13,7 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from hoigs.core.errors import ClipError
-from hoigs.core.npz import load_arrays
+from hoigs.core.npz import load_array, load_arrays
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import FrameStore
 from hoigs.core.values.lens import Lens
@@ -203,7 +203,7 @@ def _opened(path: Path) -> Image.Image:
     try:
         image = Image.open(path)
         image.load()
-    except (OSError, ValueError, SyntaxError) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ClipError(f"{path} cannot be decoded ({error}); write it again") from error
     return image
 
@@ -217,7 +217,7 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with Image.open(path) as image:
             return image.size
-    except (OSError, ValueError, SyntaxError) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ClipError(f"{path} is not a readable image ({error})") from error
 
 
@@ -244,7 +244,7 @@ def read_depth(path: Path) -> Array:
     """
     try:
         if path.suffix == ".npy":
-            values = np.load(path, allow_pickle=False)
+            values = load_array(path)
         elif path.suffix == ".npz":
             values = load_arrays(path)["depth"]
         else:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.errors import ClipError
+from hoigs.core.npz import load_array
 
 Points = tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]
 GREY = 0.5  # of points whose file has no colours
@@ -35,7 +36,7 @@ def read_points(path: Path) -> Points:
 
 
 def _npy(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    points = np.load(path, allow_pickle=False).astype(np.float64)
+    points = load_array(path).astype(np.float64)
     return points, np.full_like(points, GREY)
 
 

@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Float
 from pydantic import BaseModel, Field
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.model.smpl_params import moved_pose, pose_from_smplx
 from hoigs.core.values.clip import BodyTrack, Clip
+from hoigs.plugins.readers.common.config import VideoReaderConfig
 from hoigs.plugins.readers.common.frame_order import video_moments
 from hoigs.plugins.readers.common.json_file import load_json, parse_json
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, lens_for
@@ -51,7 +51,7 @@ class SmplxJson(BaseModel):
     trans: list[float] = Field(min_length=3, max_length=3)
 
 
-class ExavatarConfig(ComponentConfig):
+class ExavatarConfig(VideoReaderConfig):
     """Settings of reader:exavatar."""
 
     smplx: Path | None = Field(
@@ -63,8 +63,6 @@ class ExavatarConfig(ComponentConfig):
         le=300,
         description="shape coefficients kept; the spec's body has as many",
     )
-    fps: float = Field(default=30.0, gt=0, description="of the video; the layout has none")
-    cache_mb: int = Field(default=512, ge=0, description="decoded pixels kept in memory, MiB")
 
 
 class ExavatarReader(ClipReader):
@@ -74,9 +72,6 @@ class ExavatarReader(ClipReader):
     hands and stand in each frame's camera; the world's unit is the metre, as the fit has it.
     ExAvatar's joint, face and locator offsets, jaw, eyes and expression have no place in a
     BodyPose; its depth maps have no common scale and are not read.
-
-    Args:
-        smplx, num_betas, fps, cache_mb: see ExavatarConfig.
     """
 
     Config: ClassVar = ExavatarConfig
@@ -126,7 +121,6 @@ class ExavatarReader(ClipReader):
             moments=video_moments(indices, indices[-1] + 1, bodies),
             kinds={"human": "human"},
             bodies=bodies,
-            objects={},
             points=points,
             point_colors=colors,
             split={

@@ -125,13 +125,8 @@ def gather_partials(
 
 @wp.kernel
 def clear_partials(
-    tiles: int,
-    stride: int,
-    offsets: I32,
-    partials: F32,
-    base: int,
-    count: int,
-):
+    tiles: int, stride: int, offsets: I32, partials: F32, base: int, count: int,
+):  # fmt: skip
     """Zero the sums of each Gaussian, where all tiles share one list."""
     row = wp.tid() + base
     if row < count and offsets[tiles + 1] >= 0:

@@ -25,27 +25,16 @@ def forward_native(
 
 @wp.kernel(launch_bounds=BLOCK)
 def forward_pixels(
-    tiles: int,
-    tiles_x: int,
-    width: int,
-    height: int,
-    max_alpha: float,
-    log2_min_alpha: float,
+    tiles: int, tiles_x: int, width: int, height: int, max_alpha: float, log2_min_alpha: float,
     min_transmittance: float,  # negative: never stop
-    records: F32,
-    indices: I32,
-    offsets: I32,
+    records: F32, indices: I32, offsets: I32,
     features: F32,  # [N, channels]
     channels: int,
     background: F32,  # [3] with stride 0, or [H, W, 3] with stride 3
-    background_stride: int,
-    color: F32,
-    alpha: F32,
-    depth: F32,
+    background_stride: int, color: F32, alpha: F32, depth: F32,
     feature_image: F32,  # [H, W, channels]
-    base: int,
-    count: int,
-):
+    base: int, count: int,
+):  # fmt: skip
     thread = wp.tid() + base
     if thread < count:
         forward_native(
@@ -67,32 +56,13 @@ def backward_native(
 
 @wp.kernel(launch_bounds=BLOCK)
 def backward_pixels(
-    tiles: int,
-    tiles_x: int,
-    width: int,
-    height: int,
-    max_alpha: float,
-    log2_min_alpha: float,
-    min_transmittance: float,
-    records: F32,
-    indices: I32,
-    offsets: I32,
-    features: F32,
-    channels: int,
-    background: F32,
-    background_stride: int,
-    color: F32,
-    alpha: F32,
-    depth: F32,
-    feature_image: F32,
-    v_color: F32,
-    v_alpha: F32,
-    v_depth: F32,
-    v_feature_image: F32,
+    tiles: int, tiles_x: int, width: int, height: int, max_alpha: float, log2_min_alpha: float,
+    min_transmittance: float, records: F32, indices: I32, offsets: I32, features: F32,
+    channels: int, background: F32, background_stride: int, color: F32, alpha: F32, depth: F32,
+    feature_image: F32, v_color: F32, v_alpha: F32, v_depth: F32, v_feature_image: F32,
     partials: F32,  # [intersections, MOMENTS + channels]; on a CPU zero before
-    base: int,
-    count: int,
-):
+    base: int, count: int,
+):  # fmt: skip
     thread = wp.tid() + base
     if thread < count:
         backward_native(

@@ -101,20 +101,14 @@ def sort_by_depth(
 
 @wp.kernel
 def count_intersections(
-    records: F32,
-    order: I32,
-    tile_height: int,
-    tiles_x: int,
-    tiles_y: int,
-    width: int,
-    chunks: int,
+    records: F32, order: I32, tile_height: int, tiles_x: int, tiles_y: int, width: int, chunks: int,
     spans_before: I32,
     spans: I32,  # [spans, 3]: row of the Gaussian, first tile, number of tiles
     span_counts: I32,  # [chunks]
     tile_counts: I32,  # [chunks, tiles], zero
     tiles_per_gaussian: I32,  # [N], zero
     counters: I32,
-):
+):  # fmt: skip
     """Find the tiles that splats touch; count them by chunk of the depth order and by tile."""
     visible = counters[N_VISIBLE_C]
     chunk = next_work_item(counters, COUNT_WORK)
@@ -177,16 +171,11 @@ def place_intersections(
 
 @wp.kernel
 def scatter_intersections(
-    tiles: int,
-    chunks: int,
-    spans_before: I32,
-    spans: I32,
-    span_counts: I32,
-    places: I32,
+    tiles: int, chunks: int, spans_before: I32, spans: I32, span_counts: I32, places: I32,
     first_partial: I32,
     indices: I32,  # [intersections, 2]: Gaussian, partial
     counters: I32,
-):
+):  # fmt: skip
     """Write `indices`. Chunks follow the depth order, so the intersections of each tile do too."""
     chunk = next_work_item(counters, SCATTER_WORK)
     while chunk < chunks:
@@ -220,27 +209,16 @@ def forward_native(
 
 @wp.kernel
 def forward_tiles(
-    counters: I32,
-    tile_height: int,
-    tiles: int,
-    tiles_x: int,
-    width: int,
-    height: int,
-    max_alpha: float,
-    log2_min_alpha: float,
+    counters: I32, tile_height: int, tiles: int, tiles_x: int, width: int, height: int,
+    max_alpha: float, log2_min_alpha: float,
     min_transmittance: float,  # negative: never stop
-    records: F32,
-    indices: I32,
-    offsets: I32,
+    records: F32, indices: I32, offsets: I32,
     features: F32,  # [N, channels]
     channels: int,
     background: F32,  # [3] with stride 0, or [H, W, 3] with stride 3
-    background_stride: int,
-    color: F32,
-    alpha: F32,
-    depth: F32,
+    background_stride: int, color: F32, alpha: F32, depth: F32,
     feature_image: F32,  # [H, W, channels]
-):
+):  # fmt: skip
     forward_native(
         counters, TILE_WORK, tile_height, tiles, tiles_x, width, height, max_alpha, log2_min_alpha,
         min_transmittance, records, indices, offsets, features, channels, background,
@@ -260,32 +238,13 @@ def backward_native(
 
 @wp.kernel
 def backward_tiles(
-    counters: I32,
-    tile_height: int,
-    tiles: int,
-    tiles_x: int,
-    width: int,
-    height: int,
-    max_alpha: float,
-    log2_min_alpha: float,
-    min_transmittance: float,
-    records: F32,
-    indices: I32,
-    offsets: I32,
-    features: F32,
-    channels: int,
-    background: F32,
-    background_stride: int,
-    color: F32,
-    alpha: F32,
-    depth: F32,
-    feature_image: F32,
-    v_color: F32,
-    v_alpha: F32,
-    v_depth: F32,
+    counters: I32, tile_height: int, tiles: int, tiles_x: int, width: int, height: int,
+    max_alpha: float, log2_min_alpha: float, min_transmittance: float, records: F32, indices: I32,
+    offsets: I32, features: F32, channels: int, background: F32, background_stride: int, color: F32,
+    alpha: F32, depth: F32, feature_image: F32, v_color: F32, v_alpha: F32, v_depth: F32,
     v_feature_image: F32,
     partials: F32,  # [intersections, MOMENTS + channels], zero
-):
+):  # fmt: skip
     backward_native(
         counters, TILE_WORK, tile_height, tiles, tiles_x, width, height, max_alpha, log2_min_alpha,
         min_transmittance, records, indices, offsets, features, channels, background,

@@ -89,21 +89,14 @@ def place_native(
 
 @wp.kernel(launch_bounds=count_place_source.BLOCK)
 def place_intersections(
-    records: F32,
-    drawn_depths: F32,
-    count: int,
-    tile_height: int,
-    tiles_x: int,
-    tiles_y: int,
+    records: F32, drawn_depths: F32, count: int, tile_height: int, tiles_x: int, tiles_y: int,
     width: int,
     counts: I32,  # becomes zero
     first_partial: I32,  # becomes the index in `partials` of each Gaussian's first
-    tiles_per_gaussian: I32,
-    sums: I32,
-    offsets: I32,
+    tiles_per_gaussian: I32, sums: I32, offsets: I32,
     keys: I64,  # bits of the depth in the high half, partial in the low
     owners: I32,  # the Gaussian of each partial
-):
+):  # fmt: skip
     place_native(
         wp.tid(), records, drawn_depths, count, tile_height, tiles_x, tiles_y, width, counts,
         first_partial, tiles_per_gaussian, sums, offsets, keys, owners,
@@ -119,10 +112,7 @@ def sort_native(
 @wp.kernel(launch_bounds=(plan_sort_source.SORT_BLOCK, 3))
 def sort_intersections(
     blocks: int,  # of the launch
-    tiles: int,
-    offsets: I32,
-    keys: I64,
-    owners: I32,
+    tiles: int, offsets: I32, keys: I64, owners: I32,
     indices: I32,  # [capacity, 2]: Gaussian, partial
-):
+):  # fmt: skip
     sort_native(wp.tid() // SORT_BLOCK, blocks, tiles, offsets, keys, owners, indices)

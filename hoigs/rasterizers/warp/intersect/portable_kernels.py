@@ -15,16 +15,12 @@ NO_TILE = wp.constant(wp.int64(2**62))
 
 @wp.kernel
 def count_tiles(
-    records: F32,
-    drawn_depths: F32,
+    records: F32, drawn_depths: F32,
     tile_height: int,  # pixels of a tile's height
-    tiles_x: int,
-    tiles_y: int,
-    width: int,
+    tiles_x: int, tiles_y: int, width: int,
     tiles_per_gaussian: I32,  # [N] how many tiles a Gaussian touches
-    base: int,
-    count: int,
-):
+    base: int, count: int,
+):  # fmt: skip
     row = wp.tid() + base
     if row >= count:
         return
@@ -40,19 +36,13 @@ def count_tiles(
 
 @wp.kernel
 def write_keys(
-    records: F32,
-    drawn_depths: F32,
-    tile_height: int,
-    tiles_x: int,
-    tiles_y: int,
-    width: int,
+    records: F32, drawn_depths: F32, tile_height: int, tiles_x: int, tiles_y: int, width: int,
     first_partial: I32,  # [N] index in `partials` of a Gaussian's first
     tiles_per_gaussian: I32,
     keys: I64,  # [M] tile in the high half, bits of the depth in the low
     owners: I32,  # [M] the Gaussian of each partial
-    base: int,
-    count: int,
-):
+    base: int, count: int,
+):  # fmt: skip
     row = wp.tid() + base
     if row >= count:
         return
@@ -80,13 +70,10 @@ def write_keys(
 def write_offsets(
     keys: I64,  # sorted
     order: I64,  # where each was before sorting
-    owners: I32,
-    tiles: int,
-    indices: I32,
+    owners: I32, tiles: int, indices: I32,
     offsets: I32,  # [tiles + 1]
-    base: int,
-    count: int,
-):
+    base: int, count: int,
+):  # fmt: skip
     k = wp.tid() + base
     if k >= count:
         return

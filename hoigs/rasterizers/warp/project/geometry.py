@@ -111,16 +111,9 @@ def quat_adjoint(quat: wp.vec4, v: wp.mat33) -> wp.vec4:
 
 @wp.func
 def onto_screen(
-    mean: wp.vec3,
-    quat: wp.vec4,
-    scale: wp.vec3,
-    offset: wp.vec2,
-    K: F32,
-    world_to_camera: F32,
-    width: int,
-    height: int,
-    low_pass: float,
-) -> Screen:
+    mean: wp.vec3, quat: wp.vec4, scale: wp.vec3, offset: wp.vec2, K: F32, world_to_camera: F32,
+    width: int, height: int, low_pass: float,
+) -> Screen:  # fmt: skip
     s = Screen()
     rotation = pose_rotation(world_to_camera)
     s.cam = rotation * mean + pose_translation(world_to_camera)
@@ -186,18 +179,9 @@ def is_regular(s: Screen, quat: wp.vec4, scale: wp.vec3, near: float) -> bool:
 
 @wp.func
 def onto_screen_adjoint(
-    s: Screen,
-    quat: wp.vec4,
-    scale: wp.vec3,
-    mean: wp.vec3,
-    K: F32,
-    world_to_camera: F32,
-    v_u: float,
-    v_v: float,
-    v_depth: float,
-    v_m0: wp.vec3,
-    v_m1: wp.vec3,
-) -> Raw:
+    s: Screen, quat: wp.vec4, scale: wp.vec3, mean: wp.vec3, K: F32, world_to_camera: F32,
+    v_u: float, v_v: float, v_depth: float, v_m0: wp.vec3, v_m1: wp.vec3,
+) -> Raw:  # fmt: skip
     """Gradients of the raw geometry, given those of the centre, the depth and the rows m0, m1."""
     fx = K[0]
     fy = K[4]

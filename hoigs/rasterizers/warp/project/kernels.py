@@ -61,19 +61,10 @@ def camera_center(world_to_camera: F32) -> wp.vec3:
 
 @wp.func
 def row_is_finite(
-    row: int,
-    mean: wp.vec3,
-    quat: wp.vec4,
-    log_scale: wp.vec3,
-    logit: float,
-    sh: VEC3,
-    stored_bases: int,
-    active_bases: int,
-    color: wp.vec3,
-    features: F32,
-    channels: int,
+    row: int, mean: wp.vec3, quat: wp.vec4, log_scale: wp.vec3, logit: float, sh: VEC3,
+    stored_bases: int, active_bases: int, color: wp.vec3, features: F32, channels: int,
     offset: wp.vec2,
-) -> bool:
+) -> bool:  # fmt: skip
     # 0 * value is 0 for every finite value and NaN for all others; one test at the end
     zero = (
         0.0 * (mean[0] + mean[1] * 0.0 + mean[2] * 0.0)
@@ -101,35 +92,20 @@ def log2_sigmoid(logit: float) -> float:
 
 @wp.kernel
 def project(
-    means: VEC3,
-    quats: VEC4,
-    log_scales: VEC3,
-    opacity_logits: F32,
-    sh: VEC3,
+    means: VEC3, quats: VEC4, log_scales: VEC3, opacity_logits: F32, sh: VEC3,
     stored_bases: int,  # active_bases in sh
     active_bases: int,  # active_bases to use
-    features: F32,
-    channels: int,
+    features: F32, channels: int,
     offsets: F32,  # empty where none are given
     has_offsets: int,
     subset: U8,  # empty when all are drawn
-    has_subset: int,
-    K: F32,
-    world_to_camera: F32,
-    width: int,
-    height: int,
-    near: float,
-    low_pass: float,
-    min_alpha: float,
+    has_subset: int, K: F32, world_to_camera: F32, width: int, height: int, near: float,
+    low_pass: float, min_alpha: float,
     smallest_alpha: float,  # min_alpha, but not 0
-    records: F32,
-    means2d: F32,
-    depths: F32,
+    records: F32, means2d: F32, depths: F32,
     drawn_depths: F32,  # negative where nothing is drawn
-    radii: F32,
-    base: int,
-    count: int,
-):
+    radii: F32, base: int, count: int,
+):  # fmt: skip
     row = wp.tid() + base
     if row >= count:
         return
@@ -218,37 +194,16 @@ def project(
 
 @wp.kernel
 def project_adjoint(
-    means: VEC3,
-    quats: VEC4,
-    log_scales: VEC3,
-    opacity_logits: F32,
-    sh: VEC3,
-    stored_bases: int,
-    active_bases: int,
-    channels: int,
-    offsets: F32,
-    has_offsets: int,
-    K: F32,
-    world_to_camera: F32,
-    width: int,
-    height: int,
-    low_pass: float,
-    records: F32,
+    means: VEC3, quats: VEC4, log_scales: VEC3, opacity_logits: F32, sh: VEC3, stored_bases: int,
+    active_bases: int, channels: int, offsets: F32, has_offsets: int, K: F32, world_to_camera: F32,
+    width: int, height: int, low_pass: float, records: F32,
     first_partial: I32,  # index in `partials` of a Gaussian's first
     partial_counts: I32,  # how many it has
-    partials: F32,
-    v_means: VEC3,
-    v_quats: VEC4,
-    v_log_scales: VEC3,
-    v_opacity_logits: F32,
-    v_sh: VEC3,
-    v_offsets: F32,
-    v_features: F32,
+    partials: F32, v_means: VEC3, v_quats: VEC4, v_log_scales: VEC3, v_opacity_logits: F32,
+    v_sh: VEC3, v_offsets: F32, v_features: F32,
     v_pose: F32,  # empty when the pose needs no gradient
-    has_pose: int,
-    base: int,
-    count: int,
-):
+    has_pose: int, base: int, count: int,
+):  # fmt: skip
     row = wp.tid() + base
     if row >= count:
         return

@@ -117,14 +117,9 @@ def sh_color(
 
 @wp.func
 def sh_color_adjoint(
-    sh: VEC3,
-    row: int,
-    stored_bases: int,
-    active_bases: int,
-    direction: wp.vec3,
-    v_color: wp.vec3,
+    sh: VEC3, row: int, stored_bases: int, active_bases: int, direction: wp.vec3, v_color: wp.vec3,
     v_sh: VEC3,
-) -> wp.vec3:
+) -> wp.vec3:  # fmt: skip
     """Write the gradient of the coefficients; return that of the unit direction."""
     first = row * stored_bases
     basis = sh_basis(direction, active_bases)

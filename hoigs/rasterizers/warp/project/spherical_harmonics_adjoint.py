@@ -73,18 +73,15 @@ def harmonics_adjoint(
     sh: F32,  # [N, stored_bases, 3]
     stored_bases: int,
     active_bases: int,  # more than 1
-    world_to_camera: F32,
-    records: F32,
+    world_to_camera: F32, records: F32,
     first_partial: I32,  # index in `partials` of the sums of a Gaussian
     drawn: I32,  # 1 where a Gaussian has partials, else 0
-    partials: F32,
-    stride: int,
-    v_sh: F32,
+    partials: F32, stride: int, v_sh: F32,
     v_means: VEC3,  # the part that goes through the viewing direction is added
     v_pose: F32,  # its camera centre is written
     has_pose: int,
     count: int,  # N; the launch is rounded up to whole blocks
-):
+):  # fmt: skip
     row = wp.tid()
     buffer = row_buffer()
     load_rows(sh, buffer, row, count, 3 * stored_bases)

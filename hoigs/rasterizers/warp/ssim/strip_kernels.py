@@ -20,23 +20,19 @@ def similarity_native(
 @wp.kernel
 def similarity_strips(
     counters: I32,  # [1], zero: the next work item, for workers that make this same call
-    batch: int,
-    height: int,
-    width: int,
+    batch: int, height: int, width: int,
     channels: int,  # at most strip_source.MAX_CHANNELS
     strips: int,  # of one line of width * channels floats
     strip_width: int,  # floats, a multiple of 16, at most strip_source.STRIP
-    bands: int,
-    band_lines: int,
+    bands: int, band_lines: int,
     image: F32,  # [batch, height, width, channels]
     target: F32,
     scale: float,  # of the gradient
-    with_map: int,
-    with_gradient: int,
+    with_map: int, with_gradient: int,
     sums: F32,  # [batch, height, strips] of SSIM
     map: F32,  # [batch, height, width, channels], or empty
     gradient: F32,  # likewise: of the sum of SSIM to the image, times scale
-):
+):  # fmt: skip
     similarity_native(
         counters, batch, height, width, channels, strips, strip_width, bands, band_lines, image,
         target, scale, with_map, with_gradient, sums, map, gradient,

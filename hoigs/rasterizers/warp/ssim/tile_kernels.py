@@ -23,18 +23,13 @@ def forward_native(
 
 @wp.kernel(launch_bounds=BLOCK)
 def forward_tiles(
-    batch: int,
-    height: int,
-    width: int,
-    channels: int,
+    batch: int, height: int, width: int, channels: int,
     image: F32,  # [batch, height, width, channels]
-    target: F32,
-    with_map: int,
-    with_gradient: int,
+    target: F32, with_map: int, with_gradient: int,
     sums: F32,  # [tiles] of SSIM
     map: F32,  # [batch, height, width, channels], or empty
     kept: F32,  # [3, batch, channels, height, width], or empty: to blur
-):
+):  # fmt: skip
     forward_native(
         wp.tid(), batch, height, width, channels, image, target, with_map, with_gradient, sums,
         map, kept,
@@ -50,16 +45,10 @@ def backward_native(
 
 @wp.kernel(launch_bounds=BLOCK)
 def backward_tiles(
-    batch: int,
-    height: int,
-    width: int,
-    channels: int,
-    image: F32,
-    target: F32,
-    kept: F32,
+    batch: int, height: int, width: int, channels: int, image: F32, target: F32, kept: F32,
     upstream: F32,  # [1] gradient of the mean
     gradient: F32,  # [batch, height, width, channels]
-):
+):  # fmt: skip
     backward_native(
         wp.tid(), batch, height, width, channels, image, target, kept, upstream, gradient
     )

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from hoigs.core.whole_files import write_whole
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.studies.stress.capability import MEANING as HAS
 from hoigs.studies.stress.case import Case
@@ -21,6 +22,7 @@ MARKS = {"pass": "✓", "fail": "✗", "nature": "◐", "not applicable": "–",
 
 def write_stress(table: Table, out: Path) -> list[Path]:
     """All files, each whole or not at all; curves only if a sweep has run."""
+    from hoigs.studies.plotting.files import figure_files
     from hoigs.studies.stress.report.draw_curves import breakdown
     from hoigs.studies.stress.report.draw_matrix import matrix
 
@@ -34,24 +36,10 @@ def write_stress(table: Table, out: Path) -> list[Path]:
              "stress-curves": breakdown(table, "How hard until it breaks")}  # fmt: skip
     for name, figure in drawn.items():
         if figure is not None:
-            files[f"{name}.png"] = _saved(figure, "png", {"Software": None})
-            files[f"{name}.svg"] = _saved(figure, "svg", {"Date": None, "Creator": None})
+            files |= figure_files(name, figure)
     for name, content in files.items():
-        temporary = out / f".{name}.part"
-        temporary.write_bytes(content)
-        temporary.replace(out / name)
+        write_whole(out / name, content)
     return [out / name for name in files]
-
-
-def _saved(figure: Any, kind: str, metadata: dict[str, None]) -> bytes:
-    import matplotlib
-
-    from hoigs.studies.plotting.style import STYLE
-
-    buffer = io.BytesIO()
-    with matplotlib.rc_context(STYLE):
-        figure.savefig(buffer, format=kind, metadata=metadata)
-    return buffer.getvalue()
 
 
 def as_json(table: Table) -> str:

@@ -1,0 +1,116 @@
+"""Video files: frames in, mp4, webm, mov or gif out, whole or not at all."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from hoigs.core.errors import HoigsError
+
+SUFFIXES = (".mp4", ".webm", ".mov", ".gif")
+WITH_ALPHA = (".webm", ".mov", ".gif")
+FORMATS = {".mp4": "mp4", ".webm": "webm", ".mov": "mov"}
+# encoder, pixel format of RGB, pixel format of RGBA, options
+ENCODERS: dict[str, tuple[str, str, str, dict[str, str]]] = {
+    ".mp4": ("libx264", "yuv420p", "", {"crf": "18", "preset": "medium"}),
+    ".webm": (
+        "libvpx-vp9", "yuv420p", "yuva420p",
+        {"crf": "24", "b:v": "0", "auto-alt-ref": "0", "cpu-used": "4", "row-mt": "0"},
+    ),
+    ".mov": ("prores_ks", "yuv444p10le", "yuva444p10le", {"profile": "4444", "vendor": "apl0"}),
+}  # fmt: skip
+
+
+def write_video(
+    path: Path | str, frames: Iterable[UInt8[np.ndarray, "H W C"]], *, fps: float = 30.0
+) -> Path:
+    """Encode RGB or RGBA frames, under a temporary name until complete.
+
+    mp4 is H.264, webm VP9, mov ProRes 4444 and gif as it is; all but mp4 hold alpha (straight).
+    Odd sizes lose their last row or column, as the formats need even ones, except in gif.
+
+    Raises:
+        ValueError: there are no frames, or their sizes differ.
+        HoigsError: another suffix, or frames with alpha for an mp4.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind not in SUFFIXES:
+        raise HoigsError(f"{path}: videos end with {', '.join(SUFFIXES)}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.part")
+    checked = _checked(frames, even=kind != ".gif")
+    try:
+        first = next(checked, None)
+        if first is None:
+            raise ValueError("a video needs at least one frame")
+        if first.shape[2] == 4 and kind not in WITH_ALPHA:
+            raise HoigsError(f"{path}: {kind} holds no alpha; write {', '.join(WITH_ALPHA)}")
+        (_write_gif if kind == ".gif" else _encode)(
+            temporary, kind, itertools.chain((first,), checked), first, fps
+        )
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def _checked(frames: Iterable[np.ndarray], *, even: bool) -> Iterator[np.ndarray]:
+    """Frames of one size, cut to even sides."""
+    size = None
+    for i, frame in enumerate(frames):
+        if even:
+            frame = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
+        size = size or frame.shape
+        if frame.shape != size:
+            raise ValueError(
+                f"frame {i} is {frame.shape[1]}x{frame.shape[0]}, the first was {size[1]}x{size[0]}"
+            )
+        yield np.ascontiguousarray(frame)
+
+
+def _encode(
+    path: Path, kind: str, frames: Iterator[np.ndarray], first: np.ndarray, fps: float
+) -> None:
+    import av
+
+    name, rgb, rgba, options = ENCODERS[kind]
+    alpha = first.shape[2] == 4
+    # without a date and a version in the file, the same frames give the same bytes
+    flags = {"fflags": "+bitexact"}
+    with av.open(str(path), "w", format=FORMATS[kind], options=flags) as container:
+        stream: Any = container.add_stream(name, rate=Fraction(fps).limit_denominator(1001))
+        stream.pix_fmt, stream.options = (rgba if alpha else rgb), options
+        stream.height, stream.width = first.shape[:2]
+        if kind != ".mp4":  # these encoders' bytes depend on the number of threads
+            stream.codec_context.thread_count = 1
+        for frame in frames:
+            image = av.VideoFrame.from_ndarray(frame, format="rgba" if alpha else "rgb24")
+            container.mux(stream.encode(image))
+        container.mux(stream.encode())
+
+
+def _write_gif(
+    path: Path, kind: str, frames: Iterator[np.ndarray], first: np.ndarray, fps: float
+) -> None:
+    """One palette for all frames, from the first one and a few that follow, dithered."""
+    from PIL import Image
+
+    del kind
+    images = [Image.fromarray(frame) for frame in frames]
+    duration = max(20, round(100 / fps) * 10)  # gif counts hundredths; browsers slow shorter ones
+    if first.shape[2] == 3:
+        some = images[:: max(1, len(images) // 6)]
+        sheet = Image.fromarray(np.concatenate([np.asarray(i) for i in some]))
+        palette = sheet.quantize(255, dither=Image.Dither.NONE)
+        images = [i.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for i in images]
+    images[0].save(
+        path, format="GIF", save_all=True, append_images=images[1:], duration=duration, loop=0,
+        optimize=False, disposal=2 if first.shape[2] == 4 else 1,
+    )  # fmt: skip

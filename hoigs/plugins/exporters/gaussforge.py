@@ -1,0 +1,130 @@
+"""exporter:spz, splat, sog and compressed-ply: smaller files of one moment, by GaussForge."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import ClassVar
+
+import gaussforge
+import torch
+
+from hoigs.core.config import ComponentConfig
+from hoigs.core.errors import HoigsError
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.model.exporter import Exporter, ExportRequest
+from hoigs.core.progress import Progress
+from hoigs.core.values.between import camera_between, frame_of
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.plugins.exporters.common.ply_file import parse_ply, ply_bytes
+
+
+class GaussForgeConfig(ComponentConfig):
+    """These exporters have no settings."""
+
+
+class GaussForgeExporter(Exporter):
+    """One file that GaussForge makes of the PLY; it is read back and compared with it."""
+
+    Config: ClassVar[type[ComponentConfig]] = GaussForgeConfig
+    moving: ClassVar = False
+    file_format: ClassVar[str]  # GaussForge's name
+    keeps: ClassVar = {"Gaussians": "quantised; the loss is under `lost`"}
+
+    def __init__(self, config: GaussForgeConfig | None = None) -> None:
+        self.config = config or GaussForgeConfig()
+
+    def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
+        """See `Exporter.write`."""
+        progress(0.0, "gaussians")
+        ours = request.scene(request.moments[0], request.entities).joined()
+        data, read = self.packed(ours)
+        progress(0.5, "comparing")
+        (folder / f"scene{self.suffixes[0]}").write_bytes(data)
+        if len(read) != len(ours):
+            lost = {"Gaussians": f"{len(ours) - len(read)} of {len(ours)} are left out"}
+        else:
+            lost = {}
+        lost["precision"] = picture_loss(request, ours, read)
+        if read.sh_degree < ours.sh_degree:
+            lost["view-dependent colour"] = f"SH of degree {read.sh_degree} of {ours.sh_degree}"
+        if len(request.moments) > 1:
+            lost["motion"] = "the file holds one moment, the first; ply-sequence holds all"
+        return lost
+
+    def packed(self, gaussians: Gaussians) -> tuple[bytes, Gaussians]:
+        """The file, and the Gaussians that GaussForge reads back from it."""
+        data = converted(ply_bytes(gaussians), "ply", self.file_format)
+        return data, parse_ply(converted(data, self.file_format, "ply"), self.file_format)
+
+
+class SpzExporter(GaussForgeExporter):
+    """`scene.spz`, Niantic's."""
+
+    suffixes: ClassVar = (".spz",)
+    file_format = "spz"
+
+
+class SplatExporter(GaussForgeExporter):
+    """`scene.splat`, that of the first web viewers: 32 bytes a Gaussian, no SH."""
+
+    suffixes: ClassVar = (".splat",)
+    file_format = "splat"
+
+
+class SogExporter(GaussForgeExporter):
+    """`scene.sog`, PlayCanvas's."""
+
+    suffixes: ClassVar = (".sog",)
+    file_format = "sog"
+
+
+class CompressedPlyExporter(GaussForgeExporter):
+    """`scene.compressed.ply`, PlayCanvas's and SuperSplat's."""
+
+    suffixes: ClassVar = (".compressed.ply",)
+    file_format = "compressed.ply"
+
+    def packed(self, gaussians: Gaussians) -> tuple[bytes, Gaussians]:
+        """As above; SH are written in the order in which they are read.
+
+        GaussForge 0.6 writes them coefficient by coefficient and reads them, as PlayCanvas does,
+        channel by channel.
+        """
+        plain = super().packed(gaussians)
+        rest = gaussians.sh[:, 1:]
+        if rest.shape[1] == 0:
+            return plain
+        swapped = rest.mT.reshape(rest.shape)
+        other = super().packed(gaussians.replace(sh=torch.cat((gaussians.sh[:, :1], swapped), 1)))
+        # rows may be in another order than ours, so the sums of what was read are compared
+        total = rest.detach().cpu().double().sum(0)
+        errors = [float((r.sh[:, 1:].double().sum(0) - total).norm()) for _, r in (plain, other)]
+        return plain if errors[0] <= errors[1] else other
+
+
+def converted(data: bytes, source: str, target: str) -> bytes:
+    """A file in another format.
+
+    Raises:
+        HoigsError: GaussForge cannot convert it.
+    """
+    answer = gaussforge.GaussForge().convert(data, source, target)
+    if "data" not in answer:
+        raise HoigsError(f"GaussForge cannot write {target}: {answer.get('error', 'no reason')}")
+    made: bytes = answer["data"]
+    return made
+
+
+@torch.no_grad()
+def picture_loss(request: ExportRequest, ours: Gaussians, read: Gaussians) -> str:
+    """PSNR in dB between the pictures of two sets, from the camera of the video."""
+    frame = frame_of(request.clip, request.moments[0])
+    camera = camera_between(request.clip, frame).to(ours.means.device)
+    draw = request.scene.rasterizer.render
+    pictures = [draw(g.to(ours.means.device), camera, RenderRequest()).color for g in (ours, read)]
+    error = float((pictures[0] - pictures[1]).square().mean())
+    if error == 0:
+        return "none that shows from the camera of the video"
+    return f"drawn from the camera of the video: {-10 * math.log10(error):.1f} dB (PSNR) to ours"

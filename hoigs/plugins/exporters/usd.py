@@ -1,0 +1,254 @@
+"""exporter:usd: Gaussians, people, objects and the camera over time in one OpenUSD stage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from pxr import Gf, Tf, Usd, UsdGeom, UsdSkel, UsdVol, Vt
+from torch import Tensor
+
+from hoigs.core.config import ComponentConfig
+from hoigs.core.maths.rotations import axis_angle_to_quats
+from hoigs.core.model.exporter import Exporter, ExportRequest
+from hoigs.core.progress import Progress
+from hoigs.core.values.between import camera_between, frame_of
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.plugins.exporters.common.bodies import BodyMotion, body_motion
+from hoigs.plugins.exporters.common.objects import ObjectMotion, object_motions
+from hoigs.plugins.exporters.common.world import AXES, turned_gaussians, world_turn
+
+INFLUENCES = 8  # joints that may move a vertex
+FILM = 36.0  # width of the camera's aperture, millimetres
+
+
+class UsdConfig(ComponentConfig):
+    """Settings of `exporter:usd`."""
+
+    splats: bool = True
+    """Gaussians, a ParticleField3DGaussianSplat for each entity"""
+    skeletons: bool = True
+    """people as UsdSkel, invisible where there are splats"""
+
+
+class UsdExporter(Exporter):
+    """`scene.usd`: `/World/splats`, `/World/people`, `/World/objects` and `/World/camera`.
+
+    Attributes that change have a time sample a moment; the others have one value.
+    """
+
+    Config: ClassVar[type[ComponentConfig]] = UsdConfig
+    suffixes: ClassVar = (".usd", ".usdc")
+    axes = AXES["y"]
+    keeps: ClassVar = {
+        "Gaussians": "ParticleField3DGaussianSplat, float32, all SH bands, time samples",
+        "people": "UsdSkel: skeleton, animation and skinned mesh",
+        "objects": "an Xform that moves, with the centres of the visible Gaussians as points",
+        "camera": "of the video, with time samples",
+    }
+
+    def __init__(self, config: UsdConfig | None = None) -> None:
+        self.config = config or UsdConfig()
+
+    def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
+        """See `Exporter.write`."""
+        turn = world_turn(request.clip, "y")
+        stage = _stage(request)
+        lost: dict[str, str] = {}
+        if self.config.splats:
+            _add_splats(stage, request, turn, progress)
+        for name in request.of_kind("human") if self.config.skeletons else ():
+            progress(0.7, name)
+            if name in request.bodies:
+                motion = body_motion(request, name).turned(turn)
+                _add_person(stage, motion, hidden=self.config.splats)
+            else:
+                lost[f"skeleton of {name}"] = "it has no body model"
+        progress(0.8, "objects and camera")
+        for motion in object_motions(request):
+            _add_object(stage, motion, turn, hidden=self.config.splats)
+            if motion.residual > 1e-4:
+                lost[f"deformation of the points of {motion.name}"] = (
+                    f"the Xform is rigid, {1000 * motion.residual:.2f} mm (RMS) from the Gaussians"
+                )
+        frames = [frame_of(request.clip, moment) for moment in request.moments]
+        _add_camera(stage, [camera_between(request.clip, f).to("cpu") for f in frames], turn)
+        progress(0.9, "writing")
+        stage.GetRootLayer().Export(str(folder / "scene.usd"))
+        return lost
+
+
+def _stage(request: ExportRequest) -> Usd.Stage:
+    stage = Usd.Stage.CreateInMemory(".usdc")
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(request.fps)
+    stage.SetFramesPerSecond(request.fps)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(len(request.moments) - 1)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/World").GetPrim())
+    return stage
+
+
+def _name(text: str) -> str:
+    return str(Tf.MakeValidIdentifier(text))
+
+
+def _set(attribute: Any, values: Sequence[Any]) -> None:
+    """One value if all are equal, else a time sample a moment."""
+    if all(value == values[0] for value in values):
+        attribute.Set(values[0])
+        return
+    for time, value in enumerate(values):
+        attribute.Set(value, time)
+
+
+def _vectors(points: Float[Tensor, "*batch 3"]) -> Any:
+    array = np.ascontiguousarray(points.reshape(-1, 3).numpy(), np.float32)
+    return Vt.Vec3fArray.FromNumpy(array)
+
+
+def _quats(quats: Float[Tensor, "N 4"]) -> Any:
+    """wxyz, unit."""
+    unit = torch.nn.functional.normalize(quats.double(), dim=-1).tolist()
+    return Vt.QuatfArray([Gf.Quatf(w, x, y, z) for w, x, y, z in unit])
+
+
+def _add_splats(
+    stage: Usd.Stage, request: ExportRequest, turn: Float[Tensor, "3 3"], progress: Progress
+) -> None:
+    moments: dict[str, list[Gaussians]] = {name: [] for name in request.entities}
+    for i, moment in enumerate(request.moments):
+        progress(0.5 * i / len(request.moments), f"moment {i + 1} of {len(request.moments)}")
+        state = request.scene(moment, request.entities)
+        for name, gaussians in state.gaussians.items():
+            moments[name].append(turned_gaussians(gaussians.detach().to("cpu"), turn))
+    UsdGeom.Scope.Define(stage, "/World/splats")
+    for name, seen in moments.items():
+        prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/World/splats/{_name(name)}")
+        _set(prim.CreatePositionsAttr(), [_vectors(g.means) for g in seen])
+        _set(prim.CreateOrientationsAttr(), [_quats(g.quats) for g in seen])
+        _set(prim.CreateScalesAttr(), [_vectors(g.scales) for g in seen])
+        _set(
+            prim.CreateOpacitiesAttr(), [Vt.FloatArray.FromNumpy(g.opacities.numpy()) for g in seen]
+        )
+        prim.CreateRadianceSphericalHarmonicsDegreeAttr(seen[0].sh_degree)
+        colors = prim.CreateRadianceSphericalHarmonicsCoefficientsAttr()
+        _set(colors, [_vectors(g.sh) for g in seen])
+        _set(prim.CreateExtentAttr(), [_extent(g.means, g.scales.amax(1) * 3) for g in seen])
+
+
+def _extent(points: Float[Tensor, "N 3"], reach: Float[Tensor, " N"] | float = 0.0) -> Any:
+    radius = reach[:, None] if isinstance(reach, Tensor) else reach
+    if len(points) == 0:
+        return _vectors(torch.zeros(2, 3))
+    low, high = (points - radius).amin(0), (points + radius).amax(0)
+    return _vectors(torch.stack((low, high)))
+
+
+def _add_person(stage: Usd.Stage, motion: BodyMotion, *, hidden: bool) -> None:
+    path = f"/World/people/{_name(motion.name)}"
+    UsdGeom.Scope.Define(stage, "/World/people")
+    root = UsdSkel.Root.Define(stage, path)
+    parents, body = motion.body.parents, motion.body
+    names: list[str] = []
+    for joint, parent in enumerate(parents):
+        own = _name(body.joint_names[joint])
+        names.append(own if parent < 0 else f"{names[parent]}/{own}")
+    rest = motion.rest_joints
+    bones = torch.stack([rest[j] - (rest[p] if p >= 0 else 0.0) for j, p in enumerate(parents)])
+    skeleton = UsdSkel.Skeleton.Define(stage, f"{path}/skeleton")
+    skeleton.CreateJointsAttr(names)
+    skeleton.CreateBindTransformsAttr([_translation(p) for p in rest])
+    skeleton.CreateRestTransformsAttr([_translation(p) for p in bones])
+    animation = UsdSkel.Animation.Define(stage, f"{path}/animation")
+    animation.CreateJointsAttr(names)
+    turns = axis_angle_to_quats(motion.rotations)
+    places = [torch.cat((motion.pelvis[i : i + 1], bones[1:])) for i in range(len(motion))]
+    _set(animation.CreateTranslationsAttr(), [_vectors(p) for p in places])
+    _set(animation.CreateRotationsAttr(), [_quats(q) for q in turns])
+    sizes = Vt.Vec3hArray([Gf.Vec3h(motion.scale if j == 0 else 1.0) for j in range(len(parents))])
+    animation.CreateScalesAttr(sizes)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets(
+        [animation.GetPath()]
+    )
+    _add_skin(stage, f"{path}/mesh", motion, skeleton)
+    UsdSkel.BindingAPI.Apply(root.GetPrim())
+    span = [motion.vertices(i) for i in range(len(motion))]
+    _set(root.CreateExtentAttr(), [_extent(v) for v in span])
+    if hidden:
+        root.CreateVisibilityAttr(UsdGeom.Tokens.invisible)
+
+
+def _add_skin(stage: Usd.Stage, path: str, motion: BodyMotion, skeleton: UsdSkel.Skeleton) -> None:
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    vertices = motion.body.shaped(motion.betas)[0]
+    faces = motion.body.faces.numpy().astype(np.int32)
+    mesh.CreatePointsAttr(_vectors(vertices))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces.reshape(-1))))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateExtentAttr(_extent(vertices))
+    weights = motion.body.skinning_weights.float()
+    found = weights.topk(min(INFLUENCES, weights.shape[1]), dim=1)
+    kept = found.values / found.values.sum(1, keepdim=True)
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    count = found.indices.shape[1]
+    joints = np.ascontiguousarray(found.indices.numpy().reshape(-1), np.int32)
+    binding.CreateJointIndicesPrimvar(False, count).Set(Vt.IntArray.FromNumpy(joints))
+    shares = np.ascontiguousarray(kept.numpy().reshape(-1), np.float32)
+    binding.CreateJointWeightsPrimvar(False, count).Set(Vt.FloatArray.FromNumpy(shares))
+    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
+
+
+def _translation(place: Float[Tensor, " 3"]) -> Gf.Matrix4d:
+    return Gf.Matrix4d(1.0).SetTranslate(Gf.Vec3d(*place.double().tolist()))
+
+
+def _matrix(turn: Float[Tensor, "3 3"], place: Float[Tensor, " 3"]) -> Gf.Matrix4d:
+    """USD multiplies row vectors from the left."""
+    whole = torch.eye(4, dtype=torch.float64)
+    whole[:3, :3], whole[3, :3] = turn.double().mT, place.double()
+    return Gf.Matrix4d(*whole.flatten().tolist())
+
+
+def _add_object(
+    stage: Usd.Stage, motion: ObjectMotion, turn: Float[Tensor, "3 3"], *, hidden: bool
+) -> None:
+    UsdGeom.Scope.Define(stage, "/World/objects")
+    frame = UsdGeom.Xform.Define(stage, f"/World/objects/{_name(motion.name)}")
+    poses = zip(motion.rotations, motion.translations, strict=True)
+    _set(frame.AddTransformOp(), [_matrix(turn @ r, turn @ t) for r, t in poses])
+    points = UsdGeom.Points.Define(stage, frame.GetPath().AppendChild("points"))
+    points.CreatePointsAttr(_vectors(motion.points))
+    points.CreateWidthsAttr(Vt.FloatArray(len(motion.points), 0.005))
+    points.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(_vectors(motion.colors))
+    points.CreateExtentAttr(_extent(motion.points, 0.0025))
+    if hidden:
+        points.CreateVisibilityAttr(UsdGeom.Tokens.invisible)
+
+
+def _add_camera(stage: Usd.Stage, cameras: Sequence[Camera], turn: Float[Tensor, "3 3"]) -> None:
+    """The camera of the video; USD's looks along -z with y up, its lengths are millimetres."""
+    camera = UsdGeom.Camera.Define(stage, "/World/camera")
+    flip = torch.diag(torch.tensor((1.0, -1.0, -1.0)))
+    views = [turn @ c.world_to_camera[:3, :3].mT @ flip for c in cameras]
+    places = [turn @ c.center for c in cameras]
+    _set(camera.AddTransformOp(), [_matrix(r, t) for r, t in zip(views, places, strict=True)])
+    # lengths of the lens are in tenths of the scene's unit; only their ratios matter
+    scale = [FILM / c.width for c in cameras]
+    _set(camera.CreateFocalLengthAttr(), [float(c.K[0, 0]) * s for c, s in zip(cameras, scale)])
+    camera.CreateHorizontalApertureAttr(FILM)
+    heights = [c.height * s * float(c.K[0, 0] / c.K[1, 1]) for c, s in zip(cameras, scale)]
+    _set(camera.CreateVerticalApertureAttr(), heights)
+    right = [(c.width / 2 - float(c.K[0, 2])) * s for c, s in zip(cameras, scale)]
+    _set(camera.CreateHorizontalApertureOffsetAttr(), right)
+    up = [(float(c.K[1, 2]) - c.height / 2) * s for c, s in zip(cameras, scale)]
+    _set(camera.CreateVerticalApertureOffsetAttr(), up)
+    camera.CreateClippingRangeAttr(Gf.Vec2f(0.05, 1000.0))

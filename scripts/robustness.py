@@ -1,0 +1,61 @@
+"""The tables of docs/design/robustness.md, from benchmarks/results.
+
+python benchmarks/fuzz.py --json benchmarks/results/fuzz.json
+python benchmarks/busy_machine.py --json benchmarks/results/busy-machine.json
+python scripts/robustness.py
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "design" / "robustness.md"
+RESULTS = ROOT / "benchmarks" / "results"
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+
+
+def fuzz(record: dict[str, Any]) -> str:
+    """Cases of each kind of file, and what became of them."""
+    rows = [
+        [name, f"{t['cases']:,}", f"{t['read']:,}", f"{t['refused']:,}", len(t["wrong"]),
+         f"{t['slowest_s']:.1f}"]
+        for name, t in record["targets"].items()
+    ]  # fmt: skip
+    columns = ("files", "cases", "read", "refused", "wrong", "slowest, s")
+    note = f"`{record['command']}`: {record['cases']:,} cases in {minutes}"
+    return f"{table(columns, rows)}\n\n{note}, at most {record['peak_gib']} GiB."
+
+
+def busy(record: dict[str, Any]) -> str:
+    """CPU and wall seconds by the settings of OpenMP."""
+    rows = [
+        [" ".join(f"`{k}={v}`" for k, v in row["settings"].items()) or "none",
+         row["load average before"], row["added"], row["cpu_s"], row["wall_s"]]
+        for row in record["rows"]
+    ]  # fmt: skip
+    columns = ("settings", "load average before", "busy processes added", "CPU s", "wall s")
+    return f"{table(columns, rows)}\n\nOn {record['cpus']} processors."
+
+
+def main() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    for mark, file, make in (("fuzz", "fuzz.json", fuzz), ("busy", "busy-machine.json", busy)):
+        if (RESULTS / file).is_file():
+            made = make(json.loads((RESULTS / file).read_text(encoding="utf-8")))
+            pattern = rf"<!-- {mark} -->.*<!-- /{mark} -->"
+            whole = f"<!-- {mark} -->\n{made}\n<!-- /{mark} -->"
+            text = re.sub(pattern, lambda _, whole=whole: whole, text, flags=re.S)
+    PAGE.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

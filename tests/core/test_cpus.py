@@ -1,0 +1,41 @@
+"""Threads follow what the machine gives."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from hoigs.core import cpus
+
+
+@pytest.mark.parametrize(
+    ("files", "count"),
+    [
+        ({}, 64),
+        ({"cpu.max": "max 100000\n"}, 64),
+        ({"cpu.max": "150000 100000\n"}, 2),
+        ({"cpu.max": "10000 100000\n"}, 1),
+        ({"cpu.max": "nonsense"}, 64),
+        ({"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, 64),
+        ({"cpu/cpu.cfs_quota_us": "400000", "cpu/cpu.cfs_period_us": "100000"}, 4),
+    ],
+)
+def test_processors_of_a_container(tmp_path, monkeypatch, files, count):
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.setattr(cpus, "CGROUP", tmp_path)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(64)), raising=False)
+    assert cpus.available_cpus() == count
+
+
+def test_commands_do_not_spin_unless_the_user_says_so(hoigs, monkeypatch):
+    for name in ("OMP_WAIT_POLICY", "OMP_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    assert hoigs("--version").code == 0
+    assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
+    assert os.environ["OMP_NUM_THREADS"] == str(cpus.available_cpus())
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    hoigs("--version")
+    assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"

@@ -1,0 +1,206 @@
+"""A video alone: MediaPipe's environment is played by a script that knows the tiny scene."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny import FRAMES, HEIGHT, WIDTH, landmarks, masks
+
+from hoigs.core.clip_folder.check import check_clip
+from hoigs.core.environments.managed import MARKER, EnvironmentAbsentError
+from hoigs.core.errors import HoigsError, SpecError
+from hoigs.core.interfaces.estimator import EntityMasks, Estimates, Estimator, LazyFrames
+from hoigs.plugins.bodies.anny import AnnyBody
+from hoigs.plugins.estimators.common.environments import MEDIAPIPE
+from hoigs.plugins.readers.clip import ClipFolderReader
+from hoigs.preparation.estimator_plan import EstimatorPlan, plan_estimators
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.prepare import prepare, prepare_until, work_folder
+from hoigs.preparation.prompts import with_prompts
+from hoigs.preparation.stages.plan import PLAN
+from hoigs.preparation.video.source import SourceError, find_source
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+OPTIONS = PrepareOptions(fit_steps=30, scene_points=400, overlay_width=0, camera="static")
+FAKE = f"""
+from types import SimpleNamespace as Box
+import numpy as np
+known = np.load("KNOWN")
+class Selfie:
+    def __init__(self, **settings):
+        pass
+    def process(self, image):
+        near = abs(image.astype(int) - (90, 30, 110)).max(-1) < 30
+        return Box(segmentation_mask=near.astype("float32"))
+class Pose:
+    def __init__(self, **settings):
+        self.frame = -1
+    def reset(self):
+        pass
+    def process(self, image):
+        self.frame += 1
+        points = [
+            [Box(x=p[0] / size[0], y=p[1] / size[1], z=p[2] / size[0], visibility=p[3])
+             for p in rows]
+            for rows, size in (
+                (known["image_xyzv"][self.frame], ({WIDTH}, {HEIGHT})),
+                (known["world_xyzv"][self.frame], (1, 1)),
+            )
+        ]
+        own = Selfie().process(image).segmentation_mask
+        return Box(pose_landmarks=Box(landmark=points[0]), segmentation_mask=own,
+                   pose_world_landmarks=Box(landmark=points[1]))
+solutions = Box(pose=Box(Pose=Pose), selfie_segmentation=Box(SelfieSegmentation=Selfie))
+"""
+
+
+@pytest.fixture
+def alone(tiny_video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The tiny scene's video in an empty folder; hoigs's cache is empty, too."""
+    monkeypatch.setenv("HOIGS_CACHE", str(tmp_path / "cache"))
+    folder = tmp_path / "alone"
+    folder.mkdir()
+    video = folder / "my.mp4"
+    video.write_bytes(tiny_video.read_bytes())
+    return video
+
+
+@pytest.fixture
+def environment(alone: Path, tmp_path: Path) -> None:
+    """An installed environment whose mediapipe knows the tiny scene."""
+    known, package = tmp_path / "known.npz", tmp_path / "site" / "mediapipe"
+    package.mkdir(parents=True)
+    np.savez(known, **landmarks())
+    (package / "__init__.py").write_text(FAKE.replace("KNOWN", str(known)))
+    (package.parent / "cv2.py").write_text(
+        "BORDER_REPLICATE = 1\ncopyMakeBorder = lambda i, *a: i\n"
+    )
+    start = f"import sys, runpy; sys.path.insert(0, {str(package.parent)!r}); "
+    start += "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
+    python = MEDIAPIPE.folder / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    words = f'exec {shlex.quote(sys.executable)} -c {shlex.quote(start)} "$@"'
+    python.write_text(f"#!/bin/sh\nshift\n{words}\n")
+    python.chmod(0o755)
+    (MEDIAPIPE.folder / MARKER).write_text(json.dumps({"versions": "fake"}))
+
+
+class Balls(Estimator):
+    """The ball's masks, if it is shown where the ball is."""
+
+    provides = frozenset({"masks"})
+
+    def __init__(self) -> None:
+        pass
+
+    def estimate(self, video, progress=None) -> Estimates:
+        assert [e.name for e in video.entities] == ["object"]
+        assert set(video.known.masks.entities) == set(video.known.landmarks) == {"human"}
+        right = all(
+            masks(at.frame)[1][int(y), int(x)]
+            for at in video.entities[0].prompts
+            for x, y in [(p.x, p.y) for p in at.points]
+        )
+        shown = LazyFrames(video.frames, lambda i: masks(i)[1] & right)
+        return Estimates(EntityMasks({"object": shown}, notes=("a note on the ball",)))
+
+
+def made(out: Path) -> dict[str, int]:
+    found = {name: work_folder(out) / name / "result.json" for name in PLAN}
+    return {name: path.stat().st_mtime_ns for name, path in found.items() if path.is_file()}
+
+
+def test_a_video_alone_becomes_a_clip_of_a_person(
+    alone: Path, environment: None, tmp_path: Path
+) -> None:
+    plans: list[EstimatorPlan] = []
+    out = tmp_path / "clip"
+    report = prepare(
+        alone, out, object="none", options=OPTIONS, body=AnnyBody(), announce=plans.append
+    )
+    rows = {row[0]: row[1] for row in plans[0].rows()}
+    assert rows["person's mask"] == rows["person's landmarks"] == "estimator:mediapipe"
+    assert rows["object's mask"] == "none" and plans[0].frames == FRAMES
+    assert check_clip(out) == [] and report.object_observed is None
+    clip = ClipFolderReader().read(out)
+    assert len(clip) == FRAMES and not clip.objects and set(clip.bodies) == {"human"}
+    mask, true = clip[5].masks["human"].numpy(), masks(5)[0]
+    assert (mask & true).sum() / (mask | true).sum() > 0.9
+    assert not (out / "object.jpg").exists() and report.body_residual_px < 3
+
+
+def test_another_click_makes_only_the_object_again(
+    alone: Path, environment: None, tmp_path: Path
+) -> None:
+    out, body = tmp_path / "clip", AnnyBody()
+    common = {"options": OPTIONS, "body": body, "estimators": {"object": Balls()}}
+    report = prepare(alone, out, object="5,5", **common)  # it is not there
+    assert report.object_observed is None and "--object X,Y" in " ".join(report.warnings)
+    before = made(out)
+    better = common | {"options": OPTIONS.model_copy(update={"overwrite": True})}
+    report = prepare(alone, out, object=["20,36", "52,30@9"], **better)
+    changed = {name for name, when in made(out).items() if before[name] != when}
+    assert changed == {"object_masks", "masks", "object", "depth", "scene"}
+    assert report.object_observed == 1 and "a note on the ball" in report.warnings
+    assert (out / "object.jpg").is_file() and "object.jpg" in (out / "report.html").read_text()
+    assert check_clip(out) == []
+
+
+def test_without_the_environment_nothing_is_done(alone: Path, tmp_path: Path) -> None:
+    with pytest.raises(EnvironmentAbsentError, match="hoigs estimators install mediapipe"):
+        prepare(alone, tmp_path / "clip", options=OPTIONS)
+    asked: list[str] = []
+    with pytest.raises(EnvironmentAbsentError):
+        prepare(alone, tmp_path / "clip", options=OPTIONS, consent=lambda q: bool(asked.append(q)))
+    assert len(asked) == 1 and "MB" in asked[0] and "Apache" in asked[0]
+    with pytest.raises(SourceError, match=r"(?s)absent:.*pose_mediapipe\.npz"):
+        prepare(alone, tmp_path / "clip", estimators="files")
+    assert [p.name for p in tmp_path.iterdir()] == ["alone"]
+
+
+def test_clicks_are_checked_before_work(alone: Path, environment: None, tmp_path: Path) -> None:
+    for click, message in ((f"{WIDTH + 1},3", "outside of the picture"), ("3,3@99", "frame 99")):
+        with pytest.raises(SpecError, match=message):
+            prepare(alone, tmp_path / "clip", object=click, options=OPTIONS)
+    with pytest.raises(SpecError, match="need a network that reads them"):
+        prepare(alone, tmp_path / "clip", object="football", options=OPTIONS)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["alone", "cache", "known.npz", "site"]
+
+
+def test_files_come_first(tiny_source: Path, alone: Path) -> None:
+    def chosen(path: Path, options: PrepareOptions = PrepareOptions()) -> dict[str, str]:  # noqa: B008
+        found = find_source(path, complete=False)
+        return {c.place: c.use for c in plan_estimators(found, options).choices.values()}
+
+    files = "estimator:landmarks-files", "estimator:masks-files"
+    assert chosen(tiny_source) == {
+        "landmarks": files[0], "masks": files[1], "object": "ball_track.npz"
+    }  # fmt: skip
+    (tiny_source / "ball_track.npz").unlink()
+    assert chosen(tiny_source)["object"] == "with the person's mask"
+    (tiny_source / "pose_mediapipe.npz").unlink()
+    assert chosen(tiny_source)["landmarks"] == "estimator:mediapipe"
+    assert chosen(alone)["object"] == "estimator:object-tracker"
+    hub = chosen(alone, with_prompts(PrepareOptions(), "football", "hub"))
+    assert hub["object"] == "estimator:transformers-sam2" and len(hub) == 4
+    with pytest.raises(SpecError, match="of one frame"):
+        chosen(alone, with_prompts(PrepareOptions(), ["1,2", "3,4@5"], "hub"))
+
+
+def test_a_black_video_is_named(alone: Path, environment: None, tmp_path: Path) -> None:
+    import av
+
+    with av.open(str(alone), "w") as container:
+        stream = container.add_stream("h264", rate=30)
+        stream.width, stream.height = 64, 48
+        for _ in range(10):
+            frame = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    with pytest.raises(HoigsError, match="is black: in 5 frames"):
+        prepare_until("evidence", alone, tmp_path / "clip", options=OPTIONS)

@@ -1,0 +1,63 @@
+"""--object: points, boxes and words."""
+
+from __future__ import annotations
+
+import pytest
+
+from hoigs.core.errors import SpecError
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.prompts import check_prompts, parse_prompts, with_prompts
+from hoigs.preparation.video.frames import FrameList
+
+FOUND = FrameList(64, 48, 30.0, 30.0, 10, list(range(10)), [1.0] * 10)
+
+
+def test_clicks_by_frame() -> None:
+    prompt = parse_prompts(["30,20", "-10, 5", "!11,6", "12.5,7@4", "1,2,30,40@4"])
+    assert prompt.frame == 0 and prompt.box is None
+    assert prompt.points == [(30, 20, True), (10, 5, False), (11, 6, False)]
+    (other,) = prompt.further
+    assert other.frame == 4 and other.points == [(12.5, 7, True)] and other.box == (1, 2, 30, 40)
+    assert parse_prompts(["football"]).text == "football"
+    assert parse_prompts(["1,2@3"]).frame == 3
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["1,2,3"], "neither a point nor a box"),
+        (["-1,2,3,4"], "neither a point nor a box"),
+        (["9,9,3,3"], "x0 < x1"),
+        (["640;402"], "neither a point, a box nor words"),
+        (["ball@3"], "neither a point, a box nor words"),
+        (["ball", "football"], "described twice"),
+        (["-3,4"], "only points that are not on it"),
+        (["0,0,3,4", "0,0,5,6"], "has a box already"),
+        (["none", "3,4"], "leave the others out"),
+    ],
+)
+def test_what_is_wrong_is_named(texts: list[str], message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        with_prompts(PrepareOptions(), texts)
+
+
+def test_prompts_become_options() -> None:
+    options = with_prompts(PrepareOptions(), "3,4@2", "offline")
+    assert options.prompts["object"].frame == 2 and options.preset == "offline"
+    assert with_prompts(PrepareOptions(), ["none"]).find_object is False
+    untouched = PrepareOptions()
+    assert with_prompts(untouched, (), {"masks": object()}) is untouched
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("64.5,3", r"64\.5,3 in frame 0, is outside of the picture, which is 64x48"),
+        ("1,1,20,60@2", "1,1,20,60|20,60 in frame 2, is outside"),
+        ("3,4@10", "is in frame 10; .* 0 to 9"),
+    ],
+)
+def test_prompts_outside_of_the_video(text: str, message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        check_prompts(with_prompts(PrepareOptions(), text), FOUND)
+    check_prompts(with_prompts(PrepareOptions(), ["64,48", "3,4@9"]), FOUND)

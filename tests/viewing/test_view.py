@@ -1,0 +1,204 @@
+"""hoigs view: the page in a browser, a run in training, and what it says to wrong input."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hoigs
+from hoigs.core.errors import HoigsError
+from hoigs.viewing.viewer.viewer import Viewer
+
+pytest.importorskip("viser", reason="viser is not installed: pip install 'hoigs[viewer]'")
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@contextmanager
+def served(*what: Path, **options: Any) -> Iterator[tuple[Viewer, str, list[str]]]:
+    """A viewer that runs in a thread, its address, and the lines that it reports."""
+    lines: list[str] = []
+    got: list[Viewer] = []
+    failed: list[BaseException] = []
+    ready = threading.Event()
+
+    def started(viewer: Viewer) -> None:
+        got.append(viewer)
+        ready.set()
+
+    def work() -> None:
+        try:
+            hoigs.view(*what, port=0, device="cpu", report=lines.append, started=started, **options)
+        except BaseException as error:
+            failed.append(error)
+        finally:
+            ready.set()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    assert ready.wait(120) and got, (lines, failed)
+    address = next(line.split()[1] for line in lines if line.startswith("open http"))
+    yield got[0], address, lines
+    got[0].stop()
+    thread.join(30)
+    assert not thread.is_alive() and not failed, failed
+
+
+def until(check: Callable[[], bool], page: Any, what: str, seconds: float = 40) -> None:
+    for _ in range(int(seconds * 5)):
+        if check():
+            return
+        page.wait_for_timeout(200)
+    raise AssertionError(f"not within {seconds} s: {what}")
+
+
+def test_the_viewer_in_a_browser(tiny_run: Path, window: Any) -> None:
+    with served(tiny_run) as (viewer, address, lines):
+        assert address.startswith("http://127.0.0.1:") and not any("warning" in x for x in lines)
+        opened = window()
+        page = opened.page
+        page.goto(address)
+
+        def still() -> bool:
+            eyes = list(viewer._eyes.values())
+            return bool(eyes) and eyes[0].full
+
+        def picture() -> np.ndarray:
+            until(still, page, "a still picture")
+            page.wait_for_timeout(700)
+            return opened.pixels()[:, :280]  # left of the panel
+
+        until(still, page, "the first picture")
+        page.wait_for_timeout(3000)  # the notice of software rendering fades in
+        first = picture()
+        assert first.std() > 5
+        page.get_by_role("button", name="frame ▶").click()
+        page.wait_for_timeout(500)
+        second = picture()
+        assert viewer.clock.frame(0.0) == 1.0
+        page.get_by_role("button", name="Play").click()
+        until(lambda: viewer.clock.playing, page, "playing")
+        page.get_by_role("button", name="Pause").click()
+        until(lambda: not viewer.clock.playing, page, "the pause")
+        viewer.clock.seek(6.0, 0.0)
+        later = picture()
+        assert np.abs(later - second).max() > 30
+        page.get_by_label("human", exact=True).click()
+        until(lambda: "human" not in viewer.settings.entities, page, "no human")
+        alone = picture()
+        assert np.abs(alone - later).max() > 30
+        assert viewer.settings.video
+        page.mouse.move(150, 300)
+        page.mouse.down()
+        page.mouse.move(190, 310, steps=5)
+        page.mouse.up()
+        until(lambda: not viewer.settings.video, page, "the end of the video's camera")
+        turned = picture()
+        assert np.abs(turned - alone).max() > 30
+        page.get_by_label("body mesh").click()
+        until(lambda: "body mesh" in viewer.settings.overlays, page, "the body mesh")
+        meshed = np.abs(picture() - turned).max(-1) > 30
+        assert 0.002 < meshed.mean() < 0.5  # the hidden person's place, in front of the scene
+        assert opened.errors == []
+
+
+def test_a_clip_in_a_browser(tiny_run: Path, window: Any) -> None:
+    with served(tiny_run.parent / "clip") as (viewer, address, _):
+        opened = window()
+        page = opened.page
+        page.goto(address)
+        until(lambda: any(e.full for e in viewer._eyes.values()), page, "the frame")
+        page.wait_for_timeout(1500)
+        tinted = opened.pixels()[:, :280]
+        assert tinted.std() > 5
+        for name in ("cameras", "scene points", "object points"):
+            page.get_by_label(name, exact=True).click()
+        until(lambda: len(viewer.settings.overlays) == 3, page, "overlays")
+        page.wait_for_timeout(1500)
+        assert np.abs(opened.pixels()[:, :280] - tinted).max() > 30
+        assert opened.errors == []
+
+
+def test_a_run_in_training_is_followed(tiny_run: Path, tmp_path: Path) -> None:
+    run, newest = tmp_path / "run", "step_000004"
+    shutil.copytree(tiny_run, run)
+    for ending in ("safetensors", "json"):
+        (run / "checkpoints" / f"{newest}.{ending}").unlink()
+    clip = tiny_run.parent / "clip"
+    with served(run, clip=clip) as (viewer, _, lines):
+        assert "step 2" in viewer.drawings[0].title
+        for ending in ("safetensors", "json"):  # in the order in which training writes them
+            name = f"{newest}.{ending}"
+            shutil.copy(tiny_run / "checkpoints" / name, run / "checkpoints" / name)
+        done = threading.Event()
+        for _ in range(100):
+            if "step 4" in viewer.drawings[0].title:
+                break
+            done.wait(0.3)
+        assert "step 4" in viewer.drawings[0].title
+        assert any(line.endswith("step 4") for line in lines)
+
+
+def test_two_runs_have_one_clock(tiny_run: Path) -> None:
+    with served(tiny_run, tiny_run) as (viewer, _, _):
+        from hoigs.viewing.viewer.views import View
+
+        view = View.of_camera(viewer.clip.cameras[0], 2.0, (128, 64))
+        both = viewer.picture((128, 64), viewer.settings, 2.0, view).image.astype(int)
+        assert both.shape == (64, 128, 3)
+        assert np.abs(both[:, 1:63] - both[:, 65:127]).max() == 0  # the same run on both sides
+        assert both.std() > 5
+
+
+def test_wrong_input_gets_a_sentence(tiny_run: Path, tmp_path: Path) -> None:
+    clip = tiny_run.parent / "clip"
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(HoigsError, match="is in use; give another, or --port 0"):
+            hoigs.view(clip, port=taken.getsockname()[1])
+    with pytest.raises(HoigsError, match="no such folder"):
+        hoigs.view(tmp_path / "nothing")
+    with pytest.raises(HoigsError, match="this is none"):
+        hoigs.view(tiny_run, clip)
+    with pytest.raises(HoigsError, match="writes one run"):
+        hoigs.view(clip, html=tmp_path / "a.html")
+    with pytest.raises(HoigsError, match="65535"):
+        hoigs.view(clip, port=70_000)
+    with pytest.raises(HoigsError, match="host"):
+        hoigs.view(clip, host="203.0.113.7", port=0)
+    bare = tmp_path / "bare"
+    shutil.copytree(tiny_run, bare)
+    shutil.rmtree(bare / "checkpoints")
+    with pytest.raises(HoigsError, match="not a run folder, checkpoints absent"):
+        hoigs.view(bare)
+
+
+def test_other_hosts_are_warned_of(tiny_run: Path) -> None:
+    with served(tiny_run.parent / "clip", host="0.0.0.0") as (_, _, lines):
+        assert any(line.startswith("warning: anybody who can reach 0.0.0.0") for line in lines)
+
+
+def test_ctrl_c_ends_it_without_a_traceback(tiny_run: Path) -> None:
+    command = [sys.executable, "-m", "hoigs.cli.main", "view", tiny_run.parent / "clip", "--port=0"]
+    process = subprocess.Popen(
+        [*map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith("open http://127.0.0.1:"):
+            break
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0 and "stopped" in out
+    assert "Traceback" not in err and "viser" not in out
