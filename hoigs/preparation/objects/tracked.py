@@ -34,6 +34,7 @@ from hoigs.preparation.objects.surface import hull, with_samples
 FEWEST = 8  # frames that show the object whole
 SMALLEST = 10  # pixels across, median
 AGREES = 0.5  # correlation of textures from which a pose is trusted
+FAINTEST, BLUR = 0.02, 2.5  # relative contrast of texture; pixels of a crop it is blurred by
 SIDE = 96  # of the crops, pixels
 SAMPLES = 1200
 
@@ -97,6 +98,12 @@ def tracked_object(
     hands = hand_motion(joints, masks, outlines, cameras, fps)
     shown = outlines.observed
     crops = make_crops(images, masks, humans, cameras, shown, SIDE)
+    contrast = crops.contrast(BLUR)
+    if contrast < FAINTEST:
+        raise UntrackableError(
+            f"it has hardly any texture: its brightness varies by {100 * contrast:.1f} % "
+            f"({100 * FAINTEST:.0f} % are needed)"
+        )
     start = _start(hands, outlines, cameras, shown)
     radius = _radius(outlines, hands, cameras)
     held = _held(hands, shown)
