@@ -22,7 +22,7 @@ from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.preparation.objects.crops import Crops
 
 Level = tuple[float, int, int]  # blur of the texture, pixels; frames a knot of the motion; steps
-LEVELS: tuple[Level, ...] = ((5.0, 8, 150), (2.5, 3, 150), (1.2, 1, 200))
+LEVELS: tuple[Level, ...] = ((5.0, 8, 120), (2.5, 3, 120), (1.2, 1, 160))
 SAMPLES = 1200
 FACING = 0.2  # cosine between normal and view from which a point counts as seen
 TURN_RATE, SHIFT_RATE, SHAPE_RATE = 0.02, 0.01, 0.004

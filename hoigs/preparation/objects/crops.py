@@ -85,6 +85,11 @@ class Crops:
         fine = _masked_blur(logs, self.masks, blur)
         return fine - _masked_blur(logs, self.masks, 4 * blur + 2)
 
+    def contrast(self, blur: float) -> float:
+        """Relative variation of brightness within the object."""
+        maps = self.features(blur).mean(1, keepdim=True)
+        return float(maps[self.masks > 0].std())
+
 
 def make_crops(
     images: Images,

@@ -2,58 +2,84 @@
 
 In flight an object may turn by more than half a turn, about any axis, and come down on another
 side. Where a part of the clip has given its shape and texture, every rotation is compared with each
-frame; the path through the frames that looks best and turns least is taken (Viterbi 1967).
+frame of a grasp; between two grasps the spin is constant, and every spin is tried.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from hoigs.preparation.objects.alignment import FACING, Aligned, Poses, Surface
+from hoigs.core.maths.rotations import (
+    axis_angle_to_matrices,
+    matrices_to_axis_angle,
+    quats_to_matrices,
+)
+from hoigs.preparation.objects.alignment import Aligned, Poses, Surface
 from hoigs.preparation.objects.crops import Crops
-from hoigs.preparation.objects.hands import HandMotion
 
 TRIED = 1500  # rotations, about 22 degrees apart
 POINTS = 300
+SURE = 0.5  # cosine between normal and view from which a point's texture counts
 BLUR = 3.0
 SPIN = 9.0  # radians a second in flight that cost one unit
-TURNING = 0.05  # weight of that against the texture
+MOST_TURNS, SLACK = 1.3, 0.6  # of a flight; radians between its end and the next known rotation
+TURNING = 0.02  # weight of that against the texture
 NEUTRAL, UNKNOWN = 2.0, 30.0  # cost of unknown texture, and the points that it counts as
-OUTSIDE = 8.0  # cost of a point outside the mask
+OUTSIDE = 1.5  # cost of a point outside the mask
 LOOKS = 6  # frames of a grasp in which its rotation is looked for
 
 
-def placed_by_texture(
-    crops: Crops, surface: Surface, first: Aligned, start: Poses, hands: HandMotion, fps: float
+def grasps_by_texture(
+    crops: Crops, surface: Surface, first: Aligned, start: Poses, pieces: Int[np.ndarray, " C"]
 ) -> Poses:
-    """Poses of all frames: those of `first` in its frames, and found by texture in the others.
+    """Poses of frames in grasps and rests: those of `first`, and of other pieces by texture.
 
-    A grasp or rest that no frame of `first` belongs to turns as the hands do, from a rotation that
-    is found for all of it at once; frames of flight are found one by one.
-
-    Args:
-        first: alignment of the frames of one piece. start: rough poses of all.
+    Each piece turns as the hands do (`start`), from a rotation that is found for all of it.
     """
     known = np.isin(crops.frames, first.frames)
+    poses = _distances_of(crops, start, first, known)
     search = _Search(crops, surface, first, known)
-    rotations, translations = start.rotations.clone(), start.translations.clone()
-    rotations[known], translations[known] = first.poses.rotations, first.poses.translations
-    # what the first alignment changed of distances holds for the others too
-    before = (start.translations - crops.centers())[known].norm(dim=-1)
-    after = (first.poses.translations - crops.centers()[known]).norm(dim=-1)
-    centers = crops.centers()
-    farther = float((after / before).median())
-    translations[~known] = (centers + (translations - centers) * farther)[~known]
-    tied, pieces = ~hands.free[crops.frames], hands.pieces[crops.frames]
-    for piece in np.unique(pieces[tied & ~known]).tolist():
-        rows = np.flatnonzero(tied & ~known & (pieces == piece))
-        rotations[rows] = search.piece(rows, start.rotations[rows], translations)
-        known[rows] = True
+    rotations = poses.rotations.clone()
+    for piece in np.unique(pieces[~known]).tolist():
+        rows = np.flatnonzero(~known & (pieces == piece))
+        rotations[rows] = search.piece(rows, start.rotations[rows], poses.translations)
+    return Poses(rotations, poses.translations)
+
+
+def flights_by_texture(
+    crops: Crops, surface: Surface, first: Aligned, start: Poses, fps: float
+) -> Poses:
+    """Poses of all frames: those of `first`, and between them a constant spin found by texture.
+
+    Frames before the first known one and after the last keep its rotation.
+    """
+    known = np.isin(crops.frames, first.frames)
+    poses = _distances_of(crops, start, first, known)
+    search = _Search(crops, surface, first, known)
+    rotations = poses.rotations.clone()
     for rows in _runs(np.flatnonzero(~known)):
-        rotations[rows] = search.flight(rows, rotations, translations, known, fps)
+        before, after = rows[0] - 1, rows[-1] + 1
+        if before < 0:
+            rotations[rows] = rotations[after]
+        elif after == len(known):
+            rotations[rows] = rotations[before]
+        else:
+            rotations[rows] = search.flight(rows, rotations, poses.translations, fps)
+    return Poses(rotations, poses.translations)
+
+
+def _distances_of(crops: Crops, start: Poses, first: Aligned, known: np.ndarray) -> Poses:
+    """`first` where it is known; elsewhere `start`, farther by as much as `first` is."""
+    rotations, translations = start.rotations.clone(), start.translations.clone()
+    centers = crops.centers()
+    before = (translations - centers)[known].norm(dim=-1)
+    after = (first.poses.translations - centers[known]).norm(dim=-1)
+    moved = centers + (translations - centers) * (after / before).median()
+    translations[~known] = moved[~known]
+    rotations[known], translations[known] = first.poses.rotations, first.poses.translations
     return Poses(rotations, translations)
 
 
@@ -73,12 +99,12 @@ class _Search:
         values = part.sample(self.maps[known], part.project(world)[0])
         seen = self._facing(part.centers()[:, None] - world, first.poses.rotations)
         weight = (seen * values[..., 3])[..., None]
-        self.known = weight.sum(0)[:, 0] > 0.5
+        self.known = weight.sum(0)[:, 0] > 1.5
         self.texture = (weight * values[..., :3]).sum(0) / weight.sum(0).clamp_min(1e-3)
 
     def _facing(self, toward: Tensor, rotations: Tensor) -> Tensor:
         toward = torch.nn.functional.normalize(toward, dim=-1)
-        return (((self.normals @ rotations.mT) * toward).sum(-1) > FACING).float()
+        return (((self.normals @ rotations.mT) * toward).sum(-1) > SURE).float()
 
     def costs(self, row: int, rotations: Float[Tensor, "R 3 3"], place: Tensor) -> Tensor:
         """Of rotations in one frame; places are moved so that the points' middle is the mask's."""
@@ -113,50 +139,48 @@ class _Search:
         return turns @ turns[0].mT @ self.grid[total.argmin()]
 
     def flight(
-        self, rows: np.ndarray, rotations: Tensor, places: Tensor, known: np.ndarray, fps: float
-    ) -> Tensor:
-        """Rotations of frames in flight; the frames before and after are kept where known."""
+        self, rows: np.ndarray, rotations: Tensor, places: Tensor, fps: float
+    ) -> Float[Tensor, "N 3 3"]:
+        """Rotations between two known ones, by the constant spin whose pictures agree best.
+
+        The spin about a world axis is tried for all turns up to `MOST_TURNS` that end within
+        `SLACK` of the known rotation; the rest is spread over the flight.
+        """
         frames = self.crops.frames
-        ends = [
-            row if 0 <= row < len(frames) and known[row] else None
-            for row in (rows[0] - 1, rows[-1] + 1)
-        ]
-        table = []
-        path = [row for row in (ends[0], *rows.tolist(), ends[1]) if row is not None]
-        states = [rotations[row][None] if row in ends else self.grid for row in path]
-        total = torch.zeros(len(states[0]))
-        for at, row in enumerate(path):
-            if at:
-                gap = (frames[row] - frames[path[at - 1]]) / fps
-                turned = _angles(states[at - 1], states[at])
-                cost = total[:, None] + TURNING * (turned / gap / SPIN).square()
-                total, back = cost.min(0)
-                table.append(back)
-            if row not in ends:
-                total = total + self.costs(row, states[at], places[row])
-        choice = [int(total.argmin())]
-        for back in reversed(table):
-            choice.append(int(back[choice[-1]]))
-        chosen = {row: s[c] for row, s, c in zip(path, states, reversed(choice), strict=True)}
-        return torch.stack([chosen[row] for row in rows.tolist()])
+        first, last = rows[0] - 1, rows[-1] + 1
+        ahead = rotations[last] @ rotations[first].mT
+        spins = _ball(2 * np.pi * MOST_TURNS)
+        rest = matrices_to_axis_angle(axis_angle_to_matrices(spins).mT @ ahead)
+        kept = rest.norm(dim=-1) < SLACK
+        spins, rest = spins[kept], rest[kept]
+        seconds = (frames[last] - frames[first]) / fps
+        total = TURNING * len(rows) * (spins.norm(dim=-1) / seconds / SPIN).square()
+        parts = (frames[rows] - frames[first]) / (frames[last] - frames[first])
+        tried = []
+        for row, part in zip(rows.tolist(), parts.tolist(), strict=True):
+            turn = axis_angle_to_matrices(part * spins) @ axis_angle_to_matrices(part * rest)
+            tried.append(turn @ rotations[first])
+            total = total + self.costs(row, tried[-1], places[row])
+        return torch.stack([turns[total.argmin()] for turns in tried])
+
+
+def _ball(radius: float, step: float = 0.45) -> Float[Tensor, "N 3"]:
+    """Vectors of a grid within a ball, none first."""
+    count = int(radius / step)
+    line = torch.arange(-count, count + 1) * step
+    grid = torch.cartesian_prod(line, line, line)
+    grid = grid[grid.norm(dim=-1) <= radius]
+    return grid[grid.norm(dim=-1).argsort()]
 
 
 def _rotations(count: int) -> Float[Tensor, "R 3 3"]:
     """Rotations spread over all (super-Fibonacci spiral, Alexa 2022)."""
-    from hoigs.core.maths.rotations import quats_to_matrices
-
     s = torch.arange(count, dtype=torch.float64) + 0.5
     psi = 1.533751168755204288118041413
     a, b = 2 * torch.pi * s / 2**0.5, 2 * torch.pi * s / psi
     low, high = (s / count).sqrt(), (1 - s / count).sqrt()
     quats = torch.stack((low * a.sin(), low * a.cos(), high * b.sin(), high * b.cos()), -1)
     return quats_to_matrices(quats).float()
-
-
-def _angles(one: Float[Tensor, "A 3 3"], two: Float[Tensor, "B 3 3"]) -> Float[Tensor, "A B"]:
-    """Radians between all pairs."""
-    cosine = (one.flatten(1) @ two.flatten(1).mT - 1) / 2
-    return torch.acos(cosine.clamp(-1, 1))
 
 
 def _runs(rows: np.ndarray) -> list[np.ndarray]:

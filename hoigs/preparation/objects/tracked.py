@@ -26,14 +26,15 @@ from hoigs.preparation.objects.alignment import (
     Surface,
     align,
 )
-from hoigs.preparation.objects.crops import make_crops
+from hoigs.preparation.objects.crops import Crops, make_crops
 from hoigs.preparation.objects.hands import HandMotion, hand_motion
-from hoigs.preparation.objects.search import placed_by_texture
+from hoigs.preparation.objects.search import flights_by_texture, grasps_by_texture
 from hoigs.preparation.objects.surface import hull, with_samples
 
 FEWEST = 8  # frames that show the object whole
 SMALLEST = 10  # pixels across, median
 AGREES = 0.5  # correlation of textures from which a pose is trusted
+FAINTEST, BLUR = 0.02, 2.5  # relative contrast of texture; pixels of a crop it is blurred by
 SIDE = 96  # of the crops, pixels
 SAMPLES = 1200
 
@@ -97,25 +98,16 @@ def tracked_object(
     hands = hand_motion(joints, masks, outlines, cameras, fps)
     shown = outlines.observed
     crops = make_crops(images, masks, humans, cameras, shown, SIDE)
+    contrast = crops.contrast(BLUR)
+    if contrast < FAINTEST:
+        raise UntrackableError(
+            f"it has hardly any texture: its brightness varies by {100 * contrast:.1f} % "
+            f"({100 * FAINTEST:.0f} % are needed)"
+        )
     start = _start(hands, outlines, cameras, shown)
     radius = _radius(outlines, hands, cameras)
     held = _held(hands, shown)
-    known, others = _pieces(hands, shown)
-    if others.any():
-        part = np.flatnonzero(known)
-        surface = hull(crops.rows(part), start.rows(part), radius, SAMPLES)
-        first = align(
-            crops.rows(part), surface, start.rows(part), held.rows(part), fps, levels=levels,
-            progress=_share(0, progress),
-        )  # fmt: skip
-        start = placed_by_texture(crops, surface, first, start, hands, fps)
-        surface = replace(surface, rest=first.vertices)
-        found = align(
-            crops, surface, start, held, fps, levels=levels[1:], progress=_share(1, progress)
-        )
-    else:
-        surface = hull(crops, start, radius, SAMPLES)
-        found = align(crops, surface, start, held, fps, levels=levels, progress=progress)
+    surface, found = _aligned(crops, start, held, hands, radius, fps, levels, progress)
     agreement = _over_frames(found.agreement, shown)
     typical = float(np.nanmedian(found.agreement)) if np.isfinite(found.agreement).any() else 0.0
     if typical < AGREES:
@@ -126,21 +118,48 @@ def tracked_object(
     return _result(found, surface, hands, outlines, agreement, count)
 
 
-def _pieces(
-    hands: HandMotion, shown: Bool[np.ndarray, " F"]
-) -> tuple[Bool[np.ndarray, " C"], Bool[np.ndarray, " C"]]:
-    """Frames of the longest piece whose rotations are known against each other; the others."""
-    tied = ~hands.free & shown
+def _aligned(
+    crops: Crops,
+    start: Poses,
+    held: Held,
+    hands: HandMotion,
+    radius: float,
+    fps: float,
+    levels: Sequence[Level],
+    progress: Callable[[float], None],
+) -> tuple[Surface, Aligned]:
+    """One grasp first, with its rests; the other grasps by what it has shown; flights last, which
+    give the shape nothing."""
+    tied, pieces = ~hands.free[crops.frames], hands.pieces[crops.frames]
     if tied.sum() < FEWEST:  # never held, never at rest: one piece, from no rotation at all
-        every = np.ones(int(shown.sum()), bool)
-        return every, ~every
-    longest = np.bincount(hands.pieces[tied]).argmax()
-    known = (tied & (hands.pieces == longest))[shown]
-    return known, ~known
+        tied, pieces = np.ones(len(crops), bool), np.zeros(len(crops), int)
+    rows = np.flatnonzero(tied & (pieces == np.bincount(pieces[tied]).argmax()))
+    later, flies = int(tied.sum()) > len(rows), not tied.all()
+    steps = iter(range(1 + later + flies))
 
+    def share(done: float, step: int = 0) -> None:
+        progress((step + done) / (1 + later + flies))
 
-def _share(half: int, progress: Callable[[float], None]) -> Callable[[float], None]:
-    return lambda done: progress((half + done) / 2)
+    def aligned(rows: np.ndarray, poses: Poses, levels: Sequence[Level], shape: bool) -> Aligned:
+        step = next(steps)
+        return align(
+            crops.rows(rows), surface, poses, held.rows(rows), fps, levels=levels, shape=shape,
+            progress=lambda done: share(done, step),
+        )  # fmt: skip
+
+    surface = hull(crops.rows(rows), start.rows(rows), radius, SAMPLES)
+    found = aligned(rows, start.rows(rows), levels, True)
+    if later:
+        rows = np.flatnonzero(tied)
+        surface = replace(surface, rest=found.vertices)
+        poses = grasps_by_texture(crops.rows(rows), surface, found, start.rows(rows), pieces[rows])
+        found = aligned(rows, poses, levels[1:], True)
+    if flies:
+        rows = np.arange(len(crops))
+        surface = replace(surface, rest=found.vertices)
+        poses = flights_by_texture(crops, surface, found, start, fps)
+        found = aligned(rows, poses, [(blur, 1, n // 2) for blur, _, n in levels[1:]], False)
+    return surface, found
 
 
 def _check(outlines: Outlines) -> None:
