@@ -61,7 +61,7 @@ class Eye:
         """
         given = list(self._set)
         replaced = [t for t, _ in given[1:]] + [now]  # when each was followed by another
-        lately = [v for (_, v), t in zip(given, replaced, strict=True) if now - t < ECHO_S]
+        lately = [v for (_, v), t in zip(given, replaced, strict=False) if now - t < ECHO_S]
         seen = self.view
         scale = 0.01 * max(float(np.linalg.norm(seen.target - seen.position)), 1e-3)
         placed = any(np.linalg.norm(seen.position - view.position) < scale for view in lately)
