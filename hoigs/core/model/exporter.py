@@ -104,7 +104,7 @@ class Exporter(Configurable, ABC):
         keeps: what the files hold, to the form it has there.
     """
 
-    suffixes: ClassVar[tuple[str, ...]] = ()
+    suffixes: tuple[str, ...] = ()
     kinds: ClassVar[frozenset[EntityKind]] = frozenset({"scene", "human", "object"})
     moving: ClassVar[bool] = True
     reads_gaussians: ClassVar[bool] = True

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -51,12 +52,13 @@ class Finder:
         self.cv2, self.masks = cv2, settings["masks"]
         pose = {**settings["pose"], "enable_segmentation": self.masks, "smooth_segmentation": False}
         self.whole, self.padded = solutions.pose.Pose(**pose), solutions.pose.Pose(**pose)
-        self.selfie = self.close = None
+        self.selfie: Any = None
+        self.close: Any = None
         if self.masks:
             self.selfie = solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
             self.close = solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
-        self.rows = {"image_xyzv": [], "world_xyzv": []}
-        self.person = []
+        self.rows: dict[str, list] = {"image_xyzv": [], "world_xyzv": []}
+        self.person: list[np.ndarray] = []
 
     def add(self, image) -> None:
         wide = None if self.selfie is None else self.selfie.process(image).segmentation_mask

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
 import torch
 
 from hoigs.core.config import ComponentConfig
@@ -80,7 +79,7 @@ def add_splats(glb: Glb, name: str, gaussians: Gaussians) -> int:
         for k in range(2 * degree + 1):
             values[f"{NAME}:SH_DEGREE_{degree}_COEF_{k}"] = g.sh[:, degree * degree + k]
     attributes = {
-        key: glb.accessor(np.float32(value.numpy()), VERTICES) for key, value in values.items()
+        key: glb.accessor(value.float().numpy(), VERTICES) for key, value in values.items()
     }
     extension = {
         "kernel": "ellipse", "colorSpace": "srgb_rec709_display",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -37,6 +37,9 @@ class _ParametersExporter(Exporter):
     kinds: ClassVar = frozenset({"human"})
     reads_gaussians: ClassVar = False
 
+    Config: ClassVar[type[SmplxNpzConfig | AmassConfig]]
+    config: SmplxNpzConfig | AmassConfig
+
     def __init__(self, config: SmplxNpzConfig | AmassConfig | None = None) -> None:
         self.config = config or self.Config()
         self.axes = AXES[self.config.up]
@@ -48,7 +51,8 @@ class _ParametersExporter(Exporter):
         lost = {"surface details and looks": "the files hold parameters of a body"}
         for motion in body_motions(request):
             turned = motion.turned(turn)
-            np.savez(folder / f"{motion.name}.npz", **self.arrays(turned, request))
+            arrays: dict[str, Any] = self.arrays(turned, request)
+            np.savez(folder / f"{motion.name}.npz", **arrays)
             lost |= _unlike_smpl(motion, type(self).__name__)
         return lost
 
@@ -60,7 +64,7 @@ class _ParametersExporter(Exporter):
 class SmplxExporter(_ParametersExporter):
     """`NAME.npz` with the arguments of an SMPL-X layer, and the joints that they give."""
 
-    Config: ClassVar[type[ComponentConfig]] = SmplxNpzConfig
+    Config = SmplxNpzConfig
     keeps: ClassVar = {
         "global_orient, body_pose, left_hand_pose, right_hand_pose": "axis-angle; zero is the "
         "T-pose with flat hands",
@@ -79,20 +83,20 @@ class SmplxExporter(_ParametersExporter):
             "right_hand_pose": turns[:, -15:].reshape(len(motion), 45),
             "transl": motion.transl.numpy(),
             "betas": motion.betas.numpy(),
-            "scale": np.float32(motion.scale),
+            "scale": np.array(motion.scale, np.float32),
             "joints": torch.stack([motion.joints(i) for i in range(len(motion))]).numpy(),
             "joint_names": np.array(motion.body.joint_names),
             "body_model": np.array(motion.model),
             "gender": np.array(motion.gender or "neutral"),
             "flat_hand_mean": np.array(True),
-            "fps": np.float32(request.fps),
+            "fps": np.array(request.fps, np.float32),
         }
 
 
 class AmassExporter(_ParametersExporter):
     """`NAME.npz` as AMASS has it (Mahmood et al. 2019): SMPL+H poses of 52 joints."""
 
-    Config: ClassVar[type[ComponentConfig]] = AmassConfig
+    Config = AmassConfig
     keeps: ClassVar = {
         "poses": "axis-angle of 52 joints [F, 156], zero is the T-pose with flat hands",
         "trans, betas": "metres; the pelvis is at J_0(betas) + trans",

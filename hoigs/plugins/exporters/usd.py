@@ -70,11 +70,11 @@ class UsdExporter(Exporter):
             else:
                 lost[f"skeleton of {name}"] = "it has no body model"
         progress(0.8, "objects and camera")
-        for motion in object_motions(request):
-            _add_object(stage, motion, turn, hidden=self.config.splats)
-            if motion.residual > 1e-4:
-                lost[f"deformation of the points of {motion.name}"] = (
-                    f"the Xform is rigid, {1000 * motion.residual:.2f} mm (RMS) from the Gaussians"
+        for rigid in object_motions(request):
+            _add_object(stage, rigid, turn, hidden=self.config.splats)
+            if rigid.residual > 1e-4:
+                lost[f"deformation of the points of {rigid.name}"] = (
+                    f"the Xform is rigid, {1000 * rigid.residual:.2f} mm (RMS) from the Gaussians"
                 )
         frames = [frame_of(request.clip, moment) for moment in request.moments]
         _add_camera(stage, [camera_between(request.clip, f).to("cpu") for f in frames], turn)

@@ -148,8 +148,8 @@ def _boxes(masks: MaskStack, shown: Bool[np.ndarray, " F"]) -> Float[np.ndarray,
         found[i] = *middle, max(np.ptp(rows), np.ptp(columns)) + 1
     found = fill_gaps(found, shown)
     half = np.ceil(MARGIN * found[:, 2:] / 2)
-    middle = found[:, :2].round()
-    return np.concatenate((middle - half, middle + half), -1)
+    centers = found[:, :2].round()
+    return np.concatenate((centers - half, centers + half), -1)
 
 
 def _cut(mask: Bool[np.ndarray, "H W"], box: Float[np.ndarray, " 4"], size: int) -> np.ndarray:

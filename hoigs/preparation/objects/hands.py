@@ -84,7 +84,7 @@ def hand_motion(
     held &= ~flies
     frames = _hand_frames(places, near, first)
     rotations, pieces = _chained(frames, near, held, rests)
-    known = near.any(1)
+    known = np.asarray(near.any(1))
     palm_depths = _depths_of(palms, near, depths, cameras)
     if known.any():
         depths = fill_gaps(palm_depths, known)

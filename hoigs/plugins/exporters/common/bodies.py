@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -137,5 +138,5 @@ def _pose(request: ExportRequest, name: str, moment: Moment) -> BodyPose:
     residual = request.scene(moment, [name]).residuals.get(name)
     if residual is None or residual.pose is None or "pose" not in deformation.residuals:
         return pose
-    rule = getattr(getattr(deformation, "config", None), "residual_rule", "add")
+    rule: Any = getattr(getattr(deformation, "config", None), "residual_rule", "add")
     return pose.with_residual(residual.pose, rule)
