@@ -11,7 +11,7 @@ from scipy import ndimage
 from hoigs.core.interfaces.estimator import FramePrompt
 from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram, odds_of
 from hoigs.plugins.estimators.object_tracker.footage import Footage
-from hoigs.plugins.estimators.object_tracker.scene import Scene
+from hoigs.plugins.estimators.object_tracker.scene import Scene, median_of
 from hoigs.plugins.estimators.object_tracker.walker import walked
 from hoigs.plugins.estimators.object_tracker.windows import Window
 
@@ -42,7 +42,7 @@ def prompted_mask(
     seed = _disc(footage.shape, inside, max(1.5, 0.005 * footage.diagonal))
     away = scene.difference(i)
     on_person = bool(footage.person[i][seed].mean() > 0.5) if seed.any() else False
-    at_rest = not np.nanmedian(np.append(away[seed], np.nan)) > 4 if seed.any() else True
+    at_rest = not median_of(away[seed]) > 4
     fixed = _evidence(footage.person[i], away, on_person, at_rest)
     fixed[_disc(footage.shape, outside, max(1.5, 0.008 * footage.diagonal))] = -9
     fixed[footage.blank[i]] = -9
