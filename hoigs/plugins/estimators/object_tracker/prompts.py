@@ -56,8 +56,8 @@ def prompted_mask(
         center = tuple(inside.mean(0))
         reach = float(np.hypot(*(inside - center).T).max())
         spread = [reach + r * footage.diagonal for r in RADII]
-    tried = [_grown(footage, i, fixed, center, s, inside, box, known) for s in spread]
-    tried = [t for t in tried if t is not None]
+    grown = [_grown(footage, i, fixed, center, s, inside, box, known) for s in spread]
+    tried = [g for g in grown if g is not None]
     if not tried:
         return PromptedMask(i, np.zeros(footage.shape, np.float32), 0.0, on_person)
     masks = [soft > 0.5 for _, soft in tried]
@@ -135,7 +135,7 @@ def _grown(
     footage: Footage, i: int, fixed: np.ndarray, center, spread: float, seeds, box, known
 ) -> tuple[float, np.ndarray] | None:
     """Score and soft mask at one size: colours and mask in turns, as in GrabCut (Rother 2004)."""
-    window = Window.around(*center, 1.6 * spread + 4)
+    window = Window.around(center[0], center[1], 1.6 * spread + 4)
     colors = window.cut(footage.colors(i))
     valid = window.inside(footage.shape)
     bins = bins_of(colors)
