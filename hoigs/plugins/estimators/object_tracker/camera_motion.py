@@ -64,7 +64,7 @@ def _matches(
     size = min(BLOCK, *(side // 2 for side in first.shape))
     window = np.outer(np.hanning(size), np.hanning(size)).astype(np.float32)
     a, b, covered = (_blocks(image, size) for image in (first, second, hidden))
-    at = _blocks(np.stack(np.mgrid[: first.shape[0], : first.shape[1]][::-1], -1), size)
+    at = _blocks(np.moveaxis(np.mgrid[: first.shape[0], : first.shape[1]][::-1], 0, -1), size)
     seen = (covered.mean((1, 2)) < 0.2) & (a.std((1, 2)) > 3)
     a, b = (x[seen] - x[seen].mean((1, 2), keepdims=True) for x in (a, b))
     shift, weight = _phase_shifts(a * window, b * window)

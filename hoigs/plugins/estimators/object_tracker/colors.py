@@ -9,14 +9,14 @@ from jaxtyping import Float, Int
 from scipy import ndimage
 
 BINS = (20, 32, 32)  # of lightness and the two axes of chroma
-LOW, WIDE = np.float32([0, -64, -64]), np.float32([3.9, 4, 4])
+LOW, WIDE = (np.array(v, np.float32) for v in ((0, -64, -64), (3.9, 4, 4)))
 LIMIT = 3.0  # largest log-odds that a colour may give
 
 
 def bins_of(features: Float[np.ndarray, "... 3"]) -> Int[np.ndarray, "..."]:
     """The histogram's bin of each colour."""
     cell = ((features - LOW) / WIDE).astype(np.int32)
-    cell = np.clip(cell, 0, np.int32(BINS) - 1)
+    cell = np.clip(cell, 0, np.array(BINS, np.int32) - 1)
     return (cell[..., 0] * BINS[1] + cell[..., 1]) * BINS[2] + cell[..., 2]
 
 

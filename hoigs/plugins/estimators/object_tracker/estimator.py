@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -69,8 +70,9 @@ class ObjectTrackerEstimator(Estimator):
         """Of everything that masks depend on; the person's by a few frames of them."""
         person = _person(video)
         digest = hashlib.sha256()
-        for i in video.numbers[:: max(1, len(video.numbers) // 8)] if person is not None else ():
-            digest.update(np.packbits(person[i]).tobytes())
+        if person is not None:
+            for i in video.numbers[:: max(1, len(video.numbers) // 8)]:
+                digest.update(np.packbits(person[i]).tobytes())
         return settings_key({
             "version": VERSION, "settings": self.config.model_dump(), "frames": video.numbers,
             "objects": [[e.name, repr(e.prompts)] for e in wanted], "static": video.static_camera,
@@ -218,7 +220,7 @@ def _doubts(tracks: dict[str, Track | None], footage: Footage) -> list[str]:
     for name, track in tracks.items():
         if track is None:
             continue
-        seen = (track.soft > 127).any((1, 2))
+        seen = [bool((soft > 127).any()) for soft in track.soft]
         lost = [n for n, s in zip(footage.numbers, seen) if not s]
         weak = [n for n, s, c in zip(footage.numbers, seen, track.confidence) if s and c < WEAK]
         if lost:
@@ -282,10 +284,7 @@ def _read(file: Path, video: VideoRequest, names: Sequence[str]) -> EntityMasks:
         soft = {n: saved[f"soft {n}"] for n in names}
         confidence = {n: saved[f"confidence {n}"] for n in names}
     row = {number: k for k, number in enumerate(about["numbers"])}
-    masks = {
-        n: LazyFrames(video.frames, lambda i, n=n: _enlarged(soft[n], row.get(i), video))
-        for n in names
-    }
+    masks = {n: LazyFrames(video.frames, partial(_mask_at, soft[n], row, video)) for n in names}
     chosen = {
         n: tuple(
             FramePrompt(frame, tuple(PromptPoint(*p) for p in points), tuple(box) if box else None)
@@ -296,6 +295,10 @@ def _read(file: Path, video: VideoRequest, names: Sequence[str]) -> EntityMasks:
     return EntityMasks(
         masks, None, "object tracker without a network", confidence, chosen, tuple(about["notes"])
     )
+
+
+def _mask_at(soft: np.ndarray, row: dict[int, int], video: VideoRequest, i: int) -> np.ndarray:
+    return _enlarged(soft, row.get(i), video)
 
 
 def _enlarged(soft: np.ndarray, row: int | None, video: VideoRequest) -> np.ndarray:

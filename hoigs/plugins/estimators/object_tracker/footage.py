@@ -52,7 +52,7 @@ class Footage:
 
 def to_features(lab: np.ndarray) -> Float[np.ndarray, "... 3"]:
     """Stored L*a*b* as the features in which colours are compared."""
-    return (lab.astype(np.float32) - np.float32([0, 128, 128])) * np.float32([0.3, 1.0, 1.0])
+    return (lab.astype(np.float32) - _NEUTRAL) * _WEIGHTS
 
 
 def read_footage(
@@ -91,7 +91,7 @@ def read_footage(
 
 def lab_of(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """sRGB as CIE L*a*b* in uint8 (white of D65); tables make it twenty times as fast as kornia."""
-    white = np.float32([0.950456, 1.0, 1.088754])
+    white = np.array([0.950456, 1.0, 1.088754], np.float32)
     xyz = _LINEAR[image] @ (_TO_XYZ.T / white)
     f = _ROOTS[np.rint(xyz * (len(_ROOTS) - 1)).astype(np.int32).clip(0, len(_ROOTS) - 1)]
     x, y, z = f[..., 0], f[..., 1], f[..., 2]
@@ -108,9 +108,16 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
 
 
 _LINEAR, _ROOTS = _tables()
-_TO_XYZ = np.float32(
-    [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
+_TO_XYZ = np.array(
+    [
+        [0.412453, 0.357580, 0.180423],
+        [0.212671, 0.715160, 0.072169],
+        [0.019334, 0.119193, 0.950227],
+    ],
+    np.float32,
 )
+_NEUTRAL = np.array([0, 128, 128], np.float32)
+_WEIGHTS = np.array([0.3, 1.0, 1.0], np.float32)
 
 
 def _reduced(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -73,13 +73,13 @@ def _candidates(
     small = odds[::step, ::step]
     p = 1 / (1 + np.exp(-small))
     r = size / step
-    best = None
+    best = np.full(p.shape, -np.inf)
     for factor in (0.75, 1.15):
         s = r * factor / 1.5
         inner = ndimage.gaussian_filter(p, s, mode="constant", truncate=2.5)
         outer = ndimage.gaussian_filter(p, 2 * s, mode="nearest", truncate=2.5)
         response = inner - 0.6 * outer
-        best = response if best is None else np.maximum(best, response)
+        best = np.maximum(best, response)
     peaks = best == ndimage.maximum_filter(best, size=2 * max(1, int(0.5 * r)) + 1)
     peaks &= best > 0.08
     y, x = np.nonzero(peaks)
@@ -103,7 +103,9 @@ def _likeness(bins: np.ndarray, colors: ColorModel, place: np.ndarray, size: flo
 def _cheapest(frames: list, size: float, known: list[int]) -> Path:
     """Viterbi's path over candidates and absence; an absence keeps the place it began at."""
     # state: row of x, y of the last sighting, its age, whether it is seen now
-    spots, costs, back = [], [], []
+    spots: list[list] = []
+    costs: list[list] = []
+    back: list[list] = []
     for i, (places, unary) in enumerate(frames):
         here = [(p, 0) for p in places]
         if i == 0:

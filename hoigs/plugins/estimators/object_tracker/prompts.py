@@ -11,7 +11,7 @@ from scipy import ndimage
 from hoigs.core.interfaces.estimator import FramePrompt
 from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram, odds_of
 from hoigs.plugins.estimators.object_tracker.footage import Footage
-from hoigs.plugins.estimators.object_tracker.scene import Scene
+from hoigs.plugins.estimators.object_tracker.scene import Scene, median_of
 from hoigs.plugins.estimators.object_tracker.walker import walked
 from hoigs.plugins.estimators.object_tracker.windows import Window
 
@@ -42,7 +42,7 @@ def prompted_mask(
     seed = _disc(footage.shape, inside, max(1.5, 0.005 * footage.diagonal))
     away = scene.difference(i)
     on_person = bool(footage.person[i][seed].mean() > 0.5) if seed.any() else False
-    at_rest = not np.nanmedian(np.append(away[seed], np.nan)) > 4 if seed.any() else True
+    at_rest = not median_of(away[seed]) > 4
     fixed = _evidence(footage.person[i], away, on_person, at_rest)
     fixed[_disc(footage.shape, outside, max(1.5, 0.008 * footage.diagonal))] = -9
     fixed[footage.blank[i]] = -9
@@ -56,8 +56,8 @@ def prompted_mask(
         center = tuple(inside.mean(0))
         reach = float(np.hypot(*(inside - center).T).max())
         spread = [reach + r * footage.diagonal for r in RADII]
-    tried = [_grown(footage, i, fixed, center, s, inside, box, known) for s in spread]
-    tried = [t for t in tried if t is not None]
+    grown = [_grown(footage, i, fixed, center, s, inside, box, known) for s in spread]
+    tried = [g for g in grown if g is not None]
     if not tried:
         return PromptedMask(i, np.zeros(footage.shape, np.float32), 0.0, on_person)
     masks = [soft > 0.5 for _, soft in tried]
@@ -135,7 +135,7 @@ def _grown(
     footage: Footage, i: int, fixed: np.ndarray, center, spread: float, seeds, box, known
 ) -> tuple[float, np.ndarray] | None:
     """Score and soft mask at one size: colours and mask in turns, as in GrabCut (Rother 2004)."""
-    window = Window.around(*center, 1.6 * spread + 4)
+    window = Window.around(center[0], center[1], 1.6 * spread + 4)
     colors = window.cut(footage.colors(i))
     valid = window.inside(footage.shape)
     bins = bins_of(colors)

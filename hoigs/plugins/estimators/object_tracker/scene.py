@@ -133,6 +133,12 @@ def moving_scene(footage: Footage) -> MovingScene:
     return MovingScene(footage, homographies(footage))
 
 
+def median_of(differences: np.ndarray) -> float:
+    """Of those that are known; NaN where none is."""
+    known = differences[np.isfinite(differences)]
+    return float(np.median(known)) if known.size else float("nan")
+
+
 def shadowless(away: np.ndarray, scene: np.ndarray) -> Float[np.ndarray, "h w"]:
     """Length of a difference of colours, less where only lightness falls, as in a shadow."""
     light, chroma = away[..., 0], np.hypot(away[..., 1], away[..., 2])

@@ -14,7 +14,7 @@ from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, 
 from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
 from hoigs.plugins.estimators.object_tracker.path import Path, center_of, found_path
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
-from hoigs.plugins.estimators.object_tracker.scene import Scene
+from hoigs.plugins.estimators.object_tracker.scene import Scene, median_of
 from hoigs.plugins.estimators.object_tracker.transfer import shift_of, transferred
 from hoigs.plugins.estimators.object_tracker.walker import walked
 from hoigs.plugins.estimators.object_tracker.windows import Window
@@ -70,7 +70,7 @@ def tracked(
 
 def at_rest(scene: Scene, known: dict[int, Bool[np.ndarray, "h w"]]) -> bool:
     """Whether the prompted object looks like a part of the scene in any prompted frame."""
-    away = [np.nanmedian(np.append(scene.difference(i)[m], np.nan)) for i, m in known.items()]
+    away = [median_of(scene.difference(i)[m]) for i, m in known.items()]
     return not min(away) > 4
 
 
@@ -90,7 +90,7 @@ def stands_out(
     for i in seen[:: max(1, len(seen) // 24)]:
         x, y = (max(int(v), 0) for v in path.centers[i])
         part = scene.difference(i)[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1]
-        middle.append(np.nanmedian(part) if np.isfinite(part).any() else np.nan)
+        middle.append(median_of(part))
     return bool(np.nanpercentile([*middle, np.nan, 99.0], 15) > 3)
 
 
