@@ -1,6 +1,6 @@
 """The screenshots of docs/howto/view.md, made by a headless Chromium.
 
-    python scripts/view_pictures.py RUN          # for example runs/demo
+    python scripts/view_pictures.py RUN [run clip file]      # for example runs/demo
 
 Needs the extras of dev (playwright) and Chromium in PATH. Writes docs/assets/view-*.webp.
 """
@@ -22,6 +22,7 @@ import hoigs
 from hoigs.runs.run_folder import RunFolder
 
 ASSETS = Path(__file__).resolve().parents[1] / "docs" / "assets"
+SLOW_MS = 240_000  # software rendering on a busy machine
 SIZE = {"width": 1200, "height": 760}
 SOFTWARE = (
     "--no-sandbox",
@@ -32,7 +33,7 @@ SOFTWARE = (
 
 
 def save(page: Page, name: str) -> None:
-    shot = Image.open(BytesIO(page.screenshot())).convert("RGB")
+    shot = Image.open(BytesIO(page.screenshot(timeout=SLOW_MS))).convert("RGB")
     shot = shot.resize((900, round(900 * shot.height / shot.width)), Image.Resampling.LANCZOS)
     shot.save(ASSETS / f"view-{name}.webp", quality=80)
     print(f"view-{name}.webp: {(ASSETS / f'view-{name}.webp').stat().st_size // 1000} kB")
@@ -77,36 +78,32 @@ class Served:
 
 
 def drag(page: Page, dx: int, dy: int) -> None:
-    page.mouse.move(400, 380)
+    page.mouse.move(400, 380)  # left of the panel
     page.mouse.down()
     page.mouse.move(400 + dx, 380 + dy, steps=6)
     page.mouse.up()
 
 
-def choose(page: Page, label: str, value: str) -> None:
-    page.get_by_label(label).or_(page.get_by_role("textbox", name=label)).first.click()
-    page.get_by_role("option", name=value, exact=True).click()
-
-
 def of_run(browser: Any, run: Path) -> None:
     served = Served(run)
     page = served.open(browser)
-    served.viewer.clock.seek(0.5 * served.viewer.clock.last, 0.0)
+    viewer = served.viewer
+    viewer.clock.seek(0.5 * viewer.clock.last, 0.0)
     served.settle(page)
+    with viewer.controls.lock:
+        viewer.settings.layout, viewer.settings.share = "wipe", 0.32
+    served.settle(page)
+    save(page, "wipe")
+    with viewer.controls.lock:
+        viewer.settings.layout = "one"
     drag(page, 36, 20)
     served.settle(page)
     save(page, "run")
-    page.get_by_label("human", exact=True).click()
-    for name in ("body mesh", "object track", "cameras"):
-        page.get_by_label(name, exact=True).click()
+    with viewer.controls.lock:
+        viewer.settings.entities.discard("human")
+        viewer.settings.overlays.update(("body mesh", "object track"))
     served.settle(page)
     save(page, "overlays")
-    with served.viewer.controls.lock:
-        served.viewer.settings.entities.add("human")
-        served.viewer.settings.overlays.clear()
-        served.viewer.settings.layout = "wipe"
-    served.settle(page)
-    save(page, "wipe")
     served.close()
 
 
@@ -114,8 +111,8 @@ def of_clip(browser: Any, clip: Path) -> None:
     served = Served(clip)
     page = served.open(browser)
     served.viewer.clock.seek(0.5 * served.viewer.clock.last, 0.0)
-    for name in ("cameras", "body mesh"):
-        page.get_by_label(name, exact=True).click()
+    with served.viewer.controls.lock:
+        served.viewer.settings.overlays.update(("skeleton", "object track"))
     served.settle(page)
     save(page, "clip")
     served.close()
@@ -127,7 +124,7 @@ def of_file(browser: Any, run: Path) -> None:
         print(made)
         page = browser.new_context(viewport=SIZE, offline=True).new_page()
         page.goto(made.path.as_uri())
-        page.wait_for_function("window.drawn > 0")
+        page.wait_for_function("window.drawn > 0", timeout=SLOW_MS)
         page.evaluate("(() => { const t = document.getElementById('time'); t.value = t.max / 2;"
                       " t.oninput({target: t}); })()")  # fmt: skip
         page.wait_for_timeout(2000)
@@ -141,9 +138,9 @@ def main() -> None:
     clip = (run / RunFolder(run).read_provenance()["clip"]["path"]).resolve()
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=[*SOFTWARE])
-        of_run(browser, run)
-        of_clip(browser, clip)
-        of_file(browser, run)
+        made = {"file": of_file, "clip": of_clip, "run": of_run}
+        for part in sys.argv[2:] or made:
+            made[part](browser, clip if part == "clip" else run)
         browser.close()
 
 

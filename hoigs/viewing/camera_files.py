@@ -79,8 +79,9 @@ def read_camera_path(
         a, b = keys[before], keys[after]
         r = min(max((share - a.at) / (b.at - a.at), 0.0), 1.0) if b.at > a.at else 0.0
         r = r * r * (3 - 2 * r)
-        held = a.frame is not None and b.frame is not None
-        frame = a.frame + r * (b.frame - a.frame) if held else playing
+        frame = playing
+        if a.frame is not None and b.frame is not None:
+            frame = a.frame + r * (b.frame - a.frame)
         camera = blend_cameras(cameras[before], cameras[after], r)
         views.append((moment_between(clip, frame), camera))
     return views

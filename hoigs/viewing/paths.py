@@ -23,7 +23,7 @@ from hoigs.viewing.camera_files import read_camera_path
 
 View = tuple[Moment, Camera]
 OLDER = {"playback": "video"}
-BULLET_DEGREES = 35.0  # to each side: what a single video has seen of the far side is little
+BULLET_DEGREES = 25.0  # to each side: what a single video has seen of the far side is little
 BULLET_SECONDS = 4.0
 SMOOTHING = 0.25  # seconds over which the place of what is followed is averaged
 

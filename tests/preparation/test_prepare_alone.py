@@ -78,7 +78,7 @@ def environment(alone: Path, tmp_path: Path) -> None:
     np.savez(known, **landmarks())
     (package / "__init__.py").write_text(FAKE.replace("KNOWN", str(known)))
     (package.parent / "cv2.py").write_text(
-        "BORDER_REPLICATE = 1\ncopyMakeBorder = lambda i, *a: i\n"
+        "BORDER_REPLICATE = 1\ncopyMakeBorder = GaussianBlur = lambda i, *a: i\n"
     )
     start = f"import sys, runpy; sys.path.insert(0, {str(package.parent)!r}); "
     start += "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"

@@ -122,7 +122,7 @@ def test_compared_and_transparent_files(run, tmp_path):
         frames = [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
     assert len(frames) == 2 == done.frames and frames[0].shape == (64, 128, 3)
     source = run.clip.store.image(1).numpy().astype(int)
-    assert np.abs(frames[1][:, :64].astype(int) - source).mean() < 6
+    assert np.abs(frames[1][:, :64].astype(int) - source).mean() < 10  # 4:2:0 chroma of few pixels
     h.render(
         tiny_run(), out=tmp_path / "t.mov", background="transparent", entities=["human"], end=0.0,
         device="cpu",

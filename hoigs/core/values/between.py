@@ -107,8 +107,8 @@ def blend_cameras(a: Camera, b: Camera, r: float) -> Camera:
     if r == 0.0:
         return a
     b = b.resized(a.width, a.height)
-    quats = [matrices_to_quats(c.world_to_camera[:3, :3]) for c in (a, b)]
-    rotation = quats_to_matrices(slerp(*quats, r))
+    before, after = (matrices_to_quats(c.world_to_camera[:3, :3]) for c in (a, b))
+    rotation = quats_to_matrices(slerp(before, after, r))
     pose = torch.eye(4).to(a.world_to_camera)
     pose[:3, :3] = rotation
     pose[:3, 3] = -rotation @ torch.lerp(a.center, b.center, r)

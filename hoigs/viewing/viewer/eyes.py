@@ -12,7 +12,7 @@ from hoigs.viewing.viewer.resolution import Resolution
 from hoigs.viewing.viewer.views import View
 
 STILL_S = 0.25  # a picture is drawn in full once nothing has changed for so long
-ECHO_S = 10.0  # for so long a browser may still answer with a camera that was set
+ECHO_S = 10.0  # for so long a browser may still answer with a camera that was replaced
 
 
 class Eye:
@@ -60,7 +60,8 @@ class Eye:
         What comes before the browser has taken the first one is its own start.
         """
         given = list(self._set)
-        lately = [view for t, view in given if now - t < ECHO_S] or [v for _, v in given[-1:]]
+        replaced = [t for t, _ in given[1:]] + [now]  # when each was followed by another
+        lately = [v for (_, v), t in zip(given, replaced, strict=False) if now - t < ECHO_S]
         seen = self.view
         scale = 0.01 * max(float(np.linalg.norm(seen.target - seen.position)), 1e-3)
         placed = any(np.linalg.norm(seen.position - view.position) < scale for view in lately)

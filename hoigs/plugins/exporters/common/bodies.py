@@ -73,10 +73,11 @@ class BodyMotion:
 
     def turned(self, turn: Float[Tensor, "3 3"]) -> BodyMotion:
         """The same in a world that is rotated."""
-        roots = axis_angle_to_quats(self.rotations[:, 0])
-        first = matrices_to_quats(turn).expand_as(roots)
+        # in float64, as turns near 180 degrees lose digits in float32
+        roots = axis_angle_to_quats(self.rotations[:, 0].double())
+        first = matrices_to_quats(turn.double()).expand_as(roots)
         rotations = self.rotations.clone()
-        rotations[:, 0] = quats_to_axis_angle(multiply_quats(first, roots))
+        rotations[:, 0] = quats_to_axis_angle(multiply_quats(first, roots)).to(rotations)
         transl = self.pelvis @ turn.mT - self.rest_joints[0]
         return replace(self, rotations=rotations, transl=transl)
 
