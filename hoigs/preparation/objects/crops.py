@@ -144,8 +144,8 @@ def _boxes(masks: MaskStack, shown: Bool[np.ndarray, " F"]) -> Float[np.ndarray,
     found = np.zeros((len(masks), 3))
     for i in np.flatnonzero(shown).tolist():
         rows, columns = np.nonzero(masks[i])
-        middle = (columns.min() + columns.max() + 1) / 2, (rows.min() + rows.max() + 1) / 2
-        found[i] = *middle, max(np.ptp(rows), np.ptp(columns)) + 1
+        x, y = (columns.min() + columns.max() + 1) / 2, (rows.min() + rows.max() + 1) / 2
+        found[i] = x, y, max(np.ptp(rows), np.ptp(columns)) + 1
     found = fill_gaps(found, shown)
     half = np.ceil(MARGIN * found[:, 2:] / 2)
     centers = found[:, :2].round()

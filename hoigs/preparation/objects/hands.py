@@ -81,7 +81,7 @@ def hand_motion(
     held = near.any(1) & ~rests
     # hands are still, or already, near for a moment while it flies
     flies = ndimage.binary_dilation(~(held | rests), iterations=max(1, round(RELEASE * fps)))
-    held &= ~flies
+    held = np.asarray(held & ~flies)
     frames = _hand_frames(places, near, first)
     rotations, pieces = _chained(frames, near, held, rests)
     known = np.asarray(near.any(1))

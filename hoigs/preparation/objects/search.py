@@ -29,6 +29,7 @@ MOST_TURNS, SLACK = 1.3, 0.6  # of a flight; radians between its end and the nex
 TURNING = 0.02  # weight of that against the texture
 NEUTRAL, UNKNOWN = 2.0, 30.0  # cost of unknown texture, and the points that it counts as
 OUTSIDE = 1.5  # cost of a point outside the mask
+CLEARLY = 0.8  # of its cost: another rotation has to be better by so much
 LOOKS = 6  # frames of a grasp in which its rotation is looked for
 
 
@@ -132,11 +133,13 @@ class _Search:
     def piece(self, rows: np.ndarray, turns: Tensor, places: Tensor) -> Tensor:
         """Rotations of a grasp that turns as `turns` do, from one that is found."""
         looks = rows[np.linspace(0, len(rows) - 1, min(LOOKS, len(rows))).round().astype(int)]
-        total = torch.zeros(len(self.grid))
+        grid = torch.cat((turns[:1], self.grid))
+        total = torch.zeros(len(grid))
         for row in looks.tolist():
             turn = turns[int(np.flatnonzero(rows == row)[0])] @ turns[0].mT
-            total += self.costs(row, turn @ self.grid, places[row])
-        return turns @ turns[0].mT @ self.grid[total.argmin()]
+            total += self.costs(row, turn @ grid, places[row])
+        total[0] *= CLEARLY  # as it was let go, unless the texture is clearly against it
+        return turns @ turns[0].mT @ grid[total.argmin()]
 
     def flight(
         self, rows: np.ndarray, rotations: Tensor, places: Tensor, fps: float

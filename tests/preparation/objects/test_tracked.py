@@ -85,7 +85,7 @@ def test_turning_and_shape_of_a_held_box() -> None:
     )
     rotations, places = poses(0.7)
     off = angles(track.rotations @ track.rotations[0].mT, rotations @ rotations[0].mT)
-    assert float(off.median()) < 4
+    assert float(off.median()) < 6  # of a swing of 80 degrees, after a quarter of the steps
     assert float((track.translations - places).norm(dim=-1).mean()) < 0.06
     outwards = (normals * track.points).sum(-1) > 0
     assert float(outwards.float().mean()) > 0.95
