@@ -31,9 +31,8 @@ def fuzz(record: dict[str, Any]) -> str:
         for name, t in record["targets"].items()
     ]  # fmt: skip
     columns = ("files", "cases", "read", "refused", "wrong", "slowest, s")
-    note = (
-        f"`{record['command']}`: {record['cases']:,} cases in {minutes}"
-    )
+    minutes = f"{record['seconds'] / 60:.0f} minutes"
+    note = f"`{record['command']}`: {record['cases']:,} cases in {minutes}"
     return f"{table(columns, rows)}\n\n{note}, at most {record['peak_gib']} GiB."
 
 

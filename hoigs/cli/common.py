@@ -46,6 +46,9 @@ AllowFaultsOption = Annotated[
         help="Continue without masks, images and depth that are missing or broken.",
     ),
 ]
+OverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="Replace what hoigs wrote to --out before.")
+]
 PluginOption = Annotated[
     list[Path] | None,
     typer.Option(

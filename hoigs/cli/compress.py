@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hoigs.cli.common import ClipOption, DeviceOption, PluginOption
+from hoigs.cli.common import ClipOption, DeviceOption, OverwriteOption, PluginOption
 
 
 def compress(
@@ -18,9 +18,7 @@ def compress(
     ] = None,
     clip: ClipOption = None,
     device: DeviceOption = "auto",
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the run in --out.")
-    ] = False,
+    overwrite: OverwriteOption = False,
     plugin: PluginOption = None,
 ) -> None:
     """Quantise a trained model to 8 and 16 bits a number and compress it.

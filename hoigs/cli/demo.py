@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hoigs.cli.common import DeviceOption, RasterizerOption, SetOption, print_table
+from hoigs.cli.common import DeviceOption, OverwriteOption, RasterizerOption, SetOption, print_table
 from hoigs.cli.display import Display, print_scores
 
 if TYPE_CHECKING:
@@ -25,9 +25,7 @@ def demo(
         bool,
         typer.Option("--baseline/--no-baseline", help="Also train a static model for comparison."),
     ] = True,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an earlier demo.")
-    ] = False,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Generate a clip with known truth, reconstruct it, and write report.html."""
     from hoigs.workflows.demo import demo as run_demo

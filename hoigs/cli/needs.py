@@ -10,6 +10,7 @@ import typer
 from hoigs.cli.common import (
     AllowFaultsOption,
     DeviceOption,
+    OverwriteOption,
     PluginOption,
     RasterizerOption,
     SetOption,
@@ -55,9 +56,7 @@ def needs(
     settings: SetOption = None,
     rasterizer: RasterizerOption = None,
     device: DeviceOption = "auto",
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the answer in --out.")
-    ] = False,
+    overwrite: OverwriteOption = False,
     allow_faults: AllowFaultsOption = False,
     plugin: PluginOption = None,
 ) -> None:

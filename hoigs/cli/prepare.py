@@ -115,7 +115,7 @@ def prepare(
             seconds = prepare_until(
                 stage, source, out, options=options, progress=show.fraction,
                 redo=redo or (), allow_commands=allow_commands, object=object_at or (),
-                consent=_consent(yes), announce=_announce,
+                yes=yes, consent=_consent(), announce=_announce,
             )  # fmt: skip
         rows = [(name, f"{value:.1f} s") for name, value in seconds.items()]
         print_table(f"stages kept in {work_folder(out)}", ("stage", "made in"), rows)
@@ -124,7 +124,7 @@ def prepare(
         report = run(
             source, out, options=options, progress=show.fraction,
             redo=redo or (), allow_commands=allow_commands, object=object_at or (),
-            consent=_consent(yes), announce=_announce,
+            yes=yes, consent=_consent(), announce=_announce,
         )  # fmt: skip
     print_table(f"prepared {out}", ("what", "value", "note"), report.rows())
     for warning in report.warnings:
@@ -138,10 +138,8 @@ def _announce(plan: EstimatorPlan) -> None:
     print_table(title, ("what", "from", "why", "about, on 2 cores"), plan.rows())
 
 
-def _consent(yes: bool) -> Consent | None:
+def _consent() -> Consent | None:
     """Asks on a terminal; elsewhere nobody can answer."""
-    if yes:
-        return lambda question: True
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         return None
     return lambda question: typer.confirm(question, default=True)

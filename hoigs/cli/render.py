@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hoigs.cli.common import DeviceOption, PluginOption, RasterizerOption
+from hoigs.cli.common import ClipOption, DeviceOption, PluginOption, RasterizerOption
 from hoigs.cli.display import Display
 
 
@@ -52,7 +52,7 @@ def render(
         float | None,
         typer.Option("--at", help="Frame at which bullet-time stands still; default: the fastest."),
     ] = None,
-    clip: Annotated[Path | None, typer.Option("--clip", help="The clip, if it was moved.")] = None,
+    clip: ClipOption = None,
     rasterizer: RasterizerOption = None,
     device: DeviceOption = "auto",
     plugin: PluginOption = None,

@@ -10,6 +10,7 @@ import typer
 from hoigs.cli.common import (
     AllowFaultsOption,
     DeviceOption,
+    OverwriteOption,
     PluginOption,
     RasterizerOption,
     SetOption,
@@ -48,9 +49,7 @@ def train(
         bool,
         typer.Option("--resume", help="Continue the run in --out, with its own spec and clip."),
     ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the run in --out.")
-    ] = False,
+    overwrite: OverwriteOption = False,
     allow_faults: AllowFaultsOption = False,
     reader: Annotated[
         str | None,
@@ -92,8 +91,7 @@ def train(
             made = train_auto(named, spec, on_found=print_needs, **given)
             run = made.run
         else:
-            more = {"reader": reader, "reader_settings": reader_set or ()}
-            run = train_spec(clip, spec, **more, **given)
+            run = train_spec(clip, spec, reader=reader, reader_settings=reader_set or (), **given)
     if auto:
         _print_after(made.after)
     if run.evaluated is not None:

@@ -76,8 +76,10 @@ def unpack(
             raise CheckpointError(f"{name}: described, but not in the file")
         try:
             data = _decompressed(streams[name].numpy().tobytes(), _size(record))
-        except (zlib.error, ValueError, KeyError, TypeError) as error:
+        except zlib.error as error:
             raise CheckpointError(f"{name}: damaged: {error}") from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise CheckpointError(f"{name}: does not match its description: {error}") from error
         if zlib.crc32(data) != record["crc32"]:
             raise CheckpointError(f"{name}: damaged: its checksum differs")
         try:

@@ -13,16 +13,17 @@ from hoigs.preparation.options import Place, PrepareOptions
 from hoigs.preparation.video.header import video_header
 from hoigs.preparation.video.source import Source, numbered_frames
 
-# seconds a frame of 1280x720 on two cores, measured by benchmarks/prepare_alone.py
+# seconds of a processor a frame of 1280x720, about, as benchmarks/prepare_alone.py measures them;
+# those of networks are guesses
 COST = {
-    "estimator:mediapipe": 0.25,
+    "estimator:mediapipe": 0.15,
     "estimator:object-tracker": 0.25,
     "estimator:transformers-sam2": 4.0,
     "estimator:transformers-pose": 0.6,
     "estimator:transformers-depth": 1.5,
 }
 STAGES_COST = 0.35  # of all other stages, likewise
-WHAT = {
+WHAT: dict[Place, str] = {
     "landmarks": "person's landmarks",
     "masks": "person's mask",
     "object": "object's mask",
@@ -127,7 +128,6 @@ def plan_estimators(
     """
     found: dict[Place, Choice] = {}
     for place in WHAT:
-        assert place in ("landmarks", "masks", "object", "depth")
         choice = _choose(place, source, options, given)
         if choice is not None:
             found[place] = choice

@@ -327,8 +327,8 @@ class Pipeline:
         return MaskStack(silhouette(v, self.body.faces, c) for (v, _), c in pairs)
 
     def _object(self) -> None:
-        made = self._stage("object", self._place_object)
-        self.object, self.object_made = None if made is None else made.track, made
+        self.object_made = self._stage("object", self._place_object)
+        self.object = None if self.object_made is None else self.object_made.track
 
     def _place_object(self) -> MadeObject | None:
         if self.estimates.ball is None and not self.masks.object.coverage().any():

@@ -22,7 +22,7 @@ from hoigs.preparation.estimator_plan import EstimatorPlan, plan_estimators
 from hoigs.preparation.options import PrepareOptions, Preset
 from hoigs.preparation.pipeline import Pipeline
 from hoigs.preparation.prompts import with_prompts
-from hoigs.preparation.readiness import Consent, get_ready
+from hoigs.preparation.readiness import Consent, agree, get_ready
 from hoigs.preparation.report.report import PrepareReport
 from hoigs.preparation.settings import installed_estimators, load_options, refuse_commands
 from hoigs.preparation.stages.cleanup import Cleanup
@@ -59,6 +59,7 @@ def prepare(
     redo: Sequence[str] = (),
     body: BodyModel | None = None,
     estimators: Estimators | Preset | None = None,
+    yes: bool = False,
     consent: Consent | None = None,
     announce: Callable[[EstimatorPlan], builtins.object] | None = None,
     progress: Progress | None = None,
@@ -86,7 +87,8 @@ def prepare(
         estimators: by kind of estimate, "masks", "landmarks", "object" or "depth"; those of
             `options.estimators`, which are looked up among the installed plugins, come second.
             Or a preset, in place of `options.preset`.
-        consent: called with a question before anything is downloaded; None: nothing is.
+        yes: install and download what is needed. consent: called with a question before that,
+            where `yes` does not answer it; None: nothing is downloaded.
         announce: called with the plan before work begins.
         allow_commands: let `options.estimators` run the programs that they name.
 
@@ -104,7 +106,7 @@ def prepare(
     replace = options.overwrite or bool(redo)
     _, report = _run(
         source, out, body, options, progress, redo, estimators, None, replace, allow_commands,
-        consent, announce,
+        agree if yes else consent, announce,
     )  # fmt: skip
     assert report is not None  # the last stage makes it
     return report
@@ -121,6 +123,7 @@ def prepare_until(
     redo: Sequence[str] = (),
     body: BodyModel | None = None,
     estimators: Estimators | Preset | None = None,
+    yes: bool = False,
     consent: Consent | None = None,
     announce: Callable[[EstimatorPlan], builtins.object] | None = None,
     progress: Progress | None = None,
@@ -139,7 +142,7 @@ def prepare_until(
     options = with_prompts(load_options(options), object, estimators)
     pipeline, _ = _run(
         source, out, body, options, progress, redo, estimators, stage, True, allow_commands,
-        consent, announce,
+        agree if yes else consent, announce,
     )  # fmt: skip
     return pipeline.stages.seconds
 
@@ -172,7 +175,9 @@ def _run(
         own_cameras=options.camera in ("static", "sfm"), complete=options.preset == "files",
     )  # fmt: skip
     plan = plan_estimators(found, options, set(chosen))
-    specs = {**found.beside, **plan.specs()}
+    specs = plan.specs()
+    for kind, spec in found.beside.items():
+        specs[kind] = spec
     chosen = {**installed_estimators(PrepareOptions(estimators=specs)), **chosen}
     if announce is not None:
         announce(plan)

@@ -14,6 +14,11 @@ from hoigs.preparation.options import Place
 Consent = Callable[[str], bool]  # a question to whether the answer is yes
 
 
+def agree(question: str) -> bool:
+    """A Consent that answers yes."""
+    return True
+
+
 def get_ready(
     plan: EstimatorPlan,
     estimators: Mapping[Place, Estimator],

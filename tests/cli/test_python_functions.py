@@ -47,7 +47,7 @@ WITHOUT = {
 }  # fmt: skip
 # arguments that only a Python caller can give: objects and callbacks
 PYTHON = {"on_start", "on_step", "on_found", "progress", "report", "body", "estimators",
-          "positions"}  # fmt: skip
+          "positions", "consent", "announce"}  # fmt: skip
 
 
 def options_of(command: str) -> dict[str, Any]:

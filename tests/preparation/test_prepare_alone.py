@@ -45,7 +45,8 @@ class Pose:
     def process(self, image):
         self.frame += 1
         points = [
-            [Box(x=p[0] / size[0], y=p[1] / size[1], z=p[2] / size[0], visibility=p[3]) for p in rows]
+            [Box(x=p[0] / size[0], y=p[1] / size[1], z=p[2] / size[0], visibility=p[3])
+             for p in rows]
             for rows, size in (
                 (known["image_xyzv"][self.frame], ({WIDTH}, {HEIGHT})),
                 (known["world_xyzv"][self.frame], (1, 1)),
@@ -77,7 +78,7 @@ def environment(alone: Path, tmp_path: Path) -> None:
     np.savez(known, **landmarks())
     (package / "__init__.py").write_text(FAKE.replace("KNOWN", str(known)))
     (package.parent / "cv2.py").write_text(
-        "BORDER_REPLICATE = 1\ncopyMakeBorder = lambda i, *a: i\n"
+        "BORDER_REPLICATE = 1\ncopyMakeBorder = GaussianBlur = lambda i, *a: i\n"
     )
     start = f"import sys, runpy; sys.path.insert(0, {str(package.parent)!r}); "
     start += "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"

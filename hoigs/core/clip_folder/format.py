@@ -310,7 +310,7 @@ def parse_header(path: Path, model: type[Header]) -> tuple[Header | None, list[s
         return model.model_validate(content), []
     except ValidationError as error:
         found = error.errors()
-        lines = [
+        lines: list[str] = [
             f"{'.'.join(map(str, e['loc'])) or 'header'}: {e['msg'][:500]}"
             + (f" (got {short(e['input'])})" if e["type"] not in ("missing", "value_error") else "")
             for e in found[:MOST_LINES]

@@ -18,6 +18,7 @@ MARGIN = 1.25  # of the person's box, the second look at the person's mask
 CREDIBLE = 0.5  # share of the seen landmarks that have to lie on the person's mask
 TALL = 0.3  # height of the landmarks in heights of the mask, below which they are of something else
 SEEN = 0.5  # visibility
+SOFT = 1 / 640  # of the longer side: standard deviation by which the person's mask is smoothed
 
 
 def main() -> None:
@@ -67,6 +68,8 @@ class Finder:
         near = self.near(image, wide > 0.5)
         mean = wide if near is None else (wide + near) / 2
         person = mean if own is None else (2 * mean + own) / 3
+        # cells of the models are several pixels wide: without this, edges are stairs
+        person = self.cv2.GaussianBlur(person, (0, 0), max(1.0, SOFT * max(image.shape)))
         self.person.append(np.packbits(person > 0.5, axis=1))
 
     def landmarks(self, image, wide):

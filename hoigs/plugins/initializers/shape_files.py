@@ -75,10 +75,13 @@ def _load(path: Path, suffixes: tuple[str, ...]) -> list[Any]:
         raise HoigsError(f"{path}: cannot be read; expected one of {', '.join(suffixes)}")
     try:
         loaded = trimesh.load(path, process=False, allow_remote=False)
-        parts = list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
+        parts: list[Any] = list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
         for part in parts:
+            points = np.asarray(getattr(part, "vertices", np.zeros((0, 3))))
+            if points.ndim != 2 or points.shape[1] != 3:
+                raise ValueError(f"its vertices have the shape {list(points.shape)}")
             faces = getattr(part, "faces", np.zeros((0, 3), int))
-            if len(faces) and not 0 <= faces.min() <= faces.max() < len(part.vertices):
+            if len(faces) and not 0 <= faces.min() <= faces.max() < len(points):
                 raise ValueError("its faces name vertices that are not there")
     except Exception as error:  # its readers raise anything on a damaged file
         reason = f"{type(error).__name__}: {error}"

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import numpy as np
-import torch
 from pydantic import Field
 
 from hoigs.core.interfaces.reader import ClipReader
@@ -18,6 +16,7 @@ from hoigs.plugins.readers.common.lazy_frames import LazyFrames
 from hoigs.plugins.readers.common.listing import Need, require_files
 from hoigs.plugins.readers.common.point_file import Points, read_points
 from hoigs.plugins.readers.common.poses import opengl_to_world_to_camera
+from hoigs.plugins.readers.common.start_points import points_in_box
 from hoigs.plugins.readers.common.transforms import TransformFrame, Transforms, lens_of
 
 LAYOUT = "a D-NeRF scene (transforms_train.json …)"
@@ -115,10 +114,9 @@ class DnerfReader(ClipReader):
         for name in POINT_FILES:
             if (folder / name).is_file():
                 return (*read_points(folder / name), name)
-        rng, count, box = np.random.default_rng(0), self.config.points, self.config.box
-        points = torch.from_numpy(rng.uniform(-box, box, (count, 3))).float()
+        count, box = self.config.points, self.config.box
         origin = f"{count} at random within ±{box:g} (4DGaussians, readNerfSyntheticInfo)"
-        return points, torch.full_like(points, 0.5), origin
+        return (*points_in_box(count, box), origin)
 
 
 def image_names(frame: TransformFrame) -> tuple[str, ...]:

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
 import torch
 from pydantic import Field
 
@@ -21,6 +20,7 @@ from hoigs.plugins.readers.common.lazy_frames import DepthFiles, LazyFrames, Mas
 from hoigs.plugins.readers.common.listing import Need, require_files
 from hoigs.plugins.readers.common.point_file import Points, read_points
 from hoigs.plugins.readers.common.poses import opengl_to_world_to_camera
+from hoigs.plugins.readers.common.start_points import points_in_box
 from hoigs.plugins.readers.common.transforms import TransformFrame, Transforms, lens_of
 
 LAYOUT = "a nerfstudio capture (transforms.json)"
@@ -123,14 +123,10 @@ class NerfstudioReader(ClipReader):
         centers = torch.stack([camera.center for camera in cameras])
         middle = centers.mean(0)
         reach = RANDOM_BOX * max(float((centers - middle).abs().max()), 1e-6)
-        rng = np.random.default_rng(0)
-        points = (
-            middle + torch.from_numpy(rng.uniform(-reach, reach, (self.config.points, 3))).float()
-        )
-        origin = (
-            f"{self.config.points} at random within ±{reach:.3g} of the cameras, as splatfacto does"
-        )
-        return points, torch.full_like(points, 0.5), origin
+        count = self.config.points
+        points, colors = points_in_box(count, reach)
+        origin = f"{count} at random within ±{reach:.3g} of the cameras, as splatfacto does"
+        return middle + points, colors, origin
 
 
 def _problems(file: Transforms, frames: Sequence[TransformFrame]) -> list[str]:

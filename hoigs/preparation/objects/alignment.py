@@ -22,12 +22,14 @@ from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.preparation.objects.crops import Crops
 
 Level = tuple[float, int, int]  # blur of the texture, pixels; frames a knot of the motion; steps
-LEVELS: tuple[Level, ...] = ((5.0, 8, 150), (2.5, 3, 150), (1.2, 1, 200))
+LEVELS: tuple[Level, ...] = ((5.0, 8, 120), (2.5, 3, 120), (1.2, 1, 160))
 SAMPLES = 1200
 FACING = 0.2  # cosine between normal and view from which a point counts as seen
 TURN_RATE, SHIFT_RATE, SHAPE_RATE = 0.02, 0.01, 0.004
 ACCELERATION, SPIN = 6.0, 40.0  # metres and radians a second squared that cost one unit
-OUTLINE, HAND = 0.006, 0.04  # metres off that cost one unit
+OUTLINE, HAND, REST = 0.006, 0.04, 0.004  # metres off that cost one unit
+REST_TURN = 0.03  # of a rotation matrix, likewise
+RARELY = 0.08  # of the frames: a vertex that fewer show has no shape of its own
 PHOTO, HANDS, SMOOTH, BEND, SHRINK = 1.0, 0.1, 0.02, 2.0, 2.0
 
 
@@ -37,6 +39,9 @@ class Poses:
 
     rotations: Float[Tensor, "C 3 3"]
     translations: Float[Tensor, "C 3"]
+
+    def rows(self, rows: np.ndarray) -> Poses:
+        return Poses(self.rotations[rows], self.translations[rows])
 
     def place(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "C P 3"]:
         return points @ self.rotations.mT + self.translations[:, None]
@@ -48,10 +53,16 @@ class Held:
 
     Attributes:
         points: world, metres. grasps: number of the grasp that each belongs to, -1 for none.
+        rests: number of the rest that each frame belongs to, -1 for none: the pose is constant in
+            it, so that a camera that moves sees how far off the object is.
     """
 
     points: Float[Tensor, "C N 3"]
     grasps: Int[Tensor, "C N"]
+    rests: Int[Tensor, " C"]
+
+    def rows(self, rows: np.ndarray) -> Held:
+        return Held(self.points[rows], self.grasps[rows], self.rests[rows])
 
     def offsets(self, poses: Poses) -> Float[Tensor, " N"]:
         """Robust squared distances, in units of `HAND`, from their mean places on the object."""
@@ -67,6 +78,18 @@ class Held:
                 total = total + _robust((off / HAND).square().sum(-1)).sum()
                 count += int(rows.sum())
         return total / max(1, count)
+
+    def moved(self, poses: Poses) -> Float[Tensor, ""]:
+        """Robust squared distances, in units, from the mean pose of each rest."""
+        total = poses.translations.new_zeros(())
+        for rest in self.rests.unique().tolist():
+            rows = self.rests == rest
+            if rest < 0 or int(rows.sum()) < 2:
+                continue
+            for values, unit in ((poses.translations, REST), (poses.rotations, REST_TURN)):
+                off = (values[rows] - values[rows].mean(0)).flatten(1) / unit
+                total = total + _robust(off.square().sum(-1)).sum()
+        return total / len(self.rests)
 
 
 @dataclass(frozen=True)
@@ -89,14 +112,18 @@ class Surface:
         return (vertices[self.corners] * self.weights[..., None]).sum(1)
 
     def normals(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "P 3"]:
-        """Outwards, of the points' faces, smoothed over the vertices."""
+        """Of the points, outwards."""
+        found = (self.vertex_normals(vertices)[self.corners] * self.weights[..., None]).sum(1)
+        return torch.nn.functional.normalize(found, dim=-1)
+
+    def vertex_normals(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
+        """Outwards: of the faces around, by area."""
         a, b, c = (vertices[self.faces[:, i]] for i in range(3))
         flat = torch.linalg.cross(b - a, c - a)
         smooth = torch.zeros_like(vertices)
         for corner in range(3):
             smooth = smooth.index_add(0, self.faces[:, corner], flat)
-        found = (smooth[self.corners] * self.weights[..., None]).sum(1)
-        return torch.nn.functional.normalize(found, dim=-1)
+        return torch.nn.functional.normalize(smooth, dim=-1)
 
     def area(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, ""]:
         a, b, c = (vertices[self.faces[:, i]] for i in range(3))
@@ -116,11 +143,13 @@ class Aligned:
     """Result of `align`.
 
     Attributes:
+        frames: numbers of the frames.
         agreement: of each frame, correlation of its texture with that of the others at the points
             that it shows; NaN where it shows hardly any. outline: metres that the mask's outline
             and the mesh's disagree by, mean. cost: mean energy, to compare starts by.
     """
 
+    frames: np.ndarray
     poses: Poses
     vertices: Float[Tensor, "V 3"]
     agreement: Float[np.ndarray, " C"]
@@ -176,8 +205,10 @@ def align(
         poses = Poses(poses.rotations.detach(), poses.translations.detach())
         vertices = vertices.detach()
     with torch.no_grad():
+        if shape:
+            vertices = problem.closed(poses, vertices)
         problem.look(poses, vertices)
-        return Aligned(poses, vertices, *problem.judged(poses, vertices))
+        return Aligned(crops.frames, poses, vertices, *problem.judged(poses, vertices))
 
 
 class _Problem:
@@ -208,6 +239,25 @@ class _Problem:
         xy, _ = self.crops.project(world)
         self.nearest = torch.cdist(self.crops.edges, xy).argmin(-1)
 
+    @torch.no_grad()
+    def closed(self, poses: Poses, vertices: Tensor) -> Tensor:
+        """The mesh with a membrane over what no frame shows, between the vertices that are seen."""
+        normals = self.surface.vertex_normals(vertices)
+        toward = self.crops.centers()[:, None] - poses.place(vertices)
+        toward = torch.nn.functional.normalize(toward, dim=-1)
+        seen = ((normals @ poses.rotations.mT) * toward).sum(-1) > FACING
+        unseen = seen.float().mean(0) < RARELY
+        if unseen.all() or not unseen.any():
+            return vertices
+        one, two = self.surface.edges.T
+        graph = torch.zeros(len(vertices), len(vertices))
+        graph[one, two] = graph[two, one] = 1.0
+        laplace = torch.diag(graph.sum(1)) - graph
+        inner, border = laplace[unseen][:, unseen], laplace[unseen][:, ~unseen]
+        filled = vertices.clone()
+        filled[unseen] = torch.linalg.solve(inner, -border @ vertices[~unseen])
+        return filled
+
     def energy(self, poses: Poses, vertices: Tensor) -> Tensor:
         photo, outside, reach, _ = self._parts(poses, vertices)
         weight = self.crops.edge_weights
@@ -219,6 +269,7 @@ class _Problem:
             PHOTO * photo.mean()
             + outline
             + HANDS * self.held.offsets(poses)
+            + self.held.moved(poses)
             + SMOOTH * self._jerks(poses)
             + BEND * bends.square().sum(-1).mean() * len(vertices) / 100
             + SHRINK * area / 100

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -44,6 +44,10 @@ class Crops:
     edges: Float[Tensor, "C E 2"]
     edge_weights: Float[Tensor, " C"]
 
+    def rows(self, rows: np.ndarray) -> Crops:
+        """Some of the crops."""
+        return Crops(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
     @property
     def size(self) -> int:
         return self.images.shape[-1]
@@ -80,6 +84,11 @@ class Crops:
         logs = torch.log(self.images + DARK)
         fine = _masked_blur(logs, self.masks, blur)
         return fine - _masked_blur(logs, self.masks, 4 * blur + 2)
+
+    def contrast(self, blur: float) -> float:
+        """Relative variation of brightness within the object."""
+        maps = self.features(blur).mean(1, keepdim=True)
+        return float(maps[self.masks > 0].std())
 
 
 def make_crops(

@@ -20,8 +20,9 @@ from hoigs.preparation.objects.track import hand_depths
 HAND_JOINTS = 30  # the last joints of a body: fifteen of each hand, three a finger, index first
 MIDDLE, INDEX, LITTLE = 3, 0, 6  # first joints of these fingers within a hand
 REACH = 0.13  # metres in the image between a palm and what it holds
-STILL = 0.06  # metres a second: an object that moves less rests
+STILL = 0.07  # metres a second: an object that moves less rests
 SHORTEST = 0.2  # seconds of a grasp or a rest
+RELEASE = 0.12  # seconds for which hands are near what they have let go
 STEADY = 0.45  # seconds over which the hands' noise is smoothed
 
 
@@ -78,6 +79,9 @@ def hand_motion(
     depths = smooth(depths, window)
     rests = _cleaned(_rests(outlines, depths, cameras, fps)[:, None], round(SHORTEST * fps))[:, 0]
     held = near.any(1) & ~rests
+    # hands are still, or already, near for a moment while it flies
+    flies = ndimage.binary_dilation(~(held | rests), iterations=max(1, round(RELEASE * fps)))
+    held &= ~flies
     frames = _hand_frames(places, near, first)
     rotations, pieces = _chained(frames, near, held, rests)
     known = near.any(1)

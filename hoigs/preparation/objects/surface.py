@@ -35,7 +35,7 @@ def hull(
     known = torch.zeros(len(flat))
     maps = torch.cat((crops.masks, crops.hidden), 1)
     for i in range(len(crops)):
-        one = Crops(**{n: getattr(crops, n)[i : i + 1] for n in crops.__dataclass_fields__})
+        one = crops.rows(np.array([i]))
         xy, _ = one.project((flat @ poses.rotations[i].mT + poses.translations[i])[None])
         mask, hidden = one.sample(maps[i : i + 1], xy)[0].T
         inside = ((xy[0] >= 0) & (xy[0] < crops.size)).all(-1)

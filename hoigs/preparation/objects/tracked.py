@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -26,13 +26,15 @@ from hoigs.preparation.objects.alignment import (
     Surface,
     align,
 )
-from hoigs.preparation.objects.crops import make_crops
+from hoigs.preparation.objects.crops import Crops, make_crops
 from hoigs.preparation.objects.hands import HandMotion, hand_motion
+from hoigs.preparation.objects.search import flights_by_texture, grasps_by_texture
 from hoigs.preparation.objects.surface import hull, with_samples
 
 FEWEST = 8  # frames that show the object whole
 SMALLEST = 10  # pixels across, median
 AGREES = 0.5  # correlation of textures from which a pose is trusted
+FAINTEST, BLUR = 0.02, 2.5  # relative contrast of texture; pixels of a crop it is blurred by
 SIDE = 96  # of the crops, pixels
 SAMPLES = 1200
 
@@ -96,9 +98,16 @@ def tracked_object(
     hands = hand_motion(joints, masks, outlines, cameras, fps)
     shown = outlines.observed
     crops = make_crops(images, masks, humans, cameras, shown, SIDE)
+    contrast = crops.contrast(BLUR)
+    if contrast < FAINTEST:
+        raise UntrackableError(
+            f"it has hardly any texture: its brightness varies by {100 * contrast:.1f} % "
+            f"({100 * FAINTEST:.0f} % are needed)"
+        )
     start = _start(hands, outlines, cameras, shown)
-    surface = hull(crops, start, _radius(outlines, hands, cameras), SAMPLES)
-    found = align(crops, surface, start, _held(hands, shown), fps, levels=levels, progress=progress)
+    radius = _radius(outlines, hands, cameras)
+    held = _held(hands, shown)
+    surface, found = _aligned(crops, start, held, hands, radius, fps, levels, progress)
     agreement = _over_frames(found.agreement, shown)
     typical = float(np.nanmedian(found.agreement)) if np.isfinite(found.agreement).any() else 0.0
     if typical < AGREES:
@@ -107,6 +116,50 @@ def tracked_object(
             f"{AGREES} is needed): it has hardly any texture, is not rigid, or its masks are off"
         )
     return _result(found, surface, hands, outlines, agreement, count)
+
+
+def _aligned(
+    crops: Crops,
+    start: Poses,
+    held: Held,
+    hands: HandMotion,
+    radius: float,
+    fps: float,
+    levels: Sequence[Level],
+    progress: Callable[[float], None],
+) -> tuple[Surface, Aligned]:
+    """One grasp first, with its rests; the other grasps by what it has shown; flights last, which
+    give the shape nothing."""
+    tied, pieces = ~hands.free[crops.frames], hands.pieces[crops.frames]
+    if tied.sum() < FEWEST:  # never held, never at rest: one piece, from no rotation at all
+        tied, pieces = np.ones(len(crops), bool), np.zeros(len(crops), int)
+    rows = np.flatnonzero(tied & (pieces == np.bincount(pieces[tied]).argmax()))
+    later, flies = int(tied.sum()) > len(rows), not tied.all()
+    steps = iter(range(1 + later + flies))
+
+    def share(done: float, step: int = 0) -> None:
+        progress((step + done) / (1 + later + flies))
+
+    def aligned(rows: np.ndarray, poses: Poses, levels: Sequence[Level], shape: bool) -> Aligned:
+        step = next(steps)
+        return align(
+            crops.rows(rows), surface, poses, held.rows(rows), fps, levels=levels, shape=shape,
+            progress=lambda done: share(done, step),
+        )  # fmt: skip
+
+    surface = hull(crops.rows(rows), start.rows(rows), radius, SAMPLES)
+    found = aligned(rows, start.rows(rows), levels, True)
+    if later:
+        rows = np.flatnonzero(tied)
+        surface = replace(surface, rest=found.vertices)
+        poses = grasps_by_texture(crops.rows(rows), surface, found, start.rows(rows), pieces[rows])
+        found = aligned(rows, poses, levels[1:], True)
+    if flies:
+        rows = np.arange(len(crops))
+        surface = replace(surface, rest=found.vertices)
+        poses = flights_by_texture(crops, surface, found, start, fps)
+        found = aligned(rows, poses, [(blur, 1, n // 2) for blur, _, n in levels[1:]], False)
+    return surface, found
 
 
 def _check(outlines: Outlines) -> None:
@@ -146,7 +199,13 @@ def _radius(outlines: Outlines, hands: HandMotion, cameras: Sequence[Camera]) ->
 
 def _held(hands: HandMotion, shown: Bool[np.ndarray, " F"]) -> Held:
     grasps = np.where(hands.near & hands.held[:, None], hands.pieces[:, None], -1)
-    return Held(torch.from_numpy(hands.palms[shown]).float(), torch.from_numpy(grasps[shown]))
+    starts = np.diff(hands.rests.astype(int), prepend=0) == 1
+    rests = np.where(hands.rests, np.cumsum(starts), -1)
+    return Held(
+        torch.from_numpy(hands.palms[shown]).float(),
+        torch.from_numpy(grasps[shown]),
+        torch.from_numpy(rests[shown]),
+    )
 
 
 def _over_frames(

@@ -126,7 +126,7 @@ def _tracks(report: Measures) -> Iterator[MeasureDiagnostic]:
             "the object's masks grow and shrink, or it turns: mend the masks, or give its shape as "
             "a mesh (initializer:mesh)",
         )
-        yield from _object(report)
+    yield from _object(report)
     if report.depth_residual is not None:
         yield _judged(
             "depth",
@@ -168,7 +168,7 @@ def _object(report: Measures) -> Iterator[MeasureDiagnostic]:
         "object's shape",
         f"{sum(off) / len(off):.0f} mm",
         f"between its outline and the mask's ({worst:.0f} mm in the worst twentieth of the frames)",
-        _judge(report.object_scale_spread, 0.05, 0.15),
+        _judge(report.object_scale_spread or 0.0, 0.05, 0.15),
         "it is not rigid, or its masks are off: a spec whose object deforms may fit better",
     )
     palms = [1000 * v for v in report.hand_distance_m if v is not None]

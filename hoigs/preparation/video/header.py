@@ -18,7 +18,7 @@ def video_header(path: Path) -> tuple[int, float] | None:
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
             rate = float(stream.average_rate or 0)
-            seconds = float(stream.duration * stream.time_base) if stream.duration else 0.0
+            seconds = float((stream.duration or 0) * (stream.time_base or 0))
             count = stream.frames or round(seconds * rate)
             return (count, rate) if count and rate else None
     except (av.error.FFmpegError, IndexError, ValueError):

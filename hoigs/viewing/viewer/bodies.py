@@ -20,8 +20,6 @@ from hoigs.core.values.between import moment_between
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.moment import BodyPose, Moment
 
-Corners = Float[np.ndarray, "V 3"]
-
 
 @dataclass(frozen=True)
 class PosedBody:
@@ -46,7 +44,7 @@ class PosedBody:
         return np.array(pairs)
 
     @torch.no_grad()
-    def at(self, frame: float) -> tuple[Corners, Corners]:
+    def at(self, frame: float) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "J 3"]]:
         """Vertices and joints at a frame number, world, metres."""
         device = self.body.faces.device
         posed = self.body(self.pose(moment_between(self.clip, frame).to(device)))

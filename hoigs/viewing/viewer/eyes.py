@@ -12,7 +12,7 @@ from hoigs.viewing.viewer.resolution import Resolution
 from hoigs.viewing.viewer.views import View
 
 STILL_S = 0.25  # a picture is drawn in full once nothing has changed for so long
-ECHO_S = 3.0  # for so long a browser may still answer with a camera that was set
+ECHO_S = 10.0  # for so long a browser may still answer with a camera that was replaced
 
 
 class Eye:
@@ -34,7 +34,7 @@ class Eye:
         self.drawn: object = None
         self.full, self.changed = False, 0.0
         self.rates: deque[float] = deque(maxlen=20)
-        self._set: deque[tuple[float, View]] = deque(maxlen=120)
+        self._set: deque[tuple[float, View]] = deque(maxlen=400)
         self._answered = False  # whether the browser has taken a camera that was set
 
     @property
@@ -50,15 +50,23 @@ class Eye:
     def look(self, view: View, now: float) -> None:
         """Set the browser's camera."""
         self._set.append((now, view))
-        view.apply(self.client.camera)
+        with self.client.atomic():
+            view.apply(self.client.camera)
 
     def moved(self, now: float) -> None:
         """The browser has sent a camera: `dragged` is called unless it is one that was set.
 
+        Position and target may be of different ones: a browser takes them one after the other.
         What comes before the browser has taken the first one is its own start.
         """
+        given = list(self._set)
+        replaced = [t for t, _ in given[1:]] + [now]  # when each was followed by another
+        lately = [v for (_, v), t in zip(given, replaced, strict=False) if now - t < ECHO_S]
         seen = self.view
-        if any(now - t < ECHO_S and seen.near(view, 3e-3) for t, view in list(self._set)):
+        scale = 0.01 * max(float(np.linalg.norm(seen.target - seen.position)), 1e-3)
+        placed = any(np.linalg.norm(seen.position - view.position) < scale for view in lately)
+        aimed = any(np.linalg.norm(seen.target - view.target) < scale for view in lately)
+        if placed and aimed:
             self._answered = True
         elif self._answered:
             self._dragged(self)

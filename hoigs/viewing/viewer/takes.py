@@ -52,8 +52,8 @@ class Path:
         after = self.keys[min(high + 1, len(self.keys) - 1)][1]
         eye = _catmull_rom(before.position, a.position, b.position, after.position, r)
         target = _catmull_rom(before.target, a.target, b.target, after.target, r)
-        quats = [matrices_to_quats(torch.from_numpy(v.rotation.copy())) for v in (a, b)]
-        rotation = quats_to_matrices(slerp(*quats, r)).numpy()
+        turns = [matrices_to_quats(torch.from_numpy(v.rotation.copy())) for v in (a, b)]
+        rotation = quats_to_matrices(slerp(turns[0], turns[1], r)).numpy()
         view = View(eye, target, rotation, a.up, a.fov + (b.fov - a.fov) * r)
         return frame_a + (frame_b - frame_a) * r, view
 

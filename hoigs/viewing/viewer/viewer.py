@@ -62,7 +62,8 @@ class Viewer:
         self._stopped, self._widest = False, widest
         self._refresh, self._refreshed = refresh, 0.0
         self._eyes: dict[int, Eye] = {}
-        self._version, self._told, self._anchor = 0, 0.0, (None, 0.0)  # type: ignore[var-annotated]
+        self._version, self._told = 0, 0.0
+        self._anchor: tuple[str | None, float] = (None, 0.0)  # what was followed, and its frame
         self.path = takes.Path()
         server.scene.set_up_direction(tuple(self.up))
         self.overlays = Overlays(server.scene, clip, bodies)

@@ -59,8 +59,8 @@ HEADER_FAULTS = [
     (lambda h: h["entities"].update({"../up": {"kind": "object"}}), "entity name '../up'"),
     (lambda h: h["split"].update(train=[]), "split.train is empty"),
     (lambda h: h["split"].update(test=[]), "split.test is empty"),
-    (lambda h: h["split"].update(test=[1, 8]), "split names frames [8]; the clip has 0..7"),
-    (lambda h: h["split"].update(train=[0, 1], test=[1]), "frames [1] in both train and test"),
+    (lambda h: h["split"].update(test=[1, 8]), "split names frames 8; the clip has 0..7"),
+    (lambda h: h["split"].update(train=[0, 1], test=[1]), "frames 1 in both train and test"),
     (lambda h: h.update(depth_kind="feet"), "depth_kind: Input should be 'metric'"),
 ]
 

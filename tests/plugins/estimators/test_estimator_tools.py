@@ -190,6 +190,8 @@ solutions = Box(pose=Box(Pose=Pose), selfie_segmentation=Box(SelfieSegmentation=
 FAKE_CV2 = """
 import numpy
 BORDER_REPLICATE = "edge"
+def GaussianBlur(image, size, sigma):
+    return image
 def copyMakeBorder(image, above, below, left, right, kind):
     return numpy.pad(image, ((above, below), (left, right), (0, 0)), kind)
 """

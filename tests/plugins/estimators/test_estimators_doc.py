@@ -72,7 +72,7 @@ def test_the_table_names_all_choices():
 
 def test_all_estimators_are_in_the_doc():
     keys = default_registry().keys("estimator")
-    assert len(keys) == 8
+    assert len(keys) == 9
     for key in keys:
         assert f"`{key}`" in DOC, key
 

@@ -126,7 +126,7 @@ def test_wrong_folders_and_files(builtin: Clip, tmp_path: Path) -> None:
     with pytest.raises(ClipError, match=r"frames\.1\.transform_matrix: Field required"):
         DnerfReader().read(tmp_path)
     (tmp_path / "transforms_test.json").write_text("{")
-    with pytest.raises(ClipError, match=r"transforms_test\.json is not readable as JSON"):
+    with pytest.raises(ClipError, match=r"transforms_test\.json: damaged, not readable as JSON"):
         DnerfReader().read(tmp_path)
 
 

@@ -10,8 +10,12 @@ from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.masks.outlines import outlines_of
+from hoigs.preparation.objects.alignment import Aligned, Poses
+from hoigs.preparation.objects.crops import make_crops
 from hoigs.preparation.objects.hands import hand_motion
 from hoigs.preparation.objects.make_object import make_object
+from hoigs.preparation.objects.search import flights_by_texture
+from hoigs.preparation.objects.surface import hull
 from hoigs.preparation.objects.tracked import UntrackableError, tracked_object
 
 FRAMES, SIZE, FPS = 12, 96, 12.0
@@ -46,9 +50,9 @@ def picture(rotation: torch.Tensor, place: torch.Tensor, contrast: float):
 WAVES = 20 * torch.randn(3, 3, 3, generator=torch.Generator().manual_seed(0)).sum(0)
 
 
-def filmed(angle: float = 0.7, contrast: float = 0.35):
+def filmed(contrast: float = 0.35, *, motion: tuple[torch.Tensor, torch.Tensor] | None = None):
     """Images, masks of object and person, and joints of a body whose palms are at its sides."""
-    rotations, places = poses(angle)
+    rotations, places = motion or poses(0.7)
     shown = [picture(r, t, contrast) for r, t in zip(rotations, places, strict=True)]
     joints = torch.zeros(FRAMES, 52, 3) + torch.tensor([0, 0, 2.5])
     for side, wrist, first in ((-1.0, 20, 22), (1.0, 21, 37)):
@@ -122,3 +126,25 @@ def test_hands_turn_what_they_hold_and_nothing_else() -> None:
     assert float(angles(turned @ turned[0].mT, (rotations[inside] @ rotations[2].mT)).max()) < 6
     away = hand_motion(joints + 1.0, objects, outlines_of(objects), cameras, FPS)
     assert not away.held.any() and np.allclose(away.rotations, np.eye(3))
+
+
+def test_a_spin_in_flight_is_found_by_texture() -> None:
+    _, places = poses(0.7)
+    flight = slice(3, 9)
+    turns = torch.zeros(FRAMES, 3)
+    turns[:, 1] = torch.tensor([-0.7, -0.4, 0, *[0] * 6, 0, 0.4, 0.7])
+    turns[flight, 0] = torch.linspace(0, 2 * torch.pi, 8)[1:-1]
+    rotations = axis_angle_to_matrices(turns)
+    images, objects, humans, _ = filmed(motion=(rotations, places))
+    cameras = [CAMERA] * FRAMES
+    crops = make_crops(lambda: iter(images), objects, humans, cameras, np.ones(FRAMES, bool), 64)
+    known = np.array([i for i in range(FRAMES) if not 3 <= i < 9])
+    surface = hull(crops, Poses(rotations, places), 0.3, 600)
+    agreement = np.ones(len(known))
+    first = Aligned(
+        known, Poses(rotations[known], places[known]), surface.rest, agreement, agreement, 0.0
+    )
+    guess = Poses(torch.eye(3).expand(FRAMES, 3, 3), places)
+    found = flights_by_texture(crops, surface, first, guess, FPS)
+    assert float(angles(found.rotations[flight], rotations[flight]).max()) < 25
+    assert float(angles(guess.rotations[flight], rotations[flight]).max()) > 120

@@ -196,12 +196,16 @@ def _nothing_there(entity: EntityRequest, prompt: FramePrompt, footage: Footage,
     """What lies under a prompt from which no mask grows."""
     point = next((p for p in prompt.points if p.inside), None)
     where = f"{point.x:g},{point.y:g}" if point else f"the box {prompt.box}"
-    there = "the person" if footage.person[i].mean() > 0.5 else "a surface without an outline"
+    there = "a surface without an outline"
     if point is not None:
         h, w = footage.shape
         x, y = int(point.x * footage.scale), int(point.y * footage.scale)
-        if 0 <= x < w and 0 <= y < h and footage.blank[i, y, x]:
+        if not (0 <= x < w and 0 <= y < h):
+            there = "nothing: that is outside the picture"
+        elif footage.blank[i, y, x]:
             there = "a black border of the video"
+        elif footage.person[i, y, x]:
+            there = "the person"
     return (
         f"estimator:object-tracker: no {entity.name} was found at {where} in frame {prompt.frame}: "
         f"there is {there}; click on the middle of the object in a frame that shows it well"

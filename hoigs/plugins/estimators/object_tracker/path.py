@@ -33,7 +33,8 @@ def object_odds(
     odds = colors.odds(bins_of(footage.colors(i)))
     odds = odds - 0.7 * footage.person[i]
     if scene is not None:
-        odds = odds + np.nan_to_num(np.tanh((scene.difference(i) - 4) / 3), nan=0.0)
+        changed = np.nan_to_num(np.tanh((scene.difference(i) - 4) / 3), nan=0.0)
+        odds = odds + np.maximum(changed, -0.3)  # a plain or resting thing may look unchanged
     odds[footage.blank[i]] = -6
     return odds
 

@@ -51,6 +51,7 @@ def tracked(
     rests = at_rest(scene, known)
     used = None if rests else scene
     path = found_path(footage, used, colors, known, lambda x: progress(0.3 * x))
+    unchanged = 1.2 if stands_out(footage, used, path, known) else 0.1
     soft = np.zeros(footage.lab.shape[:3], np.uint8)
     confidence = np.zeros(len(footage))
     for p in prompts:
@@ -58,7 +59,8 @@ def tracked(
     walks = _walks(sorted(known), len(footage))
     done = 0
     for start, frames in walks:
-        walk = _Walk(footage, used, colors, path, next(p for p in prompts if p.frame == start))
+        first = next(p for p in prompts if p.frame == start)
+        walk = _Walk(footage, used, colors, path, first, unchanged)
         for i in frames:
             confidence[i], soft[i] = walk.step(i)
             done += 1
@@ -70,6 +72,26 @@ def at_rest(scene: Scene, known: dict[int, Bool[np.ndarray, "h w"]]) -> bool:
     """Whether the prompted object looks like a part of the scene in any prompted frame."""
     away = [np.nanmedian(np.append(scene.difference(i)[m], np.nan)) for i, m in known.items()]
     return not min(away) > 4
+
+
+def stands_out(
+    footage: Footage, scene: Scene | None, path: Path, known: dict[int, Bool[np.ndarray, "h w"]]
+) -> bool:
+    """Whether the object differs from the scene nearly everywhere on its path.
+
+    It does not where it rests so long that it became part of the scene, or where it is plain and
+    moves little before a moving camera.
+    """
+    if scene is None:
+        return False
+    half = max(1, int(0.5 * np.sqrt(np.mean([m.sum() for m in known.values()]) / np.pi)))
+    seen = np.flatnonzero(path.seen)
+    middle = []
+    for i in seen[:: max(1, len(seen) // 24)]:
+        x, y = (max(int(v), 0) for v in path.centers[i])
+        part = scene.difference(i)[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1]
+        middle.append(np.nanmedian(part) if np.isfinite(part).any() else np.nan)
+    return bool(np.nanpercentile([*middle, np.nan, 99.0], 15) > 3)
 
 
 def color_model(footage: Footage, masks: dict[int, Float[np.ndarray, "h w"]]) -> ColorModel:
@@ -101,8 +123,10 @@ class _Walk:
         colors: ColorModel,
         path: Path,
         start: PromptedMask,
+        unchanged: float,
     ) -> None:
         self.footage, self.scene, self.colors, self.path = footage, scene, colors, path
+        self.unchanged = unchanged  # log-odds by which a pixel that shows the scene is not ours
         window = _window_of(start.soft > 0.5)
         self.first = self._sighting(start.frame, window, window.cut(start.soft))
         self.last = self.first
@@ -112,9 +136,6 @@ class _Walk:
         self.unseen = 0
         mask = start.soft > 0.5
         self.area = float(mask.sum())
-        # a person's mask that leaves the object free in the prompted frame can be relied on
-        shared = float(footage.person[start.frame][mask].mean())
-        self.person_weight = 2.0 if shared < 0.05 else 0.8 if shared < 0.4 else 0.2
 
     def _sighting(self, i: int, window: Window, soft: np.ndarray) -> Sighting:
         return Sighting(window, self._colors(i, window), soft)
@@ -135,7 +156,7 @@ class _Walk:
             self.unseen += 1
             return confidence, nothing
         pasted = window.paste(soft, self.footage.shape)
-        self._remember(i, pasted, window)
+        self._remember(i, pasted, window, confidence)
         return confidence, pasted
 
     def _colors(self, i: int, window: Window) -> np.ndarray:
@@ -175,7 +196,7 @@ class _Walk:
         valid = window.inside(self.footage.shape)
         near = histogram(bins_of(colors), (prior < 0.3) * valid * 1.0)
         shape = np.log((prior + 0.03) / (1.03 - prior)) * (0.4 + 0.6 * similar)
-        odds = shape + self._odds(i, window, colors, away, near)
+        odds = shape + self._odds(i, window, colors, away, near, prior)
         odds = np.where(valid, odds, -9)
         return walked(odds, colors), prior
 
@@ -186,15 +207,20 @@ class _Walk:
         colors: np.ndarray,
         away: np.ndarray | None,
         near: np.ndarray | None = None,
+        prior: np.ndarray | None = None,
     ) -> np.ndarray:
         """Log-odds of a window's pixels by colour, person's mask and scene.
 
-        near: colours around the object in this frame.
+        near: colours around the object in this frame. prior: where other frames put it.
         """
         odds = 0.6 * self.colors.odds(bins_of(colors), near)
-        odds -= self.person_weight * window.cut(self.footage.person[i])
+        person = window.cut(self.footage.person[i])
+        # a person's mask that takes in most of what is known to be the object says little
+        taken = 0.5 if prior is None else float((prior * person).sum() / max(prior.sum(), 1e-6))
+        odds -= 2.0 * max(0.0, 1 - 1.3 * taken) * person
         if away is not None:
-            odds += window.cut(np.nan_to_num(1.2 * np.tanh((away - 4) / 3), nan=0.0))
+            changed = np.nan_to_num(1.2 * np.tanh((away - 4) / 3), nan=0.0)
+            odds += window.cut(np.maximum(changed, -self.unchanged))
         return odds
 
     def _kept(self, mask: np.ndarray, prior: np.ndarray, step: int) -> np.ndarray:
@@ -227,7 +253,7 @@ class _Walk:
         ratio = min(area, self.area) / max(area, self.area)
         return self.colors.likeness(seen) ** 0.5 * decided * min(1.0, 2.0 * ratio**0.5)
 
-    def _remember(self, i: int, pasted: np.ndarray, window: Window) -> None:
+    def _remember(self, i: int, pasted: np.ndarray, window: Window, confidence: float) -> None:
         mask = pasted > 127
         fresh = _window_of(mask) if mask.any() else window
         # the size changes slowly, so that windows of neighbouring frames can be compared
@@ -241,6 +267,9 @@ class _Walk:
         self.off = 0.7 * self.off + 0.3 * (center - self.path.centers[i])
         self.last = self._sighting(i, window, window.cut(pasted.astype(np.float32) / 255))
         self.area = 0.9 * self.area + 0.1 * float(mask.sum())
+        if confidence > 0.75:  # it turns, and other sides of it have other colours
+            seen = histogram(bins_of(self.last.colors), np.where(self.last.soft > 0.5, 1.0, 0.0))
+            self.colors = self.colors.blended(seen, 0.04)
 
 
 def _supported(mask: np.ndarray, prior: np.ndarray) -> np.ndarray:

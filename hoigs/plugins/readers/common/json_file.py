@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from hoigs.core.errors import ClipError
+from hoigs.core.json_file import read_json
 
 Model = TypeVar("Model", bound=BaseModel)
 SHOWN = 6  # problems listed for one file
@@ -20,10 +20,7 @@ def load_json(path: Path) -> Any:
     Raises:
         ClipError: it cannot be read.
     """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ClipError(f"{path} is not readable as JSON ({error}); write it again") from error
+    return read_json(path, error=ClipError, advice="write it again")
 
 
 def parse_json(path: Path, model: type[Model]) -> Model:

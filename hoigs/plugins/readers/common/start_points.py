@@ -16,6 +16,13 @@ Points = tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]
 SOURCES = 8  # frames that are read
 
 
+def points_in_box(count: int, reach: float) -> Points:
+    """Grey points at random, with coordinates between -reach and reach."""
+    places = np.random.default_rng(0).uniform(-reach, reach, (count, 3))
+    points = torch.from_numpy(places).float()
+    return points, torch.full_like(points, 0.5)
+
+
 def points_of_depth(
     store: FrameStore,
     cameras: Sequence[Camera],

@@ -1,0 +1,148 @@
+"""The screenshots of docs/howto/view.md, made by a headless Chromium.
+
+    python scripts/view_pictures.py RUN [run clip file]      # for example runs/demo
+
+Needs the extras of dev (playwright) and Chromium in PATH. Writes docs/assets/view-*.webp.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+import threading
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+from playwright.sync_api import Page, sync_playwright
+
+import hoigs
+from hoigs.runs.run_folder import RunFolder
+
+ASSETS = Path(__file__).resolve().parents[1] / "docs" / "assets"
+SLOW_MS = 240_000  # software rendering on a busy machine
+SIZE = {"width": 1200, "height": 760}
+SOFTWARE = (
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+)
+
+
+def save(page: Page, name: str) -> None:
+    shot = Image.open(BytesIO(page.screenshot(timeout=SLOW_MS))).convert("RGB")
+    shot = shot.resize((900, round(900 * shot.height / shot.width)), Image.Resampling.LANCZOS)
+    shot.save(ASSETS / f"view-{name}.webp", quality=80)
+    print(f"view-{name}.webp: {(ASSETS / f'view-{name}.webp').stat().st_size // 1000} kB")
+
+
+class Served:
+    """`hoigs view` in a thread."""
+
+    def __init__(self, *what: Path) -> None:
+        self.ready, self.lines = threading.Event(), list[str]()
+        self.thread = threading.Thread(target=self._work, args=what)
+        self.thread.start()
+        self.ready.wait()
+        self.address = next(line.split()[1] for line in self.lines if line.startswith("open"))
+
+    def _work(self, *what: Path) -> None:
+        hoigs.view(*what, port=0, report=self.lines.append, started=self._started)
+
+    def _started(self, viewer: Any) -> None:
+        self.viewer = viewer
+        self.ready.set()
+
+    def settle(self, page: Page) -> None:
+        """Wait for a still picture."""
+        page.wait_for_timeout(1500)
+        while not all(eye.full for eye in self.viewer._eyes.values()):
+            page.wait_for_timeout(200)
+        page.wait_for_timeout(1500)
+
+    def open(self, browser: Any) -> Page:
+        page: Page = browser.new_page(viewport=SIZE)
+        page.goto(self.address)
+        while not self.viewer._eyes:
+            page.wait_for_timeout(200)
+        page.wait_for_timeout(5000)
+        page.add_style_tag(content=".mantine-Notifications-root { display: none; }")
+        return page
+
+    def close(self) -> None:
+        self.viewer.stop()
+        self.thread.join()
+
+
+def drag(page: Page, dx: int, dy: int) -> None:
+    page.mouse.move(400, 380)  # left of the panel
+    page.mouse.down()
+    page.mouse.move(400 + dx, 380 + dy, steps=6)
+    page.mouse.up()
+
+
+def of_run(browser: Any, run: Path) -> None:
+    served = Served(run)
+    page = served.open(browser)
+    viewer = served.viewer
+    viewer.clock.seek(0.5 * viewer.clock.last, 0.0)
+    served.settle(page)
+    with viewer.controls.lock:
+        viewer.settings.layout, viewer.settings.share = "wipe", 0.32
+    served.settle(page)
+    save(page, "wipe")
+    with viewer.controls.lock:
+        viewer.settings.layout = "one"
+    drag(page, 36, 20)
+    served.settle(page)
+    save(page, "run")
+    with viewer.controls.lock:
+        viewer.settings.entities.discard("human")
+        viewer.settings.overlays.update(("body mesh", "object track"))
+    served.settle(page)
+    save(page, "overlays")
+    served.close()
+
+
+def of_clip(browser: Any, clip: Path) -> None:
+    served = Served(clip)
+    page = served.open(browser)
+    served.viewer.clock.seek(0.5 * served.viewer.clock.last, 0.0)
+    with served.viewer.controls.lock:
+        served.viewer.settings.overlays.update(("skeleton", "object track"))
+    served.settle(page)
+    save(page, "clip")
+    served.close()
+
+
+def of_file(browser: Any, run: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        made = hoigs.view(run, html=Path(folder) / "run.html")
+        print(made)
+        page = browser.new_context(viewport=SIZE, offline=True).new_page()
+        page.goto(made.path.as_uri())
+        page.wait_for_function("window.drawn > 0", timeout=SLOW_MS)
+        page.evaluate("(() => { const t = document.getElementById('time'); t.value = t.max / 2;"
+                      " t.oninput({target: t}); })()")  # fmt: skip
+        page.wait_for_timeout(2000)
+        drag(page, 60, 10)
+        page.wait_for_timeout(3000)
+        save(page, "html")
+
+
+def main() -> None:
+    run = Path(sys.argv[1])
+    clip = (run / RunFolder(run).read_provenance()["clip"]["path"]).resolve()
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=[*SOFTWARE])
+        made = {"file": of_file, "clip": of_clip, "run": of_run}
+        for part in sys.argv[2:] or made:
+            made[part](browser, clip if part == "clip" else run)
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,156 @@
+"""estimator:object-tracker on small pictures of a textured disc, a person and a textured wall."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from hoigs.core.errors import HoigsError
+from hoigs.core.interfaces.estimator import (
+    EntityMasks,
+    EntityRequest,
+    Estimates,
+    FramePrompt,
+    PromptPoint,
+    VideoRequest,
+    checked,
+)
+from hoigs.plugins.estimators.object_tracker.estimator import ObjectTrackerEstimator
+from hoigs.plugins.estimators.object_tracker.footage import lab_of
+
+H, W, RADIUS, COUNT = 72, 108, 8, 14
+
+
+def texture(seed: int, color: tuple[int, int, int], shape=(H, W + 60)) -> np.ndarray:
+    noise = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=(*shape, 3)), (2, 2, 0))
+    return np.clip(np.array(color) + 18 * noise / noise.std(), 0, 255)
+
+
+def places() -> list[tuple[float, float]]:
+    """Of the disc: it swings past the person."""
+    return [(16 + 5.2 * i, 40 + 14 * np.sin(i / 3)) for i in range(COUNT)]
+
+
+def world(pan: float = 0.0, hidden: range = range(0)):
+    """Frames, masks of the person, masks of the disc; `hidden`: frames with a board before it."""
+    wall, ball = texture(0, (120, 130, 90)), texture(1, (200, 60, 50))
+    y, x = np.mgrid[:H, :W] + 0.5
+    frames, people, discs = [], [], []
+    for i, (cx, cy) in enumerate(places()):
+        image = wall[:, round(pan * i) :][:, :W].copy()
+        person = (np.abs(x - 50 - 3 * np.sin(i)) < 8) & (y > 14)
+        disc = np.hypot(x - cx, y - cy) < RADIUS
+        image[person] = (70, 80, 150)
+        rolled = np.roll(ball[:, :W], (round(cy), round(cx)), (0, 1))
+        image[disc] = rolled[disc]
+        if i in hidden:
+            image[disc] = wall[:, round(pan * i) :][:, :W][disc]
+            disc = np.zeros_like(disc)
+        frames.append(image.astype(np.uint8))
+        people.append(person & ~disc)
+        discs.append(disc)
+    return frames, people, discs
+
+
+def request(tmp_path: Path, scene, prompts: tuple[FramePrompt, ...] = ()) -> VideoRequest:
+    frames, people, _ = scene
+    entity = EntityRequest("object", "object", further=prompts)
+    return VideoRequest(
+        len(frames), W, H, lambda i: frames[i], tmp_path, tmp_path, entities=(entity,),
+        known=Estimates(EntityMasks({"human": people})),
+    )  # fmt: skip
+
+
+def click(frame: int, x: float | None = None, y: float | None = None) -> FramePrompt:
+    cx, cy = places()[frame]
+    return FramePrompt(frame, (PromptPoint(cx if x is None else x, cy if y is None else y),))
+
+
+def masks_of(video: VideoRequest) -> EntityMasks:
+    estimator = ObjectTrackerEstimator()
+    found = checked(estimator.estimate(video), video, estimator).masks
+    assert found is not None
+    return found
+
+
+def overlaps(found: EntityMasks, discs: list[np.ndarray]) -> np.ndarray:
+    masks = [found.entities["object"][i] for i in range(len(discs))]
+    return np.array([(m & d).sum() / max((m | d).sum(), 1) for m, d in zip(masks, discs)])
+
+
+@pytest.mark.parametrize("pan", [0.0, 1.5])
+def test_one_click_follows_a_disc_past_a_person(tmp_path: Path, pan: float) -> None:
+    scene = world(pan)
+    found = masks_of(request(tmp_path, scene, (click(3),)))
+    assert overlaps(found, scene[2]).mean() > 0.8
+    assert overlaps(found, scene[2]).min() > 0.6
+    assert (found.confidence["object"] > 0.5).all()
+
+
+def test_without_a_prompt_the_moving_disc_is_proposed(tmp_path: Path) -> None:
+    scene = world()
+    found = masks_of(request(tmp_path, scene))
+    (prompt,) = found.chosen["object"]
+    point = prompt.points[0]
+    assert scene[2][prompt.frame][int(point.y), int(point.x)]
+    assert overlaps(found, scene[2]).mean() > 0.8
+
+
+def test_a_disc_that_is_hidden_for_some_frames_is_found_again(tmp_path: Path) -> None:
+    scene = world(hidden=range(6, 9))
+    found = masks_of(request(tmp_path, scene, (click(1),)))
+    masks = found.entities["object"]
+    assert not any(masks[i].any() for i in range(6, 9))
+    assert overlaps(found, scene[2])[10:].min() > 0.6
+    assert any("not seen in 3 frames (6-8)" in note for note in found.notes)
+
+
+def test_a_still_video_without_a_prompt_has_no_object(tmp_path: Path) -> None:
+    frames, people, discs = world()
+    found = masks_of(request(tmp_path, ([frames[0]] * COUNT, [people[0]] * COUNT, discs)))
+    assert not any(found.entities["object"][i].any() for i in range(COUNT))
+    assert "nothing was found that moves" in found.notes[0]
+
+
+def test_a_click_on_the_person_is_noted(tmp_path: Path) -> None:
+    found = masks_of(request(tmp_path, world(), (click(0, 50, 66),)))
+    assert "lies on the person's mask" in found.notes[0]
+
+
+def test_a_click_on_a_black_border_is_an_error_that_says_so(tmp_path: Path) -> None:
+    frames, people, discs = world()
+    for frame in frames:
+        frame[:, 84:] = 0
+    with pytest.raises(HoigsError, match=r"at 100,30 in frame 2: there is a black border"):
+        masks_of(request(tmp_path, (frames, people, discs), (click(2, 100, 30),)))
+
+
+def test_a_prompt_beyond_the_end_is_an_error(tmp_path: Path) -> None:
+    prompt = FramePrompt(99, (PromptPoint(5, 5),))
+    with pytest.raises(HoigsError, match="frame 99; the video has frames 0 to 13"):
+        masks_of(request(tmp_path, world(), (prompt,)))
+
+
+def test_results_are_kept_and_depend_on_the_prompt(tmp_path: Path) -> None:
+    video = request(tmp_path, world(), (click(3),))
+    first = masks_of(video).entities["object"][5]
+
+    def unread(i: int) -> np.ndarray:
+        raise AssertionError("the kept result is read")
+
+    again = masks_of(replace(video, read=unread)).entities["object"][5]
+    assert (first == again).all()
+    masks_of(request(tmp_path, world(), (click(4),)))
+    assert len(list(tmp_path.glob("object-tracker-*.npz"))) == 2
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_lab_of_known_colors() -> None:
+    # sRGB red and white in CIE L*a*b* (D65): 53.2, 80.1, 67.2 and 100, 0, 0
+    lab = lab_of(np.uint8([[[255, 0, 0], [255, 255, 255]]])).astype(float)
+    assert np.allclose(lab[0, 0] / [2.55, 1, 1] - [0, 128, 128], (53.2, 80.1, 67.2), atol=0.6)
+    assert np.allclose(lab[0, 1] / [2.55, 1, 1] - [0, 128, 128], (100, 0, 0), atol=0.6)
