@@ -94,6 +94,9 @@ def test_the_khronos_validator_finds_nothing(body, splats):
         )
         issues = json.loads(done.stdout)
         bad = [m for m in issues["messages"] if m["severity"] < 2]  # errors and warnings
+        # this validator does not know the extension, whose attribute names have a colon
+        unknown = ("MESH_PRIMITIVE_INVALID_ATTRIBUTE", f"/attributes/{NAME}:")
+        bad = [m for m in bad if m["code"] != unknown[0] or unknown[1] not in m["pointer"]]
         assert not bad, bad[:5]
 
 
