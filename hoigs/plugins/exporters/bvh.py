@@ -28,7 +28,7 @@ class BvhExporter(Exporter):
     """`NAME.bvh` for each person: bones of the body's shape, rotations in the order Z X Y."""
 
     Config: ClassVar[type[ComponentConfig]] = BvhConfig
-    suffixes: ClassVar = (".bvh",)
+    suffixes = (".bvh",)
     kinds: ClassVar = frozenset({"human"})
     reads_gaussians: ClassVar = False
     keeps: ClassVar = {

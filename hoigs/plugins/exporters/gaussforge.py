@@ -62,28 +62,28 @@ class GaussForgeExporter(Exporter):
 class SpzExporter(GaussForgeExporter):
     """`scene.spz`, Niantic's."""
 
-    suffixes: ClassVar = (".spz",)
+    suffixes = (".spz",)
     file_format = "spz"
 
 
 class SplatExporter(GaussForgeExporter):
     """`scene.splat`, that of the first web viewers: 32 bytes a Gaussian, no SH."""
 
-    suffixes: ClassVar = (".splat",)
+    suffixes = (".splat",)
     file_format = "splat"
 
 
 class SogExporter(GaussForgeExporter):
     """`scene.sog`, PlayCanvas's."""
 
-    suffixes: ClassVar = (".sog",)
+    suffixes = (".sog",)
     file_format = "sog"
 
 
 class CompressedPlyExporter(GaussForgeExporter):
     """`scene.compressed.ply`, PlayCanvas's and SuperSplat's."""
 
-    suffixes: ClassVar = (".compressed.ply",)
+    suffixes = (".compressed.ply",)
     file_format = "compressed.ply"
 
     def packed(self, gaussians: Gaussians) -> tuple[bytes, Gaussians]:

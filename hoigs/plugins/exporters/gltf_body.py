@@ -41,7 +41,7 @@ class GltfBodyExporter(Exporter):
     """
 
     Config: ClassVar[type[ComponentConfig]] = GltfBodyConfig
-    suffixes: ClassVar = (".glb",)
+    suffixes = (".glb",)
     kinds: ClassVar = frozenset({"human", "object"})
     axes = AXES["y"]
     keeps: ClassVar = {

@@ -30,7 +30,7 @@ class GltfSplatExporter(Exporter):
     """
 
     Config: ClassVar[type[ComponentConfig]] = GltfSplatConfig
-    suffixes: ClassVar = (".glb",)
+    suffixes = (".glb",)
     moving: ClassVar = False
     axes = AXES["y"]
     keeps: ClassVar = {

@@ -24,7 +24,7 @@ class PlyExporter(Exporter):
     """`scene.ply`: all entities that are exported, joined, at the first moment."""
 
     Config: ClassVar[type[ComponentConfig]] = PlyConfig
-    suffixes: ClassVar = (".ply",)
+    suffixes = (".ply",)
     moving: ClassVar = False
     keeps: ClassVar = {
         "means": "float32, world", "rotations": "unit quaternions wxyz",

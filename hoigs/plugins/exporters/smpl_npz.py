@@ -33,7 +33,7 @@ class AmassConfig(ComponentConfig):
 class _ParametersExporter(Exporter):
     """One npz for each person."""
 
-    suffixes: ClassVar = (".npz",)
+    suffixes = (".npz",)
     kinds: ClassVar = frozenset({"human"})
     reads_gaussians: ClassVar = False
 

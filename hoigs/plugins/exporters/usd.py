@@ -43,7 +43,7 @@ class UsdExporter(Exporter):
     """
 
     Config: ClassVar[type[ComponentConfig]] = UsdConfig
-    suffixes: ClassVar = (".usd", ".usdc")
+    suffixes = (".usd", ".usdc")
     axes = AXES["y"]
     keeps: ClassVar = {
         "Gaussians": "ParticleField3DGaussianSplat, float32, all SH bands, time samples",
