@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from hoigs.core.cuda_graphs.capture import capturing
-from hoigs.core.errors import RenderError
+from hoigs.core.errors import PluginError, RenderError
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.model.scene import SceneModel, SceneState
 from hoigs.core.values.camera import Camera
@@ -169,7 +169,7 @@ class Playback:
             if self.mode == "graph":
                 self._capture()
             differs = self._difference(references)
-        except (RuntimeError, TypeError, ValueError, NotImplementedError) as error:
+        except (RuntimeError, TypeError, ValueError, NotImplementedError, PluginError) as error:
             # for example from a component that reads the time as a number
             differs = f"{type(error).__name__}: {str(error).splitlines()[0]}"
         if differs is not None:

@@ -61,9 +61,6 @@ class Registry:
                 f"{offer.component.target} is {_what(loaded)}, expected a subclass of "
                 f"{interface.replace(':', '.')}",
             )
-        left = sorted(getattr(loaded, "__abstractmethods__", ()))
-        if left:
-            self._break(offer, f"{offer.component.target} does not implement {', '.join(left)}")
         return loaded
 
     def config_class(self, key: str) -> type[Any]:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from hoigs.core.cuda_graphs.eligibility import why_not_cuda_graph_safe
-from hoigs.core.errors import HoigsError
+from hoigs.core.errors import HoigsError, PluginError
 from hoigs.core.model.scene import SceneModel, SceneState
 from hoigs.core.spec.train_schema import Graphs
 from hoigs.core.values.gaussians import Gaussians
@@ -156,7 +156,7 @@ class GraphedScene:
             failure = None
             if graph_key.structure not in self._compared:
                 failure = self._difference(step, moment)
-        except (RuntimeError, TypeError, ValueError, NotImplementedError) as error:
+        except (RuntimeError, TypeError, ValueError, NotImplementedError, PluginError) as error:
             # what CUDA or a component raises when it is captured; reported below
             failure = _root_cause(error)
         if failure is None:

@@ -42,17 +42,3 @@ def test_a_component_whose_module_does_not_end(plugins, tmp_path):
     registry = plugins.registry()
     with pytest.raises(PluginError, match=r"deformation:acme@acme-slow.*did not end in 0\.4 s"):
         registry.get("deformation:acme")
-
-
-def test_a_class_without_its_methods_is_broken(plugins, tmp_path, monkeypatch):
-    monkeypatch.delenv("HOIGS_IMPORT_TIMEOUT")
-    (tmp_path / "acme_half.py").write_text(
-        "from hoigs.core.interfaces.deformation import DeformationModel\n"
-        "class Half(DeformationModel):\n    pass\n"
-    )
-    plugins.offer("acme-half", 'Component("deformation:half", "acme_half:Half", summary="x")')
-    registry = plugins.registry()
-    with pytest.raises(PluginError, match="does not implement forward"):
-        registry.get("deformation:half")
-    [offer] = [o for o in registry.manager.offers if o.key == "deformation:half"]
-    assert offer.status is Status.BROKEN
