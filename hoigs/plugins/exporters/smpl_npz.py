@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -56,9 +57,9 @@ class _ParametersExporter(Exporter):
             lost |= _unlike_smpl(motion, type(self).__name__)
         return lost
 
+    @abstractmethod
     def arrays(self, motion: BodyMotion, request: ExportRequest) -> dict[str, np.ndarray]:
-        """What the file of one person holds."""
-        raise NotImplementedError
+        """The arrays of one person's file by name; poses in radians, places in metres."""
 
 
 class SmplxExporter(_ParametersExporter):
