@@ -52,6 +52,7 @@ class Job:
     train_width: int
     device: str
     keep: Path | None
+    pictures: Path | None
     threads: int
 
 
@@ -333,7 +334,8 @@ def _spread(values: np.ndarray, *, mean: bool = False) -> dict[str, float]:
 
 
 def trained(clip: Path, run: Path, job: Job) -> dict[str, Any]:
-    """PSNR by region of test frames and held-out cameras after `job.train` steps."""
+    """PSNR by region of test frames and held-out cameras after `job.train` steps, with the body
+    poses of test frames as the clip has them ("given"), and interpolated from training frames."""
     from hoigs.evaluation.evaluate import evaluate
     from hoigs.training.session import Session
 
@@ -347,11 +349,37 @@ def trained(clip: Path, run: Path, job: Job) -> dict[str, Any]:
     start = time.perf_counter()
     session.train()
     seconds = time.perf_counter() - start
-    scores = evaluate(session.model, session.clip, timing_frames=0)
     found: dict[str, Any] = {"train_s": round(seconds, 1)}
-    for view in scores.views:
-        found[view.name] = {r: _value(scores.score(r, "psnr", view.name)) for r in REGIONS}
+    if job.pictures:
+        draw_views(session, job.pictures / f"{run.name.removesuffix('.run')}.png")
+    for poses in ("given", "interpolated"):
+        scores = evaluate(session.trainer.model, session.clip, timing_frames=0, test_pose=poses)
+        found[f"{poses} poses"] = {
+            view.name: {r: _value(scores.score(r, "psnr", view.name)) for r in REGIONS}
+            for view in scores.views
+        }
     return found
+
+
+def draw_views(session: Any, file: Path) -> None:
+    """Three test frames and three held-out views: the image above, the drawn one below."""
+    import torch
+
+    clip, model = session.clip, session.trainer.model.eval()
+    chosen = [(clip, p) for p in clip.split["test"]]
+    if clip.held_out is not None:
+        chosen += [(clip.held_out, p) for p in clip.held_out.split["test"]]
+    columns = []
+    for views in (chosen[: len(clip.split["test"])], chosen[len(clip.split["test"]) :]):
+        for source, position in views[:: max(1, len(views) // 3)][:3]:
+            frame = source[position]
+            with torch.no_grad():
+                drawn = model.render(
+                    frame.moment.to(model.device), frame.camera.to(model.device)
+                ).color.clamp(0, 1)
+            columns.append(torch.cat((frame.rgb.cpu(), drawn.cpu())))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray((255 * torch.cat(columns, 1)).byte().numpy()).save(file)
 
 
 def _value(score: Any) -> float | str:
@@ -378,6 +406,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--keep", type=Path, help="folder that sources, clips and runs stay in")
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of trained runs")
     parser.add_argument("--json", type=Path)
     return parser.parse_args()
 
@@ -396,7 +425,7 @@ def _jobs(options: argparse.Namespace) -> Iterator[Job]:
             clip=f"{clip}{'&' if '?' in clip else '?'}{extra}", noise=noise, variant=variant[0],
             settings=tuple(filter(None, variant[2].split(","))), camera=camera, seed=seed,
             train=options.train, train_width=options.train_width or options.width,
-            device=options.device, keep=options.keep, threads=threads,
+            device=options.device, keep=options.keep, pictures=options.pictures, threads=threads,
         )  # fmt: skip
 
 

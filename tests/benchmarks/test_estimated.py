@@ -16,7 +16,8 @@ import estimated
 def test_figures_of_the_smallest_clip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = [
         "estimated.py", "lift-and-swing", "--width", "64", "--frames", "8",
-        "--variant", "short:fit_steps=20", "--json", str(tmp_path / "rows.json"),
+        "--variant", "short:fit_steps=20", "--train", "2",
+        "--pictures", str(tmp_path), "--json", str(tmp_path / "rows.json"),
     ]  # fmt: skip
     monkeypatch.setattr(sys, "argv", arguments)
     assert estimated.main() == 0
@@ -25,6 +26,10 @@ def test_figures_of_the_smallest_clip(tmp_path: Path, monkeypatch: pytest.Monkey
     assert 0 < row["place_mm"]["mean"] < 1000
     assert 0 < row["root_aligned_joints_mm"] < 200
     assert 0.5 < row["size_ratio"] < 2
+    for trained in ("estimated", "every_pose_given"):
+        scores = row[trained]["interpolated poses"]
+        assert all(5 < s["human_object"] < 40 for s in scores.values()) and len(scores) == 2
+    assert len(list(tmp_path.glob("*.png"))) == 2
 
 
 def test_chamfer_finds_the_turn_and_names_the_size() -> None:
