@@ -66,9 +66,9 @@ def flights_by_texture(
     for rows in _runs(np.flatnonzero(~known)):
         before, after = rows[0] - 1, rows[-1] + 1
         if before < 0:
-            rotations[rows] = rotations[after]
+            rotations[rows] = rotations[after].clone()
         elif after == len(known):
-            rotations[rows] = rotations[before]
+            rotations[rows] = rotations[before].clone()
         else:
             rotations[rows] = search.flight(rows, rotations, poses.translations, fps)
     return Poses(rotations, poses.translations)
