@@ -74,7 +74,3 @@ def main() -> None:
     share_processors()
     with failures_as_messages():
         app()
-
-
-if __name__ == "__main__":
-    main()

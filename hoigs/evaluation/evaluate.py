@@ -15,11 +15,12 @@ from hoigs.core.errors import did_you_mean
 from hoigs.core.interfaces.rasterizer import RenderOutput
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
+from hoigs.core.spec.train_schema import TestPoseSetting
 from hoigs.core.values.clip import CAMERAS_REFINED, Clip, Frame
 from hoigs.core.values.tokens import EntityKind
 from hoigs.evaluation.geometry import measure_geometry
 from hoigs.evaluation.measure import device_name, model_size, render_time
-from hoigs.evaluation.posing import FIT_STEPS, posed_clip
+from hoigs.evaluation.posing import FIT_STEPS, posed_clip, source_of_poses
 from hoigs.evaluation.protocol import NotComputed, Pixels, Protocol, TestPose, Value
 from hoigs.evaluation.scores import METRICS, Evaluation, FrameScores, ViewScores
 from hoigs.metrics.lpips import Lpips, find_weights
@@ -37,7 +38,7 @@ def evaluate(
     split: str = "test",
     lpips_weights: Path | str | None = None,
     held_out: bool = True,
-    test_pose: TestPose = "given",
+    test_pose: TestPoseSetting = "auto",
     test_camera: TestPose = "given",
     fit_steps: int = FIT_STEPS,
     pixels: Pixels = "float",
@@ -54,7 +55,8 @@ def evaluate(
         lpips_weights: see `lpips.find_weights`; None: the package's own.
         held_out: also score the clip's held-out cameras, where it has them.
         test_pose, test_camera, fit_steps: source of body poses and cameras; see
-            `posing.posed_clip`. The clip with these is `Evaluation.scored`.
+            `posing.posed_clip`, and for "auto" `posing.source_of_poses`. The clip with these is
+            `Evaluation.scored`.
         pixels: score float renders, or round them to 8 bits first. Clamped to [0, 1] either way.
         band: width of the interaction band, pixels; by default 2 % of the longer side.
         timing_frames, timing_warmup, timing_budget_s: see `measure.render_time`; 0 frames skip it.
@@ -78,11 +80,12 @@ def evaluate(
     report = progress or no_progress
     was_training = model.training
     model.eval()
+    poses = source_of_poses(clip, test_pose)
     clip = posed_clip(
-        model, clip, split=split, test_pose=test_pose, test_camera=test_camera,
+        model, clip, split=split, test_pose=poses, test_camera=test_camera,
         fit_steps=fit_steps, progress=lambda done, text: report(FITTING_SHARE * done, text),
     )  # fmt: skip
-    begun = FITTING_SHARE if "fitted" in (test_pose, test_camera) else 0.0
+    begun = FITTING_SHARE if "fitted" in (poses, test_camera) else 0.0
     chosen = [("test frames" if split == "test" else f"{split} frames", clip, split)]
     if held_out and clip.held_out is not None and len(clip.held_out):
         chosen.append(("held-out cameras", clip.held_out, "test"))
@@ -91,7 +94,7 @@ def evaluate(
     views, done = [], 0
     for title, source, name in chosen:
         protocol = replace(
-            _protocol(model, source, title, name, trained, test_pose, pixels, band, lpips),
+            _protocol(model, source, title, name, trained, poses, pixels, band, lpips),
             test_camera=test_camera if source is clip else "given",
             fit_steps=fit_steps if begun else 0,
         )

@@ -21,15 +21,22 @@ from hoigs.core.maths.rotations import (
 from hoigs.core.maths.splines import neighbours
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
+from hoigs.core.spec.train_schema import TestPose, TestPoseSetting
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.clip import Clip, Frame
+from hoigs.core.values.clip import POSES_ESTIMATED, Clip, Frame
 from hoigs.core.values.moment import BodyPose, Moment
-from hoigs.evaluation.protocol import TestPose
 from hoigs.metrics.image_loss import image_loss
 
 FIT_STEPS = 40
 FIT_RATES = (5e-3, 2e-3)  # initial learning rates, radians and metres: body poses, cameras
 FIT_DSSIM = 0.2  # weight of D-SSIM in the image loss
+
+
+def source_of_poses(clip: Clip, setting: TestPoseSetting) -> TestPose:
+    """What "auto" stands for: poses that were estimated from test images are not used there."""
+    if setting != "auto":
+        return setting
+    return "interpolated" if clip.provenance.get(POSES_ESTIMATED) else "given"
 
 
 def posed_clip(

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from hoigs.core.clip_folder.write import ClipWriter
 from hoigs.core.interfaces.body import PELVIS
+from hoigs.core.values.clip import POSES_ESTIMATED
 from hoigs.preparation.cameras.camera_track import parallax
 from hoigs.preparation.cameras.multiview import angular_factor, full_factor
 from hoigs.preparation.objects.tracked import ObjectConfidence
@@ -44,7 +45,10 @@ def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
         if made.track.model is not None:
             writer.set_colmap(made.track.model)
         writer.provenance.update(
-            made.provenance, video=made.source.video.name, frames=made.video.indices
+            made.provenance,
+            video=made.source.video.name,
+            frames=made.video.indices,
+            **{POSES_ESTIMATED: True},
         )
         report = _report(made, writer.name)
         report.save(writer.root)

@@ -53,8 +53,9 @@ def evaluate_run(
         clip, rasterizer, device, plugins: as for `open_run`.
         lpips_weights: LPIPS weights; by default those that $HOIGS_LPIPS_WEIGHTS names, or
             AlexNet's, which are shipped.
-        test_pose: body poses of test frames: "given", "interpolated" from training frames, or
-            "fitted" to the test images themselves; by default the spec's. test_camera: likewise.
+        test_pose: body poses of test frames: "auto", "given", "interpolated" from training frames,
+            or "fitted" to the test images; by default the spec's. test_camera: likewise, but for
+            "auto".
         fit_steps: optimizer steps per "fitted" frame; by default the spec's.
         report: write report.html. progress: called with the share done, in [0, 1], and the work.
 
@@ -96,5 +97,5 @@ def _protocol(spec: EvaluationSpec, changes: Mapping[str, object]) -> Evaluation
     except ValidationError as error:
         wrong = error.errors()[0]
         value = str(wrong["input"])
-        near = did_you_mean(value, ("given", "interpolated", "fitted"))
+        near = did_you_mean(value, ("auto", "given", "interpolated", "fitted"))
         raise HoigsError(f"{wrong['loc'][0]} {value}: {wrong['msg']}{near}") from error

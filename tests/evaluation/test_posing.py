@@ -15,10 +15,16 @@ from hoigs.core.model.compose import compose
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.clip import Clip, FrameStore
+from hoigs.core.values.clip import POSES_ESTIMATED, Clip, FrameStore
 from hoigs.core.values.moment import BodyPose
 from hoigs.evaluation.evaluate import evaluate
-from hoigs.evaluation.posing import camera_between, fit_frame, pose_between, posed_clip
+from hoigs.evaluation.posing import (
+    camera_between,
+    fit_frame,
+    pose_between,
+    posed_clip,
+    source_of_poses,
+)
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.synthesis import SceneConfig, builtin_clip
@@ -137,6 +143,17 @@ def turned(a: BodyPose, b: BodyPose) -> Tensor:
     inverse = axis_angle_to_quats(-a.rotations)
     apart = quats_to_axis_angle(multiply_quats(inverse, axis_angle_to_quats(b.rotations)))
     return torch.rad2deg(apart.norm(dim=-1))
+
+
+def test_poses_that_were_estimated_from_test_frames_are_not_used_there(
+    scene: tuple[SceneModel, Clip],
+) -> None:
+    model, clip = scene
+    estimated = replace(clip, provenance={POSES_ESTIMATED: True})
+    for source, pose in ((clip, "given"), (estimated, "interpolated")):
+        (view,) = evaluate(model, source, timing_frames=0).views
+        assert view.protocol.test_pose == pose
+    assert source_of_poses(estimated, "given") == "given"
 
 
 def test_fitted_finds_the_pose_that_drew_the_image(scene: tuple[SceneModel, Clip]) -> None:

@@ -10,6 +10,7 @@ from hoigs.core.errors import did_you_mean
 
 Graphs = Literal["auto", "on", "off"]
 TestPose = Literal["given", "interpolated", "fitted"]
+TestPoseSetting = Literal["auto", "given", "interpolated", "fitted"]
 
 
 class _Strict(BaseModel):
@@ -173,11 +174,12 @@ class TrainSpec(_Strict):
 class EvaluationSpec(_Strict):
     """How a run is scored."""
 
-    test_pose: TestPose = "given"
-    """Body poses of test frames. "given" are the clip's, moved by the corrections that neighbouring
-    training frames learned; "interpolated" are these neighbours' poses, as if the clip had none for
-    test frames; "fitted" are optimised on the test images that are scored. Stored with every
-    score (docs/reference/refinement.md)."""
+    test_pose: TestPoseSetting = "auto"
+    """Body poses of test frames. "auto" is "interpolated" where the clip's poses were estimated
+    from its frames (`hoigs prepare`), and "given" elsewhere. "given" are the clip's, moved by the
+    corrections that neighbouring training frames learned; "interpolated" are these neighbours'
+    poses, as if the clip had none for test frames; "fitted" are optimised on the test images that
+    are scored. Stored with every score (docs/reference/refinement.md)."""
     test_camera: TestPose = "given"
     """Cameras of test frames, with the same choices as `test_pose`."""
     fit_steps: int = Field(default=40, ge=1)

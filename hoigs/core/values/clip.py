@@ -17,7 +17,9 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind
 
-CAMERAS_REFINED = "cameras_refined_in_training"  # a key of Clip.provenance
+# keys of Clip.provenance
+CAMERAS_REFINED = "cameras_refined_in_training"
+POSES_ESTIMATED = "poses_estimated"  # body poses were estimated from the frames, test ones too
 
 
 class FrameStore(ABC):
