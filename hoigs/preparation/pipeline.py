@@ -52,7 +52,7 @@ from hoigs.preparation.video.frames import FrameList, open_frames
 from hoigs.preparation.video.header import uneven_times
 from hoigs.preparation.video.source import Source
 
-FORMAT = 5  # of what the stages keep; another number makes older results unread
+FORMAT = 6  # of what the stages keep; another number makes older results unread
 LARGEST, REDUCED = 1920, 1280  # longer sides, pixels: of frames that are kept, and of smaller ones
 T = TypeVar("T")
 
