@@ -105,11 +105,16 @@ class PrepareOptions(ComponentConfig):
     object: str = Field(default="object", description="name of the object's entity")
     object_track: ObjectWay = Field(
         default="auto",
-        description='how the object\'s poses are found: "auto": from hands, outlines and texture, '
-        'or, where that cannot be, by "outline": its place and roll only',
+        description='how the object\'s poses are found: "ball": as those of a sphere, whose '
+        'rotation stays unknown; "texture": from hands, outlines and texture; "outline": its place '
+        'and roll only; "auto": as a ball where its masks are round in all frames, or else by '
+        "texture, and by outline where that cannot be",
     )
-    ball_radius: float = Field(
-        default=0.11, gt=0, description="radius of a tracked ball, metres; a football's is 0.11"
+    ball_radius: float | None = Field(
+        default=None,
+        gt=0,
+        description="radius of a ball, metres; None: 0.11, a football's, for one in "
+        "ball_track.npz, and what the limbs that touch it give for one known by its round masks",
     )
     object_points: int = Field(
         default=4000, ge=8, description="number of the object's first points"

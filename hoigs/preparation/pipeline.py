@@ -349,6 +349,10 @@ class Pipeline:
         lost = (~made.track.observed).nonzero().flatten().tolist()
         if lost:
             self.warnings.append(f"the object is not seen in {len(lost)} frames: {ranges(lost)}")
+        if made.confidence.way == "ball" and self.estimates.ball is None:
+            self.warnings.append(
+                f"the object: {made.confidence.reason} (object_track=texture else)"
+            )
         if made.confidence.way == "outline":
             self.warnings.append(
                 "the object's rotation is not tracked but for its roll, and its shape is a cushion "

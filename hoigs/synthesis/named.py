@@ -25,7 +25,8 @@ def is_named(clip: str | Path) -> bool:
 def clip_config(name: str) -> SceneConfig:
     """The config of "builtin:NAME", or "builtin:NAME?setting=value&group.setting=value".
 
-    A width alone sets the height too, so that frames are square.
+    A width alone sets the height too, so that frames are square. Several values have commas between
+    them: "held_out_degrees=45,90,135".
 
     Raises:
         ClipError: no clip of that name, no such setting, or an invalid value.
@@ -53,7 +54,7 @@ def clip_config(name: str) -> SceneConfig:
             place = place.setdefault(group, {})
             if not isinstance(place, dict):
                 raise ClipError(f"{name}: {group} has no settings of its own")
-        place[last] = value
+        place[last] = [v for v in value.split(",") if v] if "," in value else value
     if "width" in settings and "height" not in settings:
         settings["height"] = settings["width"]
     try:

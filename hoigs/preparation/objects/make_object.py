@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST
@@ -18,32 +18,90 @@ from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.masks.separate import Images
 from hoigs.preparation.objects.ball import BallTrack, ball_centers
 from hoigs.preparation.objects.shape import ColorSampler, sphere_points
+from hoigs.preparation.objects.sphere import (
+    Cones,
+    NoBallError,
+    ball_cones,
+    contact_radius,
+    require_round,
+)
 from hoigs.preparation.objects.track import held_object
 from hoigs.preparation.objects.tracked import ObjectConfidence, UntrackableError, tracked_object
 
-ObjectWay = Literal["auto", "outline"]
+ObjectWay = Literal["auto", "ball", "texture", "outline"]
 
 COLOR_FRAMES = 24  # a median over more changes nothing visible
+FOOTBALL = 0.11  # metres
 
 
 def ball_object(
     ball: BallTrack, cameras: Sequence[Camera], radius: float, count: int
 ) -> tuple[ObjectTrack, Float[Tensor, "P 3"], float]:
-    """A ball of known radius: track (grey), outward normals, spread of its measured radius."""
+    """A tracked ball of known radius: track (grey), outward normals, spread of its measured
+    radius."""
+    places = ball_centers(ball, list(cameras), radius)
+    text = (
+        f"tracked disc, refined on its edge; depth from a radius of {radius} m and the focal "
+        "length; its spin is not tracked"
+    )
+    return *_sphere_track(places, ball.observed, radius, count, text), ball.jitter
+
+
+def round_object(
+    cones: Cones,
+    cameras: Sequence[Camera],
+    joints: Float[Tensor, "F J 3"],
+    radius: float | None,
+    count: int,
+) -> tuple[ObjectTrack, Float[Tensor, "P 3"], ObjectConfidence]:
+    """A ball of round masks: track (grey), outward normals, and how far it may be trusted."""
+    touched = None if radius is not None else contact_radius(cones, joints, cameras)
+    if radius is not None:
+        size, text = radius, f"its radius was given as {radius:g} m"
+    elif touched is not None:
+        size, frames, spread = touched
+        text = (
+            f"its radius of {size:.3f} m puts it as far off as the hand, foot or head at it "
+            f"({frames} frames, which differ by {100 * spread:.0f} %)"
+        )
+    else:
+        size, text = FOOTBALL, f"no limb comes near it: its radius is taken as {FOOTBALL} m"
+    places = cones.places(cameras, size)
+    track, normals = _sphere_track(
+        places, cones.observed, size, count,
+        f"taken for a ball, as its masks are {100 * np.median(cones.judged):.1f} % off a circle "
+        f"(median of {len(cones.judged)} frames); place from the cone of rays along its outline; "
+        f"{text}; its rotation is unknown, and kept constant",
+    )  # fmt: skip
+    away = np.linalg.norm(places - torch.stack([c.center for c in cameras]), axis=-1)
+    nothing = np.full(len(cameras), np.nan)
+    reason = (
+        f"it was taken for a ball (masks {100 * np.median(cones.judged):.1f} % off a circle), "
+        f"whose rotation no outline shows; {text}"
+    )
+    confidence = ObjectConfidence(
+        "ball", nothing, cones.off * cones.angles * away, hand_distance=nothing, reason=reason
+    )
+    return track, normals, confidence
+
+
+def _sphere_track(
+    places: Float[Tensor, "F 3"],
+    observed: Bool[np.ndarray, " F"],
+    radius: float,
+    count: int,
+    provenance: str,
+) -> tuple[ObjectTrack, Float[Tensor, "P 3"]]:
     points = sphere_points(count, radius)
-    frames = len(cameras)
     track = ObjectTrack(
         points=points,
         colors=torch.full_like(points, 0.5),
-        rotations=torch.eye(3).expand(frames, 3, 3).clone(),
-        translations=ball_centers(ball, list(cameras), radius),
-        observed=torch.from_numpy(ball.observed),
-        provenance=(
-            f"tracked disc, refined on its edge; depth from a radius of {radius} m and the focal "
-            "length; its spin is not tracked"
-        ),
+        rotations=torch.eye(3).expand(len(places), 3, 3).clone(),
+        translations=places,
+        observed=torch.from_numpy(observed),
+        provenance=provenance,
     )
-    return track, points / radius, ball.jitter
+    return track, points / radius
 
 
 @dataclass(frozen=True)
@@ -69,7 +127,7 @@ def make_object(
     images: Images,
     *,
     way: ObjectWay,
-    radius: float,
+    radius: float | None,
     count: int,
     fps: float,
     progress: Callable[[float], None],
@@ -78,23 +136,49 @@ def make_object(
     be, and the confidence names why.
 
     Args:
-        joints: of the body, world, metres. radius: of a ball, metres. count: of points.
+        joints: of the body, world, metres. way: how; "auto": as a ball where all masks are round,
+            or else by texture. radius: of a ball, metres; None: a football's for a tracked ball,
+            and for a round mask that which the limbs at it give. count: of points.
     """
     if ball is not None:
-        track, normals, spread = ball_object(ball, cameras, radius, count)
+        track, normals, spread = ball_object(ball, cameras, radius or FOOTBALL, count)
         confidence = ObjectConfidence.none("ball", len(cameras), "a ball's spin is not tracked")
-    else:
+        return _colored(track, normals, spread, confidence, masks, cameras, images)
+    reasons = []
+    if way in ("auto", "ball"):
         try:
-            if way == "outline":
-                raise UntrackableError("object_track is outline")
-            track, normals, confidence = tracked_object(
-                masks, humans, cameras, joints, images, count, fps, progress
-            )
-            spread = float(np.nanmean(confidence.outline) / track.points.norm(dim=-1).mean())
-        except UntrackableError as reason:
-            wrists = joints[:, [LEFT_WRIST, RIGHT_WRIST]]
-            track, normals, spread = held_object(masks, list(cameras), wrists, count)
-            confidence = ObjectConfidence.none("outline", len(cameras), str(reason))
+            cones = ball_cones(masks, humans, cameras)
+            if way == "auto":
+                require_round(cones, cameras)
+            track, normals, confidence = round_object(cones, cameras, joints, radius, count)
+            return _colored(track, normals, cones.jitter, confidence, masks, cameras, images)
+        except NoBallError as reason:
+            if way == "ball":
+                reasons.append(f"it cannot be posed as a ball: {reason}")
+    try:
+        if way == "outline":
+            raise UntrackableError("object_track is outline")
+        track, normals, confidence = tracked_object(
+            masks, humans, cameras, joints, images, count, fps, progress
+        )
+        spread = float(np.nanmean(confidence.outline) / track.points.norm(dim=-1).mean())
+    except UntrackableError as reason:
+        wrists = joints[:, [LEFT_WRIST, RIGHT_WRIST]]
+        track, normals, spread = held_object(masks, list(cameras), wrists, count)
+        reasons.append(str(reason))
+        confidence = ObjectConfidence.none("outline", len(cameras), "; ".join(reasons))
+    return _colored(track, normals, spread, confidence, masks, cameras, images)
+
+
+def _colored(
+    track: ObjectTrack,
+    normals: Float[Tensor, "P 3"],
+    spread: float,
+    confidence: ObjectConfidence,
+    masks: MaskStack,
+    cameras: Sequence[Camera],
+    images: Images,
+) -> MadeObject:
     track = replace(track, colors=_colors(track, normals, masks, cameras, images))
     return MadeObject(track, spread, confidence)
 

@@ -31,6 +31,8 @@ NEUTRAL, UNKNOWN = 2.0, 30.0  # cost of unknown texture, and the points that it 
 OUTSIDE = 1.5  # cost of a point outside the mask
 CLEARLY = 0.8  # of its cost: another rotation has to be better by so much
 LOOKS = 6  # frames of a grasp in which its rotation is looked for
+REFINED, STEPS, RATE = 10, 30, 0.04  # the best of the grid, each moved to its own best place first
+APART = 0.35  # radians between them
 
 
 def grasps_by_texture(
@@ -64,9 +66,9 @@ def flights_by_texture(
     for rows in _runs(np.flatnonzero(~known)):
         before, after = rows[0] - 1, rows[-1] + 1
         if before < 0:
-            rotations[rows] = rotations[after]
+            rotations[rows] = rotations[after].clone()
         elif after == len(known):
-            rotations[rows] = rotations[before]
+            rotations[rows] = rotations[before].clone()
         else:
             rotations[rows] = search.flight(rows, rotations, poses.translations, fps)
     return Poses(rotations, poses.translations)
@@ -133,13 +135,28 @@ class _Search:
     def piece(self, rows: np.ndarray, turns: Tensor, places: Tensor) -> Tensor:
         """Rotations of a grasp that turns as `turns` do, from one that is found."""
         looks = rows[np.linspace(0, len(rows) - 1, min(LOOKS, len(rows))).round().astype(int)]
-        grid = torch.cat((turns[:1], self.grid))
-        total = torch.zeros(len(grid))
-        for row in looks.tolist():
-            turn = turns[int(np.flatnonzero(rows == row)[0])] @ turns[0].mT
-            total += self.costs(row, turn @ grid, places[row])
-        total[0] *= CLEARLY  # as it was let go, unless the texture is clearly against it
-        return turns @ turns[0].mT @ grid[total.argmin()]
+        ahead = [turns[int(np.flatnonzero(rows == row)[0])] @ turns[0].mT for row in looks]
+
+        def total(rotations: Tensor) -> Tensor:
+            costs = [
+                self.costs(row, turn @ rotations, places[row])
+                for row, turn in zip(looks.tolist(), ahead, strict=True)
+            ]
+            return torch.stack(costs).sum(0)
+
+        tried = torch.cat((turns[:1], self.grid))
+        tried = tried[_distinct(tried, total(tried))]
+        moved = torch.zeros(len(tried), 3, requires_grad=True)
+        adam = torch.optim.Adam([moved], lr=RATE)
+        for _ in range(STEPS):
+            adam.zero_grad()
+            total(axis_angle_to_matrices(moved) @ tried).sum().backward()
+            adam.step()
+        with torch.no_grad():
+            tried = axis_angle_to_matrices(moved) @ tried
+            cost = total(tried)
+        cost[0] *= CLEARLY  # as it was let go, unless the texture is clearly against it
+        return turns @ turns[0].mT @ tried[cost.argmin()]
 
     def flight(
         self, rows: np.ndarray, rotations: Tensor, places: Tensor, fps: float
@@ -165,6 +182,18 @@ class _Search:
             tried.append(turn @ rotations[first])
             total = total + self.costs(row, tried[-1], places[row])
         return torch.stack([turns[total.argmin()] for turns in tried])
+
+
+def _distinct(rotations: Float[Tensor, "R 3 3"], costs: Float[Tensor, " R"]) -> list[int]:
+    """The first rotation, and the cheapest others that are apart from each other."""
+    kept = [0]
+    for i in costs.argsort().tolist():
+        cosine = ((rotations[i] * rotations[kept]).sum((-1, -2)) - 1) / 2
+        if float(cosine.max()) < np.cos(APART):
+            kept.append(i)
+        if len(kept) == REFINED:
+            break
+    return kept
 
 
 def _ball(radius: float, step: float = 0.45) -> Float[Tensor, "N 3"]:
