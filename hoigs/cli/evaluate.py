@@ -30,8 +30,8 @@ def evaluate(
         typer.Option(
             "--test-pose",
             help="Body poses of test frames: auto (interpolated if the clip's are estimates), "
-            "given, interpolated (from training frames) or fitted (to the test images). Default: the "
-            "spec's.",
+            "given, interpolated (from training frames) or fitted (to the test images). "
+            "Default: the spec's.",
         ),
     ] = None,
     test_camera: Annotated[

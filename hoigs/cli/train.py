@@ -73,6 +73,12 @@ def train(
     evaluate: Annotated[
         bool, typer.Option("--eval/--no-eval", help="Score the run and write its report.")
     ] = True,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the training in the browser while it lasts.")
+    ] = False,
+    port: Annotated[
+        int, typer.Option("--port", help="Of --view, on this machine; 0 finds a free one.")
+    ] = 8090,
     plugin: PluginOption = None,
 ) -> None:
     """Fit a model to a clip; then score it and write report.html."""
@@ -83,8 +89,9 @@ def train(
         given: dict[str, Any] = {
             "out": out, "overrides": settings or (), "rasterizer": rasterizer, "device": device,
             "resume": resume, "overwrite": overwrite, "allow_faults": allow_faults,
-            "evaluate": evaluate, "plugins": plugin or (), "on_start": show.started,
-            "on_step": show.step, "progress": show.fraction, "report": show.line,
+            "evaluate": evaluate, "plugins": plugin or (), "view": view, "port": port,
+            "on_start": show.started, "on_step": show.step,
+            "progress": show.fraction, "report": show.line,
         }  # fmt: skip
         if auto:
             named = _clip_for_auto(clip, reader, reader_set)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import torch
 
 import hoigs
 from hoigs.core.diagnostics import ranges
@@ -271,10 +272,12 @@ class Pipeline:
 
     def _body(self) -> None:
         def make() -> FittedBody:
-            found = self.estimates
+            found, video = self.estimates, self.video
+            times = torch.tensor(video.indices) / video.list.rate
             person = fit_person(
                 found.landmarks, self.track, self.body, self.options.fit_steps,
                 self.stages.advance, self.raw.landmarks.source, found.masks.persons(found.ball),
+                times,
             )  # fmt: skip
             self.provenance["body"] = person.provenance
             self.warnings.extend(person.warnings)

@@ -77,6 +77,17 @@ def _complete(folder: Path) -> list[Path]:
     )
 
 
+def complete_checkpoints(folder: Path) -> list[int]:
+    """The steps of the complete checkpoints in a run's `checkpoints/` folder, in order."""
+    return [int(path.stem.removeprefix("step_")) for path in _complete(folder)]
+
+
+def remove_checkpoint(folder: Path, step: int) -> None:
+    """Remove a checkpoint, the file that marks it complete first; nothing if there is none."""
+    for ending in ("json", "safetensors"):
+        (folder / f"step_{step:06d}.{ending}").unlink(missing_ok=True)
+
+
 def has_checkpoint(folder: Path) -> bool:
     """Whether a run's `checkpoints/` folder has a complete checkpoint."""
     return bool(_complete(folder))

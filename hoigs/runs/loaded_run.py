@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,22 @@ class LoadedRun:
         model.eval()
         model.set_progress(min(1.0, checkpoint.meta["step"] / spec.train.steps))
         return cls(spec, source, model, checkpoint.meta["step"], provenance)
+
+    def newer(self, path: Path) -> LoadedRun:
+        """This run at the newest checkpoint, without reading the spec and the clip again.
+
+        Raises:
+            HoigsError: the checkpoint is damaged, belongs to another spec or refines cameras.
+        """
+        checkpoint = load_newest(RunFolder(path).checkpoints)
+        if checkpoint.part("cameras"):
+            raise HoigsError(f"{path}: with refined cameras the clip has to be read again")
+        model = copy.deepcopy(self.model)
+        restore_model(model, checkpoint, self.spec.model_hash())
+        model.eval()
+        step = checkpoint.meta["step"]
+        model.set_progress(min(1.0, step / self.spec.train.steps))
+        return replace(self, model=model, step=step)
 
 
 @torch.no_grad()

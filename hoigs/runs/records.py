@@ -43,6 +43,7 @@ class Provenance(_Record):
 
     clip: ClipRecord
     versions: dict[str, Any] = {}
+    command: str = ""
     components: dict[str, Any] = {}
     allow_faults: bool = False
     clip_faults: list[FaultRecord] = []

@@ -8,7 +8,9 @@ import glob
 import json
 import os
 import platform
+import shlex
 import shutil
+import sys
 from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
@@ -29,12 +31,13 @@ from hoigs.runs.records import MetricsRecord, Provenance, StepRecord
 
 PACKAGES = ("hoigs", "torch", "warp-lang", "kornia", "pluggy", "numpy")
 
-_PROTOCOL = "(given|interpolated|fitted)"
+_PROTOCOL = "(auto|given|interpolated|fitted)"
 _WRITTEN_WHOLE = (
     r"(spec\.yaml|provenance\.json|job\.json|study\.json|report\.html"
     rf"|evaluation(-{_PROTOCOL}-{_PROTOCOL})?\.json)"
 )
-# what train, eval, compress, render and studies write into a run, half-written files included
+# what train, eval, compress, render, export and studies write into a run, half-written files
+# included; exporters name their own files
 RUN = Layout(
     what="run",
     maker="hoigs",
@@ -44,10 +47,10 @@ RUN = Layout(
         rf"\.{_WRITTEN_WHOLE}\.part",
         r"metrics\.(jsonl|part)",
         r"checkpoints/step_\d+\.((safetensors|json)(\.part)?|\d+\.part)",
-        r"renders/[\w-]+\.(mp4|webm|mov|gif)",
-        r"renders/\.[\w-]+\.(mp4|webm|mov|gif)\.part",
+        r"renders/[^/]+\.(mp4|webm|mov|gif)(\.part)?",
+        r"exports/.+",
     ),
-    folders=one_of("checkpoints", "renders"),
+    folders=one_of("checkpoints", "renders", "exports(/.+)?"),
 )
 
 
@@ -239,3 +242,11 @@ def versions() -> dict[str, str]:
     found["python"] = platform.python_version()
     found["machine"] = f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPUs"
     return found
+
+
+def command_line() -> dict[str, str]:
+    """The `hoigs` command of this process under "command"; empty if it is another program."""
+    program = Path(sys.argv[0])
+    if program.stem != "hoigs" and program.parts[-2:] != ("hoigs", "__main__.py"):
+        return {}
+    return {"command": shlex.join(["hoigs", *sys.argv[1:]])}

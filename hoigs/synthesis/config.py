@@ -185,6 +185,9 @@ class SceneConfig(ComponentConfig):
     depth are those of the pixel's centre."""
     held_out_views: int = Field(default=8, ge=0)
     """Frames from cameras that are never trained on."""
+    held_out_degrees: tuple[float, ...] = ()
+    """How far these cameras are turned about the scene, by turns to the left and to the right of
+    the training camera of their moment; empty: they stay near the path."""
     test_frames: int = Field(default=16, ge=1)
     """Uniformly chosen (HOSNeRF's rule: 16)."""
     scene_points: int = Field(default=10_000, ge=100)
@@ -220,5 +223,6 @@ class SceneConfig(ComponentConfig):
 
     def digest(self, *more: str) -> str:
         """A hash of every setting and of `more` (generator version, body), 16 hex digits."""
-        text = "\n".join((self.model_dump_json(), *more))
+        unset = set() if self.held_out_degrees else {"held_out_degrees"}  # as before there was one
+        text = "\n".join((self.model_dump_json(exclude=unset), *more))
         return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -27,7 +27,7 @@ from hoigs.runs.resuming import (
     default_out,
     own_spec,
 )
-from hoigs.runs.run_folder import RunFolder, versions
+from hoigs.runs.run_folder import RunFolder, command_line, versions
 from hoigs.training.trainer import StepReport, Trainer
 
 
@@ -161,6 +161,7 @@ class Session:
         else:
             provenance = {
                 "versions": versions(),
+                **command_line(),
                 "components": registry.provenance(spec)
                 | {f"body of {n}": registry.origin(t.model) for n, t in source.bodies.items()},
                 **record,

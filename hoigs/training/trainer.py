@@ -29,6 +29,7 @@ from hoigs.runs.checkpoint import (
     restore_model,
 )
 from hoigs.runs.run_folder import RunFolder
+from hoigs.training.checkpointing import CheckpointWriter
 from hoigs.training.density_update import EntityDensity, evolve
 from hoigs.training.losses.face import unwrap_faces
 from hoigs.training.nan_guard import (
@@ -41,6 +42,7 @@ from hoigs.training.objective import JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
 from hoigs.training.sampler import EpochSampler
 from hoigs.training.stop_request import StopRequest, resume_command
+from hoigs.training.unseen import fill_unseen
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,9 @@ class Trainer:
         run: folder for metrics and checkpoints; None keeps everything in memory.
         identity: stored in checkpoints to recognise the spec (spec_name, model_hash).
         lpips: the network of the LPIPS term; needed if `spec.loss.lpips` > 0.
+
+    Attributes:
+        viewed: write checkpoints for a viewer too (`CheckpointWriter`).
 
     Raises:
         SpecError: the rasterizer lacks a gradient that the density control or cameras need.
@@ -120,7 +125,9 @@ class Trainer:
             )
             for name, control in (density or {}).items()
         }
+        self._fills = {max(1, round(share * spec.steps)) for share in spec.fill_unseen}
         self.guard = NanGuard()
+        self.viewed = False
         self.step = 0
         self.elapsed = 0.0
 
@@ -153,6 +160,9 @@ class Trainer:
         stop: StopRequest | None,
     ) -> None:
         end = self.spec.steps if until is None else min(until, self.spec.steps)
+        writer = None
+        if self.run is not None:
+            writer = CheckpointWriter(self.run, self.spec, self.checkpoint, self.viewed)
         self.model.train()
         started = time.perf_counter() - self.elapsed
         while self.step < end:
@@ -168,10 +178,8 @@ class Trainer:
             if self.step == self.spec.steps:
                 self.guard.require_any(self.step)
             signal = None if stop is None else stop.signal
-            due = self.step == self.spec.steps or self.step % self.spec.checkpoint_every == 0
-            if self.run is not None and (due or signal is not None):
-                self.run.require_lock()
-                self.checkpoint().save(self.run.checkpoints)
+            if writer is not None:
+                writer.after(self.step, signal is not None)
             if self.run is not None and signal is not None and self.step < end:
                 raise Interrupted(
                     f"stopped at step {self.step} of {self.spec.steps}; continue with: "
@@ -210,6 +218,8 @@ class Trainer:
         fixed = replace(camera, world_to_camera=camera.world_to_camera.detach())
         self._evolve(result, frame.moment, fixed)
         self._refine(result, camera.width, camera.height)
+        if self.step in self._fills:
+            fill_unseen(self.model, self.clip, shapes=self.step < self.spec.steps)
         terms = {**result.terms, "total": result.total}
         # one transfer from the device for all terms
         values = torch.stack([term.detach().reshape(()) for term in terms.values()]).tolist()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import signal
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from hoigs.core.progress import Progress
 from hoigs.core.spec.schema import Spec
 from hoigs.training.session import Session
 from hoigs.training.trainer import StepReport
+from hoigs.viewing.live import LiveView
+from hoigs.viewing.viewer.server import LOCAL
 from hoigs.workflows.evaluate_run import EvaluatedRun, evaluate_run
 
 OnStart = Callable[[Session], None]
@@ -54,6 +57,8 @@ def train(
     reader_settings: Sequence[str] = (),
     evaluate: bool = True,
     plugins: Sequence[Path | str] = (),
+    view: bool = False,
+    port: int = 8090,
     on_start: OnStart | None = None,
     on_step: OnStep | None = None,
     progress: Progress | None = None,
@@ -75,6 +80,9 @@ def train(
             of the reader, "masks=false".
         evaluate: score the run and write its report.
         plugins: Python files to load (and run) first.
+        view: show the training in the browser while it lasts, by a process of its own that reads
+            checkpoints, of which one is then written about every 10 seconds. port: of its address
+            on this machine; 0 finds a free one.
         on_start: called with the Session once all input has been checked, before the first step.
         on_step: called with the StepReport of each logged step.
         progress: called during the evaluation with the share done, in [0, 1], and the work.
@@ -84,11 +92,31 @@ def train(
         HoigsError: the input is wrong; then nothing has been written.
         Interrupted: Ctrl-C or SIGTERM; the message has the command that continues.
     """
+    live = LiveView(port, device=device, rasterizer=rasterizer, plugins=plugins) if view else None
     session = Session.open(
         clip, spec, out=out, overrides=overrides, rasterizer=rasterizer, device=device,
         resume=resume, overwrite=overwrite, plugins=plugins, allow_faults=allow_faults,
         reader=reader, reader_settings=reader_settings,
     )  # fmt: skip
+    with live or nullcontext():
+        if live is not None:
+            session.trainer.viewed = True
+            live.start(session.run.path)
+            report(f"view: http://{LOCAL}:{live.port}, after the first step and until the end")
+        return _trained(session, device, evaluate, plugins, on_start, on_step, progress, report)
+
+
+def _trained(
+    session: Session,
+    device: str,
+    evaluate: bool,
+    plugins: Sequence[Path | str],
+    on_start: OnStart | None,
+    on_step: OnStep | None,
+    progress: Progress | None,
+    report: Report,
+) -> TrainedRun:
+    """The rest of `train`: the steps and the scores."""
     if on_start is not None:
         on_start(session)
     session.train(on_step)

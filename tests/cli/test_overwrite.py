@@ -27,11 +27,15 @@ def test_a_run_with_all_that_hoigs_writes_into_it(hoigs, train, tmp_path):
     assert hoigs("eval", run, "--test-camera", "interpolated", "--device", "cpu").code == 0
     for path in ("video", "bullet-time"):
         assert hoigs("render", run, "--path", path, "--device", "cpu").code == 0
+    exports = [("ply", ()), ("tracks", ()), ("ply", ("--out", run / "exports" / "box.ply"))]
+    for name, more in exports:
+        assert hoigs("export", run, "--format", name, *more, "--device", "cpu").code == 0
     for _ in range(2):
         assert hoigs("compress", run, "--overwrite", "--device", "cpu").code == 0
     assert hoigs("eval", compact, "--device", "cpu").code == 0
     assert train("--no-eval").code == 0
-    assert not (run / "renders").exists() and not (run / "report.html").exists()
+    assert not any((run / name).exists() for name in ("renders", "exports"))
+    assert not (run / "report.html").exists()
     outcome = hoigs("compress", run, "--out", run, "--overwrite", "--device", "cpu")
     assert outcome.code == 2 and "is or holds the input" in outcome.err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run", "run-compact"]

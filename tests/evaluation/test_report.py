@@ -56,8 +56,11 @@ class Balance(HTMLParser):
 def run(tmp_path: Path) -> Path:
     (tmp_path / "spec.yaml").write_text("name: toy # <tricky> & $title\n")
     (tmp_path / "provenance.json").write_text(
-        json.dumps({"versions": {"torch": "9.9.9"}, "clip": {"path": "../clip"}})
-    )
+        json.dumps({
+            "versions": {"torch": "9.9.9"}, "clip": {"path": f"../..{Path.home()}/clip"},
+            "command": f"hoigs train {Path.home()}/clip --out {Path.home()}",
+        })
+    )  # fmt: skip
     lines = []
     for step in range(25, 1001, 25):
         decay = math.exp(-step / 300)
@@ -94,6 +97,12 @@ def test_the_page_is_whole_and_needs_nothing_else(run: Path, model: SceneModel, 
     assert not re.search(r"url\((?!#)|@import", page)
     for expected in ("9.9.9", "1,000 steps", "LPIPS not computed", "held-out cameras", "1:40"):
         assert expected in text
+    head = text[: text.index("Frames outside training")]
+    assert "Method toy" in head and "man: " in head
+    assert "hoigs train ~/clip --out ~" in head
+    assert str(Path.home()).strip("/") + "/clip" not in page
+    for command in (f"hoigs view {run.name}", f"hoigs export {run.name}"):
+        assert command in text
     for score in ("human_object", "full"):
         assert f"{evaluation.score(score, 'psnr'):.2f} dB" in text
 

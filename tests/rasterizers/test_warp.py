@@ -83,6 +83,7 @@ def test_native_and_portable_kernels_agree() -> None:
 @pytest.mark.parametrize("channels", [15, 16, 17, 33])
 def test_features_beyond_one_pass(channels: int) -> None:
     scene, camera = random_scene(60), a_camera()
+    torch.manual_seed(0)
     values = torch.randn(60, channels)
     request = RenderRequest(features=values)
     clear = clear_of_cutoffs(scene, camera, request)
@@ -90,19 +91,23 @@ def test_features_beyond_one_pass(channels: int) -> None:
         WarpRasterizer().render(scene, camera, request), CUT.render(scene, camera, request), clear
     )
     weights = torch.randn(*clear.shape, channels) * clear[..., None]
-    found = []
-    for rasterizer in (WarpRasterizer(), CUT):
-        leaf = values.clone().requires_grad_()
-        means = scene.means.clone().requires_grad_()
-        output = rasterizer.render(
-            scene.replace(means=means), camera, request.replace(features=leaf)
-        )
-        assert output.features is not None
-        (output.features * weights).sum().backward()
-        found.append((leaf.grad, means.grad))
-    for name, actual, wanted in zip(("features", "means"), *found):
-        assert wanted is not None
-        assert_close_gradient(name, actual, wanted)
+    for absolute in (False, True):
+        found = []
+        for rasterizer in (WarpRasterizer(), CUT):
+            leaves = [values, scene.means] + [torch.zeros(60, 2)] * absolute
+            leaves = [x.clone().requires_grad_() for x in leaves]
+            fields = {"features": leaves[0]} | (
+                {"absolute_gradients": leaves[2]} if absolute else {}
+            )
+            output = rasterizer.render(
+                scene.replace(means=leaves[1]), camera, request.replace(**fields)
+            )
+            assert output.features is not None
+            ((output.features * weights).sum() + output.color[clear].sum()).backward()
+            found.append([x.grad for x in leaves])
+        for name, actual, wanted in zip(("features", "means", "absolute_gradients"), *found):
+            assert wanted is not None
+            assert_close_gradient(name, actual, wanted)
 
 
 @pytest.mark.parametrize("kernels", ["native", "portable"])
@@ -325,6 +330,7 @@ rasterizer.render(random_scene(10), a_camera())
         "project.spherical_harmonics_adjoint",
         "intersect.cuda_kernels",
         "blend.pixel_kernels",
+        "blend.absolute_kernels",
         "blend.gather_kernels",
     ],
 )

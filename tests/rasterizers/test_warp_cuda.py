@@ -14,6 +14,7 @@ from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.warp import WarpRasterizer
+from hoigs.testing.rasterizer.scenes import on
 
 CUDA = torch.device("cuda", 0)
 pytestmark = [
@@ -29,24 +30,41 @@ def scene(count: int = 3000, width: int = 150, height: int = 90) -> tuple[Gaussi
 def drawn(
     rasterizer: WarpRasterizer, gaussians: Gaussians, camera: Camera, request: RenderRequest
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Images, and gradients of a fixed random weighting of them."""
+    """Images, and gradients of a fixed random weighting of them.
+
+    Those by `screen_offsets` and `absolute_gradients` are included where the request has them.
+    """
+    fields = {
+        name: torch.zeros_like(x).requires_grad_()
+        for name in ("screen_offsets", "absolute_gradients")
+        if (x := getattr(request, name)) is not None
+    }
+    request = request.replace(**fields)
     leaves = gaussians.map(lambda x: x.detach().clone().requires_grad_())
     output = images(rasterizer.render(leaves, camera, request))
     generator = torch.Generator().manual_seed(1)
-    loss = torch.zeros((), device=CUDA)
+    device = gaussians.means.device
+    loss = torch.zeros((), device=device)
     for image in output.values():
-        loss = loss + (image * torch.randn(image.shape, generator=generator).to(CUDA)).sum()
+        loss = loss + (image * torch.randn(image.shape, generator=generator).to(device)).sum()
     loss.backward()
     return (
         {name: image.detach() for name, image in output.items()},
-        {name: getattr(leaves, name).grad for name in RAW},
+        {name: getattr(leaves, name).grad for name in RAW}
+        | {name: x.grad for name, x in fields.items()},
     )
 
 
+@pytest.mark.parametrize("absolute", [False, True])
 @pytest.mark.parametrize("channels", [0, 6])
-def test_where_intersections_do_not_fit_the_picture_is_the_same(channels: int) -> None:
+def test_where_intersections_do_not_fit_the_picture_is_the_same(
+    channels: int, absolute: bool
+) -> None:
     gaussians, camera = scene()
-    request = RenderRequest(features=torch.randn(3000, channels, device=CUDA) if channels else None)
+    request = RenderRequest(
+        features=torch.randn(3000, channels, device=CUDA) if channels else None,
+        absolute_gradients=torch.zeros(3000, 2, device=CUDA) if absolute else None,
+    )
     roomy, tight = WarpRasterizer(), WarpRasterizer()
     wanted = drawn(roomy, gaussians, camera, request)
     capacity = tight.pipeline(CUDA).capacity
@@ -60,7 +78,30 @@ def test_where_intersections_do_not_fit_the_picture_is_the_same(channels: int) -
     for name, gradient in wanted[1].items():
         assert_close_gradient(name, actual[1][name], gradient)
     again = drawn(tight, gaussians, camera, request)  # there is memory now
-    assert all(torch.equal(again[1][name], wanted[1][name]) for name in RAW)
+    assert all(torch.equal(again[1][name], wanted[1][name]) for name in wanted[1])
+
+
+@pytest.mark.parametrize("channels", [0, 6])
+def test_absolute_gradients_are_those_of_the_cpu(channels: int) -> None:
+    """Beside the signed ones, in tiles with long lists, where some pixels have stopped."""
+    gaussians, camera = scene()
+    request = RenderRequest(
+        features=torch.randn(3000, channels, device=CUDA) if channels else None,
+        screen_offsets=torch.zeros(3000, 2, device=CUDA),
+        absolute_gradients=torch.zeros(3000, 2, device=CUDA),
+        min_transmittance=0.0,
+        min_alpha=0.0,  # no cut-offs, where the two may differ by a splat
+    )
+    rasterizer = WarpRasterizer()
+    _, found = drawn(rasterizer, gaussians, camera, request)
+    plain = request.replace(absolute_gradients=None)
+    for name, gradient in drawn(rasterizer, gaussians, camera, plain)[1].items():
+        assert_close_gradient(name, found[name], gradient)
+    assert (found["absolute_gradients"] >= found["screen_offsets"].abs() * 0.999 - 1e-3).all()
+    cpu = torch.device("cpu")
+    _, wanted = drawn(rasterizer, *(on(cpu, x) for x in (gaussians, camera, request)))
+    for name, gradient in wanted.items():
+        assert_close_gradient(name, found[name].cpu(), gradient)
 
 
 def test_long_lists_are_in_order() -> None:
@@ -89,16 +130,18 @@ def test_long_lists_are_in_order() -> None:
     assert torch.equal(torch.cat(partials).sort().values, torch.arange(offsets[-1], device=CUDA))
 
 
-def test_a_steady_step_waits_for_nothing() -> None:
+@pytest.mark.parametrize("absolute", [False, True])
+def test_a_steady_step_waits_for_nothing(absolute: bool) -> None:
     gaussians, camera = scene()
     rasterizer = WarpRasterizer()
 
     def step() -> Tensor:
         leaves = gaussians.map(lambda x: x.detach().requires_grad_())
-        output = rasterizer.render(leaves, camera)
+        absolutes = torch.zeros(3000, 2, device=CUDA, requires_grad=True) if absolute else None
+        output = rasterizer.render(leaves, camera, RenderRequest(absolute_gradients=absolutes))
         output.color.backward(torch.ones_like(output.color))
         assert leaves.means.grad is not None
-        return leaves.means.grad
+        return leaves.means.grad if absolutes is None else absolutes.grad
 
     wanted = step()
     torch.cuda.set_sync_debug_mode("error")
@@ -109,27 +152,36 @@ def test_a_steady_step_waits_for_nothing() -> None:
     assert torch.equal(actual, wanted)
 
 
-def test_a_whole_step_can_be_captured() -> None:
+@pytest.mark.parametrize("absolute", [False, True])
+def test_a_whole_step_can_be_captured(absolute: bool) -> None:
     gaussians, camera = scene()
     rasterizer = WarpRasterizer()
+
+    def asking() -> RenderRequest:
+        zeros = torch.zeros(3000, 2, device=CUDA, requires_grad=True)
+        return RenderRequest(absolute_gradients=zeros if absolute else None)
+
     leaves = gaussians.map(lambda x: x.detach().clone().requires_grad_())
-    graph = torch.cuda.CUDAGraph()
+    graph, request = torch.cuda.CUDAGraph(), asking()
     with pytest.raises(RenderError, match="once before the capture"), torch.cuda.graph(graph):
-        rasterizer.render(leaves, camera)
+        rasterizer.render(leaves, camera, request)
     side = torch.cuda.Stream()
     with torch.cuda.stream(side):
-        rasterizer.render(leaves, camera).color.sum().backward()
-        leaves = leaves.map(lambda x: x.detach().requires_grad_())
+        rasterizer.render(leaves, camera, request).color.sum().backward()
+        leaves, request = leaves.map(lambda x: x.detach().requires_grad_()), asking()
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph, stream=side):
-        rasterizer.render(leaves, camera).color.sum().backward()
+        rasterizer.render(leaves, camera, request).color.sum().backward()
     with torch.no_grad():
         leaves.means.add_(0.05)
     graph.replay()
-    wanted = leaves.map(lambda x: x.detach().clone().requires_grad_())
-    rasterizer.render(wanted, camera).color.sum().backward()
+    wanted, wanted_request = leaves.map(lambda x: x.detach().clone().requires_grad_()), asking()
+    rasterizer.render(wanted, camera, wanted_request).color.sum().backward()
     for name in RAW:
         assert torch.equal(getattr(leaves, name).grad, getattr(wanted, name).grad), name
+    if absolute:
+        assert request.absolute_gradients.grad.any()
+        assert torch.equal(request.absolute_gradients.grad, wanted_request.absolute_gradients.grad)
 
 
 def test_streams_do_not_disturb_each_other() -> None:

@@ -165,6 +165,18 @@ def test_held_out_cameras_are_far_from_every_filming_one() -> None:
         assert (path[frame] - camera.center).norm() > 0.8  # unlike the view of that moment
 
 
+def test_held_out_cameras_turned_about_the_scene() -> None:
+    config = SceneConfig(held_out_degrees=(45, 135), held_out_views=4)
+    path, target = camera_path(config), torch.tensor(config.camera.target)
+    turns = []
+    for frame, camera in held_out_views(config):
+        ours, theirs = ((c.center - target)[[0, 2]] for c in (camera, path[frame]))
+        cosine = torch.nn.functional.cosine_similarity(ours, theirs, dim=0)
+        turns.append(round(float(torch.rad2deg(cosine.acos()))))
+    assert turns == [45, 45, 135, 135]
+    assert SceneConfig().digest() != config.digest()
+
+
 def test_shape_changes_the_person(body: AnnyBody, scene: SyntheticScene) -> None:
     other = generate(SceneConfig.tiny(betas=(2.5,)), body)
     assert (

@@ -345,6 +345,10 @@ MUTANTS: dict[str, tuple[str, Callable[[], Rasterizer]]] = {
     "R50": ("RoundedLowPass", lambda: on_request(
         lambda r, g: {} if single(g) else {"low_pass": r.low_pass + 1e-7}
     )),
+    "R51": ("HalfAnAbsoluteGradient", lambda: on_request(
+        lambda r, g: {} if r.absolute_gradients is None
+        else {"absolute_gradients": scaled_gradient(r.absolute_gradients)}
+    )),
     "R60": ("ZeroIsTheIdentity", lambda: on_rows(
         lambda g, *_: g.replace(
             quats=torch.where((g.quats == 0).all(-1, True), IDENTITY.to(g.quats), g.quats)

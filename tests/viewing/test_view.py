@@ -206,3 +206,44 @@ def test_ctrl_c_ends_it_without_a_traceback(tiny_run: Path) -> None:
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0 and "stopped" in out
     assert "Traceback" not in err and "viser" not in out
+
+
+def test_a_training_is_shown_while_it_lasts(tiny_run: Path, tmp_path: Path) -> None:
+    """Its viewer answers on loopback, follows the checkpoints, and ends with it after Ctrl-C."""
+    run, clip = tmp_path / "run", tiny_run.parent / "clip"
+    small = ("train.steps=100000", "model.scene.points=300", "model.human.points=300")
+    settings = [f"--set={s}" for s in small]
+    command = [sys.executable, "-m", "hoigs", "train", clip, "--out", run, "--view", "--port=0"]
+    process = subprocess.Popen(
+        [*map(str, command), *settings, "--device=cpu"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        line = next(x for x in process.stdout if x.startswith("view: "))
+        address = line.split()[1].rstrip(",")
+        assert address.startswith("http://127.0.0.1:")
+        assert answers(address, 90)
+        assert (run / "checkpoints" / "step_000001.json").exists()
+        assert process.poll() is None
+    finally:
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and "hoigs train --resume" in err and "Traceback" not in err
+    assert not answers(address, 0)
+
+
+def answers(address: str, seconds: float) -> bool:
+    """Whether a page is served at an address, within this time."""
+    import time
+    import urllib.request
+
+    end = time.monotonic() + seconds
+    while True:
+        try:
+            with urllib.request.urlopen(address, timeout=5) as page:
+                return page.status == 200
+        except OSError:
+            if time.monotonic() > end:
+                return False
+            time.sleep(0.3)

@@ -171,7 +171,7 @@ def check_rasterizer(control: DensityControl, rasterizer: Rasterizer | type[Rast
         name = rasterizer.__name__ if isinstance(rasterizer, type) else type(rasterizer).__name__
         raise RenderError(
             f"{type(control).__name__} needs absolute screen gradients, which {name} does "
-            "not compute; use rasterizer:torch, or density:adc, which does not need them"
+            "not compute; use rasterizer:warp, or density:adc, which does not need them"
         )
 
 

@@ -157,7 +157,7 @@ class Rasterizer(Configurable, ABC):
         if request.absolute_gradients is not None and not self.capabilities.absolute_gradients:
             raise RenderError(
                 f"{name}: cannot compute absolute screen gradients (request.absolute_gradients); "
-                "use a rasterizer that can, for example rasterizer:torch"
+                "use a rasterizer that can, for example rasterizer:warp"
             )
         for key, (value, shapes) in _expected_shapes(gaussians, camera, request).items():
             if value is None:

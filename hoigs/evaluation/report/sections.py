@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any
 
@@ -36,6 +36,14 @@ def tiles(evaluation: Evaluation, records: Sequence[dict[str, Any]]) -> str:
         for number, what, detail in shown
     )
     return f"<div class='tiles'>{''.join(cells)}</div>"
+
+
+def made(method: str, parts: Sequence[str], command: str) -> str:
+    """The method with its parts, and the command that made the run; empty strings are left out."""
+    name = f"<b>{escape(method)}</b> " if method else ""
+    line = f"<pre><code>{escape(command)}</code></pre>" if command else ""
+    listed = f"<small>{escape(' · '.join(parts))}</small>"
+    return f"<div class='made'><p>Method {name}{listed}</p>{line}</div>"
 
 
 def _decibels(value: Value, what: str, view: str) -> list[tuple[str, str, str]]:
@@ -149,14 +157,14 @@ def document(title: str, text: str) -> str:
     return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>"
 
 
-def provenance(record: dict[str, Any]) -> str:
-    """Versions as a list, and the whole record collapsed."""
+def provenance(record: dict[str, Any], cleaned: Callable[[str], str]) -> str:
+    """Versions as a list, and the whole record collapsed; `cleaned` takes private paths out."""
     versions = record.get("versions", {})
     items = "".join(
         f"<div><dt>{escape(str(k))}</dt><dd>{escape(str(v))}</dd></div>"
         for k, v in versions.items()
     )
-    whole = document("provenance.json", json.dumps(record, indent=1, ensure_ascii=False))
+    whole = document("provenance.json", cleaned(json.dumps(record, indent=1, ensure_ascii=False)))
     return f"<dl class='versions'>{items}</dl>{whole}"
 
 

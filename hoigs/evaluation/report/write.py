@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections.abc import Callable, Sequence
 from html import escape
 from importlib import resources
@@ -12,6 +14,7 @@ from typing import Any
 import hoigs
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
+from hoigs.core.spec.loader import load_yaml
 from hoigs.core.values.clip import Clip
 from hoigs.core.whole_files import write_whole
 from hoigs.evaluation.report import curves, media, sections
@@ -59,6 +62,7 @@ def write_report(
     page = Template(_asset("page.html")).substitute(
         title=escape(clip.name),
         lead=escape(_lead(model, clip)),
+        made=_made(folder, model),
         style=_asset("style.css"),
         script=_asset("script.js"),
         tiles=sections.tiles(evaluation, records),
@@ -82,6 +86,26 @@ def _lead(model: SceneModel, clip: Clip) -> str:
         f"{len(clip)} frames of video, {camera.width}×{camera.height} at {clip.fps:g} a second, "
         f"as moving 3D Gaussians: {listed}."
     )
+
+
+def _made(folder: Path, model: SceneModel) -> str:
+    """The method, and the command that trained it where the run has one."""
+    run, method, command = RunFolder(folder), "", ""
+    if run.spec.is_file():
+        text = run.spec.read_text(encoding="utf-8")
+        method = str(load_yaml(text, str(run.spec)).data.get("name", ""))
+    if run.provenance.is_file():
+        command = run.read_provenance().get("command", "")
+    parts = [f"{n}: {type(model.entity(n).deformation).__name__}" for n in model.entities]
+    if model.interaction is not None:
+        parts.append(f"interaction: {type(model.interaction).__name__}")
+    return sections.made(method, parts, without_home(command))
+
+
+def without_home(text: str) -> str:
+    """Text with `~` in place of the home folder, which often holds a person's name."""
+    home = re.escape(str(Path.home()).strip("/"))
+    return re.sub(rf"(?:(?:\.\./)+|(?<![\w.~-])/){home}(?![\w.-])", "~", text)
 
 
 def _hero(model: SceneModel, clip: Clip) -> str:
@@ -109,12 +133,15 @@ def _compared(model: SceneModel, clip: Clip, evaluation: Evaluation) -> str:
 
 
 def _further(folder: Path) -> str:
-    run = folder.name if folder.is_absolute() else str(folder)
+    given = folder.is_absolute() or ".." in folder.parts
+    run = shlex.quote(folder.resolve().name if given else str(folder))
     return _section(
         "Look further",
         "",
         sections.commands(
             (
+                (f"hoigs view {run}", "from any side, in the browser"),
+                (f"hoigs view {run} --html run.html", "the same as one file to send"),
                 (
                     f"hoigs render {run} --path bullet-time",
                     "a film: the moment stands still, the camera moves",
@@ -196,11 +223,13 @@ def _origin(folder: Path) -> str:
     parts = []
     provenance = folder / "provenance.json"
     if provenance.is_file():
-        parts.append(sections.provenance(RunFolder(folder).read_provenance()))
+        parts.append(sections.provenance(RunFolder(folder).read_provenance(), without_home))
     spec = folder / "spec.yaml"
     if spec.is_file():
         parts.append(
-            sections.document("spec.yaml, resolved: it makes this run again", spec.read_text())
+            sections.document(
+                "spec.yaml, resolved: it makes this run again", without_home(spec.read_text())
+            )
         )
     absent = [file.name for file in (provenance, spec) if not file.is_file()]
     return _section("Provenance", f"Absent: {', '.join(absent)}." if absent else "",

@@ -58,7 +58,7 @@ class Render(torch.autograd.Function):
         with torch.cuda.device_of(inputs.means):
             out = ctx.pipeline.gradients(
                 inputs, ctx.settings, records, intersections, images, v,
-                pose=bool(needs.world_to_camera),
+                pose=bool(needs.world_to_camera), absolute=bool(needs.absolute_gradients),
             )  # fmt: skip
         background = None
         if needs.background:
@@ -77,5 +77,6 @@ class Render(torch.autograd.Function):
             world_to_camera=out.world_to_camera(inputs) if needs.world_to_camera else None,
             K=None,
             subset=None,
+            absolute_gradients=out.absolutes if needs.absolute_gradients else None,
         )
         return (None, None, *vars(gradients).values())

@@ -92,11 +92,11 @@ class CapturedRender:
             raise RenderError(
                 f"CapturedRender: captured with tensors of shapes {captured}, called with {shapes} "
                 "(means, quats, log_scales, opacity_logits, sh, features, screen_offsets, "
-                "background, world_to_camera, K, subset); capture another one"
+                "background, world_to_camera, K, subset, absolute_gradients); capture another one"
             )
         changed = [gaussians is not self._gaussians] * 5
         changed += [request is not self._request] * 3
-        changed += [camera is not self._camera] * 2 + [request is not self._request]
+        changed += [camera is not self._camera] * 2 + [request is not self._request] * 2
         with torch.no_grad():
             for buffer, tensor, new in zip(self._buffers, tensors, changed):
                 if new:

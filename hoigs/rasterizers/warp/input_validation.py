@@ -89,9 +89,11 @@ def _tensors(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> li
         x if x.dtype == torch.float32 and x.is_contiguous() else x.float().contiguous()
         for x in tensors
     ]
-    if subset is None:
-        return [*tensors, _constant(like.device, 0, dtype=torch.uint8)]
-    return [*tensors, subset.contiguous().view(torch.uint8)]
+    drawn = _constant(like.device, 0, dtype=torch.uint8)
+    if subset is not None:
+        drawn = subset.contiguous().view(torch.uint8)
+    absolutes = request.absolute_gradients
+    return [*tensors, drawn, _constant(like.device, 0, 2) if absolutes is None else absolutes]
 
 
 def _black(like: Tensor) -> Tensor:

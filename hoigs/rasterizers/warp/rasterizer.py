@@ -61,6 +61,7 @@ class WarpRasterizer(Rasterizer):
         dtypes=frozenset({"float32"}),
         camera_gradients=True,
         deterministic=True,
+        absolute_gradients=True,
     )
 
     def __init__(self, config: WarpConfig | None = None) -> None:

@@ -50,6 +50,8 @@ def auto(
     allow_faults: bool = False,
     evaluate: bool = True,
     plugins: Sequence[Path | str] = (),
+    view: bool = False,
+    port: int = 8090,
     on_found: Callable[[Needs], None] | None = None,
     on_start: OnStart | None = None,
     on_step: OnStep | None = None,
@@ -66,8 +68,8 @@ def auto(
         out: the run folder; by default runs/CLIP-SPEC-auto.
         resume: continue the training in `out`, with the answer that it was started with.
         on_found: called with the result of the search, before the training.
-        overrides, rasterizer, device, overwrite, allow_faults, evaluate, plugins, on_start,
-            on_step, progress, report: as for `train`.
+        overrides, rasterizer, device, overwrite, allow_faults, evaluate, plugins, view, port,
+            on_start, on_step, progress, report: as for `train`.
 
     Raises:
         HoigsError: anything wrong with the input, or the run to resume was pruned already.
@@ -94,7 +96,8 @@ def auto(
     run = train(
         clip, answer / "spec.yaml", out=path, overrides=overrides, rasterizer=rasterizer,
         device=device, resume=resume, overwrite=overwrite, allow_faults=allow_faults,
-        evaluate=False, plugins=plugins, on_start=on_start, on_step=on_step, report=report,
+        evaluate=False, plugins=plugins, view=view, port=port, on_start=on_start,
+        on_step=on_step, report=report,
     )  # fmt: skip
     report(f"pruning {path}:")
     trained_s = run.session.trainer.elapsed

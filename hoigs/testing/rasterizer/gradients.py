@@ -1,4 +1,4 @@
-"""R40 to R50: gradients, against the oracle's, the rules and finite differences."""
+"""R40 to R51: gradients, against the oracle's, the rules and finite differences."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ from hoigs.testing.rasterizer.scenes import (
 from hoigs.testing.rasterizer.subject import (
     CHECKS,
     RasterizerSubject,
+    absolute_gradients,
     camera_gradients,
     float64,
     free,
@@ -217,3 +218,14 @@ def float64_is_the_oracle(subject: RasterizerSubject) -> None:
         want = wanted_gradients[name]
         assert gradient is not None and want is not None
         require_close(f"gradient of {name}", gradient, want, atol=1e-9, rtol=1e-9)
+
+
+@CHECKS.check("R51", absolute_gradients)
+def absolute_gradients_are_the_oracles(subject: RasterizerSubject) -> None:
+    """Each pixel's |gradient|, of all images together, is summed; nothing else changes."""
+    scene = graded_scene()
+    request = scene.request.replace(absolute_gradients=torch.full((100, 2), 3.0))
+    asking = Scene(scene.gaussians, scene.camera, request)
+    for parts in (PARTS, ("color",)):
+        require_reference_gradients(subject, asking, parts)
+    require_close("colour", subject.draw(asking).color, subject.draw(scene).color, atol=0.0)

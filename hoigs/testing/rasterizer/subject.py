@@ -19,7 +19,8 @@ from hoigs.testing.rasterizer.scenes import RAW, Scene, forged, on
 if TYPE_CHECKING:
     from hoigs.testing.runner import Options
 
-INPUTS = (*RAW, "features", "screen_offsets", "background", "world_to_camera")
+FIELDS = ("features", "screen_offsets", "background", "absolute_gradients")
+INPUTS = (*RAW, *FIELDS, "world_to_camera")
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class RasterizerSubject:
         included where the backend declares `camera_gradients`.
         """
         parts: dict[str, Any] = {name: getattr(scene.gaussians, name) for name in RAW}
-        for name in ("features", "screen_offsets", "background"):
+        for name in FIELDS:
             parts[name] = getattr(scene.request, name)
         if self.rasterizer.capabilities.camera_gradients:
             parts["world_to_camera"] = scene.camera.world_to_camera
@@ -59,8 +60,7 @@ class RasterizerSubject:
             name: x.detach().clone().requires_grad_() for name, x in parts.items() if x is not None
         }
         view = {k: leaves[k] for k in ("world_to_camera",) if k in leaves}
-        names = ("features", "screen_offsets", "background")
-        fields = {name: leaves[name] for name in names if name in leaves}
+        fields = {name: leaves[name] for name in FIELDS if name in leaves}
         output = self.render(
             Gaussians(*(leaves[name] for name in RAW)),
             forged(scene.camera, **view),
@@ -86,6 +86,11 @@ def subject(cls: type[Rasterizer], config: Any, options: Options) -> RasterizerS
 def camera_gradients(subject: RasterizerSubject) -> str | None:
     declared = subject.rasterizer.capabilities.camera_gradients
     return None if declared else "camera_gradients is not declared"
+
+
+def absolute_gradients(subject: RasterizerSubject) -> str | None:
+    declared = subject.rasterizer.capabilities.absolute_gradients
+    return None if declared else "absolute_gradients is not declared"
 
 
 def deterministic(subject: RasterizerSubject) -> str | None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.folder_lock import FolderLock
 from hoigs.runs.checkpoint import has_checkpoint, latest_checkpoint
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.runs.run_folder import RunFolder
@@ -48,7 +49,10 @@ class FollowedRun:
 
     def _read(self) -> None:
         try:
-            self._result = self._open()
+            try:
+                self._result = self.loaded.newer(self.path)
+            except HoigsError:  # for example removed meanwhile, or of another spec
+                self._result = self._open()
         except HoigsError as error:  # for example replaced by another run meanwhile
             print(f"{self.path}: the newer checkpoint cannot be read: {error}", flush=True)
 
@@ -73,8 +77,9 @@ def wait_for_checkpoint(path: Path, report: Callable[[str], None]) -> None:
 
 
 def in_training(run: RunFolder) -> bool:
-    """Whether the run's metrics, or its spec, were written lately."""
-    files = [p for p in (run.metrics, run.spec) if p.exists()]
+    """Whether the run's metrics, its spec or the lock of its training were written lately."""
+    lock = FolderLock(run.path, "").path
+    files = [p for p in (run.metrics, run.spec, lock) if p.exists()]
     return any(time.time() - p.stat().st_mtime < RECENT_S for p in files)
 
 

@@ -23,8 +23,7 @@ def open_server(host: str, port: int, label: str) -> Any:
     Raises:
         HoigsError: viser is absent, the port is in use, or this machine has no such host.
     """
-    if find_spec("viser") is None:
-        raise HoigsError("the viewer needs viser: pip install 'hoigs[viewer]'")
+    require_viser()
     import viser
 
     class Server(viser.ViserServer):
@@ -44,6 +43,26 @@ def open_server(host: str, port: int, label: str) -> Any:
         brand_color=(242, 158, 66),
     )  # fmt: skip
     return server
+
+
+def require_viser() -> None:
+    """Raise HoigsError if viser is not installed."""
+    if find_spec("viser") is None:
+        raise HoigsError("the viewer needs viser: pip install 'hoigs[viewer]'")
+
+
+def free_port(port: int) -> int:
+    """This port, or for 0 any free one, of this machine's loopback address.
+
+    Raises:
+        HoigsError: the port is in use, or there is none of this number.
+    """
+    _require_free(LOCAL, port)
+    if port:
+        return port
+    with socket.socket() as probe:
+        probe.bind((LOCAL, 0))
+        return int(probe.getsockname()[1])
 
 
 def stop(server: Any) -> None:

@@ -9,6 +9,9 @@ run.
 On CUDA all tiles may share one list of Gaussians instead (see `warp.cuda.intersections`). Of each
 32, the warp then takes those whose box touches its tile, and adds its sums by atomics.
 
+Absolute gradients (ABSOLUTE) need a pixel's slope from all channels together. There the first pass
+has all of it, and the passes for features sum only the features' own gradients.
+
 On a CPU the lanes run one after the other, and each adds its own share to the partials.
 The arguments are described in `pixel_kernels`.
 """
@@ -210,6 +213,8 @@ _BACKWARD = r"""
                     S[i] += (color_[3 * p + j] - back[j]) * v[i][j];
                     net_v_alpha[i] -= back[j] * v[i][j];
                 }
+                for (int c = 0; ABSOLUTE && c < channels; ++c)
+                    S[i] += feature_image_[p * channels + c] * v_feature_image_[p * channels + c];
             } else {
                 for (int j = 0; j < 4 && channel + j < channels; ++j) {
                     v[i][j] = v_feature_image_[p * channels + channel + j];
@@ -219,21 +224,31 @@ _BACKWARD = r"""
         }
         %(EACH)s
                 float sums[10] = {};  // six moments, four channels
+                float absolutes[2] = {};
                 #pragma unroll
                 for (int i = 0; i < P; ++i) {
                     if (!on[i]) continue;
                     const float raw = exp2_of(exponent[i]);
                     const float opaque = raw < max_alpha ? raw : max_alpha;
-                    const float weight = T[i] * opaque, next = T[i] - weight;
+                    const float before = T[i];
+                    const float weight = before * opaque, next = before - weight;
                     if (next > min_transmittance) {
                         float value = net_v_alpha[i];
                         for (int j = 0; j < 4; ++j) {
                             value += f[j] * v[i][j];
                             sums[6 + j] += weight * v[i][j];
                         }
+                        if (ABSOLUTE && COLOR) {
+                            const int p = (y + i * STEP) * width + x;
+                            for (int c = 0; c < channels; ++c)
+                                value += features_[row * channels + c]
+                                    * v_feature_image_[p * channels + c];
+                        }
+                        T[i] = next;
+                        if (ABSOLUTE && !COLOR) continue;  // the first pass had these moments
                         S[i] -= weight * value;
                         const float clear = 1.0f - opaque > 1e-7f ? 1.0f - opaque : 1e-7f;
-                        const float slope = opaque * (T[i] * value - quotient(S[i], clear));
+                        const float slope = opaque * (before * value - quotient(S[i], clear));
                         const float g = raw <= max_alpha ? slope : 0.0f;
                         const float dy = dy0 + (float)(i * STEP), gu = g * u[i], gy = g * dy;
                         sums[0] += g;
@@ -242,12 +257,16 @@ _BACKWARD = r"""
                         sums[3] += gu * u[i];
                         sums[4] += gu * dy;
                         sums[5] += gy * dy;
-                        T[i] = next;
+                        if (ABSOLUTE) {
+                            const float along = gu * a, across = gy * c - along * shear;
+                            absolutes[0] += along < 0.0f ? -along : along;
+                            absolutes[1] += across < 0.0f ? -across : across;
+                        }
                     } else {
                         T[i] = -T[i];
                     }
                 }
-                float* out = partials_ + (long long)partial * (10 + channels);
+                float* out = partials_ + (long long)partial * stride;
 #if defined(__CUDA_ARCH__)
                 // 10 sums over 32 lanes: 5, 3, 2, 1 remain to a lane, then the last two lanes add
                 const bool in5 = lane & 16, in3 = lane & 8, in2 = lane & 4, in1 = lane & 2;
@@ -282,20 +301,37 @@ _BACKWARD = r"""
                     else if (!COLOR && sum_of_lane < 6) *to += total;
                     else *to = total;
                 }
+                if (ABSOLUTE && COLOR) {  // both over 32 lanes: lanes 0 and 16 hold one each
+                    const float away = in5 ? absolutes[0] : absolutes[1];
+                    float own = in5 ? absolutes[1] : absolutes[0];
+                    own += __shfl_xor_sync(ALL, away, 16);
+                    #pragma unroll
+                    for (int apart = 8; apart > 0; apart /= 2)
+                        own += __shfl_xor_sync(ALL, own, apart);
+                    own *= TWO_LN2;
+                    float* to = out + 10 + channels + (in5 ? 1 : 0);
+                    if ((lane & 15) == 0) {
+                        if (shared_list) atomicAdd(to, own);
+                        else *to = own;
+                    }
+                }
 #else
                 for (int j = 0; j < 10; ++j) {
                     if (j < 6 || COLOR) out[j] += sums[j];
                     else if (channel + j - 6 < channels) out[10 + channel + j - 6] += sums[j];
                 }
+                for (int j = 0; ABSOLUTE && COLOR && j < 2; ++j)
+                    out[10 + channels + j] += TWO_LN2 * absolutes[j];
 #endif
         DONE
         #undef DONE
 #if defined(__CUDA_ARCH__)
         if (!shared_list) {  // all pixels have stopped: the rest has no gradient
             for (at += lane; at < end; at += 32) {
-                float* out = partials_ + (long long)indices_[2 * at + 1] * (10 + channels);
+                float* out = partials_ + (long long)indices_[2 * at + 1] * stride;
                 if (COLOR) {
                     for (int j = 0; j < 10; ++j) out[j] = 0.0f;
+                    for (int j = 10 + channels; j < stride; ++j) out[j] = 0.0f;
                 } else {
                     for (int j = 0; j < 4 && channel + j < channels; ++j)
                         out[10 + channel + j] = 0.0f;
@@ -308,9 +344,11 @@ _BACKWARD = r"""
 # a splat that touches no pixel of the tile, on CUDA
 _CLEAR = r"""
 #if defined(__CUDA_ARCH__)
+                    float* out = partials_ + (long long)partial * stride;
                     if (!shared_list && lane < (COLOR ? 10 : min(4, channels - channel)))
-                        partials_[(long long)partial * (10 + channels)
-                                  + (COLOR ? 0 : 10 + channel) + lane] = 0.0f;
+                        out[(COLOR ? 0 : 10 + channel) + lane] = 0.0f;
+                    if (ABSOLUTE && COLOR && !shared_list && lane < 2)
+                        out[10 + channels + lane] = 0.0f;
 #endif
 """
 
@@ -321,6 +359,9 @@ _UPSTREAM = r"""
     const float* v_depth_ = (const float*)v_depth.data;
     const float* v_feature_image_ = (const float*)v_feature_image.data;
     float* partials_ = (float*)partials.data;
+    const int stride = 10 + channels + (ABSOLUTE ? 2 : 0);
+    constexpr float TWO_LN2 = 1.38629436f;
+    (void)TWO_LN2;
 #if defined(__CUDA_ARCH__)
     const int within = (thread & 4 ? 2 : 0) + (thread & 2 ? 1 : 0);  // of the three or two below
     const int sum_of_lane = (thread & 1) || within >= (thread & 8 ? 2 : 3)
@@ -353,4 +394,6 @@ def _filled(body: str, miss: str) -> str:
 
 
 FORWARD = _filled(_FORWARD, "")
-BACKWARD = _UPSTREAM + _filled(_BACKWARD, _CLEAR)
+_GRADIENTS = _UPSTREAM + _filled(_BACKWARD, _CLEAR)
+BACKWARD = "constexpr bool ABSOLUTE = false;" + _GRADIENTS
+ABSOLUTE = "constexpr bool ABSOLUTE = true;" + _GRADIENTS

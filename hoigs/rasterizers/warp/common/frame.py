@@ -36,6 +36,7 @@ class Inputs:
     Attributes:
         means [N, 3], quats [N, 4], log_scales [N, 3], opacity_logits [N], sh [N, K, 3]: raw space.
         features [N, F]; screen_offsets [N, 2] pixels; subset [N] uint8.
+        absolute_gradients [N, 2]: receives them; its values are not read.
         background: [3] or [H, W, 3].
         world_to_camera [4, 4], K [3, 3]: of the camera.
     """
@@ -51,6 +52,7 @@ class Inputs:
     world_to_camera: Tensor
     K: Tensor
     subset: Tensor
+    absolute_gradients: Tensor
 
     @property
     def count(self) -> int:

@@ -8,11 +8,11 @@ With d = (dx, dy) from its centre, u = dx - shear dy, and the screen covariance 
     log2 alpha = log2_opacity - a u^2 - c dy^2       two squares: nothing cancels in thin splats
     a = log2(e) / 2 * yy / det,  c = log2(e) / 2 / yy,  shear = xy / yy
 
-A *partial* is the gradient of one Gaussian from one tile, MOMENTS + F floats. There is one for each
-tile intersection, and those of a Gaussian are neighbours in memory. Each is written by one tile and
-they are summed in a fixed order, so that no atomics are needed and results do not depend on the
-schedule. (On CUDA there is one exception, where intersections exceed the allocated memory: see
-`warp.cuda.intersections`.)
+A *partial* is the gradient of one Gaussian from one tile, MOMENTS + F floats, and ABSOLUTES more
+where absolute gradients are requested. There is one for each tile intersection, and those of a
+Gaussian are neighbours in memory. Each is written by one tile and they are summed in a fixed order,
+so that no atomics are needed and results do not depend on the schedule. (On CUDA there is one
+exception, where intersections exceed the allocated memory: see `warp.cuda.intersections`.)
 """
 
 import math
@@ -52,6 +52,9 @@ M_UU = wp.constant(3)
 M_UY = wp.constant(4)
 M_YY = wp.constant(5)
 M_RED = wp.constant(6)  # then green, blue, depth
+
+# last in a partial: sums of |dloss / du|, |dloss / dv| of the projected mean, where requested
+ABSOLUTES = 2
 
 POSE = 15  # gradient of the pose from one Gaussian: R (9), t (3), camera centre (3)
 

@@ -4,6 +4,10 @@ S is what the splats not yet passed still add to the loss's gradient, a scalar a
 them of w (colour . v_colour + ...). It starts from the finished image, so that no list of the
 splats at each pixel is needed. With `value` the splat's own term, `slope` is dloss / d(ln alpha) =
 alpha (T value - S / (1 - alpha)); its moments in u and y are what `project_adjoint` needs.
+
+Each pass has the part of the slope that its own channels bring. Absolute gradients (ABSOLUTE) need
+a pixel's slope from all channels together: there the first pass has all of it, and later passes sum
+only the gradients of their features.
 """
 
 STATE = r"""
@@ -18,7 +22,15 @@ HEAD = r"""
     const float* v_depth_ = (const float*)v_depth.data;
     const float* v_feature_image_ = (const float*)v_feature_image.data;
     float* partials_ = (float*)partials.data;
-    const int stride = 10 + channels;
+    const int stride = 10 + channels + (ABSOLUTE ? 2 : 0);
+    auto of_block = [&](const float* image, int k, int x, int y) -> vec {  // a channel of a block
+        vec values = same(0.0f);
+        for (int i = 0; i < LANES; ++i)
+            if (x + i / HIGH < width && y + i % HIGH < height)
+                lane_of(values, i) =
+                    image[((long long)(y + i % HIGH) * width + x + i / HIGH) * channels + k];
+        return values;
+    };
     // rows from the middle of a range of blocks, and their square
     float off_[4 * BLOCKS], off_squared_[4 * BLOCKS];
     for (int i = 0; i < 4 * BLOCKS; ++i) {
@@ -89,7 +101,11 @@ LOAD_END = r"""
         p.S = in[0] * in[3] + in[1] * in[4] + in[2] * in[5] - behind
             + in[9] * in[10] + in[11] * in[12];
     }
-    for (int j = 0; j < n_features; ++j) p.S += image_features[j] * feature_blocks[j][at];
+    for (int j = 0; j < n_features && (pass == 0 || !ABSOLUTE); ++j)
+        p.S += image_features[j] * feature_blocks[j][at];
+    for (int k = PASS_CHANNELS; ABSOLUTE && pass == 0 && k < channels; ++k)
+        p.S += of_block(feature_image_, k, X + 8 * s, Y + HIGH * b)
+            * of_block(v_feature_image_, k, X + 8 * s, Y + HIGH * b);
 """
 
 # Moments are taken about the middle row of the splat in this tile and along the slanted line there:
@@ -104,15 +120,19 @@ BEFORE = r"""
     const float* off = off_ + 2 * BLOCKS - from - upto;
     const float* off_squared = off_squared_ + 2 * BLOCKS - from - upto;
     const vec* v_weight = net_v_alpha;  // what each unit of weight brings besides colour
-    if (n_features > 0) {
+    if (n_features > 0 && (pass == 0 || !ABSOLUTE)) {
         v_weight = v_weight_blocks;
         for (int s = 0; s < 2; ++s)
             for (int b = s * BLOCKS + first[s]; b <= s * BLOCKS + last[s]; ++b) {
                 v_weight_blocks[b] = net_v_alpha[b];
                 for (int j = 0; j < n_features; ++j)
                     v_weight_blocks[b] += f[j] * feature_blocks[j][b];
+                for (int k = PASS_CHANNELS; ABSOLUTE && k < channels; ++k)
+                    v_weight_blocks[b] += f[k]
+                        * of_block(v_feature_image_, k, X + 8 * s, Y + HIGH * (b - s * BLOCKS));
             }
     }
+    vec absolute_x = same(0.0f), absolute_y = absolute_x;
 """
 STRIP = "vec g0 = same(0.0f), g1 = g0, g2 = g0;"
 COMPOSITE = r"""
@@ -131,6 +151,13 @@ COMPOSITE = r"""
     g0 += slope;
     g1 += slope * off[2 * b];
     g2 += slope * off_squared[2 * b];
+    if (ABSOLUTE) {
+        const vec rise = lane_y + ((float)(HIGH * b) + 0.5f - cy);
+        const vec along = slope * g[2] * (dx - shear * rise);
+        const vec across = slope * c * rise - shear * along;
+        absolute_x += (vec)((ivec)along & ~SIGN);
+        absolute_y += (vec)((ivec)across & ~SIGN);
+    }
 """
 STRIP_END = r"""
     m0[s] = g0;
@@ -157,6 +184,11 @@ AFTER = r"""
         o[7] = total(r1);
         o[8] = total(r2);
         o[9] = total(r3);
+    }
+    if (ABSOLUTE && pass == 0) {
+        constexpr float TWO_LN2 = 1.38629436f;
+        o[10 + channels] = TWO_LN2 * total(absolute_x);
+        o[11 + channels] = TWO_LN2 * total(absolute_y);
     }
     for (int j = 0; j < n_features; ++j) {
         vec sum = same(0.0f);

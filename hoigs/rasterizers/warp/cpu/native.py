@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from hoigs.rasterizers.warp.common.frame import Settings, TileIntersections, check_addressable
+from hoigs.rasterizers.warp.cpu import absolute_kernels
 from hoigs.rasterizers.warp.cpu import native_kernels as kernels
 from hoigs.rasterizers.warp.cpu.pipeline import CpuPipeline
 from hoigs.rasterizers.warp.cpu.vector_source import MAX_ROWS
@@ -18,6 +19,7 @@ class NativePipeline(CpuPipeline):
     """Renders with `native_kernels`, where the stages are described."""
 
     forward_kernel, backward_kernel = kernels.forward_tiles, kernels.backward_tiles
+    absolute_kernel = absolute_kernels.absolute_tiles
 
     def intersect(self, projected: Projected, settings: Settings) -> TileIntersections:
         count, records = projected.depths.shape[0], projected.records

@@ -15,7 +15,7 @@ from hoigs.rasterizers.warp.common.frame import (
     TileIntersections,
     check_addressable,
 )
-from hoigs.rasterizers.warp.common.records import MOMENTS
+from hoigs.rasterizers.warp.common.records import ABSOLUTES, MOMENTS
 from hoigs.rasterizers.warp.cpu.cores import Cores
 from hoigs.rasterizers.warp.project.arguments import (
     Gradients,
@@ -35,6 +35,7 @@ class CpuPipeline(ABC):
 
     forward_kernel: ClassVar[Any]
     backward_kernel: ClassVar[Any]
+    absolute_kernel: ClassVar[Any]  # backward, with absolute gradients
 
     def __init__(self, cores: Cores) -> None:
         self.cores = cores
@@ -69,14 +70,16 @@ class CpuPipeline(ABC):
         images: Images,
         upstream: Images,
         pose: bool,
+        absolute: bool,
     ) -> Gradients:
-        count, stride = intersections.count, MOMENTS + inputs.channels
+        count, stride = intersections.count, MOMENTS + inputs.channels + ABSOLUTES * absolute
         check_addressable(count * stride, f"{count} tile intersections")
         partials = inputs.means.new_zeros(count, stride)
         arguments = tile_arguments(inputs, settings, records, intersections, images)
         arguments += upstream_arguments(upstream, partials)
-        self._tiles(self.backward_kernel, intersections, arguments)
-        out = Gradients(inputs, pose)
+        kernel = self.absolute_kernel if absolute else self.backward_kernel
+        self._tiles(kernel, intersections, arguments)
+        out = Gradients(inputs, pose, absolute)
         arguments = adjoint_arguments(inputs, settings, records, intersections, partials, out)
         self.cores.each(project_adjoint, inputs.count, arguments)
         return out

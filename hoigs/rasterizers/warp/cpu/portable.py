@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from hoigs.rasterizers.warp.blend import pixel_kernels, pixel_source
+from hoigs.rasterizers.warp.blend import absolute_kernels, pixel_kernels, pixel_source
 from hoigs.rasterizers.warp.common.frame import Settings, TileIntersections, check_addressable
 from hoigs.rasterizers.warp.cpu.pipeline import CpuPipeline
 from hoigs.rasterizers.warp.intersect import portable_kernels
@@ -18,6 +18,7 @@ class PortablePipeline(CpuPipeline):
     """Renders with `blend.pixel_kernels`, one lane after the other."""
 
     forward_kernel, backward_kernel = pixel_kernels.forward_pixels, pixel_kernels.backward_pixels
+    absolute_kernel = absolute_kernels.absolute_pixels
 
     def intersect(self, projected: Projected, settings: Settings) -> TileIntersections:
         depths, height = projected.drawn_depths, pixel_source.TILE_HEIGHT

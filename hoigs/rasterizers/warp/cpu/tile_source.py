@@ -79,7 +79,7 @@ FORWARD = _kernel(
     "",
     _splats("", _COMPOSITE, BEFORE="", STRIP_END="", STRIP="", AFTER=_FEATURES) + _IMAGE,
 )
-BACKWARD = _kernel(
+_GRADIENTS = _kernel(
     backward_source.STATE,
     backward_source.HEAD,
     _filled(
@@ -97,6 +97,8 @@ BACKWARD = _kernel(
         AFTER=backward_source.AFTER,
     ),
 )
+BACKWARD = "constexpr bool ABSOLUTE = false;" + _GRADIENTS
+ABSOLUTE = "constexpr bool ABSOLUTE = true;" + _GRADIENTS  # absolute gradients, too
 
 LANES = _filled(vector_source.VECTORS, **_SIZES) + "*(int*)lanes.data = LANES;"
 

@@ -7,7 +7,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from hoigs.rasterizers.warp.blend import gather_kernels, pixel_kernels, pixel_source
+from hoigs.rasterizers.warp.blend import (
+    absolute_kernels,
+    gather_kernels,
+    pixel_kernels,
+    pixel_source,
+)
 from hoigs.rasterizers.warp.blend.arguments import tile_arguments, upstream_arguments
 from hoigs.rasterizers.warp.common.frame import (
     Images,
@@ -16,7 +21,7 @@ from hoigs.rasterizers.warp.common.frame import (
     TileIntersections,
     check_addressable,
 )
-from hoigs.rasterizers.warp.common.records import MOMENTS
+from hoigs.rasterizers.warp.common.records import ABSOLUTES, MOMENTS
 from hoigs.rasterizers.warp.cuda.capacity import IntersectionCapacity
 from hoigs.rasterizers.warp.cuda.intersections import Intersector
 from hoigs.rasterizers.warp.cuda.launch import CudaStreams
@@ -72,8 +77,10 @@ class CudaPipeline:
         images: Images,
         upstream: Images,
         pose: bool,
+        absolute: bool,
     ) -> Gradients:
-        stream, count, stride = self.streams.current(), inputs.count, MOMENTS + inputs.channels
+        stream, count = self.streams.current(), inputs.count
+        stride = MOMENTS + inputs.channels + ABSOLUTES * absolute
         capacity, tiles = intersections.count, intersections.tiles
         check_addressable(capacity * stride, f"{capacity} tile intersections")
         partials = inputs.means.new_empty(capacity, stride)
@@ -82,14 +89,15 @@ class CudaPipeline:
         arguments = tile_arguments(inputs, settings, records, intersections, images)
         arguments += upstream_arguments(upstream, partials)
         lanes = tiles * pixel_source.LANES
-        stream.each(pixel_kernels.backward_pixels, lanes, arguments, TILE_BLOCK)
+        kernel = absolute_kernels.absolute_pixels if absolute else pixel_kernels.backward_pixels
+        stream.each(kernel, lanes, arguments, TILE_BLOCK)
 
         first, drawn = intersections.first_partial, torch.empty_like(intersections.first_partial)
         arguments = [count, stride, first, intersections.tiles_per_gaussian, partials, drawn]
         blocks = -(-count // gather_kernels.ROWS)
         stream.blocks(gather_kernels.gather_partials, blocks, gather_kernels.BLOCK, arguments)
         gathered = replace(intersections, tiles_per_gaussian=drawn)  # one partial each from here on
-        out = Gradients(inputs, pose)
+        out = Gradients(inputs, pose, absolute)
         if settings.active_bases == 1:
             arguments = adjoint_arguments(inputs, settings, records, gathered, partials, out)
             stream.each(project_adjoint, count, arguments)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hoigs.rasterizers.warp.common.frame import Inputs, Settings, TileIntersections
-from hoigs.rasterizers.warp.common.records import POSE, RECORD, SMALLEST_ALPHA
+from hoigs.rasterizers.warp.common.records import ABSOLUTES, POSE, RECORD, SMALLEST_ALPHA
 
 
 class Projected:
@@ -46,7 +46,7 @@ def project_arguments(inputs: Inputs, settings: Settings, out: Projected) -> lis
 class Gradients:
     """What `kernels.project_adjoint` writes, in the shapes of the inputs."""
 
-    def __init__(self, inputs: Inputs, pose: bool) -> None:
+    def __init__(self, inputs: Inputs, pose: bool, absolute: bool) -> None:
         self.means = torch.empty_like(inputs.means)
         self.quats = torch.empty_like(inputs.quats)
         self.log_scales = torch.empty_like(inputs.log_scales)
@@ -54,6 +54,7 @@ class Gradients:
         self.sh = torch.empty_like(inputs.sh)
         self.features = torch.empty_like(inputs.features) if inputs.channels else inputs.features
         self.screen_offsets = inputs.means.new_empty(inputs.count, 2)
+        self.absolutes = inputs.means.new_empty(inputs.count if absolute else 0, ABSOLUTES)
         self.pose = inputs.means.new_empty(inputs.count if pose else 0, POSE)
 
     def world_to_camera(self, inputs: Inputs) -> Tensor:
@@ -87,5 +88,6 @@ def adjoint_arguments(
         *(inputs.K, inputs.world_to_camera, settings.width, settings.height, settings.low_pass),
         *(records, intersections.first_partial, intersections.tiles_per_gaussian, partials),
         *(out.means, out.quats, out.log_scales, out.opacity_logits, out.sh),
-        *(out.screen_offsets, out.features, out.pose, int(out.pose.numel() > 0)),
+        *(out.screen_offsets, out.features, out.absolutes, ABSOLUTES * int(len(out.absolutes) > 0)),
+        *(out.pose, int(out.pose.numel() > 0)),
     ]

@@ -200,14 +200,15 @@ def project_adjoint(
     first_partial: I32,  # index in `partials` of a Gaussian's first
     partial_counts: I32,  # how many it has
     partials: F32, v_means: VEC3, v_quats: VEC4, v_log_scales: VEC3, v_opacity_logits: F32,
-    v_sh: VEC3, v_offsets: F32, v_features: F32,
+    v_sh: VEC3, v_offsets: F32, v_features: F32, v_absolutes: F32,
+    absolutes: int,  # how many numbers v_absolutes has of each Gaussian: 0 or 2
     v_pose: F32,  # empty when the pose needs no gradient
     has_pose: int, base: int, count: int,
 ):  # fmt: skip
     row = wp.tid() + base
     if row >= count:
         return
-    stride = MOMENTS_C + channels
+    stride = MOMENTS_C + channels + absolutes
     begin = first_partial[row] * stride
     partial_count = partial_counts[row]
     zero3 = wp.vec3(0.0, 0.0, 0.0)
@@ -216,6 +217,11 @@ def project_adjoint(
         for j in range(partial_count):
             total += partials[begin + j * stride + MOMENTS_C + k]
         v_features[row * channels + k] = total
+    for k in range(absolutes):
+        total = float(0.0)
+        for j in range(partial_count):
+            total += partials[begin + j * stride + MOMENTS_C + channels + k]
+        v_absolutes[row * absolutes + k] = total
     if has_pose != 0:
         for k in range(POSE_C):
             v_pose[row * POSE_C + k] = 0.0
