@@ -1,14 +1,12 @@
-"""Rotations of frames that hands say nothing of: a search over all rotations, by texture.
+"""Rotations of grasps that hands say nothing of: a search over all rotations, by texture.
 
-In flight an object may turn by more than half a turn, about any axis, and come down on another
-side. Where a part of the clip has given its shape and texture, every rotation is compared with each
-frame of a grasp; between two grasps the spin is constant, and every spin is tried.
+An object may be put down on another side than it was taken up from. Where a part of the clip has
+given its shape and texture, every rotation is compared with the frames of a grasp.
 """
 
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,7 +15,6 @@ from torch import Tensor
 
 from hoigs.core.maths.rotations import (
     axis_angle_to_matrices,
-    matrices_to_axis_angle,
     quats_to_matrices,
 )
 from hoigs.preparation.objects.alignment import Aligned, Poses, Surface
@@ -27,13 +24,9 @@ TRIED = 1500  # rotations, about 22 degrees apart
 POINTS = 300
 SURE = 0.5  # cosine between normal and view from which a point's texture counts
 BLUR = 3.0
-SPIN = 9.0  # radians a second in flight that cost one unit
-MOST_TURNS, SLACK = 1.3, 0.6  # of a flight; radians between its end and the next known rotation
-TURNING = 0.02  # weight of that against the texture
 NEUTRAL, UNKNOWN = 2.0, 30.0  # cost of unknown texture, and the points that it counts as
 OUTSIDE = 1.5  # cost of a point outside the mask
 CLEARLY = 0.8  # of its cost: another rotation has to be better by so much
-GRAVITY, PULL, RAY = 9.81, 1.5, 0.02  # metres a second squared, and its spread; metres of a ray
 DEPTHS = (0.7, 1.0)  # tried where the back was never seen, of its breadth and height
 LOOKS = 6  # frames of a grasp in which its rotation is looked for
 KNOWN = 2.0  # frames that the texture found before counts as
@@ -49,8 +42,8 @@ def grasps_by_texture(
     Each piece turns as the hands do (`start`), from a rotation that is found for all of it.
     """
     known = np.isin(crops.frames, first.frames)
-    poses = _distances_of(crops, start, first, known)
-    search = _Search(crops, surface, first, known)
+    poses = distances_of(crops, start, first, known)
+    search = TextureSearch(crops, surface, first, known)
     rotations = poses.rotations.clone()
     for piece in np.unique(pieces[~known]).tolist():
         rows = np.flatnonzero(~known & (pieces == piece))
@@ -59,52 +52,7 @@ def grasps_by_texture(
     return Poses(rotations, poses.translations)
 
 
-def flights_by_texture(
-    crops: Crops,
-    surface: Surface,
-    first: Aligned,
-    start: Poses,
-    up: Float[np.ndarray, " 3"],
-    fps: float,
-) -> Poses:
-    """Poses of all frames: those of `first`, and between them the free fall that the masks agree
-    with, and a constant spin found by texture.
-
-    Frames before the first known one and after the last keep its rotation. The poses are those of
-    the object's middle, which a flight shows better than the grasps before it.
-
-    Args:
-        up: against gravity, unit, world.
-    """
-    known = np.isin(crops.frames, first.frames)
-    poses = _distances_of(crops, start, first, known)
-    seen = _Search(crops, surface, first, known)
-    rotations, places = poses.rotations.clone(), poses.translations.clone()
-    chosen: list[Tensor] = []
-    for rows in _runs(np.flatnonzero(~known)):
-        before, after = rows[0] - 1, rows[-1] + 1
-        if before < 0:
-            rotations[rows] = rotations[after].clone()
-        elif after == len(known):
-            rotations[rows] = rotations[before].clone()
-        else:
-            found: list[tuple[float, Tensor, Tensor, Tensor]] = []
-            spins: Tensor | None = None
-            for search in seen.depths():
-                middles = places + rotations @ search.middle
-                middles[rows] = _ballistic(crops, middles, rows, up, fps)
-                flight = search.flight(rows, rotations, middles, fps)
-                spins = flight.likely() if spins is None else spins
-                cost, turns = flight.best(spins)
-                middle = search.middle
-                found.append((cost, turns, middles[rows] - turns @ middle, middle))
-            _, rotations[rows], places[rows], middle = min(found, key=lambda f: f[0])
-            chosen.append(middle)
-    middle = torch.stack(chosen).mean(0) if chosen else seen.middle
-    return Poses(rotations, places + rotations @ middle)
-
-
-def _distances_of(crops: Crops, start: Poses, first: Aligned, known: np.ndarray) -> Poses:
+def distances_of(crops: Crops, start: Poses, first: Aligned, known: np.ndarray) -> Poses:
     """`first` where it is known; elsewhere `start`, farther by as much as `first` is."""
     rotations, translations = start.rotations.clone(), start.translations.clone()
     centers = crops.centers()
@@ -116,7 +64,7 @@ def _distances_of(crops: Crops, start: Poses, first: Aligned, known: np.ndarray)
     return Poses(rotations, translations)
 
 
-class _Search:
+class TextureSearch:
     """Costs of rotations in frames, against the texture that an alignment has found."""
 
     def __init__(self, crops: Crops, surface: Surface, first: Aligned, known: np.ndarray) -> None:
@@ -138,12 +86,12 @@ class _Search:
         toward = (part.centers() - first.poses.translations)[:, None] @ first.poses.rotations
         self.front = torch.nn.functional.normalize(toward.mean((0, 1)), dim=-1)
 
-    def depths(self) -> list[_Search]:
+    def depths(self) -> list[TextureSearch]:
         """Stretched to each of `DEPTHS` that it is not as deep as yet; itself if there is none."""
         found = [self.stretched(ratio) for ratio in DEPTHS]
         return [f for f in found if not torch.equal(f.points, self.points)] or [self]
 
-    def stretched(self, ratio: float) -> _Search:
+    def stretched(self, ratio: float) -> TextureSearch:
         """The same with what lies behind the seen side drawn out, until the object is `ratio` as
         deep as it is broad and high (geometric mean): a side that was never seen has no place."""
         along = self.points @ self.front
@@ -234,101 +182,12 @@ class _Search:
         cost[0] *= CLEARLY  # as it was let go, unless the texture is clearly against it
         return turns @ turns[0].mT @ tried[cost.argmin()]
 
-    def flight(self, rows: np.ndarray, rotations: Tensor, places: Tensor, fps: float) -> _Flight:
-        """The rows' spin between two known rotations."""
-        frames = self.crops.frames
-        first, last = rows[0] - 1, rows[-1] + 1
-        seconds = float(frames[last] - frames[first]) / fps
-        parts = ((frames[rows] - frames[first]) / (frames[last] - frames[first])).tolist()
-        return _Flight(self, rows, places, parts, rotations[first], rotations[last], seconds)
-
-    def few(self, step: int) -> _Search:
+    def few(self, step: int) -> TextureSearch:
         """The same with every `step`-th point."""
         found = copy(self)
         for name in ("points", "normals", "known", "texture"):
             setattr(found, name, getattr(self, name)[::step])
         return found
-
-
-@dataclass(frozen=True)
-class _Flight:
-    """Spins about a world axis between two known rotations, `first` and `last`; `parts` are the
-    rows' parts of the way."""
-
-    search: _Search
-    rows: np.ndarray
-    places: Float[Tensor, "C 3"]
-    parts: list[float]
-    first: Float[Tensor, "3 3"]
-    last: Float[Tensor, "3 3"]
-    seconds: float
-
-    def likely(self) -> Float[Tensor, "N 3"]:
-        """The best of all spins up to `MOST_TURNS` that end within `SLACK` of the last rotation."""
-        spins = _ball(2 * np.pi * MOST_TURNS)
-        spins = spins[self._rest(spins).norm(dim=-1) < SLACK]
-        search = self.search.few(3)
-        cost = torch.cat([self._cost(part, search) for part in spins.split(400)])
-        return spins[_apart(spins, cost)]
-
-    def best(self, spins: Float[Tensor, "N 3"]) -> tuple[float, Float[Tensor, "R 3 3"]]:
-        """Cost and rotations of the best of `spins`, each moved to its own best place first."""
-        search = self.search.few(2)
-        moved = torch.zeros_like(spins, requires_grad=True)
-        adam = torch.optim.Adam([moved], lr=RATE)
-        for _ in range(STEPS):
-            adam.zero_grad()
-            self._cost(spins + moved, search).sum().backward()
-            adam.step()
-        with torch.no_grad():
-            cost = self._cost(spins + moved, self.search)
-            best = cost.argmin()
-            return float(cost[best]), torch.stack([t[best] for t in self._turned(spins + moved)])
-
-    def _rest(self, spins: Tensor) -> Tensor:
-        """What a spin lacks of the last rotation, spread over the flight."""
-        turned = axis_angle_to_matrices(spins).mT @ self.last @ self.first.mT
-        return matrices_to_axis_angle(turned)
-
-    def _turned(self, spins: Tensor) -> list[Tensor]:
-        rest = self._rest(spins)
-        return [
-            axis_angle_to_matrices(p * spins) @ axis_angle_to_matrices(p * rest) @ self.first
-            for p in self.parts
-        ]
-
-    def _cost(self, spins: Tensor, search: _Search) -> Tensor:
-        fast = TURNING * len(self.rows) * (spins.norm(dim=-1) / self.seconds / SPIN).square()
-        return fast + search.costs_together(self.rows, self._turned(spins), self.places)
-
-
-def _ballistic(
-    crops: Crops,
-    places: Float[Tensor, "C 3"],
-    rows: np.ndarray,
-    up: Float[np.ndarray, " 3"],
-    fps: float,
-) -> Float[Tensor, "N 3"]:
-    """Places of a flight between two known ones: a constant acceleration, near that of gravity,
-    by which the object passes the rays through the middles of its masks.
-
-    With both ends known it is linear in the acceleration a:
-    p(t) = line(t) + a (t - t0) (t - t1) / 2.
-    """
-    ends = [rows[0] - 1, rows[-1] + 1]
-    times = crops.frames[rows] / fps
-    t0, t1 = crops.frames[ends] / fps
-    first, last = places[ends].double().numpy()
-    line = first + ((times - t0) / (t1 - t0))[:, None] * (last - first)
-    bend = (times - t0) * (times - t1) / 2
-    centers, rays = crops.centers()[rows].double().numpy(), crops.middles(rows)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # what a ray sees of a shift
-    matrix = (bend[:, None, None] * across / RAY).reshape(-1, 3)
-    target = -np.einsum("nij,nj->ni", across, line - centers).reshape(-1) / RAY
-    matrix = np.concatenate((matrix, np.eye(3) / PULL))
-    target = np.concatenate((target, -GRAVITY * up / PULL))
-    acceleration = np.linalg.lstsq(matrix, target, rcond=None)[0]
-    return torch.from_numpy(line + bend[:, None] * acceleration).float()
 
 
 def _photo(off: Float[Tensor, "*R P"], weight: Float[Tensor, "*R P"]) -> Float[Tensor, "*R"]:
@@ -348,26 +207,6 @@ def _distinct(rotations: Float[Tensor, "R 3 3"], costs: Float[Tensor, " R"]) -> 
     return kept
 
 
-def _apart(spins: Float[Tensor, "R 3"], costs: Float[Tensor, " R"]) -> list[int]:
-    """The cheapest spins that are apart from each other."""
-    kept: list[int] = []
-    for i in costs.argsort().tolist():
-        if not kept or float((spins[i] - spins[kept]).norm(dim=-1).min()) > 2 * APART:
-            kept.append(i)
-        if len(kept) == REFINED:
-            break
-    return kept
-
-
-def _ball(radius: float, step: float = 0.6) -> Float[Tensor, "N 3"]:
-    """Vectors of a grid within a ball, none first."""
-    count = int(radius / step)
-    line = torch.arange(-count, count + 1) * step
-    grid = torch.cartesian_prod(line, line, line)
-    grid = grid[grid.norm(dim=-1) <= radius]
-    return grid[grid.norm(dim=-1).argsort()]
-
-
 def _rotations(count: int) -> Float[Tensor, "R 3 3"]:
     """Rotations spread over all (super-Fibonacci spiral, Alexa 2022)."""
     s = torch.arange(count, dtype=torch.float64) + 0.5
@@ -376,8 +215,3 @@ def _rotations(count: int) -> Float[Tensor, "R 3 3"]:
     low, high = (s / count).sqrt(), (1 - s / count).sqrt()
     quats = torch.stack((low * a.sin(), low * a.cos(), high * b.sin(), high * b.cos()), -1)
     return quats_to_matrices(quats).float()
-
-
-def _runs(rows: np.ndarray) -> list[np.ndarray]:
-    """Stretches of numbers that follow each other."""
-    return [r for r in np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1) if len(r)]

@@ -27,8 +27,9 @@ from hoigs.preparation.objects.alignment import (
     align,
 )
 from hoigs.preparation.objects.crops import Crops, make_crops
+from hoigs.preparation.objects.flights import flights_by_texture
 from hoigs.preparation.objects.hands import HandMotion, hand_motion
-from hoigs.preparation.objects.search import flights_by_texture, grasps_by_texture
+from hoigs.preparation.objects.search import grasps_by_texture
 from hoigs.preparation.objects.surface import hull, with_samples
 
 FEWEST = 8  # frames that show the object whole

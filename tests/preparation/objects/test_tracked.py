@@ -12,9 +12,9 @@ from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.masks.outlines import outlines_of
 from hoigs.preparation.objects.alignment import Aligned, Poses
 from hoigs.preparation.objects.crops import make_crops
+from hoigs.preparation.objects.flights import flights_by_texture
 from hoigs.preparation.objects.hands import hand_motion
 from hoigs.preparation.objects.make_object import make_object
-from hoigs.preparation.objects.search import flights_by_texture
 from hoigs.preparation.objects.surface import hull
 from hoigs.preparation.objects.tracked import UntrackableError, tracked_object
 
