@@ -21,14 +21,8 @@ def clip_folder(clip: str | Path, registry: Registry | None = None) -> Path:
         ClipError: there is no built-in clip of that name. Whether a folder exists is not checked.
     """
     if is_named(clip):
-        start_warp_quietly()
         return named_clip(str(clip), (registry or default_registry()).get("body:anny")())
     return Path(clip)
-
-
-def start_warp_quietly() -> None:
-    """Start Warp without its banner: the ray caster of built-in clips would start it with one."""
-    from hoigs.rasterizers.warp.common import runtime  # noqa: F401
 
 
 def clip_name(clip: str | Path) -> str:

@@ -42,6 +42,7 @@ from hoigs.training.objective import JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
 from hoigs.training.sampler import EpochSampler
 from hoigs.training.stop_request import StopRequest, resume_command
+from hoigs.training.unseen import fill_unseen
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,7 @@ class Trainer:
             )
             for name, control in (density or {}).items()
         }
+        self._fills = {max(1, round(share * spec.steps)) for share in spec.fill_unseen}
         self.guard = NanGuard()
         self.viewed = False
         self.step = 0
@@ -216,6 +218,8 @@ class Trainer:
         fixed = replace(camera, world_to_camera=camera.world_to_camera.detach())
         self._evolve(result, frame.moment, fixed)
         self._refine(result, camera.width, camera.height)
+        if self.step in self._fills:
+            fill_unseen(self.model, self.clip, shapes=self.step < self.spec.steps)
         terms = {**result.terms, "total": result.total}
         # one transfer from the device for all terms
         values = torch.stack([term.detach().reshape(()) for term in terms.values()]).tolist()

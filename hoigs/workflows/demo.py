@@ -6,15 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hoigs.core.progress import Progress
-from hoigs.core.registry.registry import default_registry
-from hoigs.runs.clip_source import start_warp_quietly
+from hoigs.runs.clip_source import clip_folder
 from hoigs.runs.run_folder import RunFolder
-from hoigs.synthesis import SceneConfig, builtin_clip
 from hoigs.workflows.train import OnStart, OnStep, Report, TrainedRun, silent, train
 
 STEPS = 800
+CLIP = "builtin:lift-and-swing"
 FAST_STEPS = 300
-FAST_CLIP = SceneConfig(frames=32, width=128, height=128, test_frames=8, held_out_views=4)
+FAST_CLIP = f"{CLIP}?width=128&frames=32&test_frames=8&held_out_views=4"
 FAST_POINTS = {
     "hoigs": (
         "model.scene.points=6000",
@@ -65,15 +64,12 @@ def demo(
         RunFolder(folder).refuse_existing(overwrite)
     if steps is None:
         steps = FAST_STEPS if fast else STEPS
-    config = FAST_CLIP if fast else SceneConfig()
     if fast:
         report(
-            f"fast: {config.frames} frames of {config.width}x{config.height}, {steps} steps, a "
-            "small model; without --fast the demo is larger, better and compared with a static one"
+            f"fast: 32 frames of 128x128, {steps} steps, a small model; without --fast the demo is "
+            "larger, better and compared with a static model"
         )
-    start_warp_quietly()
-    report("generating the built-in clip (once; cached afterwards)")
-    clip = builtin_clip(default_registry().get("body:anny")(), config)
+    clip = clip_folder(FAST_CLIP if fast else CLIP)
     return {
         spec: train(
             clip, spec, out=folder,

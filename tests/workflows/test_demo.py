@@ -8,6 +8,7 @@ import pytest
 
 import hoigs.workflows.demo as demonstration
 from hoigs.core.spec.schema import Spec
+from hoigs.synthesis.named import clip_config
 
 
 @pytest.mark.parametrize(
@@ -26,7 +27,9 @@ def test_what_is_trained_on_which_clip(
     def train(clip, spec, *, overrides, **_):
         asked[spec] = Spec.load(spec, overrides=overrides)  # each knows its own keys
 
-    monkeypatch.setattr(demonstration, "builtin_clip", lambda body, config: asked.update(c=config))
+    monkeypatch.setattr(
+        demonstration, "clip_folder", lambda clip: asked.update(c=clip_config(clip))
+    )
     monkeypatch.setattr(demonstration, "train", train)
     demonstration.demo(out=tmp_path / "demo", report=lines.append, **options)
     assert asked.pop("c").width == width

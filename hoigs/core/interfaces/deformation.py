@@ -214,6 +214,31 @@ class ProvidesFace(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Template:
+    """The Gaussians of a body on the surface of its template, in its zero pose.
+
+    Attributes:
+        gaussians: raw, as they are drawn but for the pose.
+        points: of the surface, one a Gaussian, metres. normals: there, outward, of unit length.
+        mirrored: `points` reflected in the body's plane of symmetry.
+    """
+
+    gaussians: Gaussians
+    points: Float[Tensor, "N 3"]
+    normals: Float[Tensor, "N 3"]
+    mirrored: Float[Tensor, "N 3"]
+
+
+@runtime_checkable
+class ProvidesTemplate(Protocol):
+    """Deformations whose Gaussians belong to points of a symmetric body's surface."""
+
+    def template(self, canonical: Gaussians) -> Template:
+        """The Gaussians before they are posed, and the surface that they belong to."""
+        ...
+
+
 class HasKnots(Protocol):
     """Deformations whose motion is a spline over knots that other knots can replace.
 

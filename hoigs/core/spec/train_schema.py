@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -156,6 +156,10 @@ class TrainSpec(_Strict):
     sh_interval: int | None = Field(default=None, ge=1)
     """Steps after which one more degree of harmonics is trained (3DGS: 1000); None trains all from
     the start."""
+    fill_unseen: tuple[Annotated[float, Field(gt=0, le=1)], ...] = ()
+    """Shares of the steps after which sides of people and objects that no training frame shows take
+    their colour, and people their shape too, from what lies beside them (hoigs/training/unseen.py);
+    with 1.0 the colours are filled again at the end. Empty: they stay as they are."""
     warmup: WarmupSpec = WarmupSpec()
     loss: LossSpec = LossSpec()
     rates: RatesSpec = RatesSpec()

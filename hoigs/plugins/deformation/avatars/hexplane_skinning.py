@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from hoigs.core.interfaces.body import PELVIS, BodySurface
 from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.interfaces.deformation import Template
 from hoigs.core.maths.skinning import skin
 from hoigs.core.values.gaussians import SH_C0, GaussianDelta, Gaussians
 from hoigs.core.values.moment import Moment, ResidualRule
@@ -195,6 +196,11 @@ class HexPlaneSkinning(SurfaceBody):
         if self.config.scale_about == "pelvis" or self.camera_centers is None:
             return pelvis
         return at_frame(self.camera_centers, moment.time)
+
+    def template(self, canonical: Gaussians) -> Template:
+        attributes, _ = self._attributes(canonical)
+        drawn = self._canonical(canonical, attributes, None)
+        return replace(super().template(canonical), gaussians=drawn)
 
     def _attributes(self, canonical: Gaussians) -> tuple[CanonicalAttributes, Float[Tensor, "N J"]]:
         """psi_h of every canonical point, and its skinning weights.

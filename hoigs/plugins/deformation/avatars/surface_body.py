@@ -9,8 +9,10 @@ from typing import ClassVar
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from hoigs.core.interfaces.body import PELVIS, BodySurface
+from hoigs.core.interfaces.deformation import Template
 from hoigs.core.maths.rotations import multiply_quats
 from hoigs.core.maths.skinning import skin, skin_quats
 from hoigs.core.values.gaussians import Gaussians
@@ -123,6 +125,15 @@ class SurfaceBody(SkinnedBody):
             quats=multiply_quats(turns, canonical.quats),
             log_scales=canonical.log_scales + self.log_alpha,
         )
+
+    def template(self, canonical: Gaussians) -> Template:
+        """The surface that the Gaussians belong to; `canonical` are drawn as they are."""
+        corners = self.rest_vertices[self.body.faces[self.faces]]
+        points = (corners * self.barycentric[..., None]).sum(1)
+        normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        middle = torch.zeros_like(points)
+        middle[:, 0] = 2 * (self.rest_joints[PELVIS, 0] - points[:, 0])
+        return Template(canonical, points, normalize(normals, dim=-1), points + middle)
 
     def point_parts(self) -> Int[Tensor, " N"]:
         return self.parts

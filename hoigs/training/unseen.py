@@ -1,0 +1,163 @@
+"""Sides of people and objects that no training frame shows.
+
+A Gaussian there has no image to follow. The few pixels in which it shines through, at outlines and
+through half-transparent neighbours, make it a spike or a blotch of somebody else's colour. Here it
+takes its values from the Gaussians beside it on the surface that were seen, and from its mirror
+image on a body: the solution of a screened Laplace equation over the graph of neighbours (as in
+gradient-domain inpainting, Perez et al. 2003), which keeps what was seen.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.core.interfaces.deformation import ProvidesTemplate
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.maths.nearest import nearest
+from hoigs.core.model.entity import Entity
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.gaussians import SH_C0, Gaussians
+
+FRAMES = 16  # training frames in which weights are summed
+NEIGHBOURS = 8
+HALF_SEEN = 0.1  # confidence is 1/2 at this share of a well seen Gaussian's weight
+WELL_SEEN = 0.9  # quantile, among Gaussians with any weight, of a well seen one
+
+
+def fill_unseen(model: SceneModel, clip: Clip, *, shapes: bool = True) -> None:
+    """Fill in, in place, the Gaussians of people and objects by how little was seen of them.
+
+    Args:
+        shapes: also opacity, size and, on a body's template, the distance from its surface; else
+            colours alone.
+    """
+    training = model.training
+    model.eval()
+    weights = seen_weights(model, clip)
+    for name in (*model.names("human"), *model.names("object")):
+        seen = confidence(*weights[name])
+        if seen is not None:
+            _fill(model.entity(name), seen, shapes)
+    model.train(training)
+
+
+def seen_weights(
+    model: SceneModel, clip: Clip, frames: int = FRAMES
+) -> dict[str, tuple[Float[Tensor, " N"], Float[Tensor, " N"]]]:
+    """Blending weights of each entity's Gaussians, summed over pixels and training frames, inside
+    the entity's mask and outside it."""
+    positions = clip.split["train"]
+    sums: dict[str, tuple[Tensor, Tensor]] = {}
+    for position in positions[:: max(1, len(positions) // frames)]:
+        frame = clip[position]
+        moment, camera = frame.moment.to(model.device), frame.camera.to(model.device)
+        with torch.no_grad():
+            state = model(moment)
+        drawn = state.joined().detach()
+        # the derivative of a colour by a degree-0 coefficient is its blending weight times Y_00
+        sh = torch.zeros(len(drawn), 1, 3, device=model.device, requires_grad=True)
+        with torch.enable_grad():
+            color = model.rasterizer.render(drawn.replace(sh=sh), camera, RenderRequest()).color
+            total = _weights(color.sum(), sh)
+            for name, rows in state.slices().items():
+                if model.entity(name).kind == "scene":
+                    continue
+                inside = total
+                if name in frame.masks:
+                    mask = frame.masks[name].to(model.device)[..., None] > 0
+                    inside = _weights((color * mask).sum(), sh)
+                known = sums.get(name, (0.0, 0.0))
+                sums[name] = (known[0] + inside[rows], known[1] + (total - inside)[rows])
+    return sums
+
+
+def _weights(total: Float[Tensor, ""], sh: Float[Tensor, "N 1 3"]) -> Float[Tensor, " N"]:
+    (gradient,) = torch.autograd.grad(total, sh, retain_graph=True)
+    return gradient[:, 0].mean(-1) / SH_C0
+
+
+def confidence(
+    inside: Float[Tensor, " N"], outside: Float[Tensor, " N"]
+) -> Float[Tensor, " N"] | None:
+    """How well each Gaussian was seen, in [0, 1); None if none was seen at all.
+
+    Weight outside the mask counts against it: its colour is then somebody else's.
+    """
+    weight = (inside - outside).clamp_min(0)
+    if not (weight > 0).any():
+        return None
+    half = HALF_SEEN * torch.quantile(weight[weight > 0], WELL_SEEN)
+    return weight.square() / (weight.square() + half.square())
+
+
+@torch.no_grad()
+def _fill(entity: Entity, seen: Float[Tensor, " N"], shapes: bool) -> None:
+    deformation, canonical = entity.deformation, entity.canonical
+    if isinstance(deformation, ProvidesTemplate):
+        template = deformation.template(canonical)
+        drawn, points, normals = template.gaussians, template.points, template.normals
+        mirror = nearest(template.mirrored, 1, points)[0][:, 0]
+        height = ((drawn.means - points) * normals).sum(-1, keepdim=True)
+    else:
+        drawn, points, mirror = canonical, canonical.means, None
+        height = torch.zeros_like(points[:, :1])
+    size = drawn.log_scales.mean(-1, keepdim=True)
+    known = torch.cat((drawn.sh[:, 0], drawn.opacity_logits[:, None], size, height), -1)
+    color, logit, size, height = spread(known, seen, points, mirror).split((3, 1, 1, 1), -1)
+    sh = torch.zeros_like(drawn.sh)
+    sh[:, 0] = color
+    target = {"sh": sh}
+    if shapes:
+        target |= {"opacity_logits": logit[:, 0], "log_scales": size.expand(-1, 3)}
+        if mirror is not None:
+            target["means"] = points + height * normals
+    _blend(entity, drawn, target, 1 - seen)
+
+
+def _blend(
+    entity: Entity, drawn: Gaussians, target: dict[str, Tensor], share: Float[Tensor, " N"]
+) -> None:
+    """Move fields that are trained from `drawn` towards `target`, in place."""
+    for name, value in target.items():
+        parameter, now = entity.get_parameter(name), getattr(drawn, name)
+        if parameter.requires_grad:
+            parameter.add_(share.reshape(-1, *[1] * (value.ndim - 1)) * (value - now))
+
+
+def spread(
+    values: Float[Tensor, "N D"],
+    seen: Float[Tensor, " N"],
+    points: Float[Tensor, "N 3"],
+    mirror: Tensor | None = None,
+) -> Float[Tensor, "N D"]:
+    """Values of what was seen, continued smoothly over what was not.
+
+    Minimises sum_i s_i / (1 - s_i) |y_i - x_i|^2 + sum_ij w_ij |y_i - y_j|^2 over the graph that
+    joins each point with its nearest neighbours, of weight 1 together, and with its mirror image.
+
+    Args:
+        seen: s, in [0, 1]. mirror: index of each point's mirror image, int64 [N].
+    """
+    from scipy import sparse  # on use: scipy takes a while to import
+    from scipy.sparse.linalg import splu
+
+    count = len(points)
+    near = nearest(points, NEIGHBOURS)[0].cpu().numpy()
+    ends, degree = near.ravel(), near.shape[1]
+    starts = np.repeat(np.arange(count), degree)
+    weights = np.full(len(ends), 1 / max(1, degree))
+    if mirror is not None:
+        ends = np.concatenate((ends, mirror.cpu().numpy()))
+        starts = np.concatenate((starts, np.arange(count)))
+        weights = np.concatenate((weights, np.ones(count)))
+    graph = sparse.coo_matrix((weights, (starts, ends)), (count, count)).tocsr()
+    graph = (graph + graph.T) / 2
+    laplacian = sparse.diags(np.asarray(graph.sum(1)).ravel()) - graph
+    s = seen.double().cpu().numpy()
+    data = sparse.diags(s / (1.0001 - s) + 1e-6)  # what is cut off from all that was seen stays
+    found = splu((data + laplacian).tocsc()).solve(data @ values.double().cpu().numpy())
+    return torch.from_numpy(found).to(values)
