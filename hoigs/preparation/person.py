@@ -15,7 +15,7 @@ from hoigs.core.interfaces.body import PELVIS, BodyModel
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_problem import FitOptions
+from hoigs.preparation.body.fit_values import FitOptions
 from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.body.silhouette import posed
 from hoigs.preparation.cameras.camera_track import CameraTrack
