@@ -100,7 +100,7 @@ def _up(places: Float[np.ndarray, "F J 3"]) -> Float[np.ndarray, " 3"]:
     body = places[:, HEAD] - places[:, list(ANKLES)].mean(1)
     tall = np.linalg.norm(body, axis=-1)
     up = body[tall >= np.quantile(tall, 1 - UPRIGHT)].mean(0)
-    return up / np.linalg.norm(up)
+    return up / max(float(np.linalg.norm(up)), 1e-9)
 
 
 def _palm_distances(

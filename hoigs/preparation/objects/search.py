@@ -8,6 +8,7 @@ frame of a grasp; between two grasps the spin is constant, and every spin is tri
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -33,10 +34,10 @@ NEUTRAL, UNKNOWN = 2.0, 30.0  # cost of unknown texture, and the points that it 
 OUTSIDE = 1.5  # cost of a point outside the mask
 CLEARLY = 0.8  # of its cost: another rotation has to be better by so much
 GRAVITY, PULL, RAY = 9.81, 1.5, 0.02  # metres a second squared, and its spread; metres of a ray
-DEPTHS = (0.0, 0.7, 1.0)  # tried where the back was never seen, of its breadth and height
+DEPTHS = (0.7, 1.0)  # tried where the back was never seen, of its breadth and height
 LOOKS = 6  # frames of a grasp in which its rotation is looked for
 KNOWN = 2.0  # frames that the texture found before counts as
-REFINED, STEPS, RATE = 10, 30, 0.04  # the best of the grid, each moved to its own best place first
+REFINED, STEPS, RATE = 8, 20, 0.06  # the best of the grid, each moved to its own best place first
 APART = 0.35  # radians between them
 
 
@@ -88,11 +89,13 @@ def flights_by_texture(
             rotations[rows] = rotations[before].clone()
         else:
             found: list[tuple[float, Tensor, Tensor, Tensor]] = []
-            for ratio in DEPTHS:
-                search = seen.stretched(ratio)
+            spins: Tensor | None = None
+            for search in seen.depths():
                 middles = places + rotations @ search.middle
                 middles[rows] = _ballistic(crops, middles, rows, up, fps)
-                cost, turns = search.flight(rows, rotations, middles, fps)
+                flight = search.flight(rows, rotations, middles, fps)
+                spins = flight.likely() if spins is None else spins
+                cost, turns = flight.best(spins)
                 middle = search.middle
                 found.append((cost, turns, middles[rows] - turns @ middle, middle))
             _, rotations[rows], places[rows], middle = min(found, key=lambda f: f[0])
@@ -134,6 +137,11 @@ class _Search:
 
         toward = (part.centers() - first.poses.translations)[:, None] @ first.poses.rotations
         self.front = torch.nn.functional.normalize(toward.mean((0, 1)), dim=-1)
+
+    def depths(self) -> list[_Search]:
+        """Stretched to each of `DEPTHS` that it is not as deep as yet; itself if there is none."""
+        found = [self.stretched(ratio) for ratio in DEPTHS]
+        return [f for f in found if not torch.equal(f.points, self.points)] or [self]
 
     def stretched(self, ratio: float) -> _Search:
         """The same with what lies behind the seen side drawn out, until the object is `ratio` as
@@ -226,49 +234,13 @@ class _Search:
         cost[0] *= CLEARLY  # as it was let go, unless the texture is clearly against it
         return turns @ turns[0].mT @ tried[cost.argmin()]
 
-    def flight(
-        self, rows: np.ndarray, rotations: Tensor, places: Tensor, fps: float
-    ) -> tuple[float, Float[Tensor, "N 3 3"]]:
-        """Rotations between two known ones, by the constant spin whose pictures agree best, and
-        its cost.
-
-        The spin about a world axis is tried for all turns up to `MOST_TURNS` that end within
-        `SLACK` of the known rotation; the rest is spread over the flight.
-        """
+    def flight(self, rows: np.ndarray, rotations: Tensor, places: Tensor, fps: float) -> _Flight:
+        """The rows' spin between two known rotations."""
         frames = self.crops.frames
         first, last = rows[0] - 1, rows[-1] + 1
-        ahead = rotations[last] @ rotations[first].mT
-        seconds = (frames[last] - frames[first]) / fps
+        seconds = float(frames[last] - frames[first]) / fps
         parts = ((frames[rows] - frames[first]) / (frames[last] - frames[first])).tolist()
-
-        def turned(spins: Tensor) -> list[Tensor]:
-            rest = matrices_to_axis_angle(axis_angle_to_matrices(spins).mT @ ahead)
-            return [
-                axis_angle_to_matrices(p * spins)
-                @ axis_angle_to_matrices(p * rest)
-                @ rotations[first]
-                for p in parts
-            ]
-
-        def total(spins: Tensor, step: int = 1) -> Tensor:
-            fast = TURNING * len(rows) * (spins.norm(dim=-1) / seconds / SPIN).square()
-            return fast + self.few(step).costs_together(rows, turned(spins), places)
-
-        spins = _ball(2 * np.pi * MOST_TURNS)
-        rest = matrices_to_axis_angle(axis_angle_to_matrices(spins).mT @ ahead)
-        spins = spins[rest.norm(dim=-1) < SLACK]
-        cost = torch.cat([total(part, 3) for part in spins.split(400)])
-        spins = spins[_apart(spins, cost)]
-        moved = torch.zeros_like(spins, requires_grad=True)
-        adam = torch.optim.Adam([moved], lr=RATE)
-        for _ in range(STEPS):
-            adam.zero_grad()
-            total(spins + moved).sum().backward()
-            adam.step()
-        with torch.no_grad():
-            cost = total(spins + moved)
-            best = cost.argmin()
-            return float(cost[best]), torch.stack([t[best] for t in turned(spins + moved)])
+        return _Flight(self, rows, places, parts, rotations[first], rotations[last], seconds)
 
     def few(self, step: int) -> _Search:
         """The same with every `step`-th point."""
@@ -276,6 +248,58 @@ class _Search:
         for name in ("points", "normals", "known", "texture"):
             setattr(found, name, getattr(self, name)[::step])
         return found
+
+
+@dataclass(frozen=True)
+class _Flight:
+    """Spins about a world axis between two known rotations, `first` and `last`; `parts` are the
+    rows' parts of the way."""
+
+    search: _Search
+    rows: np.ndarray
+    places: Float[Tensor, "C 3"]
+    parts: list[float]
+    first: Float[Tensor, "3 3"]
+    last: Float[Tensor, "3 3"]
+    seconds: float
+
+    def likely(self) -> Float[Tensor, "N 3"]:
+        """The best of all spins up to `MOST_TURNS` that end within `SLACK` of the last rotation."""
+        spins = _ball(2 * np.pi * MOST_TURNS)
+        spins = spins[self._rest(spins).norm(dim=-1) < SLACK]
+        search = self.search.few(3)
+        cost = torch.cat([self._cost(part, search) for part in spins.split(400)])
+        return spins[_apart(spins, cost)]
+
+    def best(self, spins: Float[Tensor, "N 3"]) -> tuple[float, Float[Tensor, "R 3 3"]]:
+        """Cost and rotations of the best of `spins`, each moved to its own best place first."""
+        search = self.search.few(2)
+        moved = torch.zeros_like(spins, requires_grad=True)
+        adam = torch.optim.Adam([moved], lr=RATE)
+        for _ in range(STEPS):
+            adam.zero_grad()
+            self._cost(spins + moved, search).sum().backward()
+            adam.step()
+        with torch.no_grad():
+            cost = self._cost(spins + moved, self.search)
+            best = cost.argmin()
+            return float(cost[best]), torch.stack([t[best] for t in self._turned(spins + moved)])
+
+    def _rest(self, spins: Tensor) -> Tensor:
+        """What a spin lacks of the last rotation, spread over the flight."""
+        turned = axis_angle_to_matrices(spins).mT @ self.last @ self.first.mT
+        return matrices_to_axis_angle(turned)
+
+    def _turned(self, spins: Tensor) -> list[Tensor]:
+        rest = self._rest(spins)
+        return [
+            axis_angle_to_matrices(p * spins) @ axis_angle_to_matrices(p * rest) @ self.first
+            for p in self.parts
+        ]
+
+    def _cost(self, spins: Tensor, search: _Search) -> Tensor:
+        fast = TURNING * len(self.rows) * (spins.norm(dim=-1) / self.seconds / SPIN).square()
+        return fast + search.costs_together(self.rows, self._turned(spins), self.places)
 
 
 def _ballistic(
@@ -335,7 +359,7 @@ def _apart(spins: Float[Tensor, "R 3"], costs: Float[Tensor, " R"]) -> list[int]
     return kept
 
 
-def _ball(radius: float, step: float = 0.45) -> Float[Tensor, "N 3"]:
+def _ball(radius: float, step: float = 0.6) -> Float[Tensor, "N 3"]:
     """Vectors of a grid within a ball, none first."""
     count = int(radius / step)
     line = torch.arange(-count, count + 1) * step
