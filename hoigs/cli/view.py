@@ -58,7 +58,7 @@ def view(
             rasterizer=rasterizer,
             device=device,
             plugins=plugin or (),
-            report=typer.echo,
+            report=display.line,
             progress=display.fraction,
         )
     if page is not None:

@@ -82,7 +82,9 @@ class PrepareOptions(ComponentConfig):
         "longer side (64 degrees); it scales all depths",
     )
     body: str = Field(default="body:anny", description="key of the body model, for the clip")
-    fit_steps: int = Field(default=FitOptions.steps, ge=1, description="steps of the body fit")
+    fit_steps: int = Field(
+        default=FitOptions.steps, ge=1, description="steps of the body fit, at most"
+    )
     preset: Preset = Field(
         default="auto",
         description='what finds that which no file beside the video gives: "offline": MediaPipe '

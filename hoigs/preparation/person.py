@@ -67,14 +67,19 @@ def fit_person(
     progress: Callable[[float], None] | None = None,
     source: str = "MediaPipe",
     masks: MaskStack | None = None,
+    times: Float[Tensor, " F"] | None = None,
 ) -> FittedBody:
-    """Fits the body to landmarks, and masks if there are any, in `steps`; finds the scale of a
-    world that has none."""
+    """Fits the body to landmarks, and masks if there are any, in at most `steps`; finds the scale
+    of a world that has none.
+
+    Args:
+        times: of the frames, seconds.
+    """
     options = FitOptions(scale=not track.metric, steps=steps)
     known = None if track.metric else track.points
     fit = fit_body(
         body, landmarks, track.cameras,
-        options=options, points=known, masks=masks, progress=progress,
+        options=options, points=known, masks=masks, times=times, progress=progress,
     )  # fmt: skip
     frames = list(posed(body, fit.poses))
     residual = float(fit.residual_px.nanmedian())

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import torch
 
 import hoigs
 from hoigs.core.diagnostics import ranges
@@ -51,7 +52,7 @@ from hoigs.preparation.video.frames import FrameList, open_frames
 from hoigs.preparation.video.header import uneven_times
 from hoigs.preparation.video.source import Source
 
-FORMAT = 5  # of what the stages keep; another number makes older results unread
+FORMAT = 6  # of what the stages keep; another number makes older results unread
 LARGEST, REDUCED = 1920, 1280  # longer sides, pixels: of frames that are kept, and of smaller ones
 T = TypeVar("T")
 
@@ -271,10 +272,12 @@ class Pipeline:
 
     def _body(self) -> None:
         def make() -> FittedBody:
-            found = self.estimates
+            found, video = self.estimates, self.video
+            times = torch.tensor(video.indices) / video.list.rate
             person = fit_person(
                 found.landmarks, self.track, self.body, self.options.fit_steps,
                 self.stages.advance, self.raw.landmarks.source, found.masks.persons(found.ball),
+                times,
             )  # fmt: skip
             self.provenance["body"] = person.provenance
             self.warnings.extend(person.warnings)

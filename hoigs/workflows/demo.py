@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hoigs.core.progress import Progress
-from hoigs.core.registry.registry import default_registry
+from hoigs.runs.clip_source import clip_folder
 from hoigs.runs.run_folder import RunFolder
-from hoigs.synthesis import builtin_clip
 from hoigs.workflows.train import OnStart, OnStep, Report, TrainedRun, silent, train
 
 
@@ -45,8 +44,7 @@ def demo(
         folders["static"] = folders["hoigs"].with_name(f"{folders['hoigs'].name}-static")
     for folder in folders.values():  # check both before training for minutes
         RunFolder(folder).refuse_existing(overwrite)
-    report("generating the built-in clip (once; cached afterwards)")
-    clip = builtin_clip(default_registry().get("body:anny")())
+    clip = clip_folder("builtin:lift-and-swing")
     return {
         spec: train(
             clip, spec, out=folder, overrides=[f"train.steps={steps}", *overrides],

@@ -13,11 +13,19 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.body.fit_problem import BodyFit, FitOptions, FitProblem, Unknowns
+from hoigs.preparation.body.kinematics import PER_FRAME
 from hoigs.preparation.body.landmarks import (
     ENOUGH,
     LandmarkTrack,
 )
 from hoigs.preparation.body.mask_fit import MaskFit
+from hoigs.preparation.body.normal_equations import NormalEquations
+
+DAMPING, STUCK = 1e-3, 1e4
+ESTIMATED = (6, 9, 12)  # steps before which the landmarks' noise is estimated anew
+RESCALED = (4, 8, 11)
+SETTLED = 14  # steps after which nothing but convergence is left to wait for
+ENOUGH_GAIN = 1e-3  # of the energy, below which a step is the last
 
 
 def fit_body(
@@ -28,14 +36,16 @@ def fit_body(
     options: FitOptions | None = None,
     points: Float[Tensor, "S 3"] | None = None,
     masks: Iterable[Bool[np.ndarray, "H W"]] | None = None,
+    times: Float[Tensor, " F"] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> BodyFit:
     """Pose, shape and place of a body in every frame, in metres.
 
-    Minimises, over all frames at once: robust reprojection of the landmarks, weighted by their
-    visibility; directions of bones against the 3D landmarks, where there are any; joint limits;
-    acceleration in the world; a shape estimator; departures from the start. Frames with fewer than
-    `landmarks.ENOUGH` landmarks are carried by smoothness and, where there are any, masks.
+    The most probable body, over all frames at once: robust reprojection of the landmarks, weighted
+    by their visibility, and directions of bones against the 3D landmarks, where there are any,
+    each by its noise, which is estimated; joint limits and rest; accelerations in the world, in
+    m/s^2, with the long tails that throws have; shape. Frames with fewer than `landmarks.ENOUGH`
+    landmarks are carried by smoothness and, where there are any, masks.
 
     With `options.scale` the cameras' translations are multiplied by one unknown number: the body
     is metric, and so becomes the world. It comes from the scene's points on the ground at the feet,
@@ -44,6 +54,7 @@ def fit_body(
     Args:
         points: of the scene, in the cameras' own unit; only used to find the scale.
         masks: one a frame, of the person or of all that moves.
+        times: of the frames, seconds; by default 30 frames a second.
         progress: called with 0..1.
 
     Raises:
@@ -58,45 +69,54 @@ def fit_body(
             f"{ENOUGH} landmarks or more were found in {int(seen.sum())} of {len(seen)} frames; a "
             "body fit needs at least 2: is the person in view?"
         )
-    problem = FitProblem(body, landmarks, cameras, options)
+    times = torch.arange(len(seen)) / 30.0 if times is None else times
+    problem = FitProblem(body, landmarks, cameras, times, options)
     if options.scale and points is not None:
         problem.ground = points
     if masks is not None and options.masks and not seen.all():
         unseen = {i: mask for i, mask in enumerate(masks) if not seen[i]}
-        problem.masks = MaskFit(body, unseen, options.mask_spread)
-    pairs = int(problem.points.pairs.max()) + 1
-    unknowns = Unknowns(problem.start, body.num_betas, pairs, options.scale)
-    solve(problem, unknowns, options, progress)
+        problem.masks = MaskFit(body, unseen, options.mask_spread, options.masks)
     with torch.no_grad():
-        return problem.result(unknowns)
+        return problem.result(solve(problem, options.steps, progress))
 
 
-def solve(
-    problem: FitProblem,
-    unknowns: Unknowns,
-    options: FitOptions,
-    progress: Callable[[float], None] | None,
-) -> None:
-    """Adam with a rate that falls to a hundredth."""
-    groups = [
-        {"params": [unknowns.body, unknowns.global_orient], "lr": options.rate},
-        {"params": [unknowns.transl], "lr": options.rate},
-        {"params": [unknowns.betas], "lr": options.rate},
-        {"params": [unknowns.offsets], "lr": 0.1 * options.rate},
-    ]
-    if options.scale:
-        groups.append({"params": [unknowns.log_scale], "lr": 0.1 * options.rate})
-    adam = torch.optim.Adam(groups)
-    decay = torch.optim.lr_scheduler.ExponentialLR(adam, 0.01 ** (1 / options.steps))
-    for step in range(options.steps):
-        if step in (options.steps // 3, 2 * options.steps // 3):
-            problem.rescale(unknowns)
-        problem.carry(unknowns, step / options.steps)
-        adam.zero_grad()
+def solve(problem: FitProblem, steps: int, progress: Callable[[float], None] | None) -> Unknowns:
+    """Gauss-Newton with Marquardt's damping, until steps change next to nothing."""
+    unknowns, damping = problem.begin, DAMPING
+    for step in range(steps):
         # the robust spread narrows, so that a poor start is not taken for outliers
-        widen = 1 + 4 * max(0.0, 1 - 2 * step / options.steps)
-        problem.energy(unknowns, widen).backward()
-        adam.step()
-        decay.step()
+        widen = max(1.0, 5.0 - step)
+        if step in RESCALED:
+            unknowns = problem.rescale(unknowns)
+        if step in ESTIMATED:
+            problem.estimate_noise(unknowns)
+        unknowns = problem.carry(unknowns, step / min(steps, SETTLED))
+        better, damping, gain = _improved(problem, unknowns, widen, damping)
+        unknowns = better
         if progress is not None:
-            progress((step + 1) / options.steps)
+            progress((step + 1) / steps)
+        if step >= SETTLED and gain < ENOUGH_GAIN:
+            break
+    if progress is not None:
+        progress(1.0)
+    return unknowns
+
+
+def _improved(
+    problem: FitProblem, unknowns: Unknowns, widen: float, damping: float
+) -> tuple[Unknowns, float, float]:
+    """A step downhill, the next damping, and the share of the energy that the step gained; the
+    same unknowns and 0 if no step goes down."""
+    frames, shared = len(unknowns.pose.transl), unknowns.pose.betas.numel()
+    shared += unknowns.offsets.numel() + 2
+    equations = NormalEquations(frames, PER_FRAME, shared)
+    before = problem.energy(unknowns, widen, equations)
+    while damping < STUCK:
+        found = equations.step(damping)
+        if found is not None:
+            moved = unknowns.moved(*found)
+            after = problem.energy(moved, widen)
+            if after < before:
+                return moved, max(damping / 10, 1e-6), (before - after) / abs(before)
+        damping *= 10
+    return unknowns, DAMPING, 0.0

@@ -1,67 +1,73 @@
-"""The energy of the body fit: its unknowns, its terms and what they need, precomputed."""
+"""The energy of the body fit: its unknowns, its terms and their derivatives."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from hoigs.core.interfaces.body import BodyModel
-from hoigs.core.maths.skinning import skin
+from hoigs.core.maths.rotations import (
+    axis_angle_to_quats,
+    multiply_quats,
+    quats_to_axis_angle,
+)
 from hoigs.core.values.camera import Camera, pinhole_pixels
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit_start import Start, first_guess
 from hoigs.preparation.body.ground_scale import ground_scale
-from hoigs.preparation.body.joint_limits import limit_penalty
-from hoigs.preparation.body.landmarks import (
-    BONES,
-    FEET,
-    LandmarkPoints,
-    LandmarkTrack,
-    points_of,
-)
-from hoigs.preparation.body.mask_fit import MaskFit
+from hoigs.preparation.body.kinematics import Kinematics, Posed, nearest_turn
+from hoigs.preparation.body.landmarks import FEET, TORSO, LandmarkPoints, LandmarkTrack, points_of
+from hoigs.preparation.body.mask_fit import MaskFit, Project
+from hoigs.preparation.body.noise import Noise, robust_weights
+from hoigs.preparation.body.normal_equations import NormalEquations
+from hoigs.preparation.body.pose_prior import LASTS as PRIOR_LASTS
+from hoigs.preparation.body.pose_prior import TURNING, PosePrior
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Weights of the fit; the defaults were chosen on a real clip of 247 frames.
+    """Settings of the fit. Noise is estimated, so that few weights are left to choose.
 
     Attributes:
-        steps: of Adam, over all frames at once. rate: its rate, radians.
-        spread: residual at which a landmark begins to count as an outlier, in image widths.
-        bones: of 3D bone directions. limits: of joint limits. rest: of departures from the start,
-            which is a straight spine with limbs along the 3D landmarks.
-        smooth: of accelerations of the landmarks in the world. turn: of changes of pose.
-        shape: of the shape coefficients, in standard deviations.
-        offset: of shifts between the landmarks and the body's own points, in `OFFSET`.
-        masks: of the distance from masks, in frames without landmarks. mask_spread: residual at
-            which a pixel or a point begins to count as an outlier there, in image widths.
+        steps: of Gauss and Newton, at most.
+        spread: how far a landmark may be off at first, in image widths; `Noise` replaces it.
+        space: the same of a 3D landmark, metres.
+        unit: standard deviation of the 3D landmarks' unit of length, in parts of a metre.
+        smooth: acceleration of points of the body in the world, m/s^2, that is ordinary; larger
+            ones cost less than their square (a throw is no error).
+        shape: standard deviation of the shape coefficients, in those of the body model.
+        offset: standard deviation of the distance from a landmark to the body's own point that
+            stands for it, metres.
+        masks: number of landmarks that a mask weighs as much as. mask_spread: residual at which a
+            pixel or a point begins to count as an outlier there, in image widths.
         scale: find the cameras' unit in metres too (a moving camera of unknown scale).
     """
 
-    steps: int = 250
-    rate: float = 0.03
-    spread: float = 0.012
-    bones: float = 0.3
-    limits: float = 2.0
-    rest: float = 0.004
-    smooth: float = 30.0
-    turn: float = 1.0
-    shape: float = 0.01
-    offset: float = 0.01
-    masks: float = 0.1
+    steps: int = 40
+    spread: float = 0.006
+    space: float = 0.05
+    unit: float = 0.015
+    smooth: float = 6.0
+    shape: float = 0.6
+    offset: float = 0.003
+    masks: float = 10.0
     mask_spread: float = 0.03
     scale: bool = False
 
 
 GAP = 12  # frames between landmarks that smoothness carries a pose across
 CARRIED = 0.6  # of the steps, in which frames farther off begin one after another
-OFFSET = 0.03  # metres that a landmark's point may well lie off the joint it is named after
+LASTS = 0.06  # seconds in which an acceleration stays what it is: CMU's basketball players
+INDEPENDENT = 0.4  # share of the points that move by themselves
+FAT = 4.0  # degrees of freedom of Student's distribution of accelerations
+SURFACE = 1.7  # of a landmark on the skin against one at a joint: how uncertain its place is
+REWEIGHTINGS = 3  # for the 3D landmarks' origin
+LEAST_PIXELS = 3e-3  # of the width: no landmark is known better
 
 
 @dataclass(frozen=True)
@@ -81,89 +87,126 @@ class BodyFit:
     report: dict[str, Any]
 
 
-class Unknowns(nn.Module):
-    """What is solved for."""
+@dataclass(frozen=True)
+class Unknowns:
+    """What is solved for.
 
-    def __init__(self, start: Start, betas: int, pairs: int, scale: bool) -> None:
-        super().__init__()
-        self.global_orient = nn.Parameter(start.global_orient.clone())
-        self.transl = nn.Parameter(start.transl.clone())
-        self.body = nn.Parameter(start.body.clone())
-        self.betas = nn.Parameter(torch.zeros(betas))
-        self.offsets = nn.Parameter(torch.zeros(pairs, 3))
-        self.log_scale = nn.Parameter(torch.tensor(start.scale).log(), requires_grad=scale)
+    Attributes:
+        pose: batched, one shape, no hands; float64.
+        offsets: of each left-right pair of landmarks in the rest pose, metres.
+        unit: by how much the 3D landmarks are too large, in parts of 1.
+        scale: metres a unit of the cameras' world.
+    """
 
-    def pose(self) -> BodyPose:
-        hands = self.body.new_zeros(len(self.body), 15, 3)
-        return BodyPose(self.global_orient, self.body, hands, hands, self.transl, self.betas)
+    pose: BodyPose
+    offsets: Float[Tensor, "P 3"]
+    unit: float
+    scale: float
+
+    @staticmethod
+    def start(start: Start, betas: int, pairs: int) -> Unknowns:
+        hands = start.body.new_zeros(len(start.body), 15, 3)
+        pose = BodyPose(
+            start.global_orient, start.body, hands, hands, start.transl, torch.zeros(betas)
+        )
+        offsets = torch.zeros(pairs, 3, dtype=torch.float64)
+        return Unknowns(pose.to(torch.float64), offsets, 0.0, start.scale)
+
+    def moved(self, frames: Float[Tensor, "F N"], shared: Float[Tensor, " S"]) -> Unknowns:
+        pose, betas = self.pose, len(self.pose.betas)
+        turned = multiply_quats(
+            axis_angle_to_quats(pose.global_orient), axis_angle_to_quats(frames[:, 3:6])
+        )
+        pose = pose.replace(
+            transl=pose.transl + frames[:, :3],
+            global_orient=nearest_turn(quats_to_axis_angle(turned)),
+            body=pose.body + frames[:, 6:].unflatten(-1, (21, 3)),
+            betas=pose.betas + shared[:betas],
+        )
+        offsets = self.offsets + shared[betas:-2].unflatten(0, (-1, 3))
+        unit = self.unit + float(shared[-2])
+        return Unknowns(pose, offsets, unit, max(self.scale + float(shared[-1]), 1e-4))
 
 
 class FitProblem:
-    """The energy and what it needs, precomputed."""
+    """The energy and what it needs, precomputed.
+
+    Args:
+        times: of the frames, seconds.
+    """
 
     def __init__(
         self,
         body: BodyModel,
         landmarks: LandmarkTrack,
         cameras: Sequence[Camera],
+        times: Float[Tensor, " F"],
         options: FitOptions,
     ) -> None:
         self.body, self.options = body, options
         self.points: LandmarkPoints = points_of(body)
+        self.kinematics = Kinematics(body, self.points.joints, self.points.vertices)
         rows = list(self.points.landmarks)
         self.seen: Bool[Tensor, " F"] = landmarks.found
         self.solid = int(landmarks.solid.sum())
-        image = landmarks.image[:, rows]
+        image = landmarks.image[:, rows].double()
         counted = self.seen[:, None] & landmarks.known[:, rows]
         self.visible = torch.where(counted, image[..., 2], 0.0)
         self.pixels = image[..., :2].nan_to_num()
-        self.K = torch.stack([c.K for c in cameras])
-        self.viewmats = torch.stack([c.world_to_camera for c in cameras])
+        self.K = torch.stack([c.K for c in cameras]).double()
+        self.viewmats = torch.stack([c.world_to_camera for c in cameras]).double()
         self.width = float(cameras[0].width)
         self.cameras, self.ground = cameras, cameras[0].K.new_zeros(0, 3)
         self.masks: MaskFit | None = None
         self.scale_from = "feet that stand still" if options.scale else "the cameras: given"
-        self.bones = torch.tensor([(self.points.index(a), self.points.index(b)) for a, b in BONES])
-        world = landmarks.world[:, rows]
-        solid = torch.where(torch.isfinite(world).all(-1), self.visible, 0.0)
-        self.bone_targets = _directions(world.nan_to_num(), self.bones)
-        self.bone_weights = solid[:, self.bones[:, 0]] * solid[:, self.bones[:, 1]]
-        above = [body.parents[joint] for joint in self.points.joints.tolist()]
-        bones = nn.functional.one_hot(torch.tensor(above), len(body.parents))
-        on_skin = body.skinning_weights[self.points.vertices]
-        self.carriers = torch.cat((bones.to(on_skin), on_skin))
-        self.start = first_guess(body, landmarks, cameras, options.scale)
+        self.find_scale = options.scale
+        world = landmarks.world[:, rows].double()
+        self.in_space = torch.where(torch.isfinite(world).all(-1), self.visible, 0.0)
+        self.space = world.nan_to_num()  # metres, along the cameras' axes
+        self.steps = (times[1:] - times[:-1]).double().clamp_min(1e-4)
+        self.accelerate = _second_differences(self.steps)
+        apart = torch.nn.functional.pad(self.steps, (1, 1), value=float(self.steps.median()))
+        self.spacing = 0.5 * (apart[1:] + apart[:-1])  # seconds that each frame stands for
+        self.prior = PosePrior()
+        self.torso = [self.points.index(mark) for mark in TORSO]
+        self.independent = torch.full((len(rows) + 1,), INDEPENDENT, dtype=torch.float64)
+        self.independent[-1] = 1.0
+        pairs = int(self.points.pairs.max()) + 1
+        onto = torch.nn.functional.one_hot(self.points.pairs, pairs).double()
+        self.onto_offsets = (onto[:, :, None] * self.points.mirror[:, None]).double()  # [L, P, 3]
+        surface = (onto[len(self.points.joints) :].sum(0) > 0).double()
+        self.offset_spread = options.offset * (1 + (SURFACE - 1) * surface)
+        self.noise = Noise(
+            torch.full((len(rows),), options.spread * self.width, dtype=torch.float64),
+            torch.full((len(rows), 3), options.space, dtype=torch.float64),
+        )
+        self.begin = Unknowns.start(
+            first_guess(body, landmarks, cameras, options.scale), body.num_betas, pairs
+        )
 
-    def locate(
-        self, pose: BodyPose, offsets: Float[Tensor, "P 3"] | None = None
-    ) -> Float[Tensor, "F L 3"]:
-        """World positions of the points that stand for landmarks, metres.
+    def posed(self, unknowns: Unknowns, derivatives: bool = True) -> Posed:
+        """The points that stand for landmarks.
 
         A landmark named after a joint moves with the bone above it, a shoulder with the collar
-        bone. `offsets` shift the points in the rest pose, left and right as mirror images.
+        bone. Offsets shift the points in the rest pose, left and right as mirror images.
         """
-        points = self.points
-        vertices, joints = self.body.shaped(pose.betas)
-        rest = torch.cat((joints[points.joints], vertices[points.vertices]))
-        if offsets is not None:
-            rest = rest + offsets[points.pairs] * points.mirror
-        return skin(rest, self.body.skinning_transforms(pose), self.carriers)
+        shift = unknowns.offsets[self.points.pairs] * self.points.mirror
+        return self.kinematics.posed(unknowns.pose, shift, derivatives)
 
-    def project(
-        self, points: Float[Tensor, "F L 3"], scale: Tensor
+    def in_cameras(
+        self, points: Float[Tensor, "F L 3"], scale: float
     ) -> tuple[Float[Tensor, "F L 2"], Float[Tensor, "F L 3"]]:
-        """Pixels, and positions along the cameras' axes."""
-        turned = points @ self.viewmats[:, :3, :3].mT
-        cam = turned + scale * self.viewmats[:, None, :3, 3]
-        return pinhole_pixels(self.K[:, None], cam, near=0.1), turned
+        """Pixels, and places in the cameras' axes."""
+        cam = points @ self.viewmats[:, :3, :3].mT + scale * self.viewmats[:, None, :3, 3]
+        return pinhole_pixels(self.K[:, None], cam, near=0.1), cam
 
     @torch.no_grad()
-    def carry(self, unknowns: Unknowns, progress: float) -> None:
+    def carry(self, unknowns: Unknowns, progress: float) -> Unknowns:
         """Frames far from landmarks begin one after another, each from its neighbour's current
         pose: masks alone do not separate an arm from what it holds, unless it starts close by. A
         short gap between landmarks is left to smoothness."""
-        if self.masks is None or progress > CARRIED:
-            return
+        if self.masks is None or progress > CARRIED or bool(self.seen.all()):
+            return unknowns
         frames = torch.arange(len(self.seen))
         found = frames[self.seen]
         after = torch.searchsorted(found, frames)
@@ -174,64 +217,204 @@ class FitProblem:
         far = ends | ((first - last > GAP) & ~self.seen)
         reach = int(progress / CARRIED * int(distance.max()))
         late = far & (distance > reach)
-        toward = nearest + (frames - nearest).sign() * reach
-        for values in (unknowns.body, unknowns.global_orient, unknowns.transl):
-            values[late] = values[toward[late]]
+        source = torch.where(late, nearest + (frames - nearest).sign() * reach, frames)
+        pose = unknowns.pose
+        pose = pose.replace(
+            body=pose.body[source],
+            global_orient=nearest_turn(pose.global_orient[source]),
+            transl=pose.transl[source],
+        )
+        return replace(unknowns, pose=pose)
 
-    @torch.no_grad()
-    def rescale(self, unknowns: Unknowns) -> None:
+    def rescale(self, unknowns: Unknowns) -> Unknowns:
         """Take the scale from the ground at the feet; every camera sees the body where it was."""
         if not len(self.ground):
-            return
-        old = unknowns.log_scale.exp()
-        shift = self.viewmats[:, :3, 3]
-        _, turned = self.project(self.locate(unknowns.pose(), unknowns.offsets), old)
-        feet = turned[:, [self.points.index(mark) for mark in FEET]] + old * shift[:, None]
+            return unknowns
+        points = self.posed(unknowns, derivatives=False).points
+        _, cam = self.in_cameras(points, unknowns.scale)
+        feet = cam[:, [self.points.index(mark) for mark in FEET]].float()
         found = ground_scale(feet, self.ground, self.cameras, self.seen)
         if found is None:
-            return
+            return unknowns
         scale, frames = found
         self.scale_from = f"scene points on the ground at the feet, {frames} frames"
-        back = self.viewmats[:, :3, :3].mT @ ((old - scale) * shift)[..., None]
-        unknowns.transl.add_(back[..., 0])
-        unknowns.log_scale.fill_(torch.tensor(scale).log())
-        unknowns.log_scale.requires_grad_(False)
-
-    def energy(self, unknowns: Unknowns, widen: float) -> Float[Tensor, ""]:
-        options, pose = self.options, unknowns.pose()
-        points = self.locate(pose, unknowns.offsets)
-        pixels, turned = self.project(points, unknowns.log_scale.exp())
-        squared = (pixels - self.pixels).square().sum(-1) / self.width**2
-        spread = (options.spread * widen) ** 2
-        robust = spread * squared / (squared + spread)  # Geman-McClure
-        data = (self.visible * robust).sum() / self.visible.sum() / options.spread**2
-        off = (_directions(turned, self.bones) - self.bone_targets).square().sum(-1)
-        bones = (self.bone_weights * off).sum() / self.bone_weights.sum().clamp_min(1)
-        accelerations = points[2:] - 2 * points[1:-1] + points[:-2]
-        turns = unknowns.body[1:] - unknowns.body[:-1]
-
-        def project(where: Tensor) -> Tensor:
-            return self.project(where, unknowns.log_scale.exp())[0]
-
-        masks = 0.0 if self.masks is None else self.masks.energy(pose, project, widen)
-        terms = (
-            data,
-            options.masks * masks,
-            options.bones * bones,
-            options.limits * limit_penalty(unknowns.body),
-            options.rest * (unknowns.body - self.start.body).square().sum((-1, -2)).mean(),
-            options.shape * unknowns.betas.square().sum(),
-            options.offset * (unknowns.offsets / OFFSET).square().sum(),
-            options.smooth * accelerations.square().sum(-1).mean() if len(points) > 2 else 0.0,
-            options.turn * turns.square().sum(-1).mean() if len(points) > 1 else 0.0,
+        self.find_scale = False
+        back = self.viewmats[:, :3, :3].mT @ self.viewmats[:, :3, 3:]
+        transl = unknowns.pose.transl + (unknowns.scale - scale) * back[..., 0]
+        return Unknowns(
+            unknowns.pose.replace(transl=transl), unknowns.offsets, unknowns.unit, scale
         )
-        return torch.stack([torch.as_tensor(t) for t in terms]).sum()
+
+    def estimate_noise(self, unknowns: Unknowns) -> None:
+        points = self.posed(unknowns, derivatives=False).points
+        pixels, _ = self.in_cameras(points, unknowns.scale)
+        residuals, _, _ = self._space_residuals(points, unknowns.unit, 1.0)
+        self.noise = self.noise.seen(
+            (pixels - self.pixels, self.visible),
+            (residuals, self.in_space),
+            LEAST_PIXELS * self.width,
+        )
+
+    def energy(
+        self, unknowns: Unknowns, widen: float, equations: NormalEquations | None = None
+    ) -> float:
+        """Twice the negative logarithm of the posterior; its derivatives go into `equations`."""
+        at = self.posed(unknowns, derivatives=equations is not None)
+        shared = None if equations is None else self._by_shared(at)
+        total = self._landmarks(at, shared, unknowns, widen, equations)
+        total += self._in_space(at, shared, unknowns, widen, equations)
+        if len(at.points) > 2:
+            total += self._smoothness(at, shared, unknowns, equations)
+        share = (self.spacing / PRIOR_LASTS).clamp_max(1.0)
+        total += float(self.prior.add(unknowns.pose.body.flatten(1), share, equations))
+        total += self._shared_priors(unknowns, equations)
+        if self.masks is not None:
+            total += self.masks.energy(
+                unknowns.pose, self._seen_at(unknowns.scale), widen, equations
+            )
+        return total
+
+    def _seen_at(self, scale: float) -> Project:
+        def project(points: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
+            turn, shift = self.viewmats[frames, :3, :3], self.viewmats[frames, None, :3, 3]
+            K, cam = self.K[frames], points @ turn.mT + scale * shift
+            by_point = _by_place(K, cam) @ turn[:, None]
+            return pinhole_pixels(K[:, None], cam, near=0.1), by_point
+
+        return project
+
+    def _by_shared(self, at: Posed) -> Float[Tensor, "F L 3 S"]:
+        offsets = torch.einsum("flab,lpb->flapb", at.by_rest, self.onto_offsets).flatten(-2)
+        scale = at.points.new_zeros(*at.points.shape, 2)
+        return torch.cat((at.by_betas, offsets, scale), -1)
+
+    def _landmarks(
+        self, at: Posed, shared: Tensor | None, unknowns: Unknowns, widen: float,
+        equations: NormalEquations | None,
+    ) -> float:  # fmt: skip
+        pixels, cam = self.in_cameras(at.points, unknowns.scale)
+        residuals = pixels - self.pixels
+        squares = residuals.square().sum(-1) / self.noise.pixels.square()
+        cost, weight = robust_weights(squares, widen)
+        if equations is not None and shared is not None:
+            by_point = _by_place(self.K, cam)
+            turned = by_point @ self.viewmats[:, None, :3, :3]
+            by_shared = turned @ shared
+            if self.find_scale:
+                by_shared[..., -1] = (by_point @ self.viewmats[:, None, :3, 3:])[..., 0]
+            weight = self.visible * weight / self.noise.pixels.square()
+            equations.add(
+                residuals.flatten(1), weight[..., None].expand_as(residuals).flatten(1),
+                (turned @ at.by_frame).flatten(1, 2), by_shared.flatten(1, 2),
+            )  # fmt: skip
+        return float((self.visible * cost).sum())
+
+    def _in_space(
+        self, at: Posed, shared: Tensor | None, unknowns: Unknowns, widen: float,
+        equations: NormalEquations | None,
+    ) -> float:  # fmt: skip
+        """The 3D landmarks, about an origin of each frame's own, along the camera's axes."""
+        residuals, weight, cost = self._space_residuals(at.points, unknowns.unit, widen)
+        if equations is not None and shared is not None:
+            turn = self.viewmats[:, None, :3, :3]
+            weight = weight[..., None] / self.noise.space.square()
+            total = weight.sum(1, keepdim=True).clamp_min(1e-12)
+            size = 1 + unknowns.unit
+            shared = size * turn @ shared
+            shared[..., -2] = (turn @ at.points[..., None])[..., 0]
+
+            def about_origin(by: Tensor) -> Tensor:
+                mean = (weight[..., None] * by).sum(1, keepdim=True) / total[..., None]
+                return (by - mean).flatten(1, 2)
+
+            equations.add(
+                residuals.flatten(1), weight.flatten(1),
+                about_origin(size * turn @ at.by_frame), about_origin(shared),
+            )  # fmt: skip
+        return float((self.in_space * cost).sum())
+
+    def _space_residuals(
+        self, points: Float[Tensor, "F L 3"], unit: float, widen: float
+    ) -> tuple[Float[Tensor, "F L 3"], Float[Tensor, "F L"], Float[Tensor, "F L"]]:
+        """Residuals of the 3D landmarks with the origins that fit best, their weights and cost."""
+        off = (1 + unit) * points @ self.viewmats[:, :3, :3].mT - self.space
+        weight = self.in_space
+        for _ in range(REWEIGHTINGS):
+            share = weight[..., None] / self.noise.space.square()
+            origin = (share * off).sum(1, keepdim=True) / share.sum(1, keepdim=True).clamp_min(
+                1e-12
+            )
+            residuals = off - origin
+            squares = (residuals / self.noise.space).square().sum(-1)
+            cost, robust = robust_weights(squares, widen)
+            weight = self.in_space * robust
+        return residuals, weight, cost
+
+    def _smoothness(
+        self, at: Posed, shared: Tensor | None, unknowns: Unknowns,
+        equations: NormalEquations | None,
+    ) -> float:  # fmt: skip
+        """Accelerations of points in the world, and of joint angles."""
+        count, factors = len(self.accelerate), self.accelerate
+        lasts = (self.spacing[1:-1] / LASTS).clamp_max(1.0)[:, None]
+        share = lasts * self.independent
+        # a small body close by would accelerate less than a large one far off in the same images
+        size, by_betas = self.kinematics.size(unknowns.pose.betas)
+        factors = factors / size
+        points = self._about_torso(at.points)
+        values = sum(points[k : k + count] * factors[:, k, None, None] for k in range(3))
+        squares = values.square().sum(-1) / self.options.smooth**2
+        # Student's distribution in three dimensions: ordinary motion is held, a throw let go
+        cost = share * (FAT + 3) * (1 + squares / FAT).log()
+        angles = unknowns.pose.body.flatten(1)
+        turning = (
+            sum(angles[k : k + count] * self.accelerate[:, k, None] for k in range(3)) / TURNING
+        )
+        if equations is not None and shared is not None:
+            weight = share * (FAT + 3) / (FAT + squares) / self.options.smooth**2
+            shrinking = points[..., None] * by_betas / size
+            shared = self._about_torso(shared) - torch.nn.functional.pad(
+                shrinking, (0, shared.shape[-1] - len(by_betas))
+            )
+            equations.add_accelerations(
+                values.flatten(1), weight[..., None].expand_as(values).flatten(1), factors,
+                self._about_torso(at.by_frame).flatten(1, 2), shared.flatten(1, 2),
+            )  # fmt: skip
+            for a in range(3):
+                part = INDEPENDENT * lasts * self.accelerate[:, a, None] / TURNING
+                equations.by_frame[a : a + count, 6:] += part * turning
+                for b in range(a, 3):
+                    diagonal = equations.blocks[b - a].diagonal(dim1=1, dim2=2)
+                    diagonal[a : a + count, 6:] += part * self.accelerate[:, b, None] / TURNING
+        return float(cost.sum() + (INDEPENDENT * lasts * turning.square()).sum())
+
+    def _about_torso(self, values: Float[Tensor, "F L *rest"]) -> Float[Tensor, "F K *rest"]:
+        """Points about the torso's middle, and that after them: a body that moves as a whole has
+        one acceleration, not one a point."""
+        middle = values[:, self.torso].mean(1, keepdim=True)
+        return torch.cat((values - middle, middle), 1)
+
+    def _shared_priors(self, unknowns: Unknowns, equations: NormalEquations | None) -> float:
+        """Of shape and offsets."""
+        betas = len(unknowns.pose.betas)
+        precision = torch.cat(
+            (
+                torch.full((betas,), self.options.shape**-2, dtype=torch.float64),
+                self.offset_spread.pow(-2).repeat_interleave(3),
+                self.offset_spread.new_tensor([self.options.unit**-2]),
+            )
+        )
+        unit = self.offset_spread.new_tensor([unknowns.unit])
+        values = torch.cat((unknowns.pose.betas, unknowns.offsets.flatten(), unit))
+        if equations is not None:
+            equations.by_shared[:-1] += precision * values
+            equations.shared.diagonal()[:-1] += precision
+        return float((precision * values.square()).sum())
 
     def result(self, unknowns: Unknowns) -> BodyFit:
-        pose = unknowns.pose().map(lambda x: x.detach().clone())
-        scale = unknowns.log_scale.exp()
-        pixels, _ = self.project(self.locate(pose, unknowns.offsets.detach()), scale)
-        distance = (pixels - self.pixels).norm(dim=-1)
+        points = self.posed(unknowns, derivatives=False).points
+        pixels, _ = self.in_cameras(points, unknowns.scale)
+        distance = (pixels - self.pixels).norm(dim=-1).float()
         counted = self.visible > 0.5
         residual = (distance * counted).sum(1) / counted.sum(1)
         mean = float(distance[counted].mean())
@@ -239,17 +422,33 @@ class FitProblem:
             "landmark_error_px": round(mean, 2),
             "landmark_error_px_median": round(float(distance[counted].median()), 2),
             "landmark_error_px_at_1280": round(mean * 1280 / self.width, 2),
+            "landmark_noise_px": round(float(self.noise.pixels.median()), 2),
+            "landmark_noise_m": round(float(self.noise.space.median()), 3),
+            "landmark_unit": round(1 + unknowns.unit, 3),
             "landmark_offset_m_largest": round(float(unknowns.offsets.norm(dim=-1).max()), 3),
             "frames_with_landmarks": int(self.seen.sum()),
             "frames_with_landmarks_in_space": self.solid,
             "frames": len(self.seen),
-            "scene_scale": round(float(scale), 5),
+            "scene_scale": round(float(unknowns.scale), 5),
             "scene_scale_from": self.scale_from,
         }
-        return BodyFit(pose, residual, float(scale), report)
+        pose = unknowns.pose.map(lambda x: x.float())
+        return BodyFit(pose, residual, unknowns.scale, report)
 
 
-def _directions(points: Float[Tensor, "F L 3"], bones: Tensor) -> Float[Tensor, "F B 3"]:
-    """Unit vectors along the bones."""
-    ends = points[:, bones]
-    return torch.nn.functional.normalize(ends[:, :, 1] - ends[:, :, 0], dim=-1)
+def _by_place(K: Float[Tensor, "F 3 3"], cam: Float[Tensor, "F L 3"]) -> Float[Tensor, "F L 2 3"]:
+    """Pixels by the places along the camera's axes; none nearer than in `pinhole_pixels`."""
+    z = cam[..., 2].clamp_min(0.1)
+    fx, fy = K[:, None, 0, 0] / z, K[:, None, 1, 1] / z
+    none = torch.zeros_like(fx)
+    rows = (fx, none, -fx * cam[..., 0] / z, none, fy, -fy * cam[..., 1] / z)
+    return torch.stack(rows, -1).unflatten(-1, (2, 3))
+
+
+def _second_differences(steps: Float[Tensor, " S"]) -> Float[Tensor, "T 3"]:
+    """Factors of the values at three times that give their second derivative."""
+    before, after = steps[:-1], steps[1:]
+    span = 0.5 * (before + after)
+    return torch.stack(
+        (1 / (before * span), -1 / before / span - 1 / after / span, 1 / (after * span)), 1
+    )

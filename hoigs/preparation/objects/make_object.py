@@ -66,18 +66,18 @@ def round_object(
         )
     else:
         size, text = FOOTBALL, f"no limb comes near it: its radius is taken as {FOOTBALL} m"
-    places = cones.places(cameras, size)
+    places, off = cones.places(cameras, size), f"{100 * max(0.01, np.median(cones.judged)):.0f} %"
     track, normals = _sphere_track(
         places, cones.observed, size, count,
-        f"taken for a ball, as its masks are {100 * np.median(cones.judged):.1f} % off a circle "
+        f"taken for a ball, as its masks are {off} off a circle "
         f"(median of {len(cones.judged)} frames); place from the cone of rays along its outline; "
         f"{text}; its rotation is unknown, and kept constant",
     )  # fmt: skip
     away = np.linalg.norm(places - torch.stack([c.center for c in cameras]), axis=-1)
     nothing = np.full(len(cameras), np.nan)
     reason = (
-        f"it was taken for a ball (masks {100 * np.median(cones.judged):.1f} % off a circle), "
-        f"whose rotation no outline shows; {text}"
+        f"it was taken for a ball (masks {off} off a circle), whose rotation no outline shows; "
+        f"{text}"
     )
     confidence = ObjectConfidence(
         "ball", nothing, cones.off * cones.angles * away, hand_distance=nothing, reason=reason

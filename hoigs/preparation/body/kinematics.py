@@ -1,0 +1,161 @@
+"""Points on a posed body and their derivatives by its pose, in closed form."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.maths.skinning import ancestor_table
+from hoigs.core.values.moment import BodyPose
+
+JOINTS = 22  # SMPL-X's body joints; hands, jaw and eyes move with the joint that carries them
+PER_FRAME = 3 + 3 * JOINTS  # transl, then one rotation a joint
+
+
+@dataclass(frozen=True)
+class Posed:
+    """Points in the world, metres, with their derivatives.
+
+    Attributes:
+        by_frame: by the frame's own unknowns: transl, a turn of the root about the body's own axes
+            after `global_orient`'s, and the axis-angles of joints 1..21; radians.
+        by_betas: by the shape coefficients. by_rest: by the points' rest positions.
+    """
+
+    points: Float[Tensor, "F L 3"]
+    by_frame: Float[Tensor, "F L 3 N"]
+    by_betas: Float[Tensor, "F L 3 B"]
+    by_rest: Float[Tensor, "F L 3 3"]
+
+
+class Kinematics:
+    """Points that are bound to a body, by linear blend skinning over its 22 body joints.
+
+    In float64: normal equations square the condition of their matrix. Shape directions are taken
+    for linear, as in SMPL; pose blendshapes are left out.
+
+    Args:
+        joints: joints that are points, each carried by the bone above it.
+        vertices: vertices that are the points after them.
+    """
+
+    def __init__(
+        self, body: BodyModel, joints: Int[Tensor, " A"], vertices: Int[Tensor, " B"]
+    ) -> None:
+        parents = [min(parent, JOINTS - 1) for parent in body.parents]
+        self.parents = parents[:JOINTS]
+        nothing = torch.zeros(body.num_betas)
+        shapes = [body.shaped(row) for row in (nothing, *torch.eye(body.num_betas))]
+        rest = torch.stack([torch.cat((j[joints], v[vertices])) for v, j in shapes]).double()
+        tree = torch.stack([j[:JOINTS] for _, j in shapes]).double()
+        self.rest, self.rest_by_betas = rest[0], rest[1:] - rest[0]
+        self.joints, self.joints_by_betas = tree[0], tree[1:] - tree[0]
+        ancestors = ancestor_table(body.parents)  # [joint, ancestor]
+        carrier = _last_body_joint(body.parents)
+        onto = torch.nn.functional.one_hot(carrier, JOINTS).double()
+        above = onto[torch.tensor([body.parents[j] for j in joints.tolist()], dtype=torch.long)]
+        skin = body.skinning_weights[vertices].double() @ onto
+        self.weights = torch.cat((above, skin))  # [L, 22]
+        self.below = ancestors[:JOINTS, :JOINTS].double().T  # [joint, its descendants]
+
+    def posed(self, pose: BodyPose, shift: Float[Tensor, "L 3"], derivatives: bool = True) -> Posed:
+        """The points at a batched pose with one shape.
+
+        Args:
+            shift: of the points in the rest pose, metres.
+        """
+        betas = pose.betas.double()
+        turns = torch.cat((pose.global_orient[:, None], pose.body), 1).double()
+        local = axis_angle_to_matrices(turns)
+        joints = self.joints + torch.einsum("b,bjc->jc", betas, self.joints_by_betas)
+        rest = self.rest + torch.einsum("b,blc->lc", betas, self.rest_by_betas) + shift
+        world, places = self._chain(local, joints, pose.transl.double())
+        # every point as each of its joints alone would carry it, times that joint's weight
+        arms = rest[:, None] - joints  # [L, 22, 3]
+        carried = torch.einsum("fjab,ljb->flja", world, arms) + places[:, None]
+        weighted = self.weights[..., None] * carried
+        points = weighted.sum(2)
+        if not derivatives:
+            none = points.new_zeros(0)
+            return Posed(points, none, none, none)
+        share = self.weights @ self.below.T  # [L, 22]: of a point that a joint turns
+        lever = torch.einsum("jk,flkc->fljc", self.below, weighted)
+        lever = lever - share[..., None] * places[:, None]
+        axes = world.clone()
+        axes[:, 1:] = world[:, 1:] @ right_jacobian(turns[:, 1:])
+        by_turns = torch.linalg.cross(
+            axes[:, None].mT.expand(-1, len(rest), -1, -1, -1), lever[..., None, :], dim=-1
+        )  # [F, L, 22, axis, 3]
+        by_turns = by_turns.flatten(2, 3).mT
+        still = torch.eye(3).to(points).expand(*points.shape[:2], 3, 3)
+        blended = torch.einsum("lj,fjab->flab", self.weights, world)
+        return Posed(
+            points, torch.cat((still, by_turns), -1), self._by_betas(world, blended), blended
+        )
+
+    def size(self, betas: Float[Tensor, " B"]) -> tuple[float, Float[Tensor, " B"]]:
+        """Root mean square bone length in parts of the mean body's; its derivatives by betas."""
+        parents = torch.tensor(self.parents[1:])
+        bones = self.joints[1:] - self.joints[parents]
+        changes = self.joints_by_betas[:, 1:] - self.joints_by_betas[:, parents]
+        mean = bones.norm()
+        now = bones + torch.einsum("b,bjc->jc", betas, changes)
+        size = now.norm().clamp_min(0.05 * mean)
+        return float(size / mean), torch.einsum("jc,bjc->b", now, changes) / (size * mean)
+
+    def _chain(
+        self, local: Float[Tensor, "F 22 3 3"], joints: Float[Tensor, "22 3"], transl: Tensor
+    ) -> tuple[Float[Tensor, "F 22 3 3"], Float[Tensor, "F 22 3"]]:
+        """Rotation and place of each joint in the world."""
+        turns, places = [local[:, 0]], [joints[0] + transl]
+        for joint in range(1, JOINTS):
+            parent = self.parents[joint]
+            turns.append(turns[parent] @ local[:, joint])
+            places.append(places[parent] + turns[parent] @ (joints[joint] - joints[parent]))
+        return torch.stack(turns, 1), torch.stack(places, 1)
+
+    def _by_betas(self, world: Tensor, blended: Tensor) -> Float[Tensor, "F L 3 B"]:
+        shift = self.joints_by_betas.permute(1, 2, 0)  # [22, 3, B]
+        places = [shift[0].expand(len(world), -1, -1)]
+        for joint in range(1, JOINTS):
+            parent = self.parents[joint]
+            places.append(places[parent] + world[:, parent] @ (shift[joint] - shift[parent]))
+        off = torch.stack(places, 1) - world @ shift
+        of_joints = torch.einsum("lj,fjcb->flcb", self.weights, off)
+        return of_joints + blended @ self.rest_by_betas.permute(1, 2, 0)
+
+
+def _last_body_joint(parents: tuple[int, ...]) -> Int[Tensor, " J"]:
+    """Of each joint, the nearest of the 22 body joints at or above it."""
+    found: list[int] = []
+    for joint, parent in enumerate(parents):
+        found.append(joint if joint < JOINTS else found[parent])
+    return torch.tensor(found)
+
+
+def right_jacobian(turns: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """J with Exp(v + d) = Exp(v) Exp(J d) to first order (Chirikjian 2012, eq. 10.86)."""
+    angle = turns.norm(dim=-1)[..., None, None].clamp_min(1e-4)
+    x, y, z = turns.unbind(-1)
+    none = torch.zeros_like(x)
+    cross = torch.stack((none, -z, y, z, none, -x, -y, x, none), -1).unflatten(-1, (3, 3))
+    first = (1 - angle.cos()) / angle.square()
+    second = (angle - angle.sin()) / angle.pow(3)
+    return torch.eye(3).to(turns) - first * cross + second * cross @ cross
+
+
+def nearest_turn(turns: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
+    """The same rotations as axis-angles without jumps between frames; angles may exceed pi."""
+    found = turns.clone()
+    for i in range(1, len(found)):
+        angle = found[i].norm().clamp_min(1e-9)
+        rounds = 2 * math.pi * found[i] / angle
+        choices = torch.stack([found[i] + k * rounds for k in (-1, 0, 1)])
+        found[i] = choices[(choices - found[i - 1]).norm(dim=-1).argmin()]
+    return found
