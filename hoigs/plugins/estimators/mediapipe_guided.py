@@ -17,6 +17,7 @@ KEPT = 0.5  # the same while they are followed
 AGAIN = 15  # frames until a search that found nobody is repeated, or one that was lost is left
 SHOULDERS, LEFT, RIGHT, HIPS = [11, 12], [13, 15], [14, 16], [23, 24]
 HEAD, LEGS = slice(0, 11), slice(25, 33)
+SAME = 0.8  # of the first distance of the shoulders: less is a part of them taken for the whole
 FAR = 0.1  # of the square's side: shoulders that moved farther take it with them
 NARROW = 0.08  # of the image's longer side: shoulders closer together are those of no one so near
 GRAPH = """
@@ -44,20 +45,14 @@ class GuidedPose:
     """MediaPipe's model of landmarks in a square that is searched for, then followed.
 
     Args:
-        complexity: of the model. credible: whether landmarks fit the frame's mask of people.
+        graph: of `landmark_graph`. rect: makes a square for it, NormalizedRect.
+        credible: whether landmarks fit the frame's mask of people.
     """
 
-    def __init__(self, complexity, credible) -> None:
-        from google.protobuf import text_format
-        from mediapipe.framework import calculator_pb2
-        from mediapipe.framework.formats import rect_pb2
-        from mediapipe.python.solution_base import SolutionBase
-
-        config = text_format.Parse(GRAPH, calculator_pb2.CalculatorGraphConfig())
-        sides = {"model_complexity": complexity, "enable_segmentation": True}
-        self.graph = SolutionBase(graph_config=config, side_inputs=sides)
-        self.rect, self.credible = rect_pb2.NormalizedRect, credible
+    def __init__(self, graph, rect, credible) -> None:
+        self.graph, self.rect, self.credible = graph, rect, credible
         self.square: tuple[float, float, float] | None = None  # x, y of the middle and side, pixels
+        self.broad = 0.0  # distance of the shoulders when the person was found, pixels
         self.wait = 0
 
     def process(self, image, wide):
@@ -107,7 +102,8 @@ class GuidedPose:
         points[:, :3] *= [width, height, width]
         inside = (points[:, :2] >= 0).all(1) & (points[:, :2] < [width, height]).all(1)
         points[:, 3] *= inside  # what lies outside is supposed, not seen
-        near = np.ptp(points[SHOULDERS, 0]) >= NARROW * max(width, height)
+        broad = np.ptp(points[SHOULDERS, 0])
+        near = broad >= max(NARROW * max(width, height), SAME * self.broad)
         person = near and upright(points) and self.credible(points, wide)
         mask = np.array(found.mask)
         points[HEAD, 3] = 0.0  # one that can be seen is found by the detector
@@ -125,7 +121,20 @@ class GuidedPose:
             x, y = np.array((x, y)) + middle - self.shoulders
             self.shoulders = middle
         self.square, self.wait = (x, y, side), 0
+        self.broad = self.broad or float(np.ptp(points[SHOULDERS, 0]))
         return points, space, mask
+
+
+def landmark_graph(complexity):
+    """MediaPipe's graph of the model of landmarks alone, and what makes a square for it."""
+    from google.protobuf import text_format
+    from mediapipe.framework import calculator_pb2
+    from mediapipe.framework.formats import rect_pb2
+    from mediapipe.python.solution_base import SolutionBase
+
+    config = text_format.Parse(GRAPH, calculator_pb2.CalculatorGraphConfig())
+    sides = {"model_complexity": complexity, "enable_segmentation": True}
+    return SolutionBase(graph_config=config, side_inputs=sides), rect_pb2.NormalizedRect
 
 
 def upright(points) -> bool:
