@@ -70,14 +70,14 @@ def _drawn(track: ObjectTrack, frame: int, camera: Camera) -> np.ndarray:
     """Pixels within the points' outline: the pixels of points, and the gaps between them."""
     world = track.points @ track.rotations[frame].mT + track.translations[frame]
     xy, depth = camera.project(world)
-    xy = xy[camera.shows(xy, depth)].long().numpy()
+    shown: np.ndarray = xy[camera.shows(xy, depth)].long().numpy()
     drawn = np.zeros((camera.height, camera.width), bool)
-    drawn[xy[:, 1], xy[:, 0]] = True
-    if not len(xy):
+    drawn[shown[:, 1], shown[:, 0]] = True
+    if not len(shown):
         return drawn
     # half of the points show their side: their spacing in pixels
-    spacing = int(np.ceil(np.sqrt(2 * np.prod(np.ptp(xy, axis=0) + 1) / len(xy)))) + 1
-    (x0, y0), (x1, y1) = xy.min(0), xy.max(0) + 1
+    spacing = int(np.ceil(np.sqrt(2 * np.prod(np.ptp(shown, axis=0) + 1) / len(shown)))) + 1
+    (x0, y0), (x1, y1) = shown.min(0), shown.max(0) + 1
     part = np.pad(drawn[y0:y1, x0:x1], spacing)
     part = ndimage.binary_closing(part, iterations=spacing)
     drawn[y0:y1, x0:x1] = ndimage.binary_fill_holes(part)[spacing:-spacing, spacing:-spacing]
