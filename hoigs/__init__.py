@@ -61,6 +61,7 @@ _PUBLIC = {
     "WarpRasterizer": "hoigs.rasterizers.warp",
     # work: the commands as functions, then what they are made of
     "auto": "hoigs.studies.needs.auto",
+    "batch": "hoigs.studies.batch.batch",
     "bug_report": "hoigs.workflows.bug_report",
     "compress": "hoigs.studies.needs.pruning.compact_run",
     "demo": "hoigs.workflows.demo",
@@ -74,6 +75,7 @@ _PUBLIC = {
     "render": "hoigs.viewing.films",
     "train": "hoigs.workflows.train",
     "view": "hoigs.viewing.view",
+    "work": "hoigs.studies.batch.batch",
     "LoadedRun": "hoigs.runs.loaded_run",
     "Playback": "hoigs.viewing.playback",
     "PrepareOptions": "hoigs.preparation.options",

@@ -6,6 +6,7 @@ import typer
 
 from hoigs import __version__
 from hoigs.cli import (
+    batch,
     bug_report,
     chart,
     compress,
@@ -42,6 +43,8 @@ app.command("eval")(evaluate.evaluate)
 app.command("render")(render.render)
 app.command("view")(view.view)
 app.command("export")(export.export)
+app.command("batch")(batch.batch)
+app.command("work")(batch.work)
 app.command("tables")(tables.tables)
 app.command("chart")(chart.chart)
 app.command("stress")(stress.stress)

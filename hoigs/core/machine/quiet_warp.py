@@ -8,6 +8,8 @@ from contextlib import contextmanager
 
 import warp as wp
 
+__all__ = ["wp"]
+
 NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 
 

@@ -110,9 +110,9 @@ class Finder:
             own = None if own is None else own[above:]
             return points, points_of(found.pose_world_landmarks), own
         if self.guided is None:
-            from mediapipe_guided import GuidedPose
+            from mediapipe_guided import GuidedPose, landmark_graph
 
-            self.guided = GuidedPose(self.complexity, credible)
+            self.guided = GuidedPose(*landmark_graph(self.complexity), credible)
         if (found := self.guided.process(image, wide)) is not None:
             self.following = True
             return found

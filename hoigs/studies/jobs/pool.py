@@ -79,7 +79,7 @@ def run_jobs(
                 if job.state() is JobState.done:
                     notify(job, "done")
                 else:
-                    failed[job.run] = _why(job.log, process.returncode)
+                    failed[job.run] = why_failed(job.log, process.returncode)
                     notify(job, f"failed: {failed[job.run]}")
                 if follow:
                     sort(follow(job, failed.get(job.run)))
@@ -110,7 +110,7 @@ def _start(job: Job, threads: int, workers: int) -> subprocess.Popen[bytes]:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
 
 
-def _why(log: Path, code: int) -> str:
+def why_failed(log: Path, code: int) -> str:
     """The error at the end of a job's log: what follows "error: ", else the last line."""
     if code < 0:
         return f"ended by signal {-code}"

@@ -1,0 +1,229 @@
+"""The driver of a batch: runs the stages of rows that no other driver works on.
+
+Any number of drivers may work on one folder, on one machine or on many: the lock of a row's folder
+(`hoigs.core.folder_lock`) admits one of them, and what is done is what lies on disk.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hoigs.core.errors import HoigsError
+from hoigs.core.folder_lock import FolderLock
+from hoigs.studies.batch.manifest import Row
+from hoigs.studies.batch.stages import Stage, folder_of, stages_of
+from hoigs.studies.batch.states import State
+from hoigs.studies.jobs.executor import Executor, Needs, Process
+from hoigs.studies.jobs.pool import why_failed
+
+POLL_S = 0.01
+TAKEN_POLL_S = 2.0  # how often a row that another driver has is looked at again
+RETRY_S = 1.0
+
+Report = Callable[["Work", str], None]
+
+
+class TakenError(HoigsError):
+    """Another driver works on this row."""
+
+
+@dataclass
+class Work:
+    """A row in this driver's hands.
+
+    Attributes:
+        stage: that runs, or ran last. since: when it was started, on the monotonic clock.
+        taken_at: when this driver took the row.
+        retries: of its stages, by this driver. device: where the stage runs.
+    """
+
+    row: Row
+    folder: Path
+    stages: list[Stage]
+    state: State = field(default_factory=State)
+    stage: str = ""
+    since: float = 0.0
+    taken_at: float = 0.0
+    retries: int = 0
+    device: str = ""
+    lock: FolderLock | None = None
+    process: Process | None = None
+    not_before: float = 0.0
+
+    @property
+    def todo(self) -> Sequence[Stage]:
+        return self.state.todo(self.stages)
+
+    @property
+    def log(self) -> Path:
+        return self.folder / f"{self.stage}.log"
+
+
+def drive(
+    rows: Sequence[Row],
+    out: Path,
+    executor: Executor,
+    *,
+    retries: int = 1,
+    report: Report = lambda work, word: None,
+    tick: Callable[[Sequence[Work]], None] = lambda running: None,
+) -> dict[str, str]:
+    """Run all that is not done; returns the error of each row that failed, by name.
+
+    Rows that another driver has are waited for, and taken over if it dies. A row that failed before
+    is tried again, unless that was after this call began. An interrupt ends the processes; the next
+    call continues.
+
+    Args:
+        retries: further attempts at a stage that failed.
+        report: called with a row and "done before", "taken", "STAGE", "STAGE done", "retry: why",
+            "done" or "failed: why".
+        tick: called at every look at the running rows.
+    """
+    began = time.time()
+    waiting = deque(Work(row, folder_of(out, row), stages_of(row, out)) for row in rows)
+    running: list[Work] = []
+    failed: dict[str, str] = {}
+    driver = _Driver(executor, retries, report, began, failed)
+    try:
+        while waiting or running:
+            for _ in range(len(waiting)):
+                if len(running) >= executor.slots:
+                    break
+                work = waiting.popleft()
+                if time.monotonic() < work.not_before or (taken := driver.take(work)) is None:
+                    waiting.append(work)
+                elif taken:
+                    running.append(work)
+            running = [work for work in running if driver.go_on(work)]
+            tick(running)
+            time.sleep(POLL_S)
+    finally:
+        for work in running:
+            if work.process is not None:
+                work.process.stop()
+            if work.lock is not None:
+                work.lock.release()
+    return failed
+
+
+@dataclass
+class _Driver:
+    executor: Executor
+    retries: int
+    report: Report
+    began: float
+    failed: dict[str, str]
+
+    def take(self, work: Work) -> bool | None:
+        """Whether this driver works on the row now; None if another one does."""
+        if self._settled(work):
+            return False
+        lock = FolderLock(work.folder, "hoigs batch", error=TakenError)
+        try:
+            lock.acquire()
+        except TakenError:
+            if not work.not_before:
+                self.report(work, "taken by another driver")
+            work.not_before = time.monotonic() + TAKEN_POLL_S
+            return None
+        if self._settled(work):  # by another driver, before its lock was ours
+            lock.release()
+            return False
+        work.lock = lock
+        work.not_before, work.taken_at = 0.0, time.monotonic()
+        work.folder.mkdir(exist_ok=True)
+        return True
+
+    def _settled(self, work: Work) -> bool:
+        """Whether nothing is to be done for a row."""
+        try:
+            work.state = State.read(work.folder)
+        except HoigsError as error:
+            return self._failed(work, str(error))
+        if not work.todo:
+            self.report(work, "done before")
+            return True
+        if work.state.failed.get("when", 0.0) > self.began:
+            return self._failed(work, work.state.failed["why"])
+        return False
+
+    def _failed(self, work: Work, why: str) -> bool:
+        self.failed[work.row.name] = why
+        self.report(work, f"failed: {why}")
+        return True
+
+    def go_on(self, work: Work) -> bool:
+        """Look at a row; whether it is still worked on."""
+        try:
+            return self._go_on(work)
+        except (HoigsError, OSError) as error:  # costs this row only
+            if work.process is not None:
+                work.process.stop()
+            self._failed(work, str(error))
+            return self._leave(work)
+
+    def _go_on(self, work: Work) -> bool:
+        if work.process is None:
+            self._start(work)
+            return True
+        code = work.process.poll()
+        if code is None:
+            return True
+        assert work.lock is not None
+        work.lock.require_held()  # or another driver's record would be overwritten
+        stage, work.process = work.todo[0], None
+        if code == 0 and stage.result.exists():
+            seconds = time.monotonic() - work.since
+            work.state.end(stage, seconds, work.device, socket.gethostname())
+            work.state.write(work.folder)
+            self.report(work, f"{stage.name} done")
+            if work.todo:
+                self._start(work)
+                return True
+            self.report(work, "done")
+            return self._leave(work)
+        why = why_failed(work.log, code) if code else f"made no {stage.result.name}"
+        if work.retries < self.retries:
+            work.retries += 1
+            work.not_before = time.monotonic() + RETRY_S
+            self.report(work, f"retry: {why}")
+            return True
+        work.state.fail(stage, why)
+        work.state.write(work.folder)
+        self._failed(work, why)
+        return self._leave(work)
+
+    def _start(self, work: Work) -> None:
+        """Start the next stage of a row, unless all is busy or a retry waits."""
+        if time.monotonic() < work.not_before:
+            return
+        assert work.lock is not None
+        work.lock.require_held()
+        todo = work.todo
+        stage = todo[0]
+        command = work.state.command(stage)
+        needs = Needs(gpu=work.row.device != "cpu", memory_gb=work.row.memory_gb)
+        work.stage = stage.name
+        if stage.clear and stage.result.exists():
+            shutil.rmtree(stage.result)
+        work.process = self.executor.start(command, work.log, needs)
+        if work.process is not None:
+            work.since, work.device = time.monotonic(), work.process.device
+            work.state.begin(todo)
+            work.state.write(work.folder)
+            self.report(work, stage.name)
+
+    def _leave(self, work: Work) -> bool:
+        if work.lock is not None:
+            with contextlib.suppress(OSError):
+                work.lock.release()
+        work.process = None
+        return False

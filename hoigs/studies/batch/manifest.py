@@ -1,0 +1,182 @@
+"""Manifest of a batch: rows of YAML or CSV, checked, with file, line and key in every message."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.spec.loader import load_yaml
+
+NAMES = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}$"  # of rows, as they name folders
+LISTS = ("set", "prepare", "object", "export")  # in CSV, texts with ";" between
+
+
+class ManifestError(HoigsError):
+    """A manifest that cannot be used; the message starts with file, line and key."""
+
+
+class Row(BaseModel):
+    """One video or clip of a batch. Relative paths are from the manifest's folder."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(
+        default="", pattern=NAMES, description="folder of the row; default: the file's name"
+    )
+    video: str = Field(default="", description="a video or a folder, for `hoigs prepare`")
+    clip: str = Field(default="", description="a clip folder or builtin:NAME, in place of a video")
+    spec: str = Field(default="hoigs", description="spec to train")
+    auto: bool = Field(default=False, description="reduce the spec to what the clip needs")
+    set: tuple[str, ...] = Field(default=(), description="keys of the spec: train.steps=500")
+    prepare: tuple[str, ...] = Field(
+        default=(), description="options of the preparation: width=640"
+    )
+    object: tuple[str, ...] = Field(
+        default=(), description="the object, as `hoigs prepare --object`"
+    )
+    export: tuple[str, ...] = Field(default=("ply",), description="formats to export")
+    device: str = Field(default="auto", description="cpu, cuda or auto")
+    memory_gb: float = Field(default=0.0, ge=0, description="memory to set aside while it runs, GB")
+
+    @field_validator(*LISTS, mode="before")
+    @classmethod
+    def _one_is_a_list(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            return tuple(part.strip() for part in value.split(";") if part.strip())
+        if isinstance(value, Mapping):
+            return tuple(
+                f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in value.items()
+            )
+        return value
+
+
+def read_manifest(path: Path, defaults: Mapping[str, Any] | None = None) -> list[Row]:
+    """The rows of a YAML file (`rows:`, and `defaults:` for all of them) or of a CSV file.
+
+    Args:
+        defaults: keys for rows that have none. Lists are not joined: a row's own replaces them.
+
+    Raises:
+        ManifestError: the file cannot be read, or a row cannot be used.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ManifestError(f"{path}: cannot be read ({error}); name a YAML or CSV file") from error
+    read = {".csv": _csv, ".yaml": _yaml, ".yml": _yaml}.get(path.suffix.lower())
+    if read is None:
+        raise ManifestError(f"{path}: expected a file that ends with .yaml, .yml or .csv")
+    rows: list[Row] = []
+    where: dict[str, str] = {}
+    for values, at in read(text, path):
+        row = _row({**(defaults or {}), **values}, at, path.parent)
+        place = at.get("", str(path))
+        if row.name.lower() in where:  # some disks do not tell upper from lower case
+            raise ManifestError(
+                f'{at.get("name", place)}: name: "{row.name}" is also the row at '
+                f"{where[row.name.lower()]}; give this one another name"
+            )
+        where[row.name.lower()] = place
+        rows.append(row)
+    if not rows:
+        raise ManifestError(f"{path}: has no rows; each needs a video or a clip")
+    return rows
+
+
+Read = Sequence[tuple[dict[str, Any], dict[str, str]]]  # values, and where each key is; "": the row
+
+
+def _yaml(text: str, path: Path) -> Read:
+    document = load_yaml(text, str(path))
+    _known(
+        document.data,
+        ("rows", "defaults"),
+        {k: document.where((k,), key=True) for k in document.data},
+    )
+    shared, rows = document.data.get("defaults") or {}, document.data.get("rows")
+    if not isinstance(shared, dict):
+        raise ManifestError(
+            f"{document.where(('defaults',))}: defaults: expected `key: value` lines"
+        )
+    if not isinstance(rows, list):
+        raise ManifestError(
+            f"{document.where(('rows',))}: rows: expected a list, `- video: a.mp4` …"
+        )
+    found = []
+    for i, row in enumerate(rows):
+        at = {"": document.where(("rows", i))}
+        if not isinstance(row, dict):
+            raise ManifestError(f"{at['']}: expected `key: value` lines, such as `video: a.mp4`")
+        at |= {k: document.where(("defaults", k), key=True) for k in shared}
+        at |= {k: document.where(("rows", i, k), key=True) for k in row}
+        found.append((shared | row, at))
+    return found
+
+
+def _csv(text: str, path: Path) -> Read:
+    reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
+    found = []
+    for values in reader:
+        at = f"{path}:{reader.line_num}"
+        if None in values:
+            raise ManifestError(f"{at}: has more cells than the first line has columns")
+        given = {k: v.strip() for k, v in values.items() if v is not None and v.strip()}
+        found.append((given, dict.fromkeys(("", *given), at)))
+    return found
+
+
+def _known(data: Mapping[str, Any], names: Sequence[str], at: Mapping[str, str]) -> None:
+    for key in data:
+        if key not in names:
+            hint = did_you_mean(str(key), names)
+            raise ManifestError(
+                f"{at.get(key, '')}: {key}: there is no such key{hint}; "
+                f"there are {', '.join(names)}"
+            )
+
+
+def _row(values: Mapping[str, Any], at: Mapping[str, str], folder: Path) -> Row:
+    _known(values, tuple(Row.model_fields), at)
+    place = at.get("", "")
+    if bool(values.get("video")) == bool(values.get("clip")):
+        raise ManifestError(f"{place}: a row has either a video or a clip")
+    key = "video" if values.get("video") else "clip"
+    source = str(values[key])
+    if not source.startswith("builtin:"):
+        path = (folder / source).absolute()
+        if not path.exists():
+            near = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+            raise ManifestError(
+                f"{at.get(key, place)}: {key}: {path} does not exist{did_you_mean(path.name, near)}"
+            )
+        source = str(path)
+    spec = str(values.get("spec", "hoigs"))
+    if (folder / spec.partition("@")[0]).is_file():
+        spec = str((folder / spec).absolute())
+    name = values.get("name") or _name_of(source)
+    try:
+        return Row.model_validate({**values, key: source, "spec": spec, "name": name})
+    except ValidationError as error:
+        first = error.errors()[0]
+        wrong = str(first["loc"][0])
+        raise ManifestError(
+            f"{at.get(wrong, place)}: {wrong}: {first['msg']}, got {first['input']!r}"
+        ) from error
+
+
+def _name_of(source: str) -> str:
+    name = (
+        Path(source).stem
+        if not source.startswith("builtin:")
+        else source.split(":")[1].partition("?")[0]
+    )
+    return "".join(c if c.isascii() and (c.isalnum() or c in "_-.") else "-" for c in name).lstrip(
+        ".-"
+    )[:80]

@@ -1,0 +1,136 @@
+"""summary.html, summary.csv and summary.json of a batch."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import html
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hoigs.core.whole_files import write_whole
+from hoigs.studies.batch.manifest import Row
+from hoigs.studies.batch.stages import folder_of, stages_of
+from hoigs.studies.batch.states import State
+
+METRICS = ("psnr", "ssim", "lpips")
+VIEW, REGION = "test frames", "full"
+THUMBNAIL = 160  # pixels high
+STYLE = (
+    "body{font:15px system-ui,sans-serif;margin:2rem;color:#222}table{border-collapse:collapse}"
+    "td,th{padding:.4rem .8rem;border-bottom:1px solid #ddd;text-align:left;vertical-align:middle}"
+    "td.n,th.n{text-align:right;font-variant-numeric:tabular-nums}img{height:80px;border-radius:4px}"
+    ".failed{color:#b00020}.why{max-width:32rem;font-size:13px}"
+)
+
+
+def write_summary(rows: Sequence[Row], out: Path) -> list[Path]:
+    """Write the three files; rows that are not done are in them with the reason."""
+    found = [summary_of(row, out) for row in rows]
+    text = io.StringIO()
+    columns = ["name", "state", *METRICS, "seconds", "source", "spec", "why"]
+    table = csv.DictWriter(text, columns, extrasaction="ignore")
+    table.writeheader()
+    table.writerows([{**row, **row["scores"]} for row in found])
+    files = {
+        "summary.json": json.dumps(found, indent=1, allow_nan=False),
+        "summary.csv": text.getvalue(),
+        "summary.html": _page(found, rows, out),
+    }
+    for name, content in files.items():
+        write_whole(out / name, content)
+    return [out / name for name in files]
+
+
+def summary_of(row: Row, out: Path) -> dict[str, Any]:
+    """State, scores (numbers, or "not computed: why") and times of a row."""
+    folder = folder_of(out, row)
+    state = State.read(folder)
+    todo = state.todo(stages_of(row, out))
+    times = {name: done["seconds"] for name, done in state.done.items()}
+    why = state.failed.get("why", "")
+    return {
+        "name": row.name,
+        "state": "failed" if why else "done" if not todo else f"before {todo[0].name}",
+        "why": why,
+        "log": f"rows/{row.name}/{state.failed['stage']}.log" if why else "",
+        "source": row.video or row.clip,
+        "spec": row.spec,
+        "scores": _scores(folder / "run" / "evaluation.json"),
+        "seconds": round(sum(times.values()), 1),
+        "seconds_of_stages": times,
+        "attempts": state.attempts,
+    }
+
+
+def _scores(path: Path) -> dict[str, float | str]:
+    if not path.is_file():
+        return dict.fromkeys(METRICS, "not computed: the row is not evaluated")
+    scores = json.loads(path.read_text()).get("scores", [])
+    found = {s["metric"]: s["value"] for s in scores if (s["view"], s["region"]) == (VIEW, REGION)}
+    return {m: _value(found.get(m)) for m in METRICS}
+
+
+def _value(value: Any) -> float | str:
+    if isinstance(value, int | float):
+        return float(value)
+    reason = value.get("not_computed", value) if isinstance(value, dict) else value
+    return f"not computed: {reason or 'the evaluation has no such score'}"
+
+
+def _page(found: Sequence[dict[str, Any]], rows: Sequence[Row], out: Path) -> str:
+    body = []
+    for row, item in zip(rows, found, strict=True):
+        report = folder_of(out, row) / "run" / "report.html"
+        name = html.escape(row.name)
+        link = f'<a href="rows/{name}/run/report.html">{name}</a>' if report.is_file() else name
+        log = f' <a href="{html.escape(item["log"])}">log</a>' if item["log"] else ""
+        body.append(
+            f"<tr><td>{_thumbnail(row, out)}</td><td>{link}</td>"
+            f'<td class="{item["state"]}">{html.escape(item["state"])}{log}</td>'
+            + "".join(_score_cell(item["scores"][m]) for m in METRICS)
+            + f'<td class="n">{item["seconds"]:.1f}</td>'
+            f'<td class="why">{html.escape(item["why"])}</td></tr>'
+        )
+    done = sum(item["state"] == "done" for item in found)
+    heads = "".join(f'<th class="n">{m.upper()}</th>' for m in METRICS)
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Batch</title>'
+        f"<style>{STYLE}</style><h1>{done} of {len(found)} rows done</h1>"
+        f"<p>Scores of the {VIEW}, whole images.</p><table><tr><th></th><th>row</th><th>state</th>"
+        f'{heads}<th class="n">seconds</th><th></th></tr>{"".join(body)}</table></html>\n'
+    )
+
+
+def _score_cell(value: float | str) -> str:
+    if isinstance(value, str):
+        return f'<td class="n" title="{html.escape(value)}">–</td>'
+    return f'<td class="n">{value:.3f}</td>'
+
+
+def _thumbnail(row: Row, out: Path) -> str:
+    """The middle frame of the row's clip as an image in the page; empty before it is prepared."""
+    clip = folder_of(out, row) / "clip" if row.video else _clip_folder(row.clip)
+    images = sorted((clip / "images").glob("*")) if clip else []
+    if not images:
+        return ""
+    from PIL import Image
+
+    try:
+        with Image.open(images[len(images) // 2]) as image:
+            small = image.convert("RGB")
+    except OSError:
+        return ""
+    small.thumbnail((4 * THUMBNAIL, THUMBNAIL))
+    stream = io.BytesIO()
+    small.save(stream, "JPEG", quality=85)
+    data = base64.b64encode(stream.getvalue()).decode()
+    return f'<img alt="a frame of {html.escape(row.name)}" src="data:image/jpeg;base64,{data}">'
+
+
+def _clip_folder(clip: str) -> Path | None:
+    """Of a CLIP argument; None for a built-in clip, whose folder is in a cache."""
+    return None if clip.startswith("builtin:") else Path(clip)
