@@ -30,7 +30,7 @@ def packages(tmp_path_factory) -> Path:
     """One package of each kind, written by the command."""
     folder = tmp_path_factory.mktemp("packages")
     for kind in NewKind:
-        hoigs = [sys.executable, "-m", "hoigs.cli.main", "plugins", "new"]
+        hoigs = [sys.executable, "-m", "hoigs", "plugins", "new"]
         run(*hoigs, f"acme-{kind}-one", "--kind", kind, "--out", folder)
     return folder
 
@@ -46,7 +46,7 @@ def site(packages) -> Path:
 
 
 def test_they_are_listed(site):
-    listing = run(sys.executable, "-m", "hoigs.cli.main", "plugins", site=site)
+    listing = run(sys.executable, "-m", "hoigs", "plugins", site=site)
     found = {tuple(line.split()[:3]) for line in listing.splitlines() if "acme-" in line}
     assert found == {(f"{k}:acme-{k}-one", "ok", f"acme-{k}-one") for k in NewKind}
 

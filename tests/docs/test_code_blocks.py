@@ -97,7 +97,7 @@ def run_command(line: str, where: str) -> None:
         return
     if words[0] == "PIP":
         words = shlex.split(PIP + words[1])
-    head = {"hoigs": ["-m", "hoigs.cli.main"], "pytest": ["-m", "pytest"], "pip": ["-m", "pip"]}
+    head = {"hoigs": ["-m", "hoigs"], "pytest": ["-m", "pytest"], "pip": ["-m", "pip"]}
     done = subprocess.run(
         [sys.executable, *head[words[0]], *words[1:]],
         capture_output=True,

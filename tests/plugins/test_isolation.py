@@ -104,7 +104,7 @@ def rows(site) -> list[dict]:
 def hoigs(site: Path | None, *args: str) -> subprocess.CompletedProcess[str]:
     clean = {k: v for k, v in os.environ.items() if not k.startswith("HOIGS_")}
     return subprocess.run(
-        [sys.executable, "-m", "hoigs.cli.main", *args],
+        [sys.executable, "-m", "hoigs", *args],
         capture_output=True,
         text=True,
         check=True,

@@ -80,7 +80,7 @@ def hoigs(*args: str, sites: tuple[Path, ...] = (), code: int = 0, **environ: st
     clean = {k: v for k, v in os.environ.items() if not k.startswith("HOIGS_")}
     paths = list(map(str, sites))
     done = subprocess.run(
-        [sys.executable, "-m", "hoigs.cli.main", *args],
+        [sys.executable, "-m", "hoigs", *args],
         capture_output=True,
         text=True,
         check=False,

@@ -194,7 +194,7 @@ def test_other_hosts_are_warned_of(tiny_run: Path) -> None:
 
 
 def test_ctrl_c_ends_it_without_a_traceback(tiny_run: Path) -> None:
-    command = [sys.executable, "-m", "hoigs.cli.main", "view", tiny_run.parent / "clip", "--port=0"]
+    command = [sys.executable, "-m", "hoigs", "view", tiny_run.parent / "clip", "--port=0"]
     process = subprocess.Popen(
         [*map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("own_caches")
 
 def _start(out: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "hoigs.cli.main", *WORDS, "--out", str(out)],
+        [sys.executable, "-m", "hoigs", *WORDS, "--out", str(out)],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
 
@@ -93,7 +93,7 @@ def test_a_killed_chart_goes_on_and_a_cell_is_reproduced(tmp_path: Path) -> None
 
     run = cells[0]["run"].removeprefix("runs/")
     again = subprocess.run(
-        [sys.executable, "-m", "hoigs.cli.main", "chart", "--out", str(out), "--rerun", run,
+        [sys.executable, "-m", "hoigs", "chart", "--out", str(out), "--rerun", run,
          "--threads", "1"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
