@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from hoigs.core.diagnostics import ranges
 from hoigs.preparation.cameras.camera_track import ASSUMED_FOCAL
 from hoigs.preparation.cameras.colmap_log import quiet_colmap
 from hoigs.preparation.cameras.motion import grown
@@ -21,6 +22,7 @@ from hoigs.preparation.video.source import SourceError
 LENS = "SIMPLE_RADIAL"  # one focal length, one distortion: a video determines no more
 FEATURES = 8192  # of an image
 OVERLAP = 10  # frames that each is matched with, and as many at distances 1, 2, 4, 8, …
+FURTHER = (1.15, 1.6, 0.55)  # focal lengths, in longer sides, after ASSUMED_FOCAL
 SMALLEST_SHARE = 0.5  # of the frames: with fewer cameras there is no clip
 
 
@@ -34,12 +36,15 @@ def structure_from_motion(
 ) -> Path:
     """A COLMAP model of the chosen frames, the largest that was found.
 
+    COLMAP verifies pairs of images with the focal length at the start, and a bad guess leaves no
+    pair; so several are tried until half of the frames have a camera.
+
     Features on masked pixels are left out; frames are matched with their neighbours in time; one
     camera with one radial distortion serves all (COLMAP, Schoenberger and Frahm 2016).
 
     Args:
         folder: to work in; images, databases and models are left there. Features and matches
-            that an earlier run of the same frames, masks and focal length left are used again.
+            that an earlier run of the same frames and masks left are used again.
         focal: pixels of the frames' size, if known; it is still refined.
         progress: called with 0..1.
 
@@ -52,33 +57,38 @@ def structure_from_motion(
     import pycolmap
 
     report = progress or (lambda _done: None)
-    images, matches = folder / "images", folder / "matches.db"
+    images, features = folder / "images", folder / "features.db"
     for name in ("images", "masks", "models", "largest"):  # cheap, or half-made
         shutil.rmtree(folder / name, ignore_errors=True)
     _write_images(video, masks, folder, lambda done: report(0.1 * done))
+    longer = max(video.width, video.height)
+    tried = (focal,) if focal else tuple(share * longer for share in (ASSUMED_FOCAL, *FURTHER))
+    best, count = None, 0
     with quiet_colmap():
-        if not matches.is_file():
-            features = folder / "features.db"
-            if not features.is_file():
-                _extract(pycolmap, features, images, _reader(pycolmap, video, folder, focal))
-            report(0.4)
-            _match(pycolmap, features, matches)
-        report(0.7)
-        (folder / "models").mkdir()
-        models = pycolmap.incremental_mapping(
-            _copy(matches),
-            images,
-            folder / "models",
-            options=_mapping(pycolmap),
-        )
-    best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
-    count = best.num_reg_images() if best is not None else 0
+        if not features.is_file():
+            _extract(pycolmap, features, images, _reader(pycolmap, video, folder, tried[0]))
+        for number, length in enumerate(tried):
+            begun = 0.4 + 0.6 * number / len(tried)
+            report(begun)
+            matches = folder / f"matches-{number}.db"
+            if not matches.is_file():
+                _match(pycolmap, features, matches, length)
+            report(begun + 0.3 / len(tried))
+            found = _mapped(pycolmap, matches, images, folder / "models" / str(number))
+            if found is not None and found.num_reg_images() > count:
+                best, count = found, found.num_reg_images()
+            if count >= SMALLEST_SHARE * len(video):
+                break
     if best is None or count < SMALLEST_SHARE * len(video):
+        lengths = ", ".join(f"{length:.0f}" for length in tried)
+        some = "" if best is None else f" ({_registered(best)})"
         raise SourceError(
-            f"structure from motion gave cameras to {count} of {len(video)} frames. If the camera "
-            "stands still or only turns, use --camera static; else the background may lack "
-            "texture, be blurred or be hidden by the masks: look at the masks, take sharper or "
-            "more frames, or put a COLMAP model of your own beside the video, as sparse/"
+            f"structure from motion gave cameras to {count} of {len(video)} frames{some}, with "
+            f"focal lengths of {lengths} px to start from. If the camera stands still or only "
+            "turns, use --camera static; if you know the focal length, give --focal; else the "
+            "background may lack texture, be blurred or be hidden by the masks: look at the masks, "
+            "take sharper or more frames, or put a COLMAP model of your own beside the video, as "
+            "sparse/"
         )
     kept = folder / "largest"
     kept.mkdir()
@@ -115,9 +125,14 @@ def _extract(pycolmap: Any, features: Path, images: Path, reader: Any) -> None:
     half.replace(features)
 
 
-def _match(pycolmap: Any, features: Path, matches: Path) -> None:
-    """A database with features and matches, likewise."""
+def _match(pycolmap: Any, features: Path, matches: Path, focal: float) -> None:
+    """A database with features, and matches that hold for a focal length, likewise."""
     half = _copy(features, matches)
+    database = pycolmap.Database.open(half)
+    for camera in database.read_all_cameras():
+        camera.focal_length = focal
+        database.update_camera(camera)
+    database.close()
     pycolmap.match_sequential(
         half,
         matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=_threads()),
@@ -125,6 +140,20 @@ def _match(pycolmap: Any, features: Path, matches: Path) -> None:
         device=pycolmap.Device.cpu,
     )
     half.replace(matches)
+
+
+def _mapped(pycolmap: Any, matches: Path, images: Path, folder: Path) -> Any:
+    """The reconstruction with the most cameras, or None."""
+    folder.mkdir(parents=True)
+    models = pycolmap.incremental_mapping(
+        _copy(matches), images, folder, options=_mapping(pycolmap)
+    )
+    return max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+
+
+def _registered(model: Any) -> str:
+    """The frames that have a camera."""
+    return "frames " + ranges(sorted(int(Path(i.name).stem) for i in model.images.values()))
 
 
 def _copy(database: Path | None, name: Path | None = None) -> Path:
