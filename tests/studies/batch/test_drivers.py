@@ -65,7 +65,9 @@ class Batches:
                                 env=environment)  # fmt: skip
 
     def noted(self) -> list[list[str]]:
-        return [x.split() for x in self.notes.read_text().splitlines()] if self.notes.exists() else []
+        return (
+            [x.split() for x in self.notes.read_text().splitlines()] if self.notes.exists() else []
+        )
 
     def wait_for(self, event: str, stage: str) -> int:
         """The process of the first such event."""
@@ -81,7 +83,9 @@ class Batches:
         return Counter((stage, row) for what, stage, row, _ in self.noted() if what == "end")
 
     def states(self) -> dict[str, str]:
-        return {row["name"]: row["state"] for row in json.loads((self.out / "summary.json").read_text())}
+        return {
+            row["name"]: row["state"] for row in json.loads((self.out / "summary.json").read_text())
+        }
 
 
 def all_gone(pids: list[int]) -> bool:
