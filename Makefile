@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test lint docs charts stress changelog format clean
+.PHONY: demo test lint docs charts stress changelog format wheel sbom clean
 
 demo: $(INSTALLED)
 	$(BIN)/hoigs demo --out runs/demo --overwrite
@@ -19,6 +19,7 @@ lint: $(INSTALLED)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python scripts/check_types_for_users.py
+	$(BIN)/python scripts/licences.py > /dev/null
 
 # the site, into build/site; strict: a dead link or a page without a link to it is an error
 docs: $(INSTALLED)
@@ -58,6 +59,21 @@ changelog: $(INSTALLED)
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# the wheel, built twice: both have the same bytes
+wheel: $(INSTALLED)
+	rm -rf build/again
+	$(BIN)/python -m hatchling build -t wheel -d dist
+	$(BIN)/python -m hatchling build -t wheel -d build/again
+	for wheel in build/again/*.whl; do cmp $$wheel dist/$$(basename $$wheel); done
+
+# what the pins hold, as CycloneDX
+sbom:
+	$(PYTHON) -m venv build/sbom
+	build/sbom/bin/pip install --quiet --disable-pip-version-check 'cyclonedx-bom>=7,<8'
+	mkdir -p dist
+	build/sbom/bin/cyclonedx-py requirements constraints.txt --pyproject pyproject.toml \
+		--output-reproducible --of JSON -o dist/hoigs-sbom.json
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -12,6 +12,7 @@ case is wrong.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import copy
 import io
 import json
@@ -185,7 +186,8 @@ def _json(data: bytes, rng: random.Random) -> bytes:
         if action == 0:
             del holder[key]
         elif action == 1 and isinstance(holder, dict):
-            holder[rng.choice(ODD_TEXTS)] = copy.deepcopy(holder[key])
+            with contextlib.suppress(RecursionError):  # an earlier damage may be this deep
+                holder[rng.choice(ODD_TEXTS)] = copy.deepcopy(holder[key])
         else:
             holder[key] = _odd(rng)
     lines[number] = json.dumps(tree if rng.random() > 0.03 else _odd(rng))

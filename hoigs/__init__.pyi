@@ -51,6 +51,8 @@ from hoigs.rasterizers.warp import WarpRasterizer as WarpRasterizer
 from hoigs.runs.clip_source import read_clip as read_clip
 from hoigs.runs.loaded_run import LoadedRun as LoadedRun
 from hoigs.runs.loaded_run import open_run as open_run
+from hoigs.studies.batch.batch import batch as batch
+from hoigs.studies.batch.batch import work as work
 from hoigs.studies.needs.auto import auto as auto
 from hoigs.studies.needs.needs import needs as needs
 from hoigs.studies.needs.pruning.compact_run import compress as compress

@@ -19,7 +19,8 @@ from hoigs.cli.common import (
     print_table,
 )
 from hoigs.cli.evaluate import LpipsOption
-from hoigs.core.cpus import available_cpus
+from hoigs.core.machine.cpus import available_cpus
+from hoigs.core.names import printable
 from hoigs.runs.choices import pick_device
 
 
@@ -107,7 +108,7 @@ def chart(
         )
 
         def report(job: Job, word: str) -> None:
-            typer.echo(f"{job.clip_label}/{job.folder.name}: {word}")
+            typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
 
         limit = None if minutes is None else 60 * minutes
         cells = run_chart(study, workers=jobs, threads=each, limit_s=limit, report=report)

@@ -60,22 +60,32 @@ PluginOption = Annotated[
 def print_table(
     title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], notes: Sequence[str] = ()
 ) -> None:
-    """Print a table on stdout."""
+    """Print a table on stdout; without rows its title and notes alone.
+
+    No cell is cut: in a terminal that is too narrow words break, elsewhere lines are as long as
+    they need to be.
+    """
     from rich.console import Console
     from rich.markup import escape
+    from rich.measure import Measurement
     from rich.table import Table
 
-    console = Console(width=None if Console().is_terminal else 160)
-    table = Table(title=title, title_justify="left")
+    console = Console()
+    table = Table(title=escape(printable(title)), title_justify="left")
     for i, column in enumerate(columns):
-        table.add_column(column, justify="left" if i == 0 else "right")
+        table.add_column(
+            escape(printable(column)), justify="left" if i == 0 else "right", overflow="fold"
+        )
     for row in rows:
         table.add_row(
             *(escape(printable(str(cell))) for cell in row)
         )  # "hoigs[gsplat]" is no markup
-    console.print(table)
+    if not console.is_terminal:
+        wide = console.options.update(max_width=10_000)
+        console.width = max(160, Measurement.get(console, wide, table).maximum)
+    console.print(table if rows else f"[bold]{table.title}[/bold]", highlight=False)
     for note in notes:
-        console.print(f"[dim]{note}[/dim]", highlight=False)
+        console.print(f"[dim]{escape(printable(note))}[/dim]", highlight=False)
 
 
 class Bar:
@@ -101,10 +111,11 @@ def progress_bar(title: str, total: float) -> Iterator[Bar]:
     )
 
     console = Console(stderr=True)
+    count = "{task.completed:.0f}/{task.total:.0f}" if total > 1 else "{task.percentage:.0f} %"
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TextColumn(count),
         TimeElapsedColumn(),
         TextColumn("ETA"),
         TimeRemainingColumn(),

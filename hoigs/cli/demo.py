@@ -17,14 +17,23 @@ if TYPE_CHECKING:
 
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Run folder.")] = Path("runs/demo"),
-    steps: Annotated[int, typer.Option("--steps", help="Training steps of each model.")] = 800,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="A first look in about a minute: smaller, less sharp.")
+    ] = False,
+    steps: Annotated[
+        int | None,
+        typer.Option("--steps", help="Training steps of each model; 800, with --fast 300."),
+    ] = None,
     settings: SetOption = None,
     rasterizer: RasterizerOption = None,
     device: DeviceOption = "auto",
     baseline: Annotated[
-        bool,
-        typer.Option("--baseline/--no-baseline", help="Also train a static model for comparison."),
-    ] = True,
+        bool | None,
+        typer.Option(
+            "--baseline/--no-baseline",
+            help="Also train a static model for comparison; by default not with --fast.",
+        ),
+    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Generate a clip with known truth, reconstruct it, and write report.html."""
@@ -34,6 +43,7 @@ def demo(
     with Display() as show:
         runs = run_demo(
             out=out,
+            fast=fast,
             steps=steps,
             overrides=settings or (),
             rasterizer=rasterizer,

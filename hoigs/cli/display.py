@@ -57,7 +57,7 @@ class Display:
             f"{camera.width}x{camera.height}"
         )
         for change in session.changes:
-            typer.echo(f"changed on resuming: {change}")
+            typer.echo(printable(f"changed on resuming: {change}"))
         for fault in session.faults:
             typer.echo(printable(f"warning: {fault}"), err=True)
         self._psnr = {}
@@ -89,6 +89,9 @@ class Display:
 
 
 def print_scores(evaluated: EvaluatedRun) -> None:
-    """The tables of an evaluated run."""
+    """The tables of an evaluated run; a note that several have is printed once."""
+    printed: set[str] = set()
     for table in evaluated.evaluation.tables():
-        print_table(table.title, table.columns, table.rows, table.notes)
+        notes = [note for note in table.notes if note not in printed]
+        print_table(table.title, table.columns, table.rows, notes)
+        printed.update(notes)

@@ -26,7 +26,7 @@ from hoigs.cli import (
     view,
 )
 from hoigs.cli.failures import GuardedGroup, failures_as_messages
-from hoigs.core.cpus import share_processors
+from hoigs.core.machine.cpus import share_processors
 
 app = typer.Typer(
     name="hoigs",

@@ -10,6 +10,7 @@ from hoigs.cli.common import PluginOption
 from hoigs.cli.plugins_check import check
 from hoigs.cli.plugins_new import new
 from hoigs.cli.plugins_show import one_line, show
+from hoigs.core.names import printable
 
 app = typer.Typer(invoke_without_command=True)
 app.command("check")(check)
@@ -48,7 +49,7 @@ def plugins(
         text = one_line(row["error"] or row["summary"])
         typer.echo(LINE.format(**{**row, "origin": origin, "text": text}).rstrip())
     for note in notes:
-        typer.echo(f"note: {note}", err=True)
+        typer.echo(printable(f"note: {note}"), err=True)
 
 
 def list_plugins(*, load: bool = False, files: Any = ()) -> tuple[list[dict[str, Any]], list[str]]:

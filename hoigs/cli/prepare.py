@@ -10,6 +10,7 @@ import typer
 
 from hoigs.cli.common import print_table
 from hoigs.cli.display import Display
+from hoigs.core.names import printable
 
 if TYPE_CHECKING:
     from hoigs.preparation.estimator_plan import EstimatorPlan
@@ -128,7 +129,7 @@ def prepare(
         )  # fmt: skip
     print_table(f"prepared {out}", ("what", "value", "note"), report.rows())
     for warning in report.warnings:
-        typer.echo(f"- {warning}")
+        typer.echo(printable(f"- {warning}"))
     typer.echo(f"clip: {out}")
     typer.echo(f"report: {out / 'report.html'}")
 

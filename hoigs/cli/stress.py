@@ -17,7 +17,8 @@ from hoigs.cli.common import (
     SetOption,
     ThreadsOption,
 )
-from hoigs.core.cpus import available_cpus
+from hoigs.core.machine.cpus import available_cpus
+from hoigs.core.names import printable
 from hoigs.runs.choices import pick_device
 
 
@@ -81,7 +82,7 @@ def stress(
     each = threads or max(1, available_cpus() // jobs)
 
     def report(job: Job, word: str) -> None:
-        typer.echo(f"{job.clip_label}/{job.folder.name}: {word}")
+        typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
 
     before = signal.signal(signal.SIGTERM, _stop)  # so that SIGTERM ends the runs too
     try:

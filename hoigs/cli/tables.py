@@ -18,7 +18,8 @@ from hoigs.cli.common import (
     ThreadsOption,
 )
 from hoigs.cli.evaluate import LpipsOption
-from hoigs.core.cpus import available_cpus
+from hoigs.core.machine.cpus import available_cpus
+from hoigs.core.names import printable
 from hoigs.runs.choices import pick_device
 
 
@@ -80,7 +81,7 @@ def tables(
     def report(job: Job, word: str) -> None:
         nonlocal ended
         ended += word not in ("started", "stopped")
-        typer.echo(f"[{ended:>3}] {job.clip_label}/{job.folder.name}: {word}")
+        typer.echo(printable(f"[{ended:>3}] {job.clip_label}/{job.folder.name}: {word}"))
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt  # so that SIGTERM ends the runs too

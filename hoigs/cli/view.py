@@ -36,6 +36,9 @@ def view(
     width: Annotated[
         int, typer.Option("--width", min=64, help="Pixels of a still picture at most.")
     ] = 1280,
+    client: Annotated[
+        bool, typer.Option("--client", help="Send the Gaussians to the browser, which draws them.")
+    ] = False,
     clip: Annotated[Path | None, typer.Option("--clip", help="The clip, if it was moved.")] = None,
     rasterizer: RasterizerOption = None,
     device: DeviceOption = "auto",
@@ -54,11 +57,12 @@ def view(
             max_mb=max_mb,
             entities=entities or (),
             width=width,
+            client=client,
             clip=clip,
             rasterizer=rasterizer,
             device=device,
             plugins=plugin or (),
-            report=typer.echo,
+            report=display.line,
             progress=display.fraction,
         )
     if page is not None:

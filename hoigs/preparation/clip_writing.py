@@ -14,7 +14,7 @@ from hoigs.core.interfaces.body import PELVIS
 from hoigs.core.values.clip import POSES_ESTIMATED
 from hoigs.preparation.cameras.camera_track import parallax
 from hoigs.preparation.cameras.multiview import angular_factor, full_factor
-from hoigs.preparation.objects.tracked import ObjectConfidence
+from hoigs.preparation.objects.make_object import MadeObject
 from hoigs.preparation.pipeline import Pipeline
 from hoigs.preparation.report.object_picture import save_object_picture, shown_frame
 from hoigs.preparation.report.overlay import OverlayVideo
@@ -132,17 +132,19 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         depth_residual=None if depth is None else depth.typical,
         depth_residuals=[] if depth is None else _numbers(depth.residual, 4),
         depth_against="" if depth is None else depth.against,
-        **({} if made.object_made is None else _object_measures(made.object_made.confidence)),
+        **({} if made.object_made is None else _object_measures(made.object_made)),
         omega=angular_factor(made.cameras, pelvis, made.video.fps),
         big_omega=full_factor(made.cameras, moving),
     )
 
 
-def _object_measures(found: ObjectConfidence) -> dict[str, Any]:
+def _object_measures(made: MadeObject) -> dict[str, Any]:
+    found = made.confidence
     return {
         "object_way": found.way,
         "object_reason": found.reason,
         "object_agreement": _numbers(found.agreement, 3),
+        "object_iou": _numbers(made.ious, 3),
         "object_outline_m": _numbers(found.outline, 4),
         "object_held": found.held,
         "object_rests": found.rests,

@@ -9,7 +9,7 @@ from pydantic import Field
 from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
-from hoigs.preparation.body.fit_problem import FitOptions
+from hoigs.preparation.body.fit_values import FitOptions
 from hoigs.preparation.objects.make_object import ObjectWay
 from hoigs.preparation.video.frames import Pick
 

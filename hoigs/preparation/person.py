@@ -15,12 +15,14 @@ from hoigs.core.interfaces.body import PELVIS, BodyModel
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_problem import FitOptions
+from hoigs.preparation.body.fit_values import FitOptions
 from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.body.silhouette import posed
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.masks.mask_stack import MaskStack
 
+SEEN, RARELY = 0.3, 0.2  # visibility; share of frames: a part seen in fewer of them is a guess
+PARTS = {"head": (0, 7, 8), "arms": (13, 14, 15, 16), "legs": (25, 26, 27, 28)}  # landmarks
 POOR_FIT = 0.02  # of the image's longer side: a fit that misses by more deserves a warning
 
 
@@ -98,7 +100,7 @@ def fit_person(
             f"{residual:.1f} px off (median of frames); hands are not fitted"
         ),
         report=fit.report,
-        warnings=_warnings(residual, found, solid, track.cameras),
+        warnings=[*_warnings(residual, found, solid, track.cameras), *_unseen(landmarks)],
     )
 
 
@@ -117,3 +119,15 @@ def _warnings(residual: float, found: int, solid: int, cameras: Sequence[Camera]
             "others follow their neighbours, and masks where there are any"
         )
     return warnings
+
+
+def _unseen(landmarks: LandmarkTrack) -> list[str]:
+    """A sentence for the report if parts of the body are hardly ever seen, else nothing."""
+    seen = landmarks.image[landmarks.found][..., 2] > SEEN
+    parts = [name for name, marks in PARTS.items() if seen[:, marks].any(1).float().mean() < RARELY]
+    if not parts:
+        return []
+    return [
+        f"the person's {' and '.join(parts)} are out of view or hidden: their pose is not known "
+        "and is held relaxed, and the body's height is a guess"
+    ]

@@ -30,6 +30,7 @@ from hoigs.preparation.estimates import (
 from hoigs.preparation.given import GivenMasks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack, load_ball, refine_ball
+from hoigs.preparation.objects.doubts import doubts
 from hoigs.preparation.objects.make_object import MadeObject, make_object
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.person import FittedBody, fit_person
@@ -52,7 +53,7 @@ from hoigs.preparation.video.frames import FrameList, open_frames
 from hoigs.preparation.video.header import uneven_times
 from hoigs.preparation.video.source import Source
 
-FORMAT = 5  # of what the stages keep; another number makes older results unread
+FORMAT = 6  # of what the stages keep; another number makes older results unread
 LARGEST, REDUCED = 1920, 1280  # longer sides, pixels: of frames that are kept, and of smaller ones
 T = TypeVar("T")
 
@@ -349,12 +350,13 @@ class Pipeline:
             count=options.object_points, fps=self.video.fps, progress=self.stages.advance,
         )  # fmt: skip
         self.provenance["object"] = made.track.provenance
+        self.warnings += doubts(self.masks.object, self.estimates.landmarks.image)
         lost = (~made.track.observed).nonzero().flatten().tolist()
         if lost:
             self.warnings.append(f"the object is not seen in {len(lost)} frames: {ranges(lost)}")
         if made.confidence.way == "ball" and self.estimates.ball is None:
             self.warnings.append(
-                f"the object: {made.confidence.reason} (object_track=texture else)"
+                f"the object: {made.confidence.reason}; if it is none, --set object_track=texture"
             )
         if made.confidence.way == "outline":
             self.warnings.append(

@@ -6,6 +6,7 @@ import functools
 import hashlib
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ import torch
 from hoigs.core.clip_folder.write import ClipWriter
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.clip import BodyTrack, ObjectTrack, uniform_test_split
+from hoigs.synthesis.clips import name_of
 from hoigs.synthesis.config import SceneConfig
 from hoigs.synthesis.degradation.damage import damage, with_frames_dropped
 from hoigs.synthesis.degradation.noise import (
@@ -42,6 +44,21 @@ SOURCES_OF_POINTS = 8  # frames from which the initial scene points are back-pro
 Progress = Callable[[int, int], None]
 
 
+class GenerationNotice:
+    """Says on stderr that a clip is generated, which takes minutes; in a terminal also how far."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __call__(self, done: int, frames: int) -> None:
+        text = f"generating the clip {self._name}, once:"
+        if sys.stderr.isatty():
+            end = "\n" if done == frames else ""
+            print(f"\r{text} frame {done} of {frames}", end=end, file=sys.stderr, flush=True)
+        elif done == 0:
+            print(f"{text} {frames} frames", file=sys.stderr, flush=True)
+
+
 def cache_folder() -> Path:
     """$HOIGS_CACHE, or ~/.cache/hoigs."""
     named = os.environ.get("HOIGS_CACHE")
@@ -63,7 +80,8 @@ def builtin_clip(
     Args:
         body: drawn and posed. body_key: its registry key, written into the clip.
         config: SceneConfig() by default.
-        progress: called with (frames done, frames) after each frame, when one is generated.
+        progress: called with (frames done, frames), before the first frame and after each, when a
+            clip is generated; by default a notice on stderr.
 
     Returns:
         folder of a clip that `reader:clip` reads, with `truth.npz` in it (see `save_truth`).
@@ -73,6 +91,8 @@ def builtin_clip(
     folder = cache_folder() / "clips" / f"builtin-{key}"
     if folder.exists():
         return folder
+    progress = progress or GenerationNotice(name_of(config))
+    progress(0, config.frames)
     folder.parent.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=".builtin-", dir=folder.parent))
     try:
@@ -125,7 +145,7 @@ def write_scene(
     gather = _Points(scene, rng)
     with ClipWriter(
         folder,
-        name=f"builtin-{config.object.motion}",
+        name=name_of(config),
         fps=config.fps,
         entities={"human": "human", "object": "object"},
         depth_kind="metric",

@@ -11,10 +11,10 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
-import warp as wp
 from jaxtyping import Bool, Float, Int, UInt8
 
 from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.machine.quiet_warp import wp
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.synthesis.config import SceneConfig

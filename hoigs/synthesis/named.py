@@ -11,30 +11,10 @@ from pydantic import ValidationError
 from hoigs.core.errors import ClipError, did_you_mean
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.synthesis.builtin import Progress, builtin_clip
+from hoigs.synthesis.clips import CLIPS
 from hoigs.synthesis.config import SceneConfig
 
 PREFIX = "builtin:"
-
-# what each clip sets; the rest is a default of SceneConfig
-CLIPS: Mapping[str, Mapping[str, Any]] = {
-    "lift-and-swing": {},
-    "carry": {
-        "frames": 80,
-        "object": {"motion": "carried", "size": (0.36, 0.30, 0.26)},
-        "camera": {
-            "azimuth_degrees": 0.0,
-            "arc_degrees": 30.0,
-            "distance": 3.7,
-            "target": (0.0, 0.88, -0.1),
-        },
-    },
-    "throw-and-catch": {"object": {"motion": "thrown"}},
-    "still-box": {"object": {"motion": "static"}},
-    "glide": {"object": {"motion": "gliding"}},
-    "figure-eight": {"object": {"motion": "figure-eight"}},
-    "bending-bar": {"object": {"motion": "bending", "size": (0.70, 0.12, 0.12)}},
-    "jolted-push": {"object": {"motion": "pushed", "jolt_metres": 0.03}},
-}
 
 
 def is_named(clip: str | Path) -> bool:

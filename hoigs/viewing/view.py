@@ -12,6 +12,7 @@ from hoigs.core.registry.registry import default_registry
 from hoigs.runs.clip_source import read_clip
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.html.page import Page, write_page
+from hoigs.viewing.splats import ClientScene
 from hoigs.viewing.viewer.bodies import bodies_of_clip, bodies_of_run
 from hoigs.viewing.viewer.clip_drawing import ClipDrawing
 from hoigs.viewing.viewer.drawing import Drawing, RunDrawing
@@ -33,6 +34,7 @@ def view(
     max_mb: float | None = None,
     entities: Sequence[str] = (),
     width: int = 1280,
+    client: bool = False,
     clip: Path | str | None = None,
     rasterizer: str | None = None,
     device: str = "auto",
@@ -52,6 +54,7 @@ def view(
         html: write the run to this file instead, to be opened without a server or a network.
         max_mb, entities: of that file (`write_page`).
         width: of a still picture at most, pixels.
+        client: send the Gaussians of `what` to the browser, which draws them itself.
         clip, rasterizer, device, plugins: as for `open_run`.
         report: receives lines: the address, and warnings.
         progress: called with the share done of the file, in [0, 1], and the work.
@@ -76,6 +79,8 @@ def view(
         return write_page(loaded, html, max_mb=max_mb, entities=entities, progress=progress)
     if max_mb is not None or entities:
         raise HoigsError("max_mb and entities are of the file that `html` names")
+    if client and not runs:
+        raise HoigsError(f"--client shows the Gaussians of a run, and {what} is none")
     registry = default_registry(plugin_files=plugins)
     followed = []
     for path in runs:
@@ -100,6 +105,7 @@ def view(
         viewer = Viewer(
             server, drawings, bodies, overlays, widest=width,
             refresh=partial(_newer, followed, drawings, report),
+            splats=ClientScene(server.scene) if client else None,
         )  # fmt: skip
         if not is_loopback(host):
             report(

@@ -6,20 +6,34 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hoigs.core.progress import Progress
-from hoigs.core.registry.registry import default_registry
+from hoigs.runs.clip_source import clip_folder
 from hoigs.runs.run_folder import RunFolder
-from hoigs.synthesis import builtin_clip
 from hoigs.workflows.train import OnStart, OnStep, Report, TrainedRun, silent, train
+
+STEPS = 800
+CLIP = "builtin:lift-and-swing"
+FAST_STEPS = 300
+FAST_CLIP = f"{CLIP}?width=128&frames=32&test_frames=8&held_out_views=4"
+FAST_POINTS = {
+    "hoigs": (
+        "model.scene.points=6000",
+        "model.scene.density.cap=6000",
+        "model.human.points=3500",
+        "model.object.points=1000",
+    ),
+    "static": ("model.scene.points=10500",),
+}
 
 
 def demo(
     *,
     out: Path | str = "runs/demo",
-    steps: int = 800,
+    fast: bool = False,
+    steps: int | None = None,
     overrides: Sequence[str] = (),
     rasterizer: str | None = None,
     device: str = "auto",
-    baseline: bool = True,
+    baseline: bool | None = None,
     overwrite: bool = False,
     on_start: OnStart | None = None,
     on_step: OnStep | None = None,
@@ -29,8 +43,11 @@ def demo(
     """Generate a clip with known truth, reconstruct it, and write report.html.
 
     Args:
-        out: the run folder; that of the static model is OUT-static. steps: of each training.
-        baseline: also train a static model, to compare with.
+        out: the run folder; that of the static model is OUT-static.
+        fast: half the frames, at half the width, and a third of the Gaussians: a first look in
+            about a minute. Its scores are not those of the whole demo.
+        steps: of each training; by default 800, or 300 with `fast`.
+        baseline: also train a static model, to compare with; by default not with `fast`.
         overwrite: replace earlier runs in these folders.
         overrides, rasterizer, device, on_start, on_step, progress, report: as for `train`.
 
@@ -41,15 +58,22 @@ def demo(
         HoigsError: a folder exists already, or an option is wrong.
     """
     folders = {"hoigs": Path(out)}
-    if baseline:
+    if not fast if baseline is None else baseline:
         folders["static"] = folders["hoigs"].with_name(f"{folders['hoigs'].name}-static")
     for folder in folders.values():  # check both before training for minutes
         RunFolder(folder).refuse_existing(overwrite)
-    report("generating the built-in clip (once; cached afterwards)")
-    clip = builtin_clip(default_registry().get("body:anny")())
+    if steps is None:
+        steps = FAST_STEPS if fast else STEPS
+    if fast:
+        report(
+            f"fast: 32 frames of 128x128, {steps} steps, a small model; without --fast the demo is "
+            "larger, better and compared with a static model"
+        )
+    clip = clip_folder(FAST_CLIP if fast else CLIP)
     return {
         spec: train(
-            clip, spec, out=folder, overrides=[f"train.steps={steps}", *overrides],
+            clip, spec, out=folder,
+            overrides=[f"train.steps={steps}", *(FAST_POINTS[spec] if fast else ()), *overrides],
             rasterizer=rasterizer, device=device, overwrite=overwrite, on_start=on_start,
             on_step=on_step, progress=progress, report=report,
         )

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import torch
 
-from hoigs.core.cpus import available_cpus
 from hoigs.core.errors import PluginError
 from hoigs.core.interfaces.rasterizer import Rasterizer
+from hoigs.core.machine.cpus import available_cpus
 from hoigs.core.registry.manager import Offer, Status
 from hoigs.core.registry.registry import Registry
 from hoigs.core.values.camera import Camera

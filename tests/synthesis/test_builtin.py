@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -102,8 +103,9 @@ def test_the_second_call_takes_the_cached_folder(
     calls: list[tuple[int, int]] = []
     config = SceneConfig.tiny(**SMALLEST)
     first = builtin_clip(body, config, progress=lambda done, of: calls.append((done, of)))
-    assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert calls == [(0, 4), (1, 4), (2, 4), (3, 4), (4, 4)]
     assert first.is_relative_to(cache)
+    assert json.loads((first / "clip.json").read_text())["name"] == "lift-and-swing"
 
     def never(*_: object) -> None:
         raise AssertionError("generated again")

@@ -9,7 +9,8 @@ import pytest
 from hoigs.core.errors import ClipError
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.synthesis import SceneConfig, builtin_clip
-from hoigs.synthesis.named import CLIPS, clip_config, is_named, named_clip
+from hoigs.synthesis.clips import CLIPS
+from hoigs.synthesis.named import clip_config, is_named, named_clip
 
 
 def test_the_default_clip_is_lift_and_swing() -> None:

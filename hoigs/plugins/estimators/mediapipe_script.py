@@ -23,6 +23,7 @@ SOFT = 1 / 640  # of the longer side: standard deviation by which the person's m
 
 
 def main() -> None:
+    sys.path.append(str(Path(__file__).parent))  # last: -I leaves it out, nothing there may shadow
     try:
         import cv2
         import mediapipe
@@ -57,6 +58,9 @@ class Finder:
         if self.masks:
             self.selfie = solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
             self.close = solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
+        self.guided: Any = None  # made where it is needed
+        self.complexity = settings["pose"]["model_complexity"]
+        self.following = False  # a person whom `guided` found and the detector does not
         self.rows: dict[str, list] = {"image_xyzv": [], "world_xyzv": []}
         self.person: list[np.ndarray] = []
 
@@ -67,16 +71,26 @@ class Finder:
         self.rows["world_xyzv"].append(world_xyzv)
         if wide is None:
             return
+        if self.following and own is not None:
+            self.keep(image, own)  # segmentation of selfies takes tables in where there is no head
+            return
         near = self.near(image, wide > 0.5)
         mean = wide if near is None else (wide + near) / 2
         person = mean if own is None else (2 * mean + own) / 3
+        self.keep(image, person)
+
+    def keep(self, image, person) -> None:
         # cells of the models are several pixels wide: without this, edges are stairs
         person = self.cv2.GaussianBlur(person, (0, 0), max(1.0, SOFT * max(image.shape)))
         self.person.append(np.packbits(person > 0.5, axis=1))
 
     def landmarks(self, image, wide):
         """In the image and in space, and the mask of their person; looked for a second time with a
-        border above the image where they are not found, as with a head out of view."""
+        border above the image where they are not found, as with a head out of view, and then
+        without the detector (mediapipe_guided.py)."""
+        if self.following and (found := self.guided.process(image, wide)) is not None:
+            return found
+        self.following = False
         height, width = image.shape[:2]
         border = round(PADDING * height)
         for pose, above in ((self.whole, 0), (self.padded, border)):
@@ -95,6 +109,13 @@ class Finder:
             own = found.segmentation_mask
             own = None if own is None else own[above:]
             return points, points_of(found.pose_world_landmarks), own
+        if self.guided is None:
+            from mediapipe_guided import GuidedPose, landmark_graph
+
+            self.guided = GuidedPose(*landmark_graph(self.complexity), credible)
+        if (found := self.guided.process(image, wide)) is not None:
+            self.following = True
+            return found
         nothing = np.full((33, 4), np.nan)
         return nothing, nothing, None
 

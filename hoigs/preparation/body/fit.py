@@ -12,7 +12,8 @@ from torch import Tensor
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.camera import Camera
-from hoigs.preparation.body.fit_problem import BodyFit, FitOptions, FitProblem, Unknowns
+from hoigs.preparation.body.fit_problem import FitProblem
+from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Unknowns
 from hoigs.preparation.body.kinematics import PER_FRAME
 from hoigs.preparation.body.landmarks import (
     ENOUGH,

@@ -3,129 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hoigs.core.interfaces.body import BodyModel
-from hoigs.core.maths.rotations import (
-    axis_angle_to_quats,
-    multiply_quats,
-    quats_to_axis_angle,
-)
 from hoigs.core.values.camera import Camera, pinhole_pixels
-from hoigs.core.values.moment import BodyPose
-from hoigs.preparation.body.fit_start import Start, first_guess
+from hoigs.preparation.body.fit_start import first_guess
+from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Unknowns
 from hoigs.preparation.body.ground_scale import ground_scale
 from hoigs.preparation.body.kinematics import Kinematics, Posed, nearest_turn
 from hoigs.preparation.body.landmarks import FEET, TORSO, LandmarkPoints, LandmarkTrack, points_of
 from hoigs.preparation.body.mask_fit import MaskFit, Project
+from hoigs.preparation.body.motion_prior import MotionPrior
 from hoigs.preparation.body.noise import Noise, robust_weights
 from hoigs.preparation.body.normal_equations import NormalEquations
-from hoigs.preparation.body.pose_prior import LASTS as PRIOR_LASTS
-from hoigs.preparation.body.pose_prior import TURNING, PosePrior
-
-
-@dataclass(frozen=True)
-class FitOptions:
-    """Settings of the fit. Noise is estimated, so that few weights are left to choose.
-
-    Attributes:
-        steps: of Gauss and Newton, at most.
-        spread: how far a landmark may be off at first, in image widths; `Noise` replaces it.
-        space: the same of a 3D landmark, metres.
-        unit: standard deviation of the 3D landmarks' unit of length, in parts of a metre.
-        smooth: acceleration of points of the body in the world, m/s^2, that is ordinary; larger
-            ones cost less than their square (a throw is no error).
-        shape: standard deviation of the shape coefficients, in those of the body model.
-        offset: standard deviation of the distance from a landmark to the body's own point that
-            stands for it, metres.
-        masks: number of landmarks that a mask weighs as much as. mask_spread: residual at which a
-            pixel or a point begins to count as an outlier there, in image widths.
-        scale: find the cameras' unit in metres too (a moving camera of unknown scale).
-    """
-
-    steps: int = 40
-    spread: float = 0.006
-    space: float = 0.05
-    unit: float = 0.015
-    smooth: float = 6.0
-    shape: float = 0.6
-    offset: float = 0.003
-    masks: float = 10.0
-    mask_spread: float = 0.03
-    scale: bool = False
-
+from hoigs.preparation.body.pose_prior import LASTS, PosePrior
 
 GAP = 12  # frames between landmarks that smoothness carries a pose across
 CARRIED = 0.6  # of the steps, in which frames farther off begin one after another
-LASTS = 0.06  # seconds in which an acceleration stays what it is: CMU's basketball players
-INDEPENDENT = 0.4  # share of the points that move by themselves
-FAT = 4.0  # degrees of freedom of Student's distribution of accelerations
 SURFACE = 1.7  # of a landmark on the skin against one at a joint: how uncertain its place is
 REWEIGHTINGS = 3  # for the 3D landmarks' origin
 LEAST_PIXELS = 3e-3  # of the width: no landmark is known better
-
-
-@dataclass(frozen=True)
-class BodyFit:
-    """A fitted body.
-
-    Attributes:
-        poses: batched over the frames, in a world of metres.
-        residual_px: mean distance of visible landmarks per frame, pixels; NaN where unseen.
-        scene_scale: metres a unit of the cameras' own world (1 unless it was requested).
-        report: numbers for people.
-    """
-
-    poses: BodyPose
-    residual_px: Float[Tensor, " F"]
-    scene_scale: float
-    report: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Unknowns:
-    """What is solved for.
-
-    Attributes:
-        pose: batched, one shape, no hands; float64.
-        offsets: of each left-right pair of landmarks in the rest pose, metres.
-        unit: by how much the 3D landmarks are too large, in parts of 1.
-        scale: metres a unit of the cameras' world.
-    """
-
-    pose: BodyPose
-    offsets: Float[Tensor, "P 3"]
-    unit: float
-    scale: float
-
-    @staticmethod
-    def start(start: Start, betas: int, pairs: int) -> Unknowns:
-        hands = start.body.new_zeros(len(start.body), 15, 3)
-        pose = BodyPose(
-            start.global_orient, start.body, hands, hands, start.transl, torch.zeros(betas)
-        )
-        offsets = torch.zeros(pairs, 3, dtype=torch.float64)
-        return Unknowns(pose.to(torch.float64), offsets, 0.0, start.scale)
-
-    def moved(self, frames: Float[Tensor, "F N"], shared: Float[Tensor, " S"]) -> Unknowns:
-        pose, betas = self.pose, len(self.pose.betas)
-        turned = multiply_quats(
-            axis_angle_to_quats(pose.global_orient), axis_angle_to_quats(frames[:, 3:6])
-        )
-        pose = pose.replace(
-            transl=pose.transl + frames[:, :3],
-            global_orient=nearest_turn(quats_to_axis_angle(turned)),
-            body=pose.body + frames[:, 6:].unflatten(-1, (21, 3)),
-            betas=pose.betas + shared[:betas],
-        )
-        offsets = self.offsets + shared[betas:-2].unflatten(0, (-1, 3))
-        unit = self.unit + float(shared[-2])
-        return Unknowns(pose, offsets, unit, max(self.scale + float(shared[-1]), 1e-4))
 
 
 class FitProblem:
@@ -163,14 +64,12 @@ class FitProblem:
         world = landmarks.world[:, rows].double()
         self.in_space = torch.where(torch.isfinite(world).all(-1), self.visible, 0.0)
         self.space = world.nan_to_num()  # metres, along the cameras' axes
-        self.steps = (times[1:] - times[:-1]).double().clamp_min(1e-4)
-        self.accelerate = _second_differences(self.steps)
-        apart = torch.nn.functional.pad(self.steps, (1, 1), value=float(self.steps.median()))
+        steps = (times[1:] - times[:-1]).double().clamp_min(1e-4)
+        apart = torch.nn.functional.pad(steps, (1, 1), value=float(steps.median()))
         self.spacing = 0.5 * (apart[1:] + apart[:-1])  # seconds that each frame stands for
         self.prior = PosePrior()
-        self.torso = [self.points.index(mark) for mark in TORSO]
-        self.independent = torch.full((len(rows) + 1,), INDEPENDENT, dtype=torch.float64)
-        self.independent[-1] = 1.0
+        torso = [self.points.index(mark) for mark in TORSO]
+        self.motion = MotionPrior(self.kinematics, torso, len(rows), times, options.smooth)
         pairs = int(self.points.pairs.max()) + 1
         onto = torch.nn.functional.one_hot(self.points.pairs, pairs).double()
         self.onto_offsets = (onto[:, :, None] * self.points.mirror[:, None]).double()  # [L, P, 3]
@@ -263,9 +162,8 @@ class FitProblem:
         shared = None if equations is None else self._by_shared(at)
         total = self._landmarks(at, shared, unknowns, widen, equations)
         total += self._in_space(at, shared, unknowns, widen, equations)
-        if len(at.points) > 2:
-            total += self._smoothness(at, shared, unknowns, equations)
-        share = (self.spacing / PRIOR_LASTS).clamp_max(1.0)
+        total += self.motion.add(at, shared, unknowns.pose, equations)
+        share = (self.spacing / LASTS).clamp_max(1.0)
         total += float(self.prior.add(unknowns.pose.body.flatten(1), share, equations))
         total += self._shared_priors(unknowns, equations)
         if self.masks is not None:
@@ -350,50 +248,6 @@ class FitProblem:
             weight = self.in_space * robust
         return residuals, weight, cost
 
-    def _smoothness(
-        self, at: Posed, shared: Tensor | None, unknowns: Unknowns,
-        equations: NormalEquations | None,
-    ) -> float:  # fmt: skip
-        """Accelerations of points in the world, and of joint angles."""
-        count, factors = len(self.accelerate), self.accelerate
-        lasts = (self.spacing[1:-1] / LASTS).clamp_max(1.0)[:, None]
-        share = lasts * self.independent
-        # a small body close by would accelerate less than a large one far off in the same images
-        size, by_betas = self.kinematics.size(unknowns.pose.betas)
-        factors = factors / size
-        points = self._about_torso(at.points)
-        values = sum(points[k : k + count] * factors[:, k, None, None] for k in range(3))
-        squares = values.square().sum(-1) / self.options.smooth**2
-        # Student's distribution in three dimensions: ordinary motion is held, a throw let go
-        cost = share * (FAT + 3) * (1 + squares / FAT).log()
-        angles = unknowns.pose.body.flatten(1)
-        turning = (
-            sum(angles[k : k + count] * self.accelerate[:, k, None] for k in range(3)) / TURNING
-        )
-        if equations is not None and shared is not None:
-            weight = share * (FAT + 3) / (FAT + squares) / self.options.smooth**2
-            shrinking = points[..., None] * by_betas / size
-            shared = self._about_torso(shared) - torch.nn.functional.pad(
-                shrinking, (0, shared.shape[-1] - len(by_betas))
-            )
-            equations.add_accelerations(
-                values.flatten(1), weight[..., None].expand_as(values).flatten(1), factors,
-                self._about_torso(at.by_frame).flatten(1, 2), shared.flatten(1, 2),
-            )  # fmt: skip
-            for a in range(3):
-                part = INDEPENDENT * lasts * self.accelerate[:, a, None] / TURNING
-                equations.by_frame[a : a + count, 6:] += part * turning
-                for b in range(a, 3):
-                    diagonal = equations.blocks[b - a].diagonal(dim1=1, dim2=2)
-                    diagonal[a : a + count, 6:] += part * self.accelerate[:, b, None] / TURNING
-        return float(cost.sum() + (INDEPENDENT * lasts * turning.square()).sum())
-
-    def _about_torso(self, values: Float[Tensor, "F L *rest"]) -> Float[Tensor, "F K *rest"]:
-        """Points about the torso's middle, and that after them: a body that moves as a whole has
-        one acceleration, not one a point."""
-        middle = values[:, self.torso].mean(1, keepdim=True)
-        return torch.cat((values - middle, middle), 1)
-
     def _shared_priors(self, unknowns: Unknowns, equations: NormalEquations | None) -> float:
         """Of shape and offsets."""
         betas = len(unknowns.pose.betas)
@@ -443,12 +297,3 @@ def _by_place(K: Float[Tensor, "F 3 3"], cam: Float[Tensor, "F L 3"]) -> Float[T
     none = torch.zeros_like(fx)
     rows = (fx, none, -fx * cam[..., 0] / z, none, fy, -fy * cam[..., 1] / z)
     return torch.stack(rows, -1).unflatten(-1, (2, 3))
-
-
-def _second_differences(steps: Float[Tensor, " S"]) -> Float[Tensor, "T 3"]:
-    """Factors of the values at three times that give their second derivative."""
-    before, after = steps[:-1], steps[1:]
-    span = 0.5 * (before + after)
-    return torch.stack(
-        (1 / (before * span), -1 / before / span - 1 / after / span, 1 / (after * span)), 1
-    )

@@ -37,15 +37,14 @@ LIMITS: dict[int, tuple[tuple[float, float], tuple[float, float], tuple[float, f
 
 
 @functools.cache
-def bounds() -> tuple[Float[Tensor, "21 3"], Float[Tensor, "21 3"]]:
+def _bounds() -> tuple[Float[Tensor, "21 3"], Float[Tensor, "21 3"]]:
     """Lowest and highest angles, radians."""
     degrees = torch.tensor([LIMITS[joint] for joint in range(1, 22)])
     radians = degrees * (math.pi / 180)
     return radians[..., 0], radians[..., 1]
 
 
-def limit_penalty(body: Float[Tensor, "*batch 21 3"]) -> Float[Tensor, ""]:
-    """Squared radians beyond the limits, summed over joints, mean over frames."""
-    low, high = (bound.to(body) for bound in bounds())
-    beyond = (low - body).clamp_min(0) + (body - high).clamp_min(0)
-    return beyond.square().sum((-1, -2)).mean()
+def beyond(body: Float[Tensor, "*batch 21 3"]) -> Float[Tensor, "*batch 21 3"]:
+    """Radians by which angles exceed their limits, negative below the lowest; 0 within."""
+    low, high = (bound.to(body) for bound in _bounds())
+    return (body - high).clamp_min(0) - (low - body).clamp_min(0)

@@ -15,11 +15,6 @@ from hoigs.core.interfaces.body import BodyModel
 JOINTS = {11: 16, 12: 17, 13: 18, 14: 19, 15: 20, 16: 21, 23: 1, 24: 2, 25: 4, 26: 5, 27: 7, 28: 8}
 # landmark -> joint within the hands' 30: knuckles of index and little finger
 KNUCKLES = {19: 0, 17: 6, 20: 15, 18: 21}
-# bones whose directions are compared in 3D: pairs of landmarks
-BONES = (
-    (11, 13), (13, 15), (12, 14), (14, 16), (23, 25), (25, 27), (24, 26), (26, 28), (11, 12),
-    (23, 24), (11, 23), (12, 24), (27, 31), (28, 32), (15, 19), (16, 20),
-)  # fmt: skip
 TORSO = (11, 12, 23, 24)
 FEET = (29, 30, 31, 32)
 USED = tuple(sorted((*JOINTS, *KNUCKLES, 0, 7, 8, *FEET)))  # landmarks that `points_of` places

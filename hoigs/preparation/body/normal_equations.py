@@ -55,7 +55,9 @@ class NormalEquations:
         """Residuals that are, of frames t, t + 1 and t + 2, a sum of values times `factors`."""
         count = len(residuals)
         parts = [by_frame[k : k + count] * factors[:, k, None, None] for k in range(3)]
-        shared = sum(by_shared[k : k + count] * factors[:, k, None, None] for k in range(3))
+        shared = torch.stack(
+            [by_shared[k : k + count] * factors[:, k, None, None] for k in range(3)]
+        ).sum(0)
         for a in range(3):
             weighted = parts[a].mT * weights[:, None]
             self.border[a : a + count] += weighted @ shared

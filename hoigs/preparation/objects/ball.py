@@ -16,6 +16,7 @@ from hoigs.core.maths.series import fill_gaps, smooth
 from hoigs.core.npz import load_arrays
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.undistortion import Undistortion
+from hoigs.preparation.objects.sphere import fit_cone, outline_rays
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import SourceError
 
@@ -135,13 +136,11 @@ def _ring(
 
 
 def ball_centers(ball: BallTrack, cameras: list[Camera], radius: float) -> Float[Tensor, "F 3"]:
-    """Ball centres in the world, metres, from the apparent size of a sphere of known radius.
-
-    A sphere at distance Z on the optical axis has the outline r = f R / sqrt(Z^2 - R^2).
-    """
+    """Ball centres in the world, metres, from the apparent size of a sphere of known radius: where
+    the cone of rays along the disc's edge touches it."""
     centers = []
     for camera, xy, r in zip(cameras, ball.centers, ball.radii, strict=True):
-        distance = radius * np.sqrt(1 + (float(camera.K[0, 0]) / r) ** 2)
-        pixel = torch.tensor(xy, dtype=torch.float32)
-        centers.append(camera.unproject(pixel, torch.tensor(distance, dtype=torch.float32)))
+        axis, angle, _ = fit_cone(outline_rays(xy + r * _CIRCLE.T, camera))
+        local = torch.from_numpy(radius / np.sin(angle) * axis).float()
+        centers.append(camera.to_world(local))
     return torch.stack(centers)

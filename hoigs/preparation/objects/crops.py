@@ -71,6 +71,17 @@ class Crops:
         view = self.world_to_camera
         return -(view[:, :3, :3].mT @ view[:, :3, 3:])[..., 0]
 
+    def middles(self, rows: np.ndarray) -> Float[np.ndarray, "N 3"]:
+        """Unit rays through the middles of the masks' boxes, world."""
+        found = []
+        for row in rows.tolist():
+            y, x = self.masks[row, 0].nonzero().double().T.numpy() + 0.5
+            middle = np.array([(x.min() + x.max()) / 2, (y.min() + y.max()) / 2, 1.0])
+            ray = np.linalg.solve(self.K[row].double().numpy(), middle)
+            ray = self.world_to_camera[row, :3, :3].double().numpy().T @ ray
+            found.append(ray / np.linalg.norm(ray))
+        return np.stack(found)
+
     def sample(self, maps: Float[Tensor, "C D S S"], xy: Float[Tensor, "C P 2"]) -> Tensor:
         """Bilinear values [C P D] of maps at pixels; those of the border beyond it."""
         grid = (xy / self.size * 2 - 1)[:, None]
@@ -84,6 +95,13 @@ class Crops:
         logs = torch.log(self.images + DARK)
         fine = _masked_blur(logs, self.masks, blur)
         return fine - _masked_blur(logs, self.masks, 4 * blur + 2)
+
+    def hues(self, blur: float) -> Float[Tensor, "C D S S"]:
+        """Log ratios of colours, which neither shading nor other sides beside a point change, and
+        brightness between two blurs, which is all that something grey has."""
+        logs = _masked_blur(torch.log(self.images + DARK), self.masks, blur)
+        light = self.features(blur).mean(1, keepdim=True)
+        return torch.cat((logs[:, :1] - logs[:, 1:2], logs[:, 2:] - logs[:, 1:2], light), 1)
 
     def contrast(self, blur: float) -> float:
         """Relative variation of brightness within the object."""

@@ -19,6 +19,8 @@ from hoigs.preparation.objects.track import hand_depths
 
 HAND_JOINTS = 30  # the last joints of a body: fifteen of each hand, three a finger, index first
 MIDDLE, INDEX, LITTLE = 3, 0, 6  # first joints of these fingers within a hand
+ANKLES, HEAD = (7, 8), 15
+UPRIGHT = 0.25  # of the frames: those in which the body stands straightest
 REACH = 0.13  # metres in the image between a palm and what it holds
 STILL = 0.07  # metres a second: an object that moves less rests
 SHORTEST = 0.2  # seconds of a grasp or a rest
@@ -36,6 +38,8 @@ class HandMotion:
             that follow each other in a grasp or a rest; constant while the object rests.
         depths: of the hands along the view, metres, interpolated where they do not hold it.
         palms: left and right, world, metres. near: which of them are at the object.
+        up: against gravity, unit, world: from the ankles to the head, where
+            they are farthest apart.
         pieces: number of each frame's piece: within one the rotations are known against each
             other, between two they are not (a flight lies between them).
     """
@@ -47,6 +51,7 @@ class HandMotion:
     palms: Float[np.ndarray, "F 2 3"]
     near: Bool[np.ndarray, "F 2"]
     pieces: np.ndarray
+    up: Float[np.ndarray, " 3"]
 
     @property
     def free(self) -> Bool[np.ndarray, " F"]:
@@ -88,7 +93,14 @@ def hand_motion(
     palm_depths = _depths_of(palms, near, depths, cameras)
     if known.any():
         depths = fill_gaps(palm_depths, known)
-    return HandMotion(held, rests, rotations, depths, palms, near, pieces)
+    return HandMotion(held, rests, rotations, depths, palms, near, pieces, _up(places))
+
+
+def _up(places: Float[np.ndarray, "F J 3"]) -> Float[np.ndarray, " 3"]:
+    body = places[:, HEAD] - places[:, list(ANKLES)].mean(1)
+    tall = np.linalg.norm(body, axis=-1)
+    up = body[tall >= np.quantile(tall, 1 - UPRIGHT)].mean(0)
+    return up / max(float(np.linalg.norm(up)), 1e-9)
 
 
 def _palm_distances(

@@ -17,6 +17,7 @@ from hoigs.core.values.clip import ObjectTrack
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.masks.separate import Images
 from hoigs.preparation.objects.ball import BallTrack, ball_centers
+from hoigs.preparation.objects.doubts import silhouette_ious
 from hoigs.preparation.objects.shape import ColorSampler, sphere_points
 from hoigs.preparation.objects.sphere import (
     Cones,
@@ -66,18 +67,18 @@ def round_object(
         )
     else:
         size, text = FOOTBALL, f"no limb comes near it: its radius is taken as {FOOTBALL} m"
-    places = cones.places(cameras, size)
+    places, off = cones.places(cameras, size), f"{100 * max(0.01, np.median(cones.judged)):.0f} %"
     track, normals = _sphere_track(
         places, cones.observed, size, count,
-        f"taken for a ball, as its masks are {100 * np.median(cones.judged):.1f} % off a circle "
+        f"taken for a ball, as its masks are {off} off a circle "
         f"(median of {len(cones.judged)} frames); place from the cone of rays along its outline; "
         f"{text}; its rotation is unknown, and kept constant",
     )  # fmt: skip
     away = np.linalg.norm(places - torch.stack([c.center for c in cameras]), axis=-1)
     nothing = np.full(len(cameras), np.nan)
     reason = (
-        f"it was taken for a ball (masks {100 * np.median(cones.judged):.1f} % off a circle), "
-        f"whose rotation no outline shows; {text}"
+        f"it was taken for a ball (masks {off} off a circle), whose rotation no outline shows; "
+        f"{text}"
     )
     confidence = ObjectConfidence(
         "ball", nothing, cones.off * cones.angles * away, hand_distance=nothing, reason=reason
@@ -111,11 +112,13 @@ class MadeObject:
     Attributes:
         spread: of its apparent over its expected size, relative.
         confidence: how far poses and shape may be trusted.
+        ious: of each frame, intersection over union of its outline and the mask; NaN if not seen.
     """
 
     track: ObjectTrack
     spread: float
     confidence: ObjectConfidence
+    ious: Float[np.ndarray, " F"]
 
 
 def make_object(
@@ -143,7 +146,7 @@ def make_object(
     if ball is not None:
         track, normals, spread = ball_object(ball, cameras, radius or FOOTBALL, count)
         confidence = ObjectConfidence.none("ball", len(cameras), "a ball's spin is not tracked")
-        return _colored(track, normals, spread, confidence, masks, cameras, images)
+        return _colored(track, normals, spread, confidence, masks, humans, cameras, images)
     reasons = []
     if way in ("auto", "ball"):
         try:
@@ -151,7 +154,9 @@ def make_object(
             if way == "auto":
                 require_round(cones, cameras)
             track, normals, confidence = round_object(cones, cameras, joints, radius, count)
-            return _colored(track, normals, cones.jitter, confidence, masks, cameras, images)
+            return _colored(
+                track, normals, cones.jitter, confidence, masks, humans, cameras, images
+            )
         except NoBallError as reason:
             if way == "ball":
                 reasons.append(f"it cannot be posed as a ball: {reason}")
@@ -167,7 +172,7 @@ def make_object(
         track, normals, spread = held_object(masks, list(cameras), wrists, count)
         reasons.append(str(reason))
         confidence = ObjectConfidence.none("outline", len(cameras), "; ".join(reasons))
-    return _colored(track, normals, spread, confidence, masks, cameras, images)
+    return _colored(track, normals, spread, confidence, masks, humans, cameras, images)
 
 
 def _colored(
@@ -176,11 +181,13 @@ def _colored(
     spread: float,
     confidence: ObjectConfidence,
     masks: MaskStack,
+    humans: MaskStack,
     cameras: Sequence[Camera],
     images: Images,
 ) -> MadeObject:
     track = replace(track, colors=_colors(track, normals, masks, cameras, images))
-    return MadeObject(track, spread, confidence)
+    ious = silhouette_ious(track, masks, humans, cameras)
+    return MadeObject(track, spread, confidence, ious)
 
 
 def _colors(

@@ -7,6 +7,9 @@ frame of a grasp; between two grasps the spin is constant, and every spin is tri
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -30,8 +33,11 @@ TURNING = 0.02  # weight of that against the texture
 NEUTRAL, UNKNOWN = 2.0, 30.0  # cost of unknown texture, and the points that it counts as
 OUTSIDE = 1.5  # cost of a point outside the mask
 CLEARLY = 0.8  # of its cost: another rotation has to be better by so much
+GRAVITY, PULL, RAY = 9.81, 1.5, 0.02  # metres a second squared, and its spread; metres of a ray
+DEPTHS = (0.7, 1.0)  # tried where the back was never seen, of its breadth and height
 LOOKS = 6  # frames of a grasp in which its rotation is looked for
-REFINED, STEPS, RATE = 10, 30, 0.04  # the best of the grid, each moved to its own best place first
+KNOWN = 2.0  # frames that the texture found before counts as
+REFINED, STEPS, RATE = 8, 20, 0.06  # the best of the grid, each moved to its own best place first
 APART = 0.35  # radians between them
 
 
@@ -48,21 +54,33 @@ def grasps_by_texture(
     rotations = poses.rotations.clone()
     for piece in np.unique(pieces[~known]).tolist():
         rows = np.flatnonzero(~known & (pieces == piece))
-        rotations[rows] = search.piece(rows, start.rotations[rows], poses.translations)
+        middles = poses.translations + start.rotations @ search.middle
+        rotations[rows] = search.piece(rows, start.rotations[rows], middles)
     return Poses(rotations, poses.translations)
 
 
 def flights_by_texture(
-    crops: Crops, surface: Surface, first: Aligned, start: Poses, fps: float
+    crops: Crops,
+    surface: Surface,
+    first: Aligned,
+    start: Poses,
+    up: Float[np.ndarray, " 3"],
+    fps: float,
 ) -> Poses:
-    """Poses of all frames: those of `first`, and between them a constant spin found by texture.
+    """Poses of all frames: those of `first`, and between them the free fall that the masks agree
+    with, and a constant spin found by texture.
 
-    Frames before the first known one and after the last keep its rotation.
+    Frames before the first known one and after the last keep its rotation. The poses are those of
+    the object's middle, which a flight shows better than the grasps before it.
+
+    Args:
+        up: against gravity, unit, world.
     """
     known = np.isin(crops.frames, first.frames)
     poses = _distances_of(crops, start, first, known)
-    search = _Search(crops, surface, first, known)
-    rotations = poses.rotations.clone()
+    seen = _Search(crops, surface, first, known)
+    rotations, places = poses.rotations.clone(), poses.translations.clone()
+    chosen: list[Tensor] = []
     for rows in _runs(np.flatnonzero(~known)):
         before, after = rows[0] - 1, rows[-1] + 1
         if before < 0:
@@ -70,8 +88,20 @@ def flights_by_texture(
         elif after == len(known):
             rotations[rows] = rotations[before].clone()
         else:
-            rotations[rows] = search.flight(rows, rotations, poses.translations, fps)
-    return Poses(rotations, poses.translations)
+            found: list[tuple[float, Tensor, Tensor, Tensor]] = []
+            spins: Tensor | None = None
+            for search in seen.depths():
+                middles = places + rotations @ search.middle
+                middles[rows] = _ballistic(crops, middles, rows, up, fps)
+                flight = search.flight(rows, rotations, middles, fps)
+                spins = flight.likely() if spins is None else spins
+                cost, turns = flight.best(spins)
+                middle = search.middle
+                found.append((cost, turns, middles[rows] - turns @ middle, middle))
+            _, rotations[rows], places[rows], middle = min(found, key=lambda f: f[0])
+            chosen.append(middle)
+    middle = torch.stack(chosen).mean(0) if chosen else seen.middle
+    return Poses(rotations, places + rotations @ middle)
 
 
 def _distances_of(crops: Crops, start: Poses, first: Aligned, known: np.ndarray) -> Poses:
@@ -93,8 +123,8 @@ class _Search:
         step = -(-len(surface.corners) // POINTS)
         self.points = surface.points(first.vertices)[::step]
         self.normals = surface.normals(first.vertices)[::step]
-        features = crops.features(BLUR)
-        features = features / features.std()
+        features = crops.hues(BLUR)
+        features = features / features[crops.masks.expand_as(features) > 0].std()
         self.maps = torch.cat((features, crops.masks, crops.hidden), 1)
         self.crops, self.grid = crops, _rotations(TRIED)
         part = crops.rows(np.flatnonzero(known))
@@ -105,14 +135,44 @@ class _Search:
         self.known = weight.sum(0)[:, 0] > 1.5
         self.texture = (weight * values[..., :3]).sum(0) / weight.sum(0).clamp_min(1e-3)
 
+        toward = (part.centers() - first.poses.translations)[:, None] @ first.poses.rotations
+        self.front = torch.nn.functional.normalize(toward.mean((0, 1)), dim=-1)
+
+    def depths(self) -> list[_Search]:
+        """Stretched to each of `DEPTHS` that it is not as deep as yet; itself if there is none."""
+        found = [self.stretched(ratio) for ratio in DEPTHS]
+        return [f for f in found if not torch.equal(f.points, self.points)] or [self]
+
+    def stretched(self, ratio: float) -> _Search:
+        """The same with what lies behind the seen side drawn out, until the object is `ratio` as
+        deep as it is broad and high (geometric mean): a side that was never seen has no place."""
+        along = self.points @ self.front
+        flat = self.points - along[:, None] * self.front
+        broad, high = (2 * torch.pca_lowrank(flat, 2)[1] * (3 / len(flat)) ** 0.5).tolist()
+        near, far = along.quantile(0.98), along.quantile(0.02)
+        factor = max(1.0, ratio * (broad * high) ** 0.5 / float(near - far))
+        found = copy(self)
+        found.points = self.points + ((factor - 1) * (along - near))[:, None] * self.front
+        into = (self.normals @ self.front)[:, None] * self.front
+        found.normals = torch.nn.functional.normalize(self.normals - into + into / factor, dim=-1)
+        return found
+
+    @property
+    def middle(self) -> Float[Tensor, " 3"]:
+        """Of the points' box."""
+        return (self.points.amax(0) + self.points.amin(0)) / 2
+
     def _facing(self, toward: Tensor, rotations: Tensor) -> Tensor:
         toward = torch.nn.functional.normalize(toward, dim=-1)
         return (((self.normals @ rotations.mT) * toward).sum(-1) > SURE).float()
 
-    def costs(self, row: int, rotations: Float[Tensor, "R 3 3"], place: Tensor) -> Tensor:
-        """Of rotations in one frame; places are moved so that the points' middle is the mask's."""
+    def samples(
+        self, row: int, rotations: Float[Tensor, "R 3 3"], place: Tensor
+    ) -> tuple[Float[Tensor, "R P 3"], Float[Tensor, "R P"], Float[Tensor, " R"]]:
+        """Texture at the points and whether they show it, and the share of points outside the
+        mask; places are moved so that the points' middle is the mask's."""
         one = self.crops.rows(np.array([row]))
-        world = self.points @ rotations.mT + place
+        world = (self.points - self.middle) @ rotations.mT + place
         xy, _ = one.project(world.flatten(0, 1)[None])
         xy = xy[0].unflatten(0, world.shape[:2])
         box = (xy.amax(1) + xy.amin(1)) / 2
@@ -124,13 +184,29 @@ class _Search:
         values = values.unflatten(0, world.shape[:2])
         mask, hidden = values[..., 3], values[..., 4]
         seen = self._facing(one.centers()[:, None] - world, rotations) * (1 - hidden)
-        off = (values[..., :3] - self.texture).abs().sum(-1).clamp_max(4.0)
-        weight = seen * mask * self.known
-        # sides that no frame has shown yet say nothing for or against a rotation
-        photo = (weight * off).sum(-1) + NEUTRAL * UNKNOWN
-        photo = photo / (weight.sum(-1) + UNKNOWN)
-        outside = ((1 - mask) * (1 - hidden)).mean(-1)
-        return photo + OUTSIDE * outside
+        return values[..., :3], seen * mask, ((1 - mask) * (1 - hidden)).mean(-1)
+
+    def costs(self, row: int, rotations: Float[Tensor, "R 3 3"], place: Tensor) -> Tensor:
+        """Of rotations in one frame, against the known texture."""
+        values, weight, outside = self.samples(row, rotations, place)
+        off = (values - self.texture).abs().sum(-1).clamp_max(4.0)
+        return _photo(off, weight * self.known) + OUTSIDE * outside
+
+    def costs_together(self, rows: np.ndarray, rotations: list[Tensor], places: Tensor) -> Tensor:
+        """Of rotations of several frames, against the known texture and each other's, so that
+        sides which nothing has shown before count as soon as two of the frames show them."""
+        found = [
+            self.samples(r, t, places[r]) for r, t in zip(rows.tolist(), rotations, strict=True)
+        ]
+        values, weight = (torch.stack([f[i] for f in found]) for i in (0, 1))
+        known = (KNOWN * self.known).expand(values.shape[1:3])
+        total = weight.sum(0) + known
+        mean = (weight[..., None] * values).sum(0) + known[..., None] * self.texture
+        others = (total - weight)[..., None]
+        expected = (mean - weight[..., None] * values) / others.clamp_min(1e-3)
+        off = (values - expected).abs().sum(-1).clamp_max(4.0)
+        outside = torch.stack([f[2] for f in found])
+        return (_photo(off, weight * (others[..., 0] > 0.5)) + OUTSIDE * outside).sum(0)
 
     def piece(self, rows: np.ndarray, turns: Tensor, places: Tensor) -> Tensor:
         """Rotations of a grasp that turns as `turns` do, from one that is found."""
@@ -158,30 +234,106 @@ class _Search:
         cost[0] *= CLEARLY  # as it was let go, unless the texture is clearly against it
         return turns @ turns[0].mT @ tried[cost.argmin()]
 
-    def flight(
-        self, rows: np.ndarray, rotations: Tensor, places: Tensor, fps: float
-    ) -> Float[Tensor, "N 3 3"]:
-        """Rotations between two known ones, by the constant spin whose pictures agree best.
-
-        The spin about a world axis is tried for all turns up to `MOST_TURNS` that end within
-        `SLACK` of the known rotation; the rest is spread over the flight.
-        """
+    def flight(self, rows: np.ndarray, rotations: Tensor, places: Tensor, fps: float) -> _Flight:
+        """The rows' spin between two known rotations."""
         frames = self.crops.frames
         first, last = rows[0] - 1, rows[-1] + 1
-        ahead = rotations[last] @ rotations[first].mT
+        seconds = float(frames[last] - frames[first]) / fps
+        parts = ((frames[rows] - frames[first]) / (frames[last] - frames[first])).tolist()
+        return _Flight(self, rows, places, parts, rotations[first], rotations[last], seconds)
+
+    def few(self, step: int) -> _Search:
+        """The same with every `step`-th point."""
+        found = copy(self)
+        for name in ("points", "normals", "known", "texture"):
+            setattr(found, name, getattr(self, name)[::step])
+        return found
+
+
+@dataclass(frozen=True)
+class _Flight:
+    """Spins about a world axis between two known rotations, `first` and `last`; `parts` are the
+    rows' parts of the way."""
+
+    search: _Search
+    rows: np.ndarray
+    places: Float[Tensor, "C 3"]
+    parts: list[float]
+    first: Float[Tensor, "3 3"]
+    last: Float[Tensor, "3 3"]
+    seconds: float
+
+    def likely(self) -> Float[Tensor, "N 3"]:
+        """The best of all spins up to `MOST_TURNS` that end within `SLACK` of the last rotation."""
         spins = _ball(2 * np.pi * MOST_TURNS)
-        rest = matrices_to_axis_angle(axis_angle_to_matrices(spins).mT @ ahead)
-        kept = rest.norm(dim=-1) < SLACK
-        spins, rest = spins[kept], rest[kept]
-        seconds = (frames[last] - frames[first]) / fps
-        total = TURNING * len(rows) * (spins.norm(dim=-1) / seconds / SPIN).square()
-        parts = (frames[rows] - frames[first]) / (frames[last] - frames[first])
-        tried = []
-        for row, part in zip(rows.tolist(), parts.tolist(), strict=True):
-            turn = axis_angle_to_matrices(part * spins) @ axis_angle_to_matrices(part * rest)
-            tried.append(turn @ rotations[first])
-            total = total + self.costs(row, tried[-1], places[row])
-        return torch.stack([turns[total.argmin()] for turns in tried])
+        spins = spins[self._rest(spins).norm(dim=-1) < SLACK]
+        search = self.search.few(3)
+        cost = torch.cat([self._cost(part, search) for part in spins.split(400)])
+        return spins[_apart(spins, cost)]
+
+    def best(self, spins: Float[Tensor, "N 3"]) -> tuple[float, Float[Tensor, "R 3 3"]]:
+        """Cost and rotations of the best of `spins`, each moved to its own best place first."""
+        search = self.search.few(2)
+        moved = torch.zeros_like(spins, requires_grad=True)
+        adam = torch.optim.Adam([moved], lr=RATE)
+        for _ in range(STEPS):
+            adam.zero_grad()
+            self._cost(spins + moved, search).sum().backward()
+            adam.step()
+        with torch.no_grad():
+            cost = self._cost(spins + moved, self.search)
+            best = cost.argmin()
+            return float(cost[best]), torch.stack([t[best] for t in self._turned(spins + moved)])
+
+    def _rest(self, spins: Tensor) -> Tensor:
+        """What a spin lacks of the last rotation, spread over the flight."""
+        turned = axis_angle_to_matrices(spins).mT @ self.last @ self.first.mT
+        return matrices_to_axis_angle(turned)
+
+    def _turned(self, spins: Tensor) -> list[Tensor]:
+        rest = self._rest(spins)
+        return [
+            axis_angle_to_matrices(p * spins) @ axis_angle_to_matrices(p * rest) @ self.first
+            for p in self.parts
+        ]
+
+    def _cost(self, spins: Tensor, search: _Search) -> Tensor:
+        fast = TURNING * len(self.rows) * (spins.norm(dim=-1) / self.seconds / SPIN).square()
+        return fast + search.costs_together(self.rows, self._turned(spins), self.places)
+
+
+def _ballistic(
+    crops: Crops,
+    places: Float[Tensor, "C 3"],
+    rows: np.ndarray,
+    up: Float[np.ndarray, " 3"],
+    fps: float,
+) -> Float[Tensor, "N 3"]:
+    """Places of a flight between two known ones: a constant acceleration, near that of gravity,
+    by which the object passes the rays through the middles of its masks.
+
+    With both ends known it is linear in the acceleration a:
+    p(t) = line(t) + a (t - t0) (t - t1) / 2.
+    """
+    ends = [rows[0] - 1, rows[-1] + 1]
+    times = crops.frames[rows] / fps
+    t0, t1 = crops.frames[ends] / fps
+    first, last = places[ends].double().numpy()
+    line = first + ((times - t0) / (t1 - t0))[:, None] * (last - first)
+    bend = (times - t0) * (times - t1) / 2
+    centers, rays = crops.centers()[rows].double().numpy(), crops.middles(rows)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # what a ray sees of a shift
+    matrix = (bend[:, None, None] * across / RAY).reshape(-1, 3)
+    target = -np.einsum("nij,nj->ni", across, line - centers).reshape(-1) / RAY
+    matrix = np.concatenate((matrix, np.eye(3) / PULL))
+    target = np.concatenate((target, -GRAVITY * up / PULL))
+    acceleration = np.linalg.lstsq(matrix, target, rcond=None)[0]
+    return torch.from_numpy(line + bend[:, None] * acceleration).float()
+
+
+def _photo(off: Float[Tensor, "*R P"], weight: Float[Tensor, "*R P"]) -> Float[Tensor, "*R"]:
+    """Mean difference of texture; sides that nothing has shown say nothing for or against."""
+    return ((weight * off).sum(-1) + NEUTRAL * UNKNOWN) / (weight.sum(-1) + UNKNOWN)
 
 
 def _distinct(rotations: Float[Tensor, "R 3 3"], costs: Float[Tensor, " R"]) -> list[int]:
@@ -196,7 +348,18 @@ def _distinct(rotations: Float[Tensor, "R 3 3"], costs: Float[Tensor, " R"]) -> 
     return kept
 
 
-def _ball(radius: float, step: float = 0.45) -> Float[Tensor, "N 3"]:
+def _apart(spins: Float[Tensor, "R 3"], costs: Float[Tensor, " R"]) -> list[int]:
+    """The cheapest spins that are apart from each other."""
+    kept: list[int] = []
+    for i in costs.argsort().tolist():
+        if not kept or float((spins[i] - spins[kept]).norm(dim=-1).min()) > 2 * APART:
+            kept.append(i)
+        if len(kept) == REFINED:
+            break
+    return kept
+
+
+def _ball(radius: float, step: float = 0.6) -> Float[Tensor, "N 3"]:
     """Vectors of a grid within a ball, none first."""
     count = int(radius / step)
     line = torch.arange(-count, count + 1) * step

@@ -83,10 +83,10 @@ def ball_cones(masks: MaskStack, humans: MaskStack, cameras: Sequence[Camera]) -
         xy, free = _outline(masks[i], humans[i])
         if len(xy) < FEWEST_EDGES:
             continue
-        rays[i] = _rays(xy, cameras[i])
+        rays[i] = outline_rays(xy, cameras[i])
         direction, angle, residual = fit_cone(rays[i])
         off[i] = _off(residual, angle, focal)
-        if off[i] > MOSTLY and free.sum() >= max(ENOUGH * len(xy), FEWEST_EDGES):
+        if off[i] > ROUND and free.sum() >= max(ENOUGH * len(xy), FEWEST_EDGES):
             rays[i] = rays[i][free]  # the person hides a part of it
             direction, angle, residual = fit_cone(rays[i])
             if free.mean() >= SHOWN:
@@ -182,7 +182,8 @@ def _angles(rays: Float[np.ndarray, "N 3"], axis: Float[np.ndarray, " 3"]) -> np
     return np.arctan2(np.linalg.norm(np.cross(rays, axis), axis=-1), rays @ axis)
 
 
-def _rays(xy: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 3"]:
+def outline_rays(xy: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 3"]:
+    """Unit rays of pixels, camera axes."""
     flat = pinhole_rays(camera.K.double(), torch.from_numpy(xy)).numpy()
     rays = np.concatenate((flat, np.ones((len(flat), 1))), -1)
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)

@@ -155,10 +155,14 @@ def _aligned(
         poses = grasps_by_texture(crops.rows(rows), surface, found, start.rows(rows), pieces[rows])
         found = aligned(rows, poses, levels[1:], True)
     if flies:
-        rows = np.arange(len(crops))
+        rows, flying = np.arange(len(crops)), np.flatnonzero(~tied)
         surface = replace(surface, rest=found.vertices)
-        poses = flights_by_texture(crops, surface, found, start, fps)
-        found = aligned(rows, poses, [(blur, 1, n // 2) for blur, _, n in levels[1:]], False)
+        poses = flights_by_texture(crops, surface, found, start, hands.up, fps)
+        # a flight shows other sides: as many of its frames as of the others shape the hull
+        others = np.flatnonzero(tied)[:: max(1, int(tied.sum()) // len(flying))]
+        both = np.sort(np.concatenate((flying, others)))
+        surface = hull(crops.rows(both), poses.rows(both), radius, SAMPLES)
+        found = aligned(rows, poses, levels[1:], True)
     return surface, found
 
 

@@ -149,6 +149,12 @@ def _object(report: Measures) -> Iterator[MeasureDiagnostic]:
             "training has to find rotation and shape: film the object larger, sharper and whole, "
             "mend its masks, or choose a spec whose object deforms",
         )
+    yield from _object_outline(report)
+    if report.object_way == "ball":
+        yield _judged(
+            "object's rotation", "unknown", report.object_reason, "fair",
+            "the object does not turn in the clip; if it is no ball, --set object_track=texture",
+        )  # fmt: skip
     if report.object_way != "texture and hands":
         return
     known = [v for v in report.object_agreement if v is not None]
@@ -157,7 +163,8 @@ def _object(report: Measures) -> Iterator[MeasureDiagnostic]:
     yield _judged(
         "object's rotation",
         f"{100 * trusted:.0f} % of the frames",
-        f"its texture agrees there with that of other frames (correlation {middle:.2f}, median)",
+        f"its texture agrees there with that of other frames (correlation {middle:.2f}, median); "
+        f"worst in {_worst(report.object_agreement)}",
         _judge(1 - trusted, 0.1, 0.3),
         "the others follow their neighbours and the hands. Where the object is hidden nothing can "
         "be done; where it is blurred or small, take sharper frames",
@@ -182,6 +189,27 @@ def _object(report: Measures) -> Iterator[MeasureDiagnostic]:
             _judge(abs(middle), 60, 120),
             "body and object are at different distances: look at both in overlay.mp4",
         )
+
+
+def _object_outline(report: Measures) -> Iterator[MeasureDiagnostic]:
+    known = sorted(v for v in report.object_iou if v is not None)
+    if known:
+        mean = sum(known) / len(known)
+        yield _judged(
+            "object on its mask",
+            f"IoU {mean:.2f}",
+            f"mean of its outline and the mask's; {known[int(0.05 * len(known))]:.2f} in the worst "
+            f"twentieth; worst in {_worst(report.object_iou)}",
+            _judge(1 - mean, 0.15, 0.3),
+            "look at these frames in overlay.mp4: poses, shape or masks are off there",
+        )
+
+
+def _worst(values: list[float | None], count: int = 3) -> str:
+    """The frames with the smallest values."""
+    known = [(v, i) for i, v in enumerate(values) if v is not None]
+    worst = sorted(i for _, i in sorted(known)[:count])
+    return f"frames {', '.join(map(str, worst))}"
 
 
 def _views(report: Measures) -> Iterator[MeasureDiagnostic]:

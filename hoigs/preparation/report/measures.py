@@ -38,7 +38,7 @@ class Measures:
             object_reason: why not better.
         object_agreement: of each frame, correlation of the object's texture with that of the other
             frames; None where it shows too little. object_outline_m: metres between the mask's
-            outline and the shape's.
+            outline and the shape's. object_iou: of each frame, intersection over union of both.
         object_held, object_rests: parts of the frames in which hands move it, and it rests.
         hand_distance_m: of each frame, from the nearest palm to its surface while held; negative
             inside.
@@ -75,6 +75,7 @@ class Measures:
     object_way: str = ""
     object_reason: str = ""
     object_agreement: list[float | None] = field(default_factory=list)
+    object_iou: list[float | None] = field(default_factory=list)
     object_outline_m: list[float | None] = field(default_factory=list)
     object_held: float = 0.0
     object_rests: float = 0.0

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from hoigs.core.cpus import available_cpus
 from hoigs.core.errors import HoigsError
+from hoigs.core.machine.cpus import available_cpus
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 

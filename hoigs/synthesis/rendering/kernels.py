@@ -10,7 +10,7 @@ on to see them all.
 # No `from __future__ import annotations` here: Warp reads kernel annotations as objects.
 # float(1.0) declares a variable that a loop may change; a bare literal would be a constant.
 # ruff: noqa: UP018, RUF046
-import warp as wp
+from hoigs.core.machine.quiet_warp import wp
 
 wp.set_module_options({"enable_backward": False})
 

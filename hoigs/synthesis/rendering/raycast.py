@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import warp as wp
 from jaxtyping import Float, Int
 
+from hoigs.core.machine.quiet_warp import wp
 from hoigs.core.values.camera import Camera
 from hoigs.synthesis.config import LightConfig
 from hoigs.synthesis.rendering import kernels

@@ -92,7 +92,7 @@ def track_of(
     means = torch.stack([g.means for g in frames])
     quats = _continuous(torch.stack([normalize_quats(g.quats) for g in frames]))
     scales = torch.stack([g.log_scales for g in frames])
-    rgba = torch.stack([_rgba(g, eyes) for g in frames])
+    rgba = torch.stack([rgba_of(g, eyes) for g in frames])
     whole = Track(name, "moving", means, quats, scales, rgba)
     steady = all(float((x - x[:1]).abs().max()) < STEADY for x in (scales, rgba[..., 3]))
     if not steady or not len(whole):
@@ -106,14 +106,15 @@ def track_of(
         return one
     if not rigid or len(whole) < 3:
         return whole
-    poses = torch.stack([_pose(means[0], m) for m in means])
-    left = [_remaining(means[0], quats[0], m, q, p) for m, q, p in zip(means, quats, poses)]
+    poses = torch.stack([pose_of(means[0], m) for m in means])
+    left = [remaining(means[0], quats[0], m, q, p) for m, q, p in zip(means, quats, poses)]
     if max(left) > RIGID_M:
         return whole
     return replace(one, motion="rigid", poses=poses)
 
 
-def _rgba(gaussians: Gaussians, eyes: Sequence[Float[Tensor, " 3"]]) -> Float[Tensor, "N 4"]:
+def rgba_of(gaussians: Gaussians, eyes: Sequence[Float[Tensor, " 3"]]) -> Float[Tensor, "N 4"]:
+    """Colour, the mean of what these camera centres see, and opacity, in [0, 1]."""
     seen = [sh_to_colors(gaussians.sh, gaussians.means, eye) for eye in eyes]
     color = torch.stack(seen).mean(0).clamp(0, 1)
     return torch.cat((color, gaussians.opacities[:, None]), -1)
@@ -126,14 +127,14 @@ def _continuous(quats: Float[Tensor, "K N 4"]) -> Float[Tensor, "K N 4"]:
     return quats * signs[..., None]
 
 
-def _pose(source: Float[Tensor, "N 3"], target: Float[Tensor, "N 3"]) -> Float[Tensor, " 7"]:
+def pose_of(source: Float[Tensor, "N 3"], target: Float[Tensor, "N 3"]) -> Float[Tensor, " 7"]:
     """Rotation (quaternion) and translation that take the source to the target."""
     rotation = kabsch(source.double(), target.double())
     shift = target.double().mean(0) - rotation @ source.double().mean(0)
     return torch.cat((matrices_to_quats(rotation), shift)).float()
 
 
-def _remaining(
+def remaining(
     means: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],
     moved: Float[Tensor, "N 3"],

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import UInt8
@@ -31,6 +31,14 @@ DEPTH_WIDTH = 400  # pixels of the depth that is sent, which hides overlays behi
 JPEG = {True: 80, False: 93}  # quality of a moving and of a still picture
 
 
+class Splats(Protocol):
+    """What sends Gaussians to the browsers (`hoigs.viewing.splats`)."""
+
+    def draws(self, settings: Settings) -> bool: ...
+
+    def update(self, drawing: RunDrawing, frame: float, settings: Settings) -> int: ...
+
+
 class Viewer:
     """One server, its panel, and the thread that draws (the one that calls `serve`).
 
@@ -39,6 +47,7 @@ class Viewer:
         bodies: for overlays. overlays: their names.
         widest: pixels of width of a still picture at most.
         refresh: called now and then; may return drawings to go on with.
+        splats: shows the first drawing where the browser can draw it.
     """
 
     def __init__(
@@ -50,6 +59,7 @@ class Viewer:
         *,
         widest: int = 1280,
         refresh: Callable[[], Sequence[Drawing] | None] | None = None,
+        splats: Splats | None = None,
     ) -> None:
         self.server, self.drawings = server, list(drawings)
         first, clip = drawings[0], drawings[0].clip
@@ -61,6 +71,8 @@ class Viewer:
         self._wake, self._jobs = threading.Event(), queue.SimpleQueue[Callable[[], None]]()
         self._stopped, self._widest = False, widest
         self._refresh, self._refreshed = refresh, 0.0
+        self._splats = splats
+        self._splatted: object = None  # what was last sent
         self._eyes: dict[int, Eye] = {}
         self._version, self._told = 0, 0.0
         self._anchor: tuple[str | None, float] = (None, 0.0)  # what was followed, and its frame
@@ -105,12 +117,27 @@ class Viewer:
             frame = self.clock.frame(now)
             self.controls.show_time(frame, now)
         self.overlays.update(settings.overlays, frame)
+        browser = self._splats is not None and self._splats.draws(settings)
+        if self._splats is not None:
+            self._send(settings, frame)
         drew = False
         for eye in list(self._eyes.values()):
             self._follow(eye, settings, frame, now)
-            drew |= self._draw_for(eye, settings, frame, now)
+            drew |= self._clear(eye) if browser else self._draw_for(eye, settings, frame, now)
         self._anchor = (settings.follow, frame)
         return drew
+
+    def _send(self, settings: Settings, frame: float) -> None:
+        """Bring the browsers' Gaussians up to date, if anything has changed."""
+        key = (frame, settings.key(), self._version)
+        first = self.drawings[0]
+        if self._splats is None or key == self._splatted or not isinstance(first, RunDrawing):
+            return
+        self._splatted = key
+        sent = self._splats.update(first, frame, settings)
+        if self._splats.draws(settings):
+            text = f"{first.title}  \ndrawn by the browser, {sent:,} Gaussians sent"
+            self.controls.status.content = text
 
     def _connect(self, client: Any) -> None:
         eye = Eye(client, self._widest, self._dragged)

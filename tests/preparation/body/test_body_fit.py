@@ -17,9 +17,9 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_problem import BodyFit, FitOptions
+from hoigs.preparation.body.fit_values import BodyFit, FitOptions
 from hoigs.preparation.body.ground_scale import ground_scale
-from hoigs.preparation.body.joint_limits import limit_penalty
+from hoigs.preparation.body.joint_limits import beyond
 from hoigs.preparation.body.landmarks import LandmarkTrack, points_of
 from hoigs.preparation.body.limb_start import limb_pose
 from hoigs.preparation.report.mesh_overlay import overlay_frame
@@ -201,6 +201,10 @@ def test_limbs_start_on_their_landmarks() -> None:
         goal = torch.nn.functional.normalize(true[:, b] - true[:, a], dim=-1)
         assert (way * goal).sum(-1).min() > np.cos(np.deg2rad(3)), (a, b)
     assert limit_penalty(angles) < 0.02  # elbows and knees bend the way they can
+
+
+def limit_penalty(body: Tensor) -> Tensor:
+    return beyond(body).square().sum((-1, -2)).mean()
 
 
 def test_joint_limits() -> None:

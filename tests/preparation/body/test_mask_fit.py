@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_problem import BodyFit
+from hoigs.preparation.body.fit_values import BodyFit
 from hoigs.preparation.body.kinematics import PER_FRAME
 from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.body.mask_fit import MaskFit

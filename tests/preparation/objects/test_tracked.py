@@ -145,6 +145,6 @@ def test_a_spin_in_flight_is_found_by_texture() -> None:
         known, Poses(rotations[known], places[known]), surface.rest, agreement, agreement, 0.0
     )
     guess = Poses(torch.eye(3).expand(FRAMES, 3, 3), places)
-    found = flights_by_texture(crops, surface, first, guess, FPS)
+    found = flights_by_texture(crops, surface, first, guess, np.array([0.0, -1, 0]), FPS)
     assert float(angles(found.rotations[flight], rotations[flight]).max()) < 25
     assert float(angles(guess.rotations[flight], rotations[flight]).max()) > 120

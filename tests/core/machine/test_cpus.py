@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from hoigs.core import cpus
+from hoigs.core.machine import cpus
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,1 @@
+"""What the machine offers: `cpus` counts processors, `quiet_warp` starts Warp."""

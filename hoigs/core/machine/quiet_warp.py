@@ -1,0 +1,47 @@
+"""Warp, initialised once and quietly; every module of hoigs takes `wp` from here."""
+
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import warp as wp
+
+__all__ = ["wp"]
+
+NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
+
+
+def start() -> None:
+    """Initialise Warp without its banner, its list of devices and its notice of each module."""
+    if not hasattr(wp.config, "log_level"):  # Warp before 1.12
+        setattr(wp.config, "quiet", True)  # noqa: B010
+        wp.init()
+        return
+    level = wp.config.log_level
+    wp.config.log_level = max(level, 40)  # no warning on a machine without CUDA
+    with _without_driver_notice():
+        wp.init()
+    wp.config.log_level = max(level, 30)
+
+
+@contextmanager
+def _without_driver_notice() -> Iterator[None]:
+    """Drop the line that Warp's C++ prints to stderr where there is no CUDA driver, no other."""
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as caught:
+        saved = os.dup(2)
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            caught.seek(0)
+            for line in caught.read().decode(errors="replace").splitlines():
+                if NO_DRIVER not in line:
+                    print(line, file=sys.stderr)
+
+
+start()

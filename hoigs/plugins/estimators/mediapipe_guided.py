@@ -1,0 +1,159 @@
+"""Read by `mediapipe_script.py`: landmarks of a person whom MediaPipe's detector does not find.
+
+That detector looks for a face. Where the frame cuts the head off, the model of landmarks can do
+without it if it is shown the square in which the person stands: squares of several sizes and
+heights are tried in one frame, and the one whose shoulders and arms are seen best is followed.
+It imports nothing of hoigs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+SIZES = (0.8, 1.1, 1.5, 2.0)  # sides of the squares, in longer sides of the image
+HEIGHTS = (0.2, 0.5, 0.8, 1.1)  # their middles, in heights of the image
+FOUND = 0.8  # mean visibility of shoulders and of the better arm, for a person to be found
+KEPT = 0.5  # the same while they are followed
+AGAIN = 15  # frames until a search that found nobody is repeated, or one that was lost is left
+SHOULDERS, LEFT, RIGHT, HIPS = [11, 12], [13, 15], [14, 16], [23, 24]
+HEAD, LEGS = slice(0, 11), slice(25, 33)
+SAME = 0.8  # of the first distance of the shoulders: less is a part of them taken for the whole
+FAR = 0.1  # of the square's side: shoulders that moved farther take it with them
+NARROW = 0.08  # of the image's longer side: shoulders closer together are those of no one so near
+GRAPH = """
+input_stream: "image"
+input_stream: "square"
+input_side_packet: "model_complexity"
+input_side_packet: "enable_segmentation"
+output_stream: "landmarks"
+output_stream: "world"
+output_stream: "mask"
+node {
+  calculator: "PoseLandmarkByRoiCpu"
+  input_side_packet: "MODEL_COMPLEXITY:model_complexity"
+  input_side_packet: "ENABLE_SEGMENTATION:enable_segmentation"
+  input_stream: "IMAGE:image"
+  input_stream: "ROI:square"
+  output_stream: "LANDMARKS:landmarks"
+  output_stream: "WORLD_LANDMARKS:world"
+  output_stream: "SEGMENTATION_MASK:mask"
+}
+"""
+
+
+class GuidedPose:
+    """MediaPipe's model of landmarks in a square that is searched for, then followed.
+
+    Args:
+        graph: of `landmark_graph`. rect: makes a square for it, NormalizedRect.
+        credible: whether landmarks fit the frame's mask of people.
+    """
+
+    def __init__(self, graph, rect, credible) -> None:
+        self.graph, self.rect, self.credible = graph, rect, credible
+        self.square: tuple[float, float, float] | None = None  # x, y of the middle and side, pixels
+        self.broad = 0.0  # distance of the shoulders when the person was found, pixels
+        self.wait = 0
+
+    def process(self, image, wide):
+        """Landmarks in the image and in space, and the person's mask; None where nobody is found.
+
+        Args:
+            wide: the frame's mask of people, or None.
+        """
+        if self.square is not None:
+            found = self.look(image, wide, self.square)
+            if found is not None and found[0] >= KEPT:
+                return self.follow(found)
+            self.wait += 1
+            if self.wait <= AGAIN:  # another square now would more often be a wrong one
+                nothing = np.full((33, 4), np.nan)
+                return None if found is None else (nothing, nothing, found[3])
+            self.square, self.wait = None, 0
+        if self.wait:
+            self.wait -= 1
+            return None
+        found = self.search(image, wide)
+        if found is None or found[0] < FOUND:
+            self.wait = AGAIN
+            return None
+        return self.follow(found)
+
+    def search(self, image, wide):
+        """The best of all squares."""
+        height, width = image.shape[:2]
+        middle = width / 2 if wide is None else middle_of(wide > 0.5)
+        if middle is None:
+            return None
+        squares = [(middle, y * height, s * max(width, height)) for s in SIZES for y in HEIGHTS]
+        tried = [f for f in (self.look(image, wide, s) for s in squares) if f is not None]
+        return max(tried, key=lambda f: f[0], default=None)
+
+    def look(self, image, wide, square):
+        """Score (0 if they are nobody's), landmarks, places in space, mask, square; or None."""
+        height, width = image.shape[:2]
+        x, y, side = square
+        rect = self.rect(x_center=x / width, y_center=y / height, width=side / width,
+                         height=side / height, rotation=0.0)  # fmt: skip
+        found = self.graph.process({"image": image, "square": rect})
+        if found.landmarks is None or found.mask is None:
+            return None
+        points, space = rows_of(found.landmarks), rows_of(found.world)
+        points[:, :3] *= [width, height, width]
+        inside = (points[:, :2] >= 0).all(1) & (points[:, :2] < [width, height]).all(1)
+        points[:, 3] *= inside  # what lies outside is supposed, not seen
+        broad = np.ptp(points[SHOULDERS, 0])
+        near = broad >= max(NARROW * max(width, height), SAME * self.broad)
+        person = near and upright(points) and self.credible(points, wide)
+        mask = np.array(found.mask)
+        points[HEAD, 3] = 0.0  # one that can be seen is found by the detector
+        x, y = points[LEGS, :2].astype(int).clip(0, [width - 1, height - 1]).T
+        points[LEGS, 3] *= mask[y, x]  # not on the person: on a table before them
+        return score(points[:, 3]) if person else 0.0, points, space, mask, square
+
+    def follow(self, found):
+        """Keeps the square over the person: it moves with the shoulders, if they move far."""
+        _, points, space, mask, (x, y, side) = found
+        middle = points[SHOULDERS, :2].mean(0)
+        if self.square is None:
+            self.shoulders = middle
+        elif np.linalg.norm(middle - self.shoulders) > FAR * side:
+            x, y = np.array((x, y)) + middle - self.shoulders
+            self.shoulders = middle
+        self.square, self.wait = (x, y, side), 0
+        self.broad = self.broad or float(np.ptp(points[SHOULDERS, 0]))
+        return points, space, mask
+
+
+def landmark_graph(complexity):
+    """MediaPipe's graph of the model of landmarks alone, and what makes a square for it."""
+    from google.protobuf import text_format
+    from mediapipe.framework import calculator_pb2
+    from mediapipe.framework.formats import rect_pb2
+    from mediapipe.python.solution_base import SolutionBase
+
+    config = text_format.Parse(GRAPH, calculator_pb2.CalculatorGraphConfig())
+    sides = {"model_complexity": complexity, "enable_segmentation": True}
+    return SolutionBase(graph_config=config, side_inputs=sides), rect_pb2.NormalizedRect
+
+
+def upright(points) -> bool:
+    """Whether the head is above the shoulders, and they above the hips."""
+    head, hips = points[0, 1], points[HIPS, 1].mean()
+    return bool(head < points[SHOULDERS, 1].mean() < hips)
+
+
+def score(visibility) -> float:
+    """Mean visibility of the shoulders and the arm that is seen better."""
+    arm = max(visibility[LEFT].mean(), visibility[RIGHT].mean())
+    return float((visibility[SHOULDERS].mean() + arm) / 2)
+
+
+def middle_of(mask):
+    """Mean x of a mask; None if it is empty."""
+    columns = mask.sum(0)
+    return float(np.average(np.arange(len(columns)), weights=columns)) if columns.any() else None
+
+
+def rows_of(found):
+    return np.array([[p.x, p.y, p.z, p.visibility] for p in found.landmark])

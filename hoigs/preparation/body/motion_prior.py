@@ -1,0 +1,109 @@
+"""How a body moves before it is seen: accelerations of its points and joint angles, per second."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.core.values.moment import BodyPose
+from hoigs.preparation.body.kinematics import Kinematics, Posed
+from hoigs.preparation.body.normal_equations import NormalEquations
+
+TURNING = 30.0  # rad/s^2 of a joint: CMU's basketball players, 6 to 100
+LASTS = 0.06  # seconds in which an acceleration stays what it is: CMU's basketball players
+INDEPENDENT = 0.4  # share of the points that move by themselves
+FAT = 4.0  # degrees of freedom of Student's distribution of accelerations
+
+
+class MotionPrior:
+    """Accelerations by Student's distribution (Lange, Little and Taylor 1989): ordinary motion is
+    held, a throw let go. Angles of joints by a normal one.
+
+    Points count about the torso's middle, and that as one more: a body that moves as a whole has
+    one acceleration, not one a point.
+
+    Args:
+        torso: numbers of points. count: of all points.
+        times: of the frames, seconds.
+        smooth: acceleration that is ordinary, m/s^2.
+    """
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        torso: list[int],
+        count: int,
+        times: Float[Tensor, " F"],
+        smooth: float,
+    ) -> None:
+        self.kinematics, self.torso, self.smooth = kinematics, torso, smooth
+        steps = (times[1:] - times[:-1]).double().clamp_min(1e-4)
+        self.factors = _second_differences(steps)
+        self.lasts = (0.5 * (steps[1:] + steps[:-1]) / LASTS).clamp_max(1.0)[:, None]
+        self.independent = torch.full((count + 1,), INDEPENDENT, dtype=torch.float64)
+        self.independent[-1] = 1.0
+
+    def add(
+        self, at: Posed, shared: Tensor | None, pose: BodyPose, equations: NormalEquations | None
+    ) -> float:
+        """Cost, twice the negative logarithm of the density; adds to the equations, if any."""
+        if len(at.points) < 3:
+            return 0.0
+        return self._points(at, shared, pose, equations) + self._angles(pose, equations)
+
+    def _points(
+        self, at: Posed, shared: Tensor | None, pose: BodyPose, equations: NormalEquations | None
+    ) -> float:
+        # a small body close by would accelerate less than a large one far off in the same images
+        size, by_betas = self.kinematics.size(pose.betas)
+        factors, share = self.factors / size, self.lasts * self.independent
+        points = self._about_torso(at.points)
+        values = _differences(points.flatten(1), factors).unflatten(1, (-1, 3))
+        squares = values.square().sum(-1) / self.smooth**2
+        cost = share * (FAT + 3) * (1 + squares / FAT).log()
+        if equations is not None and shared is not None:
+            weight = share * (FAT + 3) / (FAT + squares) / self.smooth**2
+            shrinking = points[..., None] * by_betas / size
+            shared = self._about_torso(shared) - torch.nn.functional.pad(
+                shrinking, (0, shared.shape[-1] - len(by_betas))
+            )
+            equations.add_accelerations(
+                values.flatten(1), weight[..., None].expand_as(values).flatten(1), factors,
+                self._about_torso(at.by_frame).flatten(1, 2), shared.flatten(1, 2),
+            )  # fmt: skip
+        return float(cost.sum())
+
+    def _angles(self, pose: BodyPose, equations: NormalEquations | None) -> float:
+        factors = self.factors / TURNING
+        turning, weight = _differences(pose.body.flatten(1), factors), INDEPENDENT * self.lasts
+        if equations is not None:
+            count = len(turning)
+            for a in range(3):
+                part = weight * factors[:, a, None]
+                equations.by_frame[a : a + count, 6:] += part * turning
+                for b in range(a, 3):
+                    diagonal = equations.blocks[b - a].diagonal(dim1=1, dim2=2)
+                    diagonal[a : a + count, 6:] += part * factors[:, b, None]
+        return float((weight * turning.square()).sum())
+
+    def _about_torso(self, values: Float[Tensor, "F L *rest"]) -> Float[Tensor, "F K *rest"]:
+        middle = values[:, self.torso].mean(1, keepdim=True)
+        return torch.cat((values - middle, middle), 1)
+
+
+def _differences(
+    values: Float[Tensor, "F N"], factors: Float[Tensor, "T 3"]
+) -> Float[Tensor, "T N"]:
+    count = len(factors)
+    first, second, third = (values[k : k + count] * factors[:, k, None] for k in range(3))
+    return first + second + third
+
+
+def _second_differences(steps: Float[Tensor, " S"]) -> Float[Tensor, "T 3"]:
+    """Factors of the values at three times that give their second derivative."""
+    before, after = steps[:-1], steps[1:]
+    span = 0.5 * (before + after)
+    return torch.stack(
+        (1 / (before * span), -1 / before / span - 1 / after / span, 1 / (after * span)), 1
+    )

@@ -1,0 +1,90 @@
+"""The moving picture at the top of the README: the video, its reconstruction, and bullet time.
+
+    hoigs demo --out runs/demo --no-baseline
+    python scripts/readme_film.py runs/demo
+
+All three show the same moment; while time stands still, only the camera of the third one moves.
+Renders have twice the pixels of the picture, and are averaged. Writes docs/assets/demo.webp.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+from PIL import Image, ImageDraw, ImageFont
+
+from hoigs.core.values.between import camera_between, frame_numbers
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip
+from hoigs.evaluation.report.draw import picture
+from hoigs.runs.loaded_run import open_run
+from hoigs.viewing.films import playback_of
+from hoigs.viewing.frames import source_frame
+from hoigs.viewing.paths import film_path, frames_shown
+
+OUT = Path(__file__).resolve().parents[1] / "docs" / "assets" / "demo.webp"
+TITLES = ("the video", "reconstruction", "bullet time")
+GAP, HEAD = 8, 28  # pixels
+GROUND, INK = (14, 16, 20), (214, 210, 202)
+LARGEST = 3_000_000  # bytes
+
+
+def frames(run: Path, clip: Path | None, side: int) -> Iterator[tuple[Image.Image, float]]:
+    """The pictures of the film, and the seconds that each is shown."""
+    loaded = open_run(run, clip=clip)
+    numbers, fps = frame_numbers(loaded.clip)
+    around = film_path(loaded.model, loaded.clip, "bullet-time", numbers, fps)
+    shown = frames_shown(loaded.clip, around)
+    views = [(moment, camera.resized(2 * side, 2 * side)) for moment, camera in around]
+    straight = [
+        (moment, camera_between(loaded.clip, frame).resized(2 * side, 2 * side))
+        for (moment, _), frame in zip(around, shown, strict=True)
+    ]
+    play = playback_of(loaded.model, [*views[::8], *straight[::8]])
+    font = ImageFont.load_default(15)
+    for (moment, own), (_, beside), frame in zip(straight, views, shown, strict=True):
+        sheet = Image.new("RGB", (3 * side + 2 * GAP, side + HEAD), GROUND)
+        draw = ImageDraw.Draw(sheet)
+        panels = (
+            _source(loaded.clip, frame),
+            Image.fromarray(picture(play(moment, own).color)),
+            Image.fromarray(picture(play(moment, beside).color)),
+        )
+        for i, (panel, title) in enumerate(zip(panels, TITLES, strict=True)):
+            left = i * (side + GAP)
+            sheet.paste(panel.resize((side, side), Image.Resampling.LANCZOS), (left, HEAD))
+            draw.text((left + side / 2, HEAD / 2), title, INK, font, anchor="mm")
+        yield sheet, 1 / fps
+
+
+def _source(clip: Clip, frame: float) -> Image.Image:
+    camera: Camera = camera_between(clip, frame)
+    return Image.fromarray(source_frame(clip, frame, camera, channels=3))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--clip", type=Path)
+    parser.add_argument("--side", type=int, default=256, help="pixels of each of the three")
+    parser.add_argument("--quality", type=int, default=66, help="lowered until it fits")
+    parser.add_argument("--out", type=Path, default=OUT)
+    arguments = parser.parse_args()
+    made = list(frames(arguments.run, arguments.clip, arguments.side))
+    for quality in range(arguments.quality, 20, -8):
+        made[0][0].save(
+            arguments.out, save_all=True, append_images=[image for image, _ in made[1:]],
+            duration=[round(1000 * seconds) for _, seconds in made], loop=0, quality=quality,
+            method=6,
+        )  # fmt: skip
+        size = arguments.out.stat().st_size
+        print(f"{arguments.out}: {len(made)} pictures, quality {quality}, {size / 1e6:.2f} MB")
+        if size <= LARGEST:
+            return
+    raise SystemExit("too large for a README: lower --side")
+
+
+if __name__ == "__main__":
+    main()

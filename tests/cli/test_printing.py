@@ -1,0 +1,52 @@
+"""What commands print: nothing is cut, repeated or empty, and no escape sequence comes through."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from hoigs.cli.common import print_table
+
+WIDE = [f"a column with a long title, number {i}" for i in range(9)]
+
+
+def test_wide_tables_are_not_cut(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table("wide", WIDE, [[f"a{i}-" + 30 * "x" for i in range(9)]])
+    shown = capsys.readouterr().out
+    assert "…" not in shown
+    assert all(title in shown for title in WIDE) and all(
+        f"a{i}-{30 * 'x'}" in shown for i in range(9)
+    )
+
+
+def test_narrow_terminals_break_words(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes this for a terminal
+    print_table("narrow", ["name", "value"], [[50 * "n", 30 * "v"]])
+    shown = capsys.readouterr().out
+    assert "…" not in shown and shown.count("n") >= 50 and shown.count("v") >= 30
+
+
+def test_names_and_notes_are_not_taken_for_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    odd = "\x1b]0;title\x07\x1b[31mred"
+    print_table(odd, [odd], [[odd]], [odd, "pip install 'hoigs[usd]'"])
+    shown = capsys.readouterr().out
+    assert "\x1b" not in shown and "\x07" not in shown
+    assert shown.count("red") == 4 and "hoigs[usd]" in shown
+
+
+def test_a_table_without_rows_is_its_notes(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table("geometry", ["measure", "mean"], [], ["all of it: not computed: no truth"])
+    assert capsys.readouterr().out.split("\n") == [
+        "geometry", "all of it: not computed: no truth", "",
+    ]  # fmt: skip
+
+
+def test_warp_starts_without_a_word() -> None:
+    code = "import hoigs.synthesis.generate, hoigs.rasterizers.warp"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "" and done.stderr == ""

@@ -1,0 +1,64 @@
+"""A person without a head in view: the square that shows them is found and followed."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace as Box
+
+import numpy as np
+import pytest
+
+from hoigs.plugins.estimators.mediapipe_guided import AGAIN, GuidedPose
+
+IMAGE = np.zeros((90, 160, 3), np.uint8)
+# nose, shoulders, elbows, wrists, hips of someone cut off at the neck, pixels
+PLACES = {0: (80, -10), 11: (110, 10), 12: (50, 10), 13: (120, 40), 14: (40, 40), 15: (118, 60),
+          16: (42, 60), 23: (95, 70), 24: (65, 70)}  # fmt: skip
+
+
+class Graph:
+    """Sees the person best in squares whose middle is at half of the image's height."""
+
+    def __init__(self, narrow: float = 1.0, turned: bool = False) -> None:
+        self.narrow, self.turned, self.looks = narrow, turned, 0
+
+    def process(self, given: dict) -> Box:
+        self.looks += 1
+        sure = 1.0 if abs(given["square"].y_center - 0.5) < 0.1 else 0.7
+        points = [Box(x=-1.0, y=-1.0, z=0.0, visibility=0.0) for _ in range(33)]
+        for mark, (x, y) in PLACES.items():
+            x, y = 80 + (x - 80) * self.narrow, 89 - y if self.turned else y
+            points[mark] = Box(x=x / 160, y=y / 90, z=0.0, visibility=sure)
+        rows = Box(landmark=points)
+        return Box(landmarks=rows, world=rows, mask=np.ones((90, 160), np.float32))
+
+
+def guided(graph: Graph) -> GuidedPose:
+    return GuidedPose(graph, Box, lambda points, wide: True)
+
+
+def test_the_best_square_is_followed() -> None:
+    graph = Graph()
+    pose = guided(graph)
+    points, _, mask = pose.process(IMAGE, None)
+    np.testing.assert_allclose(points[11], (110, 10, 0, 1), atol=1e-9)
+    assert not points[0, 3]  # what is out of view is not seen
+    assert mask.shape == IMAGE.shape[:2] and pose.square[1] == pytest.approx(45)
+    tried = graph.looks
+    pose.process(IMAGE, None)
+    assert graph.looks == tried + 1
+
+
+def test_a_part_of_the_person_is_not_taken_for_the_whole() -> None:
+    graph = Graph()
+    pose = guided(graph)
+    pose.process(IMAGE, None)
+    graph.narrow = 0.7
+    points, _, mask = pose.process(IMAGE, None)
+    assert np.isnan(points).all() and mask.all()
+
+
+def test_nobody_who_stands_on_their_head_and_no_search_in_every_frame() -> None:
+    graph = Graph(turned=True)
+    pose = guided(graph)
+    assert [pose.process(IMAGE, None) for _ in range(AGAIN + 1)] == [None] * (AGAIN + 1)
+    assert graph.looks == 16

@@ -1,0 +1,16 @@
+"""The report names parts of the body that are out of view."""
+
+from __future__ import annotations
+
+import torch
+
+from hoigs.preparation.body.landmarks import LandmarkTrack
+from hoigs.preparation.person import _unseen
+
+
+def test_parts_out_of_view_are_named() -> None:
+    image = torch.ones(10, 33, 3)
+    assert _unseen(LandmarkTrack(image, image)) == []
+    image[1:, 25:, 2] = 0.1  # one frame in ten shows a leg
+    [sentence] = _unseen(LandmarkTrack(image, image))
+    assert sentence.startswith("the person's legs are out of view")
