@@ -76,7 +76,7 @@ def test_blocks_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {"__name__": "__main__"}
     for block in blocks_of(page):
-        if block.skip or block.language not in ("python", "console", "json"):
+        if block.skip or block.language not in ("python", "console", "json", "csv"):
             continue
         where = f"{page.name}:{block.line}"
         if block.file:

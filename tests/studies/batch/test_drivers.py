@@ -1,0 +1,125 @@
+"""Drivers of one batch at the same time, and drivers and stages that are killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+# in place of `hoigs`: notes its start and end, and makes what the stage would make
+STAGE = """
+import os, sys, time
+from pathlib import Path
+from hoigs.studies.jobs.command import end_with
+end_with(int(sys.argv[1]))
+words = sys.argv[2:]
+def note(text):
+    with open(os.environ["NOTES"], "a") as file:
+        file.write(f"{text} {words[0]} {target.parent.name} {os.getpid()}\\n")
+target = Path(words[words.index("--out") + 1] if "--out" in words else words[1])
+if words[0] == "export":
+    target = target.parent
+note("start")
+if "broken" in str(target):
+    sys.exit("error: this one is broken")
+time.sleep(float(os.environ["SECONDS"]))
+if words[0] == "export":
+    (target / words[words.index("--format") + 1]).mkdir(parents=True)
+elif words[0] == "eval":
+    (target / "evaluation.json").write_text("{}")
+else:
+    target.mkdir(exist_ok=True)
+note("end")
+"""
+DRIVER = """
+import sys
+import hoigs
+from hoigs.studies.jobs.executor import LocalExecutor
+where = LocalExecutor(2, program=(sys.executable, sys.argv[1]))
+done = hoigs.batch(sys.argv[2], sys.argv[3], executor=where)
+sys.exit(len(done.failed))
+"""
+
+
+class Batches:
+    """Starts drivers on one folder."""
+
+    def __init__(self, folder: Path, rows: list[str]) -> None:
+        self.folder, self.out, self.notes = folder, folder / "out", folder / "notes"
+        (folder / "clip").mkdir()
+        (folder / "stage.py").write_text(STAGE)
+        text = "".join(f"  - {{name: {row}, clip: clip}}\n" for row in rows)
+        (folder / "rows.yaml").write_text(f"rows:\n{text}")
+
+    def start(self, seconds: float = 0.1) -> subprocess.Popen[bytes]:
+        names = [str(self.folder / name) for name in ("stage.py", "rows.yaml")]
+        environment = os.environ | {"NOTES": str(self.notes), "SECONDS": str(seconds)}
+        return subprocess.Popen([sys.executable, "-c", DRIVER, *names, str(self.out)],
+                                env=environment)  # fmt: skip
+
+    def noted(self) -> list[list[str]]:
+        return (
+            [x.split() for x in self.notes.read_text().splitlines()] if self.notes.exists() else []
+        )
+
+    def wait_for(self, event: str, stage: str) -> int:
+        """The process of the first such event."""
+        until = time.monotonic() + 30
+        while time.monotonic() < until:
+            for what, name, _, pid in self.noted():
+                if (what, name) == (event, stage):
+                    return int(pid)
+            time.sleep(0.02)
+        raise AssertionError(f"no {event} of {stage} in {self.noted()}")
+
+    def ends(self) -> Counter[tuple[str, str]]:
+        return Counter((stage, row) for what, stage, row, _ in self.noted() if what == "end")
+
+    def states(self) -> dict[str, str]:
+        return {
+            row["name"]: row["state"] for row in json.loads((self.out / "summary.json").read_text())
+        }
+
+
+def all_gone(pids: list[int]) -> bool:
+    until = time.monotonic() + 5
+    while time.monotonic() < until:
+        if not any(Path(f"/proc/{pid}").exists() for pid in pids):
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def test_two_drivers_do_every_stage_once_and_a_failed_row_costs_only_itself(tmp_path):
+    batches = Batches(tmp_path, ["a", "b", "broken", "c"])
+    first, second = batches.start(), batches.start()
+    assert first.wait(60) == 1 and second.wait(60) == 1
+    assert set(batches.ends().values()) == {1} and len(batches.ends()) == 9
+    assert batches.states() == {"a": "done", "b": "done", "broken": "failed", "c": "done"}
+    assert "this one is broken" in (batches.out / "rows/broken/train.log").read_text()
+    assert not [p for p in batches.out.rglob("*") if p.suffix in (".part", ".lock")]
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
+@pytest.mark.parametrize("victim", ["driver", "stage"])
+def test_after_a_kill_every_row_is_done_once(tmp_path, victim):
+    batches = Batches(tmp_path, ["a", "b"])
+    driver = batches.start(seconds=1.0)
+    stage = batches.wait_for("start", "train")
+    os.kill(driver.pid if victim == "driver" else stage, signal.SIGKILL)
+    if victim == "driver":
+        assert driver.wait(10) == -signal.SIGKILL
+        assert all_gone([int(pid) for *_, pid in batches.noted()])  # no stage outlives its driver
+        driver = batches.start(seconds=0.1)
+    assert driver.wait(60) == 0
+    assert set(batches.ends().values()) == {1} and len(batches.ends()) == 6
+    assert set(batches.states().values()) == {"done"}
+    assert not [p for p in batches.out.rglob("*") if p.suffix in (".part", ".lock")]
+    assert all_gone([int(pid) for *_, pid in batches.noted()])
