@@ -2,6 +2,7 @@
 
     python benchmarks/estimated.py builtin:lift-and-swing --width 160 --frames 24
     python benchmarks/estimated.py --jobs 5 --train 800 --json benchmarks/results/estimated.json
+    python benchmarks/estimated.py --table benchmarks/results/estimated.json
     python benchmarks/estimated.py --variant outline:object_track=outline --variant now:
 
 Each clip is written as a user with good 2D tools has it: frames, true masks, cameras in metres,
@@ -58,6 +59,9 @@ class Job:
 
 def main() -> int:
     options = _arguments()
+    if options.table:
+        print(table(json.loads(options.table.read_text())["rows"]))
+        return 0
     jobs = list(_jobs(options))
     rows: list[dict[str, Any]] = []
     if options.jobs > 1:
@@ -408,6 +412,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--keep", type=Path, help="folder that sources, clips and runs stay in")
     parser.add_argument("--pictures", type=Path, help="folder for pictures of trained runs")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--table", type=Path, help="print the rows of such a file, run nothing")
     return parser.parse_args()
 
 
@@ -438,6 +443,32 @@ def _add(rows: list[dict[str, Any]], row: dict[str, Any], options: argparse.Name
         temporary = options.json.with_name(f".{options.json.name}.{os.getpid()}.part")
         temporary.write_text(json.dumps(record, indent=1) + "\n")
         temporary.replace(options.json)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: what was estimated, and PSNR of person + object beside the run with all poses."""
+    head = (
+        "clip", "seed", "joints mm", "wrists mm", "acceleration m/s²", "rotation °", "place mm",
+        "Chamfer mm", "path", "path, all given", "held out", "held out, all given",
+        "object held out", "object held out, all given",
+    )  # fmt: skip
+    lines = [head, ["---"] * len(head)]
+    for row in rows:
+        if "estimated" not in row:
+            continue
+        found: list[Any] = [
+            row["clip"].removeprefix("builtin:").split("?")[0], row["seed"],
+            row["root_aligned_joints_mm"], row["wrists_mm"], row["acceleration_error_m_s2"],
+            row["rotation_deg"]["median"], row["place_mm"]["mean"], row["chamfer_mm"],
+        ]  # fmt: skip
+        runs = (row["estimated"]["interpolated poses"], row["every_pose_given"]["given poses"])
+        for view, region in (
+            ("test frames", "human_object"), ("held-out cameras", "human_object"),
+            ("held-out cameras", "object"),
+        ):  # fmt: skip
+            found += [run[view][region] for run in runs]
+        lines.append([str(value) for value in found])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _line(row: dict[str, Any]) -> str:
