@@ -70,15 +70,15 @@ def test_resume_equals_the_unbroken_run(hoigs, tiny_clip, tmp_path, request):
     torch.set_num_threads(1)
     request.addfinalizer(lambda: torch.set_num_threads(threads))
 
-    settings = ("--set", "train.steps=24", "--set", "train.checkpoint_every=12", "--no-eval")
+    settings = ("--set", "train.steps=8", "--set", "train.checkpoint_every=4", "--no-eval")
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     assert hoigs("train", tiny_clip, "--out", whole, *settings).code == 0
     assert hoigs("train", tiny_clip, "--out", broken, *settings).code == 0
-    for name in ("step_000024.safetensors", "step_000024.json"):
+    for name in ("step_000008.safetensors", "step_000008.json"):
         (broken / "checkpoints" / name).unlink()
     assert hoigs("train", tiny_clip, "--out", broken, *settings, "--resume").code == 0
-    ours = load_file(broken / "checkpoints" / "step_000024.safetensors")
-    theirs = load_file(whole / "checkpoints" / "step_000024.safetensors")
+    ours = load_file(broken / "checkpoints" / "step_000008.safetensors")
+    theirs = load_file(whole / "checkpoints" / "step_000008.safetensors")
     assert ours.keys() == theirs.keys()
     for key in ours:
         assert ours[key].equal(theirs[key]), key

@@ -8,6 +8,7 @@ user names; it reads frames from standard input and writes one file.
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar
@@ -33,6 +34,7 @@ from hoigs.plugins.estimators.common.environments import HEAVY, MEDIAPIPE
 from hoigs.plugins.estimators.common.subprocess import run_tool, settings_key
 
 SCRIPT = Path(__file__).with_name("mediapipe_script.py")
+GUIDED = Path(__file__).with_name("mediapipe_guided.py")  # which it imports
 INSTALL = "run `hoigs estimators install mediapipe` and leave `python` out"
 LONGEST = 1280  # pixels: larger frames are made smaller, which the models do in any case
 
@@ -118,6 +120,8 @@ class MediapipeEstimator(Estimator):
             )
         count = max(video.numbers, default=-1) + 1
         settings = {"pose": self._settings(), "frames": count, "masks": self.config.masks}
+        # what other versions of the scripts found is not taken
+        settings["scripts"] = [zlib.crc32(path.read_bytes()) for path in (SCRIPT, GUIDED)]
         out = video.work / f"mediapipe-{settings_key(settings)}.npz"
         if not out.is_file():
             self._run(self._python(video), out, count, video, progress)

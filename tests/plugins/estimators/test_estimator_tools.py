@@ -187,6 +187,20 @@ class Pose:
                    pose_world_landmarks=Box(landmark=[world] * 33))
 solutions = Box(pose=Box(Pose=Pose), selfie_segmentation=Box(SelfieSegmentation=Selfie))
 """
+# what the search without a detector imports: its graph finds nobody
+FAKE_GRAPH = {
+    "google/protobuf/text_format.py": "def Parse(text, config): return config",
+    "mediapipe/framework/calculator_pb2.py": "class CalculatorGraphConfig: pass",
+    "mediapipe/framework/formats/rect_pb2.py": "from types import SimpleNamespace as NormalizedRect",
+    "mediapipe/python/solution_base.py": """
+from types import SimpleNamespace as Box
+class SolutionBase:
+    def __init__(self, **settings):
+        pass
+    def process(self, given):
+        return Box(landmarks=None, world=None, mask=None)
+""",
+}
 FAKE_CV2 = """
 import numpy
 BORDER_REPLICATE = "edge"
@@ -204,6 +218,9 @@ def fake_python(tmp_path) -> Path:
     package.mkdir(parents=True)
     (package / "__init__.py").write_text(FAKE)
     (package.parent / "cv2.py").write_text(FAKE_CV2)
+    for name, text in FAKE_GRAPH.items():
+        (package.parent / name).parent.mkdir(parents=True, exist_ok=True)
+        (package.parent / name).write_text(text)
     start = f"import sys, runpy; sys.path.insert(0, {str(package.parent)!r}); "
     start += "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
     path = tmp_path / "python"
