@@ -191,7 +191,8 @@ solutions = Box(pose=Box(Pose=Pose), selfie_segmentation=Box(SelfieSegmentation=
 FAKE_GRAPH = {
     "google/protobuf/text_format.py": "def Parse(text, config): return config",
     "mediapipe/framework/calculator_pb2.py": "class CalculatorGraphConfig: pass",
-    "mediapipe/framework/formats/rect_pb2.py": "from types import SimpleNamespace as NormalizedRect",
+    "mediapipe/framework/formats/rect_pb2.py": "class NormalizedRect:\n"
+    "    def __init__(self, **place): pass",
     "mediapipe/python/solution_base.py": """
 from types import SimpleNamespace as Box
 class SolutionBase:
