@@ -72,9 +72,9 @@ class FolderLock:
         self._token = ""
 
     def require_held(self) -> None:
-        """Raise HoigsError if another process took the lock over, as after a long suspension."""
+        """Raise `error` if another process took the lock over, as after a long suspension."""
         if self._token and _read(self.path).get("token") != self._token:
-            raise HoigsError(
+            raise self.error(
                 f"{self.folder}: another process took this folder over, since this one was "
                 "suspended or its disk did not answer; nothing more is written"
             )

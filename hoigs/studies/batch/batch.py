@@ -67,7 +67,7 @@ def batch(
     """
     out = Path(out).absolute()
     rows = read_manifest(Path(manifest), defaults)
-    chosen = [row for row in rows if not only_failed or State.read(folder_of(out, row)).failed]
+    chosen = [row for row in rows if not only_failed or State.known(folder_of(out, row)).failed]
     chosen = chosen[:limit]
     plan = {row.name: _plan(row, out) for row in chosen}
     if dry_run:
@@ -111,5 +111,5 @@ def work(
 
 
 def _plan(row: Row, out: Path) -> list[str]:
-    state = State.read(folder_of(out, row))
+    state = State.known(folder_of(out, row))
     return [" ".join(("hoigs", *state.command(s))) for s in state.todo(stages_of(row, out))]

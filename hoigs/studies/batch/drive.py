@@ -26,6 +26,7 @@ from hoigs.studies.jobs.pool import why_failed
 POLL_S = 0.01
 TAKEN_POLL_S = 2.0  # how often a row that another driver has is looked at again
 RETRY_S = 1.0
+WRONG_INPUT = 2  # exit code that another attempt does not change
 
 Report = Callable[["Work", str], None]
 
@@ -41,7 +42,7 @@ class Work:
     Attributes:
         stage: that runs, or ran last. since: when it was started, on the monotonic clock.
         taken_at: when this driver took the row.
-        retries: of its stages, by this driver. device: where the stage runs.
+        retries: of the present stage, by this driver. device: where the stage runs.
     """
 
     row: Row
@@ -103,6 +104,8 @@ def drive(
                 elif taken:
                     running.append(work)
             running = [work for work in running if driver.go_on(work)]
+            waiting.extend(driver.lost)
+            driver.lost.clear()
             tick(running)
             time.sleep(POLL_S)
     finally:
@@ -121,6 +124,7 @@ class _Driver:
     report: Report
     began: float
     failed: dict[str, str]
+    lost: list[Work] = field(default_factory=list)  # rows that another driver took over
 
     def take(self, work: Work) -> bool | None:
         """Whether this driver works on the row now; None if another one does."""
@@ -167,6 +171,15 @@ class _Driver:
         except (HoigsError, OSError) as error:  # costs this row only
             if work.process is not None:
                 work.process.stop()
+                work.process = None
+            if isinstance(error, TakenError):
+                self.report(work, "taken over by another driver")
+                work.lock, work.not_before = None, time.monotonic() + TAKEN_POLL_S
+                self.lost.append(work)
+                return False
+            with contextlib.suppress(OSError):  # a full disk, say, which is the error itself
+                work.state.fail(work.todo[0], str(error))
+                work.state.write(work.folder)
             self._failed(work, str(error))
             return self._leave(work)
 
@@ -184,6 +197,7 @@ class _Driver:
             seconds = time.monotonic() - work.since
             work.state.end(stage, seconds, work.device, socket.gethostname())
             work.state.write(work.folder)
+            work.retries = 0
             self.report(work, f"{stage.name} done")
             if work.todo:
                 self._start(work)
@@ -191,7 +205,7 @@ class _Driver:
             self.report(work, "done")
             return self._leave(work)
         why = why_failed(work.log, code) if code else f"made no {stage.result.name}"
-        if work.retries < self.retries:
+        if code != WRONG_INPUT and work.retries < self.retries:
             work.retries += 1
             work.not_before = time.monotonic() + RETRY_S
             self.report(work, f"retry: {why}")

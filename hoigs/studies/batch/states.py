@@ -47,6 +47,14 @@ class State:
         except (ValueError, TypeError) as error:
             raise HoigsError(f"{path}: damaged ({error}); remove it to do the row again") from error
 
+    @classmethod
+    def known(cls, folder: Path) -> Self:
+        """As `read`; a damaged record is a failure of its row."""
+        try:
+            return cls.read(folder)
+        except HoigsError as error:
+            return cls(failed={"stage": "", "why": str(error)})
+
     def write(self, folder: Path) -> None:
         write_whole(folder / STATE, json.dumps(asdict(self), indent=1))
 

@@ -48,7 +48,7 @@ def write_summary(rows: Sequence[Row], out: Path) -> list[Path]:
 def summary_of(row: Row, out: Path) -> dict[str, Any]:
     """State, scores (numbers, or "not computed: why") and times of a row."""
     folder = folder_of(out, row)
-    state = State.read(folder)
+    state = State.known(folder)
     todo = state.todo(stages_of(row, out))
     times = {name: done["seconds"] for name, done in state.done.items()}
     why = state.failed.get("why", "")
@@ -56,7 +56,7 @@ def summary_of(row: Row, out: Path) -> dict[str, Any]:
         "name": row.name,
         "state": "failed" if why else "done" if not todo else f"before {todo[0].name}",
         "why": why,
-        "log": f"rows/{row.name}/{state.failed['stage']}.log" if why else "",
+        "log": f"rows/{row.name}/{state.failed['stage']}.log" if state.failed.get("stage") else "",
         "source": row.video or row.clip,
         "spec": row.spec,
         "scores": _scores(folder / "run" / "evaluation.json"),

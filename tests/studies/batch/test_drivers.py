@@ -108,18 +108,31 @@ def test_two_drivers_do_every_stage_once_and_a_failed_row_costs_only_itself(tmp_
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
-@pytest.mark.parametrize("victim", ["driver"])
-def test_after_a_kill_every_row_is_done_once(tmp_path, victim):
+def test_after_a_kill_every_row_is_done_once(tmp_path):
     batches = Batches(tmp_path, ["a", "b"])
     driver = batches.start(seconds=1.0)
-    stage = batches.wait_for("start", "train")
-    os.kill(driver.pid if victim == "driver" else stage, signal.SIGKILL)
-    if victim == "driver":
-        assert driver.wait(10) == -signal.SIGKILL
-        assert all_gone([int(pid) for *_, pid in batches.noted()])  # no stage outlives its driver
-        driver = batches.start(seconds=0.1)
+    batches.wait_for("start", "train")
+    os.kill(driver.pid, signal.SIGKILL)
+    assert driver.wait(10) == -signal.SIGKILL
+    assert all_gone([int(pid) for *_, pid in batches.noted()])  # no stage outlives its driver
+    driver = batches.start(seconds=0.1)
     assert driver.wait(60) == 0
     assert set(batches.ends().values()) == {1} and len(batches.ends()) == 6
     assert set(batches.states().values()) == {"done"}
     assert not [p for p in batches.out.rglob("*") if p.suffix in (".part", ".lock")]
     assert all_gone([int(pid) for *_, pid in batches.noted()])
+
+
+def test_what_goes_wrong_with_a_row_is_on_its_record(tmp_path):
+    """More memory than the machine has, and a damaged record."""
+    batches = Batches(tmp_path, ["big", "spoilt", "fine"])
+    rows = tmp_path / "rows.yaml"
+    rows.write_text(rows.read_text().replace("name: big,", "name: big, memory_gb: 1000000,"))
+    spoilt = batches.out / "rows/spoilt/state.json"
+    spoilt.parent.mkdir(parents=True)
+    spoilt.write_text("{")
+    assert batches.start().wait(60) == 2
+    found = {r["name"]: r for r in json.loads((batches.out / "summary.json").read_text())}
+    assert [found[n]["state"] for n in ("big", "spoilt", "fine")] == ["failed", "failed", "done"]
+    assert "damaged" in found["spoilt"]["why"] and "memory_gb" in found["big"]["why"]
+    assert json.loads((batches.out / "rows/big/state.json").read_text())["failed"]["why"]
