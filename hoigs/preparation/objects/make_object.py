@@ -33,6 +33,7 @@ ObjectWay = Literal["auto", "ball", "texture", "outline"]
 
 COLOR_FRAMES = 24  # a median over more changes nothing visible
 FOOTBALL = 0.11  # metres
+FARTHEST_OUTLINE = 0.5  # of its size: what is farther off its masks is no object
 
 
 def ball_object(
@@ -167,6 +168,11 @@ def make_object(
             masks, humans, cameras, joints, images, count, fps, progress
         )
         spread = float(np.nanmean(confidence.outline) / track.points.norm(dim=-1).mean())
+        if not spread < FARTHEST_OUTLINE:
+            raise UntrackableError(
+                f"the shape found by its texture is off its masks' outlines by {100 * spread:.0f} "
+                f"% of its size ({100 * FARTHEST_OUTLINE:.0f} % at most)"
+            )
     except UntrackableError as reason:
         wrists = joints[:, [LEFT_WRIST, RIGHT_WRIST]]
         track, normals, spread = held_object(masks, list(cameras), wrists, count)

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import ObjectTrack
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.masks.outlines import outlines_of
+from hoigs.preparation.objects import make_object as making
 from hoigs.preparation.objects.alignment import Aligned, Poses
 from hoigs.preparation.objects.crops import make_crops
 from hoigs.preparation.objects.flights import flights_by_texture
 from hoigs.preparation.objects.hands import hand_motion
 from hoigs.preparation.objects.make_object import make_object
 from hoigs.preparation.objects.surface import hull
-from hoigs.preparation.objects.tracked import UntrackableError, tracked_object
+from hoigs.preparation.objects.tracked import ObjectConfidence, UntrackableError, tracked_object
 
 FRAMES, SIZE, FPS = 12, 96, 12.0
 HALF = torch.tensor([0.17, 0.12, 0.13])
@@ -148,3 +152,23 @@ def test_a_spin_in_flight_is_found_by_texture() -> None:
     found = flights_by_texture(crops, surface, first, guess, np.array([0.0, -1, 0]), FPS)
     assert float(angles(found.rotations[flight], rotations[flight]).max()) < 25
     assert float(angles(guess.rotations[flight], rotations[flight]).max()) > 120
+
+
+def test_a_shape_far_off_its_masks_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where landmarks are wrong, and the texture is another thing's."""
+    images, objects, humans, joints = filmed()
+
+    def collapsed(*arguments: object) -> object:
+        points = 0.01 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
+        rotations, places = poses(0.7)
+        seen = torch.ones(FRAMES, dtype=torch.bool)
+        track = ObjectTrack(points, torch.full_like(points, 0.5), rotations, places, seen)
+        return track, points, replace(ObjectConfidence.none("t", FRAMES, ""),
+                                      outline=np.full(FRAMES, 0.1))  # fmt: skip
+
+    monkeypatch.setattr(making, "tracked_object", collapsed)
+    made = make_object(
+        None, objects, humans, [CAMERA] * FRAMES, joints, lambda: iter(images), way="texture",
+        radius=None, count=200, fps=FPS, progress=lambda _: None,
+    )  # fmt: skip
+    assert made.confidence.way == "outline" and "off its masks" in made.confidence.reason
