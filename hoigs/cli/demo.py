@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Run folder.")] = Path("runs/demo"),
     fast: Annotated[
-        bool, typer.Option("--fast", help="A first look in about a minute: smaller, less sharp.")
+        bool,
+        typer.Option(
+            "--fast", help="A first look in about a minute and a half: smaller, less sharp."
+        ),
     ] = False,
     steps: Annotated[
         int | None,

@@ -45,7 +45,7 @@ def demo(
     Args:
         out: the run folder; that of the static model is OUT-static.
         fast: half the frames, at half the width, and a third of the Gaussians: a first look in
-            about a minute. Its scores are not those of the whole demo.
+            about a minute and a half. Its scores are not those of the whole demo.
         steps: of each training; by default 800, or 300 with `fast`.
         baseline: also train a static model, to compare with; by default not with `fast`.
         overwrite: replace earlier runs in these folders.
