@@ -267,7 +267,7 @@ def test_where_native_kernels_do_not_compile_portable_ones_run_with_a_warning(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("processor", "lanes"), [("haswell", 8)])
+@pytest.mark.parametrize(("processor", "lanes"), [("haswell", 8), ("x86-64", 8)])
 def test_native_kernels_run_without_avx512(processor: str, lanes: int, tmp_path: Path) -> None:
     """The same picture and gradients from kernels compiled for older processors."""
     if platform.machine() not in ("x86_64", "AMD64"):

@@ -108,14 +108,16 @@ def test_two_drivers_do_every_stage_once_and_a_failed_row_costs_only_itself(tmp_
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
-def test_after_a_kill_every_row_is_done_once(tmp_path):
+@pytest.mark.parametrize("victim", ["driver", "stage"])
+def test_after_a_kill_every_row_is_done_once(tmp_path, victim):
     batches = Batches(tmp_path, ["a", "b"])
     driver = batches.start(seconds=1.0)
-    batches.wait_for("start", "train")
-    os.kill(driver.pid, signal.SIGKILL)
-    assert driver.wait(10) == -signal.SIGKILL
-    assert all_gone([int(pid) for *_, pid in batches.noted()])  # no stage outlives its driver
-    driver = batches.start(seconds=0.1)
+    stage = batches.wait_for("start", "train")
+    os.kill(driver.pid if victim == "driver" else stage, signal.SIGKILL)
+    if victim == "driver":
+        assert driver.wait(10) == -signal.SIGKILL
+        assert all_gone([int(pid) for *_, pid in batches.noted()])  # no stage outlives its driver
+        driver = batches.start(seconds=0.1)
     assert driver.wait(60) == 0
     assert set(batches.ends().values()) == {1} and len(batches.ends()) == 6
     assert set(batches.states().values()) == {"done"}
