@@ -62,6 +62,13 @@ def prepare(
     fps: Annotated[
         float | None, typer.Option("--fps", help="Use this many frames a second, the sharpest.")
     ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            "--start", help="Start here: 2.5 (seconds), 1:02.5, or 75f (frame 75 of the video)."
+        ),
+    ] = None,
+    end: Annotated[str | None, typer.Option("--end", help="End before this, likewise.")] = None,
     focal: Annotated[
         float | None, typer.Option("--focal", help="Focal length in pixels of the video, if known.")
     ] = None,
@@ -108,7 +115,8 @@ def prepare(
 
     flags = {
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
-        "focal": focal, "keep_black": keep_black, "overwrite": overwrite, "preset": estimators,
+        "start": start, "end": end, "focal": focal, "keep_black": keep_black, "overwrite": overwrite,
+        "preset": estimators,
     }  # fmt: skip
     options = load_options(file, settings or (), flags)
     if stage is not None:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from hoigs.core.config import ComponentConfig
+from hoigs.core.errors import SpecError
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
 from hoigs.preparation.body.fit_values import FitOptions
 from hoigs.preparation.objects.make_object import ObjectWay
 from hoigs.preparation.video.frames import Pick
+from hoigs.preparation.video.span import Span
 
 Place = EstimateKind | Literal["object"]  # "object": masks of the object alone
 Preset = Literal["auto", "offline", "hub", "files"]
@@ -26,8 +28,11 @@ class PromptAt(ComponentConfig):
     box: tuple[float, float, float, float] | None = Field(
         default=None, description="x0, y0, x1, y1, pixels of the video"
     )
-    frame: int = Field(
-        default=0, ge=0, description="frame of the video that points and box refer to"
+    frame: int | None = Field(
+        default=None,
+        ge=0,
+        description="frame of the video that points and box refer to, counted from 0 at its first "
+        "one; None: the first that is used",
     )
 
 
@@ -63,7 +68,16 @@ class PrepareOptions(ComponentConfig):
     folder_fps: float = Field(
         default=30.0, gt=0, description="frames a second of a folder of frames"
     )
-    max_frames: int | None = Field(default=None, ge=1, description="stop after so many frames")
+    start: str | float | None = Field(
+        default=None,
+        description="where in the video to start: 2.5 (seconds), 1:02.5, or 75f (frame 75)",
+    )
+    end: str | float | None = Field(
+        default=None, description="where to end, likewise; the frame there is not used"
+    )
+    max_frames: int | None = Field(
+        default=None, ge=1, description="stop after so many chosen frames"
+    )
     image_format: Literal["jpg", "png"] = Field(
         default="jpg", description="format of stored frames"
     )
@@ -137,3 +151,11 @@ class PrepareOptions(ComponentConfig):
     overlay_width: int = Field(
         default=640, ge=0, description="width of overlay.mp4, pixels; 0 writes none"
     )
+
+    @model_validator(mode="after")
+    def _span_is_one(self) -> PrepareOptions:
+        try:
+            Span.of(self.start, self.end)
+        except SpecError as error:
+            raise ValueError(str(error)) from error
+        return self

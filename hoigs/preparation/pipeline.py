@@ -34,7 +34,7 @@ from hoigs.preparation.objects.doubts import doubts
 from hoigs.preparation.objects.make_object import MadeObject, make_object
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.person import FittedBody, fit_person
-from hoigs.preparation.prompts import check_prompts
+from hoigs.preparation.prompts import check_prompts, placed_prompts
 from hoigs.preparation.saved import from_result, to_result
 from hoigs.preparation.scene.depth import (
     POOR,
@@ -50,10 +50,11 @@ from hoigs.preparation.stages.progress import Stages
 from hoigs.preparation.stages.work_folder import Result, WorkFolder, digest, fingerprint
 from hoigs.preparation.video.blank import blank_pixels, require_pictures
 from hoigs.preparation.video.frames import FrameList, open_frames
-from hoigs.preparation.video.header import uneven_times
+from hoigs.preparation.video.header import missing_frames
 from hoigs.preparation.video.source import Source
+from hoigs.preparation.video.span import Span
 
-FORMAT = 6  # of what the stages keep; another number makes older results unread
+FORMAT = 7  # of what the stages keep; another number makes older results unread
 LARGEST, REDUCED = 1920, 1280  # longer sides, pixels: of frames that are kept, and of smaller ones
 T = TypeVar("T")
 
@@ -144,19 +145,21 @@ class Pipeline:
 
     def _frames(self) -> None:
         options, path = self.options, self.source.video
+        span = Span.of(options.start, options.end)
 
         def make() -> FrameList:
             frames = open_frames(
                 path, options.width, options.every, options.max_frames, fps=options.fps,
-                pick=options.pick, rate=options.folder_fps,
+                pick=options.pick, rate=options.folder_fps, span=span,
             )  # fmt: skip
             require_pictures(frames)
-            if path.is_file():
-                self.warnings += uneven_times(path, frames.fps)
+            if path.is_file() and span.end is None and options.max_frames is None:
+                self.warnings += missing_frames(path, frames.total)
             return frames.list
 
         found = self._stage("frames", make, fingerprint([path]))
-        check_prompts(options, found)
+        self.options = placed_prompts(options, found)
+        check_prompts(self.options, found)
         width = options.width or self._smaller_width(found)
         self.video = open_frames(path, width, known=found)
 
@@ -274,7 +277,7 @@ class Pipeline:
     def _body(self) -> None:
         def make() -> FittedBody:
             found, video = self.estimates, self.video
-            times = torch.tensor(video.indices) / video.list.rate
+            times = torch.tensor(video.times)
             person = fit_person(
                 found.landmarks, self.track, self.body, self.options.fit_steps,
                 self.stages.advance, self.raw.landmarks.source, found.masks.persons(found.ball),

@@ -25,7 +25,9 @@ class Stage:
 
 
 PLAN = {
-    "frames": Stage(2, (), ("width", "every", "fps", "max_frames", "pick", "folder_fps")),
+    "frames": Stage(
+        2, (), ("width", "every", "fps", "max_frames", "pick", "folder_fps", "start", "end")
+    ),
     "evidence": Stage(30, ("frames",), ("human", "object"), slow=True),
     "object_masks": Stage(30, ("evidence",), (), slow=True),
     "cameras": Stage(3, ("frames", "evidence"), ("camera", "focal")),
