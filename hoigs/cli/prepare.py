@@ -115,8 +115,8 @@ def prepare(
 
     flags = {
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
-        "start": start, "end": end, "focal": focal, "keep_black": keep_black, "overwrite": overwrite,
-        "preset": estimators,
+        "start": start, "end": end, "focal": focal, "keep_black": keep_black,
+        "overwrite": overwrite, "preset": estimators,
     }  # fmt: skip
     options = load_options(file, settings or (), flags)
     if stage is not None:

@@ -71,7 +71,7 @@ def test_prompts_count_frames_of_the_video_wherever_it_is_started() -> None:
     prompt = placed_prompts(options, late).prompts["object"]
     assert [at.frame for at in prompt.places()] == [4, 8]
     assert prompt.points == [(3, 4, True), (1, 1, False)]
-    with pytest.raises(SpecError, match="in frame 2; .* are 4 to 9 .* whatever --start is"):
+    with pytest.raises(SpecError, match=r"in frame 2; .* are 4 to 9 .* whatever --start is"):
         check_prompts(with_prompts(PrepareOptions(), "3,4@2"), late)
     with pytest.raises(SpecError, match="frame 4 has two boxes"):
         placed_prompts(with_prompts(PrepareOptions(), ["0,0,3,4", "0,0,5,6@4"]), late)

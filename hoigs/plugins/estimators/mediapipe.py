@@ -80,9 +80,9 @@ class MediapipeEstimator(Estimator):
     """Landmarks and mask of the one person of a video by MediaPipe, in one pass over it.
 
     It follows a person from frame to frame and loses one that jumps, so it is given every frame
-    from the first wanted one to the last. Where no landmarks are found it looks again with a border above the
-    frame, and landmarks that are not on the person's mask are dropped. The mask is the mean of the
-    segmentation of the frame, of the person's part of it, and of the pose's own.
+    from the first wanted one to the last. Where no landmarks are found it looks again with a
+    border above the frame, and landmarks that are not on the person's mask are dropped. The mask is
+    the mean of the segmentation of the frame, of the person's part of it, and of the pose's own.
     """
 
     Config: ClassVar = MediapipeConfig
@@ -174,8 +174,8 @@ class MediapipeEstimator(Estimator):
         """The rows of the given frames among those of the whole video."""
         if rows.shape != (len(given), 33, 4):
             raise HoigsError(
-                f"estimator:mediapipe wrote an array of shape {rows.shape} for {len(given)} frames; "
-                "expected 33 landmarks of 4 numbers in each"
+                f"estimator:mediapipe wrote an array of shape {rows.shape} for {len(given)} "
+                "frames; expected 33 landmarks of 4 numbers in each"
             )
         spread = np.full((video.frames, 33, 4), np.nan, np.float32)
         spread[given.start : given.stop] = rows

@@ -49,7 +49,7 @@ def test_places(text: str | float, place: Place) -> None:
 
 @pytest.mark.parametrize("text", ["-1", "soon", "1:2:3:4", "7.5f", ""])
 def test_no_places(text: str) -> None:
-    with pytest.raises(SpecError, match='is no place in a video; "2.5" is in seconds'):
+    with pytest.raises(SpecError, match="is no place in a video"):
         parse_place(text, "--start")
 
 
