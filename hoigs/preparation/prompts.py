@@ -14,7 +14,8 @@ _PLACE = re.compile(rf"\s*([-!]?)\s*({_NUMBER}(?:\s*,\s*{_NUMBER})+)\s*(?:@\s*(\
 NONE = "none"
 HOW = (
     '"640,402" is a point on it in the first frame used, "640,402@120" in frame 120 of the '
-    'video, "-700,380" a point that is not on it, "600,350,700,450" its box x0,y0,x1,y1, "none" that there is no object'
+    'video, "-700,380" a point that is not on it, "600,350,700,450" its box x0,y0,x1,y1, '
+    '"none" that there is no object'
 )
 
 
