@@ -72,6 +72,21 @@ def prepare(
     focal: Annotated[
         float | None, typer.Option("--focal", help="Focal length in pixels of the video, if known.")
     ] = None,
+    intrinsics: Annotated[
+        str | None,
+        typer.Option(
+            "--intrinsics",
+            help="The lens, in pixels of the video: fx,fy,cx,cy or fx,fy,cx,cy,k1,k2,p1,p2.",
+        ),
+    ] = None,
+    calibration: Annotated[
+        str | None,
+        typer.Option(
+            "--calibration",
+            help="The lens, in a file of COLMAP, OpenCV, Qualisys or Pose2Sim; FILE#NAME of "
+            "several.",
+        ),
+    ] = None,
     keep_black: Annotated[
         bool | None,
         typer.Option(
@@ -115,7 +130,8 @@ def prepare(
 
     flags = {
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
-        "start": start, "end": end, "focal": focal, "keep_black": keep_black,
+        "start": start, "end": end, "focal": focal, "intrinsics": intrinsics,
+        "calibration": calibration, "keep_black": keep_black,
         "overwrite": overwrite, "preset": estimators,
     }  # fmt: skip
     options = load_options(file, settings or (), flags)

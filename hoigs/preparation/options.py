@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import SpecError
@@ -95,6 +95,16 @@ class PrepareOptions(ComponentConfig):
         "what the file's metadata give, or the landmarks if they determine it, or else 0.8 x the "
         "longer side (64 degrees); it scales all depths",
     )
+    intrinsics: tuple[float, ...] | None = Field(
+        default=None,
+        description="fx, fy, cx, cy and perhaps k1, k2, p1, p2 of the lens, in pixels of the "
+        "video's own size, as OpenCV has them; frames are undistorted, and the lens is not refined",
+    )
+    calibration: str | None = Field(
+        default=None,
+        description="file with the lens: COLMAP's cameras, OpenCV's FileStorage, Qualisys, or a "
+        "TOML of Pose2Sim; FILE#NAME where it holds several",
+    )
     body: str = Field(default="body:anny", description="key of the body model, for the clip")
     fit_steps: int = Field(
         default=FitOptions.steps, ge=1, description="steps of the body fit, at most"
@@ -151,6 +161,28 @@ class PrepareOptions(ComponentConfig):
     overlay_width: int = Field(
         default=640, ge=0, description="width of overlay.mp4, pixels; 0 writes none"
     )
+
+    @field_validator("intrinsics", mode="before")
+    @classmethod
+    def _numbers(cls, value: Any) -> Any:
+        return value.split(",") if isinstance(value, str) else value
+
+    @field_validator("intrinsics")
+    @classmethod
+    def _all_there(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if value is not None and len(value) not in (4, 8):
+            raise ValueError(
+                f"{len(value)} numbers; expected fx,fy,cx,cy or fx,fy,cx,cy,k1,k2,p1,p2 (for more "
+                "coefficients write a file for --calibration)"
+            )
+        return value
+
+    @model_validator(mode="after")
+    def _one_lens(self) -> PrepareOptions:
+        given = [n for n in ("focal", "intrinsics", "calibration") if getattr(self, n) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} both give the focal length: leave one out")
+        return self
 
     @model_validator(mode="after")
     def _span_is_one(self) -> PrepareOptions:

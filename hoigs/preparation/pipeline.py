@@ -17,7 +17,8 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.clip import BodyTrack
 from hoigs.preparation.body.silhouette import silhouette
-from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras
+from hoigs.preparation.cameras.calibration import calibration_file
+from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras, known_lens
 from hoigs.preparation.entity_masks import EntityMasks, entity_masks
 from hoigs.preparation.estimates import (
     EstimateReader,
@@ -162,6 +163,7 @@ class Pipeline:
         check_prompts(self.options, found)
         width = options.width or self._smaller_width(found)
         self.video = open_frames(path, width, known=found)
+        known_lens(self.options, self.video)  # before anything slow
 
     def _smaller_width(self, found: FrameList) -> int | None:
         """Of frames that are larger than what can be seen of them in a clip."""
@@ -235,7 +237,9 @@ class Pipeline:
             }
 
     def _cameras(self) -> None:
-        known = [p for p in (self.source.colmap, self.source.cameras) if p is not None]
+        calibration = self.options.calibration
+        lens = None if calibration is None else calibration_file(calibration)[0]
+        known = [p for p in (self.source.colmap, self.source.cameras, lens) if p is not None]
         files = [[str(path), fingerprint([path])] for path in known]
         folder = self.work.unfinished("cameras", self._key("cameras", files))
         chosen = self._stage(

@@ -52,6 +52,8 @@ def prepare(
     start: str | float | None = None,
     end: str | float | None = None,
     focal: float | None = None,
+    intrinsics: str | Sequence[float] | None = None,
+    calibration: str | Path | None = None,
     keep_black: bool | None = None,
     overwrite: bool | None = None,
     object: str | Sequence[str] = (),
@@ -77,8 +79,9 @@ def prepare(
             video in it.
         out: the clip folder to make, with report.json, report.md and overlay.mp4 in it; it
             appears when it is whole.
-        width, camera, max_frames, every, fps, start, end, focal, keep_black, overwrite: fields of
-            `PrepareOptions`, laid over `options`; None leaves a field as it is.
+        width, camera, max_frames, every, fps, start, end, focal, intrinsics, calibration,
+            keep_black, overwrite: fields of `PrepareOptions`, laid over `options`; None leaves a
+            field as it is.
         object: where the object is, in place of its prompt in `options`: "640,402@0", or several
             such (`prompts.parse_prompts`); "none": there is none.
         overrides: any field likewise: "estimators.masks.use=estimator:masks-files".
@@ -102,8 +105,9 @@ def prepare(
     """
     flags = {
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
-        "start": start, "end": end, "focal": focal, "keep_black": keep_black,
-        "overwrite": overwrite,
+        "start": start, "end": end, "focal": focal, "intrinsics": intrinsics,
+        "calibration": None if calibration is None else str(calibration),
+        "keep_black": keep_black, "overwrite": overwrite,
     }  # fmt: skip
     options = with_prompts(load_options(options, overrides, flags), object, estimators)
     replace = options.overwrite or bool(redo)
