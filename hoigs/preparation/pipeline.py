@@ -52,7 +52,7 @@ from hoigs.preparation.stages.work_folder import Result, WorkFolder, digest, fin
 from hoigs.preparation.video.blank import blank_pixels, require_pictures
 from hoigs.preparation.video.frames import FrameList, open_frames
 from hoigs.preparation.video.header import missing_frames
-from hoigs.preparation.video.source import Source
+from hoigs.preparation.video.source import NobodyFoundError, Source
 from hoigs.preparation.video.span import Span
 
 FORMAT = 7  # of what the stages keep; another number makes older results unread
@@ -196,9 +196,13 @@ class Pipeline:
             self._prompts(*((self.options.object,) if self.reader.of_both else ())),
         ]
         self.worth_keeping |= any(kind not in beside for kind in used)
-        self.raw = self._stage(
-            "evidence", lambda: self.reader.landmarks_and_masks(self.stages.advance), made_from
-        )
+        try:
+            self.raw = self._stage(
+                "evidence", lambda: self.reader.landmarks_and_masks(self.stages.advance), made_from
+            )
+        except NobodyFoundError:
+            self.worth_keeping = False
+            raise
 
     def _prompts(self, *names: str) -> dict[str, Any]:
         """The prompts of the person and of `names`, as JSON."""

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from hoigs.core.values.lens import Lens
 from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
 from hoigs.preparation.cameras.camera_track import (
@@ -15,7 +17,7 @@ from hoigs.preparation.cameras.camera_track import (
     static_cameras,
 )
 from hoigs.preparation.cameras.given_cameras import given_cameras
-from hoigs.preparation.cameras.motion import background_motion
+from hoigs.preparation.cameras.motion import BackgroundMotion, background_motion
 from hoigs.preparation.cameras.sfm import structure_from_motion
 from hoigs.preparation.cameras.static_focal import static_focal
 from hoigs.preparation.given import GivenMasks, RawLandmarks
@@ -64,26 +66,25 @@ def choose_cameras(
         return ChosenCameras(given_cameras(video, given))
     if options.camera not in {"static", "sfm"} and model is not None:
         return ChosenCameras(colmap_cameras(video, model))
-    if options.camera == "static":
-        return _static(video, landmarks, options, lens, "", {})
-    if options.camera == "auto":
+    if options.camera in {"auto", "static"}:
         motion = background_motion(video, masks)
-        if motion.static:
-            figures = {"displacement_px": round(motion.largest, 3)} if motion.known else {}
-            how = (
-                f"; features outside the masks move by up to {motion.largest:.2f} px at a width "
-                "of 640"
-                if motion.known
-                else ""
+        if options.camera == "static" or motion.static:
+            return _static(video, landmarks, options, lens, motion)
+        if motion.turned is not None:
+            raise SourceError(
+                f"{_turns(motion)}: without a change of place structure from motion finds no "
+                "depth, and hoigs does not solve such cameras. Choose a part in which it stands "
+                "still (--start, --end), use --camera static if it hardly turns, or --camera "
+                "moving if it does walk"
             )
-            chosen = _static(video, landmarks, options, lens, how, figures)
-            if not motion.known:
-                chosen.warnings.append(
-                    f"only {motion.features} features lie outside the masks, too few to tell "
-                    "whether the camera moves: it is taken to stand still (--camera moving if not)"
-                )
-            return chosen
     return _from_motion(video, masks, options, lens, folder, progress)
+
+
+def _turns(motion: BackgroundMotion) -> str:
+    return (
+        f"the camera turns on its spot (by {motion.turned:.1f} degrees between two of the compared "
+        f"frames; the background moves by up to {motion.largest:.0f} px at a width of 640)"
+    )
 
 
 def known_lens(options: PrepareOptions, video: Frames) -> tuple[Lens, str] | None:
@@ -108,20 +109,44 @@ def _static(
     landmarks: RawLandmarks,
     options: PrepareOptions,
     lens: tuple[Lens, str] | None,
-    how: str,
-    figures: dict[str, float],
+    motion: BackgroundMotion,
 ) -> ChosenCameras:
+    figures, warnings, how = {}, _doubts(motion, options.camera == "static"), ""
+    if motion.known:
+        figures = {"displacement_px": round(motion.largest, 3)}
+        how = (
+            f"; features outside the masks move by up to {motion.largest:.2f} px at a width of 640"
+        )
     if lens is not None:
         track = static_cameras(video, *lens)
-        track = replace(
-            track, provenance=track.provenance + how, figures={**track.figures, **figures}
-        )
-        return ChosenCameras(track)
-    found = static_focal(video, landmarks, options.focal)
-    track = static_cameras(video, pinhole(video, found.pixels), found.how)
-    figures = {**figures, **found.figures}
-    track = replace(track, provenance=track.provenance + how, figures=figures)
-    return ChosenCameras(track, warnings=list(found.warnings))
+    else:
+        found = static_focal(video, landmarks, options.focal)
+        track = static_cameras(video, pinhole(video, found.pixels), found.how)
+        figures |= found.figures
+        warnings += found.warnings
+    track = replace(track, provenance=track.provenance + how, figures={**track.figures, **figures})
+    return ChosenCameras(track, warnings=warnings)
+
+
+def _doubts(motion: BackgroundMotion, declared: bool) -> list[str]:
+    """A sentence for the report if a camera that is taken to stand still may not do so."""
+    if not motion.known and declared:
+        return []
+    if not motion.known:
+        return [
+            f"only {motion.features} features lie outside the masks, too few to tell "
+            "whether the camera moves: it is taken to stand still (--camera moving if not)"
+        ]
+    if motion.static:
+        return []
+    if motion.turned is not None:
+        return [f"{_turns(motion)}, but was declared static: the scene is blurred by as much"]
+    seen = np.isfinite(motion.displacement).sum()
+    return [
+        f"the camera was declared static, but it moves: the background by up to "
+        f"{motion.largest:.1f} px at a width of 640, in {seen} of {len(motion.displacement)} "
+        "compared frames that show it again; without --camera static hoigs finds its way"
+    ]
 
 
 def _from_motion(
@@ -133,10 +158,16 @@ def _from_motion(
     progress: Callable[[float], None],
 ) -> ChosenCameras:
     focal = options.focal and options.focal * video.width / video.native_width
-    model = structure_from_motion(
-        video, masks, folder / "sfm", focal=focal, lens=None if lens is None else lens[0],
-        progress=progress,
-    )  # fmt: skip
+    try:
+        model = structure_from_motion(
+            video, masks, folder / "sfm", focal=focal, lens=None if lens is None else lens[0],
+            progress=progress,
+        )  # fmt: skip
+    except SourceError as error:
+        motion = background_motion(video, masks)
+        if motion.turned is None:
+            raise
+        raise SourceError(f"{_turns(motion)}. {error}") from error
     track = colmap_cameras(video, model, partial=True)
     track = replace(
         track, provenance=f"structure from motion without the masked pixels: {track.provenance}"

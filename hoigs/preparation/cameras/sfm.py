@@ -87,14 +87,13 @@ def structure_from_motion(
                 break
     if best is None or count < SMALLEST_SHARE * len(video):
         lengths = ", ".join(f"{length:.0f}" for length in tried)
-        some = "" if best is None else f" ({_registered(best)})"
         raise SourceError(
-            f"structure from motion gave cameras to {count} of {len(video)} frames{some}, with "
-            f"focal lengths of {lengths} px to start from. If the camera stands still or only "
-            "turns, use --camera static; if you know the focal length, give --focal; else the "
-            "background may lack texture, be blurred or be hidden by the masks: look at the masks, "
-            "take sharper or more frames, or put a COLMAP model of your own beside the video, as "
-            "sparse/"
+            f"structure from motion gave cameras to {count} of {len(video)} frames, with focal "
+            f"lengths of {lengths} px to start from. {_what_to_do(best, video)}if the camera "
+            "stands still, use --camera static; if you know the lens, give --focal or "
+            "--calibration; else the background may lack texture, be blurred or be hidden by the "
+            "masks: look at the masks, take sharper or more frames, or put a COLMAP model of your "
+            "own beside the video, as sparse/"
         )
     kept = folder / "largest"
     kept.mkdir()
@@ -159,9 +158,24 @@ def _mapped(pycolmap: Any, matches: Path, images: Path, folder: Path, lens: Lens
     return max(models.values(), key=lambda m: m.num_reg_images(), default=None)
 
 
-def _registered(model: Any) -> str:
-    """The frames that have a camera."""
-    return "frames " + ranges(sorted(int(Path(i.name).stem) for i in model.images.values()))
+def _what_to_do(model: Any, video: Frames) -> str:
+    """The frames that have a camera, and how to use the longest part of them."""
+    if model is None:
+        return "To go on: "
+    known = sorted(int(Path(image.name).stem) for image in model.images.values())
+    order = {number: place for place, number in enumerate(video.indices)}
+    runs = [known[:1]]
+    for number in known[1:]:
+        if order[number] == order[runs[-1][-1]] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    longest = max(runs, key=len)
+    seconds = video.times[order[longest[-1]]] - video.times[order[longest[0]]]
+    return (
+        f"Frames {ranges(known)} of the video have one; --start {longest[0]}f --end "
+        f"{longest[-1] + 1}f uses the longest part of them, {seconds:.1f} s. To have more: "
+    )
 
 
 def _copy(database: Path | None, name: Path | None = None) -> Path:

@@ -15,6 +15,7 @@ from hoigs.core.values.lens import Lens
 from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
 from hoigs.preparation.cameras.choose import choose_cameras
 from hoigs.preparation.given import GivenMasks, RawLandmarks
+from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.settings import load_options
 from hoigs.preparation.video.frames import VideoFrames
@@ -134,7 +135,8 @@ def test_sizes_have_to_agree() -> None:
 
 def test_a_still_cameras_frames_are_undistorted(tiny_video: Path, tmp_path: Path) -> None:
     unseen = np.full((FRAMES, 33, 4), np.nan)
-    everything = RawLandmarks(unseen, unseen), GivenMasks()
+    nothing = [np.zeros((HEIGHT // 2, WIDTH // 2), bool)] * FRAMES
+    everything = RawLandmarks(unseen, unseen), GivenMasks(human=MaskStack(nothing))
     options = load_options(
         flags={"camera": "static", "intrinsics": f"90,92,{WIDTH / 2 - 0.5},{HEIGHT / 2},-0.3,0,0,0"}
     )
