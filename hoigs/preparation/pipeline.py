@@ -52,7 +52,7 @@ from hoigs.preparation.stages.work_folder import Result, WorkFolder, digest, fin
 from hoigs.preparation.video.blank import blank_pixels, require_pictures
 from hoigs.preparation.video.frames import FrameList, open_frames
 from hoigs.preparation.video.header import missing_frames
-from hoigs.preparation.video.source import NobodyFoundError, Source
+from hoigs.preparation.video.source import NobodyFoundError, Source, SourceError
 from hoigs.preparation.video.span import Span
 
 FORMAT = 7  # of what the stages keep; another number makes older results unread
@@ -153,6 +153,11 @@ class Pipeline:
                 path, options.width, options.every, options.max_frames, fps=options.fps,
                 pick=options.pick, rate=options.folder_fps, span=span,
             )  # fmt: skip
+            if len(frames) < 2:
+                raise SourceError(
+                    f"one frame of {path} is chosen, of {frames.total}: a clip shows motion, and "
+                    "needs two or more"
+                )
             require_pictures(frames)
             if path.is_file() and span.end is None and options.max_frames is None:
                 self.warnings += missing_frames(path, frames.total)
