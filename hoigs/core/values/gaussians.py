@@ -200,7 +200,9 @@ class Gaussians:
 def _facing(normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 4"]:
     """Rotations that take the z axis to `normals` or to their opposites, wxyz."""
     x, y, z = torch.where(normals[:, 2:] < 0, -normals, normals).unbind(-1)
-    return torch.nn.functional.normalize(torch.stack((1 + z, -y, x, torch.zeros_like(z)), -1), dim=-1)
+    return torch.nn.functional.normalize(
+        torch.stack((1 + z, -y, x, torch.zeros_like(z)), -1), dim=-1
+    )
 
 
 def neighbour_distances(points: Float[Tensor, "N 3"], neighbours: int = 3) -> Float[Tensor, " N"]:
