@@ -161,6 +161,8 @@ def prepare(
 def _announce(plan: EstimatorPlan) -> None:
     title = "plan" if plan.frames is None else f"plan for {plan.frames} frames"
     print_table(title, ("what", "from", "why", "about, on 2 cores"), plan.rows())
+    for note in plan.notes:
+        typer.echo(printable(note))
 
 
 def _consent() -> Consent | None:

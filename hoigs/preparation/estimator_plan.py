@@ -85,11 +85,12 @@ class EstimatorPlan:
 
     Attributes:
         choices: what gives each kind of estimate.
-        frames: of the video, about; None: unknown.
+        frames: of the video, about; None: unknown. notes: sentences about what was found.
     """
 
     choices: dict[Place, Choice]
     frames: int | None = None
+    notes: tuple[str, ...] = ()
 
     def specs(self) -> dict[Place, ComponentSpec]:
         """Estimators of the preset."""

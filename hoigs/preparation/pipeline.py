@@ -368,8 +368,9 @@ class Pipeline:
         options = self.options
         made = make_object(
             self.estimates.ball, self.masks.object, self.masks.human, self.cameras,
-            self.person.joints, self.images, way=options.object_track, radius=options.ball_radius,
-            count=options.object_points, fps=self.video.fps, progress=self.stages.advance,
+            self.person.joints, self.body.parents, self.images, way=options.object_track,
+            radius=options.ball_radius, count=options.object_points, fps=self.video.fps,
+            progress=self.stages.advance,
         )  # fmt: skip
         self.provenance["object"] = made.track.provenance
         self.warnings += doubts(self.masks.object, self.estimates.landmarks.image)

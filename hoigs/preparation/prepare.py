@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -21,6 +22,7 @@ from hoigs.preparation.estimates import Estimators
 from hoigs.preparation.estimator_plan import EstimatorPlan, plan_estimators
 from hoigs.preparation.options import PrepareOptions, Preset
 from hoigs.preparation.pipeline import Pipeline
+from hoigs.preparation.prompt_file import with_stored
 from hoigs.preparation.prompts import with_prompts
 from hoigs.preparation.readiness import Consent, agree, get_ready
 from hoigs.preparation.report.report import PrepareReport
@@ -29,7 +31,7 @@ from hoigs.preparation.stages.cleanup import Cleanup
 from hoigs.preparation.stages.plan import PLAN, check_stage, with_dependents
 from hoigs.preparation.stages.progress import Stages
 from hoigs.preparation.stages.work_folder import WorkFolder
-from hoigs.preparation.video.source import SourceError, find_source
+from hoigs.preparation.video.source import SourceError, find_source, find_video
 
 __all__ = ["PrepareOptions", "PrepareReport", "prepare", "prepare_until", "work_folder"]
 
@@ -83,7 +85,8 @@ def prepare(
             keep_black, overwrite: fields of `PrepareOptions`, laid over `options`; None leaves a
             field as it is.
         object: where the object is, in place of its prompt in `options`: "640,402@0", or several
-            such (`prompts.parse_prompts`); "none": there is none.
+            such (`prompts.parse_prompts`); "none": there is none. Without it, the clicks that
+            `annotate` stored beside the video hold.
         overrides: any field likewise: "estimators.masks.use=estimator:masks-files".
         options: ready-made, or a YAML or TOML file.
         body: the model to fit, whose key is `options.body`; by default it is made from that key.
@@ -110,9 +113,9 @@ def prepare(
         "keep_black": keep_black, "overwrite": overwrite,
     }  # fmt: skip
     options = with_prompts(load_options(options, overrides, flags), object, estimators)
-    replace = options.overwrite or bool(redo)
+    may_replace = options.overwrite or bool(redo)
     _, report = _run(
-        source, out, body, options, progress, redo, estimators, None, replace, allow_commands,
+        source, out, body, options, progress, redo, estimators, None, may_replace, allow_commands,
         agree if yes else consent, announce,
     )  # fmt: skip
     assert report is not None  # the last stage makes it
@@ -163,7 +166,7 @@ def _run(
     redo: Sequence[str],
     estimators: Estimators | Preset | None,
     until: str | None,
-    replace: bool,
+    may_replace: bool,
     allow_commands: bool,
     consent: Consent | None,
     announce: Callable[[EstimatorPlan], object] | None,
@@ -171,7 +174,8 @@ def _run(
     source, out = Path(source), Path(out)
     for name in redo:
         check_stage(name)
-    _check_paths(source, out, replace)
+    _check_paths(source, out, may_replace)
+    options, stored = with_stored(options, find_video(source))
     named = installed_estimators(options)
     if not allow_commands:
         refuse_commands(named)  # `estimators` are the caller's own code
@@ -181,7 +185,7 @@ def _run(
         source, human=options.human, object_name=options.object, given=set(chosen),
         own_cameras=options.camera in ("static", "sfm"), complete=options.preset == "files",
     )  # fmt: skip
-    plan = plan_estimators(found, options, set(chosen))
+    plan = replace(plan_estimators(found, options, set(chosen)), notes=stored)
     specs = plan.specs()
     for kind, spec in found.beside.items():
         specs[kind] = spec

@@ -144,6 +144,17 @@ def _files(kind: EstimateKind, path: str, **settings: Any) -> ComponentSpec:
     return ComponentSpec(use=f"estimator:{kind}-files", path=path, **settings)
 
 
+def find_video(path: Path) -> Path | None:
+    """The video of a source, or its folder of frames; None if it has neither.
+
+    Raises:
+        SourceError: there are several videos.
+    """
+    if path.is_file():
+        return path
+    return _find_video(path, []) if path.is_dir() else None
+
+
 def _find_video(folder: Path, missing: list[str]) -> Path | None:
     videos = sorted(p for p in folder.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
     if len(videos) > 1:
