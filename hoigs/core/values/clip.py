@@ -6,7 +6,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -215,9 +214,8 @@ class Clip:
         if all(abs(time - index / max(count - 1, 1)) < EVEN for index, time in known):
             return None
         indices, times = zip(*known, strict=True)
-        if any(b <= a for a, b in pairwise(times)):
-            return None
-        return tuple(np.interp(np.arange(count), indices, times).tolist())
+        every = np.interp(np.arange(count), indices, times)
+        return tuple(every.tolist()) if (np.diff(every) > 0).all() else None
 
     def frame(self, position: int) -> Frame:
         return self[position]
