@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from typing import overload
 
 import torch
 from torch import Tensor
@@ -12,6 +13,10 @@ from hoigs.core.cuda_graphs.device_constants import Time, constant
 FrameTimes = tuple[float, ...] | None  # of each frame, from 0 to 1, ascending; None: evenly spaced
 
 
+@overload
+def frame_at(time: float, count: int, times: FrameTimes) -> float: ...
+@overload
+def frame_at(time: Tensor, count: int, times: FrameTimes) -> Tensor: ...
 def frame_at(time: Time, count: int, times: FrameTimes) -> Time:
     """The frame number of a time, between frames a fraction; held at the first and the last.
 
