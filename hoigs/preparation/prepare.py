@@ -51,7 +51,11 @@ def prepare(
     max_frames: int | None = None,
     every: int | None = None,
     fps: float | None = None,
+    start: str | float | None = None,
+    end: str | float | None = None,
     focal: float | None = None,
+    intrinsics: str | Sequence[float] | None = None,
+    calibration: str | Path | None = None,
     keep_black: bool | None = None,
     overwrite: bool | None = None,
     object: str | Sequence[str] = (),
@@ -77,8 +81,9 @@ def prepare(
             video in it.
         out: the clip folder to make, with report.json, report.md and overlay.mp4 in it; it
             appears when it is whole.
-        width, camera, max_frames, every, fps, focal, keep_black, overwrite: fields of
-            `PrepareOptions`, laid over `options`; None leaves a field as it is.
+        width, camera, max_frames, every, fps, start, end, focal, intrinsics, calibration,
+            keep_black, overwrite: fields of `PrepareOptions`, laid over `options`; None leaves a
+            field as it is.
         object: where the object is, in place of its prompt in `options`: "640,402@0", or several
             such (`prompts.parse_prompts`); "none": there is none. Without it, the clicks that
             `annotate` stored beside the video hold.
@@ -103,7 +108,9 @@ def prepare(
     """
     flags = {
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
-        "focal": focal, "keep_black": keep_black, "overwrite": overwrite,
+        "start": start, "end": end, "focal": focal, "intrinsics": intrinsics,
+        "calibration": None if calibration is None else str(calibration),
+        "keep_black": keep_black, "overwrite": overwrite,
     }  # fmt: skip
     options = with_prompts(load_options(options, overrides, flags), object, estimators)
     may_replace = options.overwrite or bool(redo)

@@ -33,6 +33,10 @@ class SourceError(HoigsError):
     """A video or its estimators that are absent, unreadable or do not fit together."""
 
 
+class NobodyFoundError(SourceError):
+    """No person is seen in any frame: nothing that was kept of this video is of use."""
+
+
 @dataclass(frozen=True)
 class Source:
     """Where each input of `prepare` lies.
