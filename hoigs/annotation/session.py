@@ -104,8 +104,8 @@ class Session:
 
     def _said(self) -> dict[str, Any]:
         texts = to_texts(self.entities)
-        given = [("--person", t) for t in texts.person] + [("--object", t) for t in texts.object]
-        words = ["hoigs", "prepare", str(self.path), *(w for pair in given for w in pair)]
+        words = ["hoigs", "prepare", str(self.path)]
+        words += [w for text in texts.object for w in ("--object", text)]
         return {"file": prompt_file(self.path).name, "command": shlex.join(words)}
 
     def clicked(self, content: Any) -> tuple[bytes, str] | None:
