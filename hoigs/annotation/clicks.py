@@ -215,7 +215,9 @@ def _colors(done: Sequence[tuple[_Still, PromptedMask]]):
     parts = [still.alone() for still, _ in done]
     joined = replace(
         parts[0], numbers=tuple(n for p in parts for n in p.numbers),
-        **{k: np.concatenate([getattr(p, k) for p in parts]) for k in ("lab", "person", "blank")},
+        lab=np.concatenate([p.lab for p in parts]),
+        person=np.concatenate([p.person for p in parts]),
+        blank=np.concatenate([p.blank for p in parts]),
     )  # fmt: skip
     return color_model(joined, {row: found.soft for row, (_, found) in enumerate(done)})
 

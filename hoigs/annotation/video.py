@@ -137,15 +137,14 @@ class ScrubbedVideo:
         cursor = _Cursor(self.path)
         rate = cursor.video.average_rate or cursor.video.guessed_rate or 30
         self.fps = float(rate)
-        packets = [
-            (p.pts, p.is_keyframe)
+        shown = [
+            p
             for p in cursor.container.demux(cursor.video)
             if p.size and not getattr(p, "is_discard", False)
         ]
+        packets = sorted((p.pts, p.is_keyframe) for p in shown if p.pts is not None)
         cursor.container.close()
-        timed = all(time is not None for time, _ in packets)
-        if timed and len({time for time, _ in packets}) == len(packets):
-            packets.sort()
+        if len({time for time, _ in packets}) == len(shown):
             self._times = [time for time, _ in packets]
             self.count = len(packets)
             self.keyframes = [i for i, (_, key) in enumerate(packets) if key] or [0]
