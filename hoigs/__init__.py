@@ -60,6 +60,7 @@ _PUBLIC = {
     "TrackedHermite": "hoigs.plugins.deformation.splines.tracked_chs",
     "WarpRasterizer": "hoigs.rasterizers.warp",
     # work: the commands as functions, then what they are made of
+    "annotate": "hoigs.annotation.annotate",
     "auto": "hoigs.studies.needs.auto",
     "batch": "hoigs.studies.batch.batch",
     "bug_report": "hoigs.workflows.bug_report",

@@ -1,5 +1,6 @@
 # written by scripts/public_stub.py
 
+from hoigs.annotation.annotate import annotate as annotate
 from hoigs.core.interfaces.body import BodyModel as BodyModel
 from hoigs.core.interfaces.deformation import DeformationModel as DeformationModel
 from hoigs.core.interfaces.density import DensityControl as DensityControl

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hoigs.annotation.video import ScrubbedVideo
-from hoigs.core.interfaces.estimator import FramePrompt, PromptPoint, VideoRequest
+from hoigs.core.interfaces.estimator import FramePrompt, LazyFrames, PromptPoint, VideoRequest
 from hoigs.plugins.estimators.object_tracker.camera_motion import is_static
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, prompted_mask
@@ -200,7 +200,7 @@ class ClickMasks:
             frames=self.video.count, width=width, height=height, folder=Path(), work=Path(),
             read=lambda n: self.video.rgb(n, width), wanted=tuple(numbers),
         )  # fmt: skip
-        person = _Masks(known, nobody) if known else None
+        person = LazyFrames(self.video.count, lambda n: known.get(n, nobody)) if known else None
         return read_footage(request, person, longest=SIZE)
 
 
@@ -210,23 +210,14 @@ def _scaled(prompt: FramePrompt, s: float) -> FramePrompt:
     return FramePrompt(prompt.frame, points, box)  # type: ignore[arg-type]
 
 
-class _Masks(dict):
-    """Masks by frame; of frames that have none, an empty one."""
-
-    def __init__(self, known: dict[int, np.ndarray], nobody: np.ndarray) -> None:
-        super().__init__(known)
-        self._nobody = nobody
-
-    def __missing__(self, frame: int) -> np.ndarray:
-        return self._nobody
-
-
 def _colors(done: Sequence[tuple[_Still, PromptedMask]]):
     """What is known of the object's colours from masks in other frames."""
     parts = [still.alone() for still, _ in done]
     joined = replace(
         parts[0], numbers=tuple(n for p in parts for n in p.numbers),
-        **{k: np.concatenate([getattr(p, k) for p in parts]) for k in ("lab", "person", "blank")},
+        lab=np.concatenate([p.lab for p in parts]),
+        person=np.concatenate([p.person for p in parts]),
+        blank=np.concatenate([p.blank for p in parts]),
     )  # fmt: skip
     return color_model(joined, {row: found.soft for row, (_, found) in enumerate(done)})
 
@@ -234,6 +225,4 @@ def _colors(done: Sequence[tuple[_Still, PromptedMask]]):
 def _note(found: PromptedMask) -> str:
     if not (found.soft > 0.5).any():
         return "nothing with an outline is there: click on the middle of it, or draw a box"
-    if found.on_person:
-        return "this lies on the person's mask; if the person was meant, click as the person"
     return ""

@@ -112,8 +112,15 @@ class Jobs:
         self._job: Job | None = None
         self._lock = threading.Lock()
 
-    def start(self, out: Path, *, whole: bool, yes: bool, finished: Callable[[], None]) -> None:
-        """
+    def start(
+        self, out: Path, *, whole: bool, yes: bool, replace: bool, finished: Callable[[], None]
+    ) -> None:
+        """Starts one.
+
+        Args:
+            whole: a clip, or masks alone. yes: install what is needed. replace: an older clip.
+            finished: called when it has ended well.
+
         Raises:
             HoigsError: one is running.
         """
@@ -122,7 +129,7 @@ class Jobs:
                 raise HoigsError("a preparation is running: stop it, or wait for its end")
             settings = {
                 "video": str(self.video), "out": str(out), "options": self.options,
-                "whole": whole, "yes": yes,
+                "whole": whole, "yes": yes, "replace": replace,
             }  # fmt: skip
             self._job = Job(settings, finished)
 

@@ -101,6 +101,6 @@ def from_texts(stored: StoredPrompts) -> list[Marked]:
 
 
 def _marks(at: PromptAt) -> list[Mark]:
-    frame = at.frame or 0  # without one, the first
+    frame = at.frame or 0  # a place without one, in a file that was written by hand
     boxes = [] if at.box is None else [Mark(frame=frame, box=at.box)]
     return [*boxes, *(Mark(frame=frame, x=x, y=y, inside=i) for x, y, i in at.points)]

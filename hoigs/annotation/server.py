@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import secrets
+import traceback
 from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -87,9 +88,14 @@ class _Handler(BaseHTTPRequestHandler):
                 wrong = "; ".join(e["msg"] for e in error.errors())
                 found = _text(HTTPStatus.BAD_REQUEST, wrong)
             except (ValueError, IndexError) as error:
+                self.close_connection = True  # its body may not have been read
                 found = _text(HTTPStatus.BAD_REQUEST, str(error))
             except HoigsError as error:
                 found = _text(HTTPStatus.CONFLICT, str(error))
+            except Exception as error:  # a fault of ours: the page says so and goes on
+                traceback.print_exc()
+                text = f"{type(error).__name__} in the server; its terminal has the details"
+                found = _text(HTTPStatus.INTERNAL_SERVER_ERROR, text)
         self._send(*found)
 
     def _allowed(self) -> list[str] | None:

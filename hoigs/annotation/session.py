@@ -21,7 +21,13 @@ from hoigs.annotation.video import ScrubbedVideo
 from hoigs.core.clip_folder.format import is_clip_folder
 from hoigs.core.errors import HoigsError
 from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.prompt_file import prompt_file, read_prompts, write_prompts
+from hoigs.preparation.prompt_file import (
+    StoredPrompts,
+    prompt_file,
+    read_prompts,
+    with_stored,
+    write_prompts,
+)
 
 MASK_WIDTH = 640  # pixels of the masks that the page gets, at most
 _ENTITIES = TypeAdapter(list[Marked])
@@ -44,6 +50,7 @@ class StartRequest(BaseModel):
     whole: bool
     out: str = Field(min_length=1)
     yes: bool = False
+    replace: bool = False
 
 
 class Session:
@@ -67,6 +74,7 @@ class Session:
         self.jobs = Jobs(video, options.model_dump(mode="json", exclude_defaults=True))
         self._lock = threading.Lock()
         self._tracked: TrackedMasks | None = None
+        self._tracked_from: StoredPrompts | None = None
         self.tracks = 0  # how often masks were tracked; the page looks at them anew
         threading.Thread(target=self.clicks.survey, daemon=True).start()
 
@@ -96,8 +104,8 @@ class Session:
 
     def _said(self) -> dict[str, Any]:
         texts = to_texts(self.entities)
-        given = [("--person", t) for t in texts.person] + [("--object", t) for t in texts.object]
-        words = ["hoigs", "prepare", str(self.path), *(w for pair in given for w in pair)]
+        words = ["hoigs", "prepare", str(self.path)]
+        words += [w for text in texts.object for w in ("--object", text)]
         return {"file": prompt_file(self.path).name, "command": shlex.join(words)}
 
     def clicked(self, content: Any) -> tuple[bytes, str] | None:
@@ -139,21 +147,28 @@ class Session:
         if out.exists() and not is_clip_folder(out) and any(out.iterdir() if out.is_dir() else "x"):
             raise HoigsError(f"{out} is there and is no clip: choose another name")
         self.out = out
-        self.jobs.start(out, whole=wanted.whole, yes=wanted.yes, finished=self._look)
+        said = to_texts(self.entities)
+        chosen, _ = with_stored(self.options, self.path)  # for the entities' names
+        self.jobs.start(
+            out, whole=wanted.whole, yes=wanted.yes, replace=wanted.replace,
+            finished=lambda: self._look(said, chosen),
+        )  # fmt: skip
 
     def state(self) -> dict[str, Any]:
         """Of the preparation, for the page."""
         tracked = self._tracked
         return {
             **self.jobs.state(), "tracks": self.tracks,
+            "fresh": to_texts(self.entities) == self._tracked_from,
             "tracked": [] if tracked is None else tracked.names(),
             "confidence": {} if tracked is None else tracked.confidence,
         }  # fmt: skip
 
-    def _look(self) -> None:
-        """Takes up the masks of the preparation that has just ended."""
-        self._tracked = TrackedMasks(self.out, self.options.object, self.options.human)
+    def _look(self, said: StoredPrompts, chosen: PrepareOptions) -> None:
+        """Takes up the masks of the preparation that has just ended, and began with these."""
+        self._tracked = TrackedMasks(self.out, chosen.object, chosen.human)
         self.tracks += 1
+        self._tracked_from = said
         self.clicks.forget()
 
     def _person(self, frame: int) -> np.ndarray | None:

@@ -20,6 +20,10 @@ from hoigs.preparation.video.frames import FrameList
 class TrackedMasks:
     """By entity, the mask in each frame of the video that was tracked.
 
+    Attributes:
+        confidence: of each entity by frame, 0..1, or 1 where its estimator gives none; 0: it is not
+            seen. None: not tracked there.
+
     Args:
         out: the clip of the preparation; `object_name`, `human` are the entities' names in it.
     """
@@ -40,10 +44,13 @@ class TrackedMasks:
             for name, stack in ((human, people), (object_name, masks.object)):
                 if stack is not None:
                     self._stacks[name] = stack
+        sure: dict[str, np.ndarray | None] = {}
         if isinstance(found, FoundObject):
-            self._stacks[object_name] = found.masks
-            if found.confidence is not None:
-                self.confidence[object_name] = _by_frame(found.confidence, self._rows)
+            self._stacks[object_name], sure[object_name] = found.masks, found.confidence
+        for name, stack in self._stacks.items():
+            seen = stack.bits.any(axis=(1, 2)).astype(float)
+            given = sure.get(name)
+            self.confidence[name] = _by_frame(seen if given is None else given * seen, self._rows)
 
     def names(self) -> list[str]:
         """Entities that have masks."""

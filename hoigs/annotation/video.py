@@ -62,7 +62,7 @@ class ScrubbedVideo:
 
     def __init__(self, path: Path, folder_fps: float = 30.0) -> None:
         self.path, self.fps = Path(path), folder_fps
-        self._lock = threading.Lock()
+        self._lock, self._converting = threading.Lock(), threading.Lock()
         self._pictures: OrderedDict[int, Picture] = OrderedDict()
         self._encoded: OrderedDict[tuple[int, int], bytes] = OrderedDict()
         self._cursors: list[_Cursor] = []
@@ -97,7 +97,9 @@ class ScrubbedVideo:
     def rgb(self, number: int, width: int | None = None) -> UInt8[np.ndarray, "H W 3"]:
         """Pixels of one frame, `width` wide; None: at the video's own size."""
         width = self.width if width is None else min(width, self.width)
-        return self.picture(number).rgb(width, max(1, round(self.height * width / self.width)))
+        picture, height = self.picture(number), max(1, round(self.height * width / self.width))
+        with self._converting:  # a decoded frame keeps its converter, which is not for two threads
+            return picture.rgb(width, height)
 
     def jpeg(self, number: int, width: int) -> bytes:
         """One frame, encoded; those looked at lately are kept."""
@@ -135,15 +137,14 @@ class ScrubbedVideo:
         cursor = _Cursor(self.path)
         rate = cursor.video.average_rate or cursor.video.guessed_rate or 30
         self.fps = float(rate)
-        packets = [
-            (p.pts, p.is_keyframe)
+        shown = [
+            p
             for p in cursor.container.demux(cursor.video)
             if p.size and not getattr(p, "is_discard", False)
         ]
+        packets = sorted((p.pts, p.is_keyframe) for p in shown if p.pts is not None)
         cursor.container.close()
-        timed = all(time is not None for time, _ in packets)
-        if timed and len({time for time, _ in packets}) == len(packets):
-            packets.sort()
+        if len({time for time, _ in packets}) == len(shown):
             self._times = [time for time, _ in packets]
             self.count = len(packets)
             self.keyframes = [i for i, (_, key) in enumerate(packets) if key] or [0]

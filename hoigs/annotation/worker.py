@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from hoigs.core.clip_folder.format import is_clip_folder
 from hoigs.core.environments.managed import EnvironmentAbsentError
 from hoigs.core.errors import HoigsError
 from hoigs.preparation.estimator_plan import EstimatorPlan
@@ -21,7 +22,9 @@ from hoigs.preparation.stages.plan import PLAN
 TRACKED = "object_masks"  # the stage after which all masks are there
 
 
-def run(video: Path, out: Path, options: dict[str, Any], whole: bool, yes: bool) -> None:
+def run(
+    video: Path, out: Path, options: dict[str, Any], whole: bool, yes: bool, replace: bool
+) -> None:
     """Masks alone, or the whole clip."""
     share = 1.0 if whole else _share(TRACKED)
 
@@ -31,7 +34,7 @@ def run(video: Path, out: Path, options: dict[str, Any], whole: bool, yes: bool)
     def announce(plan: EstimatorPlan) -> None:
         _say(plan=plan.rows(), notes=plan.notes)
 
-    given = PrepareOptions.model_validate({**options, "overwrite": True})
+    given = PrepareOptions.model_validate({**options, "overwrite": replace})
     if not whole:
         prepare_until(
             TRACKED, video, out, options=given, yes=yes, announce=announce, progress=progress
@@ -56,15 +59,13 @@ def _say(**event: Any) -> None:
 
 def main() -> None:
     given = json.loads(sys.argv[1])
+    out = Path(given.pop("out"))
     try:
-        run(
-            Path(given["video"]), Path(given["out"]), given["options"], given["whole"],
-            given["yes"],
-        )  # fmt: skip
+        run(Path(given.pop("video")), out, **given)
     except EnvironmentAbsentError as error:
         _say(error=str(error), absent=True)
     except HoigsError as error:
-        _say(error=str(error))
+        _say(error=str(error), exists=is_clip_folder(out) and not given["replace"])
     else:
         _say(finished=True)
 

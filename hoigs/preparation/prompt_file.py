@@ -21,7 +21,7 @@ class StoredPrompts:
     """What was clicked.
 
     Attributes:
-        object, person: what would follow `--object` and `--person`, each as often as it would.
+        object: what would follow `--object`, once for each time. person: likewise of the person.
     """
 
     object: tuple[str, ...] = ()
@@ -98,7 +98,7 @@ def with_stored(
         if not texts:
             continue
         if explicit[kind]:
-            said.append(f"{file} has the {kind}, too, which is not used: --{kind} comes first")
+            said.append(f"{file} has the {kind}, too, which is not used: your options come first")
             continue
         split = [split_name(text) for text in texts]
         if len({name for name, _ in split}) > 1:

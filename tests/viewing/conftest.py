@@ -1,15 +1,16 @@
-"""A tiny run, and a headless Chromium, for tests of what is seen."""
+"""A tiny run, for tests of what is seen."""
 
 from __future__ import annotations
 
-import os
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from browser import chromium, window
+
+__all__ = ["chromium", "window"]
 
 SMALL = ("model.scene.points=2000", "model.human.points=1500", "model.object.points=500")
 
@@ -34,54 +35,3 @@ def _tiny() -> Any:
     from hoigs.synthesis import SceneConfig
 
     return SceneConfig.tiny()
-
-
-@pytest.fixture(scope="session")
-def chromium() -> Iterator[Any]:
-    """A browser, by playwright; HOIGS_CHROMIUM names one that is not in PATH."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    found = os.environ.get("HOIGS_CHROMIUM") or next(
-        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-    )
-    if found is None:
-        pytest.skip("no Chromium in PATH, and HOIGS_CHROMIUM is not set")
-    software = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-    with playwright.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=found, args=["--no-sandbox", *software])
-        yield browser
-        browser.close()
-
-
-class Window:
-    """A page of the browser that collects the errors of its console."""
-
-    def __init__(self, browser: Any, **context: Any) -> None:
-        self.context = browser.new_context(viewport={"width": 640, "height": 480}, **context)
-        self.page = self.context.new_page()
-        self.errors: list[str] = []
-        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
-
-    def pixels(self) -> Any:
-        """The window as RGB, [H, W, 3] in [0, 255]."""
-        from io import BytesIO
-
-        import numpy as np
-        from PIL import Image
-
-        shot = Image.open(BytesIO(self.page.screenshot())).convert("RGB")
-        return np.asarray(shot).astype(np.float64)
-
-
-@pytest.fixture
-def window(chromium: Any) -> Iterator[Any]:
-    """Makes windows, and closes them after the test."""
-    opened: list[Window] = []
-
-    def make(**context: Any) -> Window:
-        opened.append(Window(chromium, **context))
-        return opened[-1]
-
-    yield make
-    for one in opened:
-        one.context.close()
