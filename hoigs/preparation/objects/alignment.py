@@ -29,8 +29,7 @@ TURN_RATE, SHIFT_RATE, SHAPE_RATE = 0.02, 0.01, 0.004
 ACCELERATION, SPIN = 6.0, 40.0  # metres and radians a second squared that cost one unit
 OUTLINE, HAND, REST = 0.006, 0.03, 0.004  # metres off that cost one unit
 REST_TURN = 0.03  # of a rotation matrix, likewise
-RARELY = 0.08  # of the frames: a vertex that fewer show has no shape of its own
-PHOTO, HANDS, SMOOTH, BEND, SHRINK = 1.0, 1.0, 0.02, 2.0, 2.0
+PHOTO, HANDS, SMOOTH, BEND, SHRINK = 1.0, 0.4, 0.02, 2.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -205,8 +204,6 @@ def align(
         poses = Poses(poses.rotations.detach(), poses.translations.detach())
         vertices = vertices.detach()
     with torch.no_grad():
-        if shape:
-            vertices = problem.closed(poses, vertices)
         problem.look(poses, vertices)
         return Aligned(crops.frames, poses, vertices, *problem.judged(poses, vertices))
 
@@ -238,25 +235,6 @@ class _Problem:
         self.seen = ((cosine - FACING) / 0.3).clamp(0, 1)
         xy, _ = self.crops.project(world)
         self.nearest = torch.cdist(self.crops.edges, xy).argmin(-1)
-
-    @torch.no_grad()
-    def closed(self, poses: Poses, vertices: Tensor) -> Tensor:
-        """The mesh with a membrane over what no frame shows, between the vertices that are seen."""
-        normals = self.surface.vertex_normals(vertices)
-        toward = self.crops.centers()[:, None] - poses.place(vertices)
-        toward = torch.nn.functional.normalize(toward, dim=-1)
-        seen = ((normals @ poses.rotations.mT) * toward).sum(-1) > FACING
-        unseen = seen.float().mean(0) < RARELY
-        if unseen.all() or not unseen.any():
-            return vertices
-        one, two = self.surface.edges.T
-        graph = torch.zeros(len(vertices), len(vertices))
-        graph[one, two] = graph[two, one] = 1.0
-        laplace = torch.diag(graph.sum(1)) - graph
-        inner, border = laplace[unseen][:, unseen], laplace[unseen][:, ~unseen]
-        filled = vertices.clone()
-        filled[unseen] = torch.linalg.solve(inner, -border @ vertices[~unseen])
-        return filled
 
     def energy(self, poses: Poses, vertices: Tensor) -> Tensor:
         photo, outside, reach, _ = self._parts(poses, vertices)

@@ -257,7 +257,7 @@ def _result(
                 f"{int(known.sum())} of {len(shown)} frames, the others follow their neighbours; "
                 f"distance from the hands that hold it ({int(hands.held.sum())} frames); shape "
                 f"from outlines and texture, {1000 * off:.0f} mm off the masks' outlines, sides "
-                "never seen closed over"
+                "never seen as small and smooth as the outlines allow"
             ),
         ),
         normals,

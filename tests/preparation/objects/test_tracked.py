@@ -95,9 +95,10 @@ def test_turning_and_shape_of_a_held_box() -> None:
         levels=((5.0, 6, 60), (2.0, 2, 60)),
     )
     rotations, places = poses(0.7)
-    off = angles(track.rotations @ track.rotations[0].mT, rotations @ rotations[0].mT)
+    left, _, right = torch.linalg.svd((track.rotations.mT @ rotations).sum(0))
+    off = angles(track.rotations @ left @ right, rotations)
     assert float(off.median()) < 6  # of a swing of 80 degrees, after a quarter of the steps
-    assert float((track.translations - places).norm(dim=-1).mean()) < 0.06
+    assert float((track.translations - places).norm(dim=-1).mean()) < 0.03
     outwards = (normals * track.points).sum(-1) > 0
     assert float(outwards.float().mean()) > 0.95
     assert np.nanmedian(confidence.agreement) > 0.8 and confidence.held > 0.6
