@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import jaxtyping
 import pytest
 import torch
 from jaxtyping import install_import_hook
+from shapecheck import only_arrays
 
 # Annotations are promises: every call in these modules is checked against its shapes and types.
 # hoigs.rasterizers.warp is left out, because Warp reads the source of its kernels; the modules
@@ -33,6 +35,7 @@ CHECKED = (
     "hoigs.viewing",
 )
 install_import_hook(list(CHECKED), "shapecheck.check")
+jaxtyping.jaxtyped = only_arrays(jaxtyping.jaxtyped)
 
 
 def pytest_configure(config: pytest.Config) -> None:
