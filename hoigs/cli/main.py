@@ -6,6 +6,7 @@ import typer
 
 from hoigs import __version__
 from hoigs.cli import (
+    annotate,
     batch,
     bug_report,
     chart,
@@ -37,6 +38,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.command("demo")(demo.demo)
+app.command("annotate")(annotate.annotate)
 app.command("prepare")(prepare.prepare)
 app.command("train")(train.train)
 app.command("eval")(evaluate.evaluate)

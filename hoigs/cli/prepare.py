@@ -62,8 +62,30 @@ def prepare(
     fps: Annotated[
         float | None, typer.Option("--fps", help="Use this many frames a second, the sharpest.")
     ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            "--start", help="Start here: 2.5 (seconds), 1:02.5, or 75f (frame 75 of the video)."
+        ),
+    ] = None,
+    end: Annotated[str | None, typer.Option("--end", help="End before this, likewise.")] = None,
     focal: Annotated[
         float | None, typer.Option("--focal", help="Focal length in pixels of the video, if known.")
+    ] = None,
+    intrinsics: Annotated[
+        str | None,
+        typer.Option(
+            "--intrinsics",
+            help="The lens, in pixels of the video: fx,fy,cx,cy or fx,fy,cx,cy,k1,k2,p1,p2.",
+        ),
+    ] = None,
+    calibration: Annotated[
+        str | None,
+        typer.Option(
+            "--calibration",
+            help="The lens, in a file of COLMAP, OpenCV, Qualisys or Pose2Sim; FILE#NAME of "
+            "several.",
+        ),
     ] = None,
     keep_black: Annotated[
         bool | None,
@@ -108,7 +130,9 @@ def prepare(
 
     flags = {
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
-        "focal": focal, "keep_black": keep_black, "overwrite": overwrite, "preset": estimators,
+        "start": start, "end": end, "focal": focal, "intrinsics": intrinsics,
+        "calibration": calibration, "keep_black": keep_black,
+        "overwrite": overwrite, "preset": estimators,
     }  # fmt: skip
     options = load_options(file, settings or (), flags)
     if stage is not None:
@@ -137,6 +161,8 @@ def prepare(
 def _announce(plan: EstimatorPlan) -> None:
     title = "plan" if plan.frames is None else f"plan for {plan.frames} frames"
     print_table(title, ("what", "from", "why", "about, on 2 cores"), plan.rows())
+    for note in plan.notes:
+        typer.echo(printable(note))
 
 
 def _consent() -> Consent | None:

@@ -87,7 +87,7 @@ def _object_picture(made: Pipeline) -> int | None:
     if made.object is None or made.found_object is None:
         return None
     prompt = made.options.prompts.get(made.options.object)
-    prompted = [at.frame for at in prompt.places()] if prompt else []
+    prompted = [at.frame or 0 for at in prompt.places()] if prompt else []
     coverage = made.masks.object.coverage().tolist()
     return shown_frame(made.video.indices, made.found_object.boxes, prompted, coverage)
 

@@ -165,7 +165,9 @@ class EstimateReader:
     @cached_property
     def _total(self) -> int:
         """Frames of the whole video, which are counted only where the survey stopped early."""
-        return self.video.total if self.options.max_frames is None else self.video.count()
+        options = self.options
+        whole = options.max_frames is None and options.end is None
+        return self.video.total if whole else self.video.count()
 
     def _entities(self, kind: Place) -> tuple[EntityRequest, ...]:
         options = self.options
@@ -236,9 +238,9 @@ def _request(options: PrepareOptions, name: str, kind) -> EntityRequest:
     prompt = options.prompts.get(name)
     if prompt is None:
         return EntityRequest(name, kind)
-    further = tuple(FramePrompt(at.frame, _points(at), at.box) for at in prompt.further)
+    further = tuple(FramePrompt(at.frame or 0, _points(at), at.box) for at in prompt.further)
     points = _points(prompt)
-    return EntityRequest(name, kind, prompt.text, points, prompt.box, prompt.frame, further)
+    return EntityRequest(name, kind, prompt.text, points, prompt.box, prompt.frame or 0, further)
 
 
 def _points(prompt: PromptAt) -> tuple[PromptPoint, ...]:

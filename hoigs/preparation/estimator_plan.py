@@ -12,6 +12,7 @@ from hoigs.core.spec.schema import ComponentSpec
 from hoigs.preparation.options import Place, PrepareOptions
 from hoigs.preparation.video.header import video_header
 from hoigs.preparation.video.source import Source, numbered_frames
+from hoigs.preparation.video.span import Span
 
 # seconds of a processor a frame of 1280x720, about, as benchmarks/prepare_alone.py measures them;
 # those of networks are guesses
@@ -84,11 +85,12 @@ class EstimatorPlan:
 
     Attributes:
         choices: what gives each kind of estimate.
-        frames: of the video, about; None: unknown.
+        frames: of the video, about; None: unknown. notes: sentences about what was found.
     """
 
     choices: dict[Place, Choice]
     frames: int | None = None
+    notes: tuple[str, ...] = ()
 
     def specs(self) -> dict[Place, ComponentSpec]:
         """Estimators of the preset."""
@@ -144,6 +146,12 @@ def _frames(video: Path, options: PrepareOptions) -> int | None:
         if header is None:
             return None
         count, rate = header
+    span = Span.of(options.start, options.end)
+    start, end = (
+        None if x is None else x.value if x.in_frames else x.value * rate
+        for x in (span.start, span.end)
+    )  # fmt: skip
+    count = max(1, round(min(end or count, count) - (start or 0)))
     step = options.every if options.fps is None else rate / options.fps
     return max(1, min(round(count / step), options.max_frames or count))
 
@@ -191,7 +199,7 @@ def _of_preset(place: Place, options: PrepareOptions) -> Choice:
     if place == "object":
         prompt = options.prompts.get(options.object)
         where = prompt.places() if prompt else []
-        frames = ", ".join(str(at.frame) for at in where)
+        frames = ", ".join("first" if at.frame is None else str(at.frame) for at in where)
         why = f"--object in frame {frames}" if where else "proposed: moves, near the hands"
         if prompt is not None and prompt.text:
             why = f'"{prompt.text}"'

@@ -13,7 +13,7 @@ from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack
 from hoigs.preparation.video.frames import Frames
-from hoigs.preparation.video.source import SourceError
+from hoigs.preparation.video.source import NobodyFoundError
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def chosen_landmarks(
         world: None if the estimator sees the image only.
 
     Raises:
-        SourceError: no person is found in them; `what` names where they come from.
+        NobodyFoundError: no person is found in them; `what` names where they come from.
     """
     image = image[video.indices].astype(np.float64)
     image[..., :3] *= video.width / video.native_width
@@ -61,7 +61,7 @@ def chosen_landmarks(
         places = world[video.indices].astype(np.float64)
     raw = RawLandmarks(image, places, source)
     if not LandmarkTrack.from_mediapipe(raw.image, raw.world).found.any():
-        raise SourceError(
+        raise NobodyFoundError(
             f"{what}: no person was found in the {len(image)} chosen frames; the body of a person "
             "whose shoulders, hips and some of the limbs are in the picture can be fitted"
         )

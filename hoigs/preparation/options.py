@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator, model_validator
 
 from hoigs.core.config import ComponentConfig
+from hoigs.core.errors import SpecError
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
 from hoigs.preparation.body.fit_values import FitOptions
 from hoigs.preparation.objects.make_object import ObjectWay
 from hoigs.preparation.video.frames import Pick
+from hoigs.preparation.video.span import Span
 
 Place = EstimateKind | Literal["object"]  # "object": masks of the object alone
 Preset = Literal["auto", "offline", "hub", "files"]
@@ -26,8 +28,11 @@ class PromptAt(ComponentConfig):
     box: tuple[float, float, float, float] | None = Field(
         default=None, description="x0, y0, x1, y1, pixels of the video"
     )
-    frame: int = Field(
-        default=0, ge=0, description="frame of the video that points and box refer to"
+    frame: int | None = Field(
+        default=None,
+        ge=0,
+        description="frame of the video that points and box refer to, counted from 0 at its first "
+        "one; None: the first that is used",
     )
 
 
@@ -63,7 +68,16 @@ class PrepareOptions(ComponentConfig):
     folder_fps: float = Field(
         default=30.0, gt=0, description="frames a second of a folder of frames"
     )
-    max_frames: int | None = Field(default=None, ge=1, description="stop after so many frames")
+    start: str | float | None = Field(
+        default=None,
+        description="where in the video to start: 2.5 (seconds), 1:02.5, or 75f (frame 75)",
+    )
+    end: str | float | None = Field(
+        default=None, description="where to end, likewise; the frame there is not used"
+    )
+    max_frames: int | None = Field(
+        default=None, ge=1, description="stop after so many chosen frames"
+    )
     image_format: Literal["jpg", "png"] = Field(
         default="jpg", description="format of stored frames"
     )
@@ -80,6 +94,16 @@ class PrepareOptions(ComponentConfig):
         description="focal length in pixels of the *video's* own size, for a static camera; None: "
         "what the file's metadata give, or the landmarks if they determine it, or else 0.8 x the "
         "longer side (64 degrees); it scales all depths",
+    )
+    intrinsics: tuple[float, ...] | None = Field(
+        default=None,
+        description="fx, fy, cx, cy and perhaps k1, k2, p1, p2 of the lens, in pixels of the "
+        "video's own size, as OpenCV has them; frames are undistorted, and the lens is not refined",
+    )
+    calibration: str | None = Field(
+        default=None,
+        description="file with the lens: COLMAP's cameras, OpenCV's FileStorage, Qualisys, or a "
+        "TOML of Pose2Sim; FILE#NAME where it holds several",
     )
     body: str = Field(default="body:anny", description="key of the body model, for the clip")
     fit_steps: int = Field(
@@ -137,3 +161,33 @@ class PrepareOptions(ComponentConfig):
     overlay_width: int = Field(
         default=640, ge=0, description="width of overlay.mp4, pixels; 0 writes none"
     )
+
+    @field_validator("intrinsics", mode="before")
+    @classmethod
+    def _numbers(cls, value: Any) -> Any:
+        return value.split(",") if isinstance(value, str) else value
+
+    @field_validator("intrinsics")
+    @classmethod
+    def _all_there(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if value is not None and len(value) not in (4, 8):
+            raise ValueError(
+                f"{len(value)} numbers; expected fx,fy,cx,cy or fx,fy,cx,cy,k1,k2,p1,p2 (for more "
+                "coefficients write a file for --calibration)"
+            )
+        return value
+
+    @model_validator(mode="after")
+    def _one_lens(self) -> PrepareOptions:
+        given = [n for n in ("focal", "intrinsics", "calibration") if getattr(self, n) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} both give the focal length: leave one out")
+        return self
+
+    @model_validator(mode="after")
+    def _span_is_one(self) -> PrepareOptions:
+        try:
+            Span.of(self.start, self.end)
+        except SpecError as error:
+            raise ValueError(str(error)) from error
+        return self

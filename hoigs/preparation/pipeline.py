@@ -17,7 +17,8 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.clip import BodyTrack
 from hoigs.preparation.body.silhouette import silhouette
-from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras
+from hoigs.preparation.cameras.calibration import calibration_file
+from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras, known_lens
 from hoigs.preparation.entity_masks import EntityMasks, entity_masks
 from hoigs.preparation.estimates import (
     EstimateReader,
@@ -34,7 +35,7 @@ from hoigs.preparation.objects.doubts import doubts
 from hoigs.preparation.objects.make_object import MadeObject, make_object
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.person import FittedBody, fit_person
-from hoigs.preparation.prompts import check_prompts
+from hoigs.preparation.prompts import check_prompts, placed_prompts
 from hoigs.preparation.saved import from_result, to_result
 from hoigs.preparation.scene.depth import (
     POOR,
@@ -50,10 +51,11 @@ from hoigs.preparation.stages.progress import Stages
 from hoigs.preparation.stages.work_folder import Result, WorkFolder, digest, fingerprint
 from hoigs.preparation.video.blank import blank_pixels, require_pictures
 from hoigs.preparation.video.frames import FrameList, open_frames
-from hoigs.preparation.video.header import uneven_times
-from hoigs.preparation.video.source import Source
+from hoigs.preparation.video.header import missing_frames
+from hoigs.preparation.video.source import NobodyFoundError, Source, SourceError
+from hoigs.preparation.video.span import Span
 
-FORMAT = 6  # of what the stages keep; another number makes older results unread
+FORMAT = 7  # of what the stages keep; another number makes older results unread
 LARGEST, REDUCED = 1920, 1280  # longer sides, pixels: of frames that are kept, and of smaller ones
 T = TypeVar("T")
 
@@ -144,21 +146,29 @@ class Pipeline:
 
     def _frames(self) -> None:
         options, path = self.options, self.source.video
+        span = Span.of(options.start, options.end)
 
         def make() -> FrameList:
             frames = open_frames(
                 path, options.width, options.every, options.max_frames, fps=options.fps,
-                pick=options.pick, rate=options.folder_fps,
+                pick=options.pick, rate=options.folder_fps, span=span,
             )  # fmt: skip
+            if len(frames) < 2:
+                raise SourceError(
+                    f"one frame of {path} is chosen, of {frames.total}: a clip shows motion, and "
+                    "needs two or more"
+                )
             require_pictures(frames)
-            if path.is_file():
-                self.warnings += uneven_times(path, frames.fps)
+            if path.is_file() and span.end is None and options.max_frames is None:
+                self.warnings += missing_frames(path, frames.total)
             return frames.list
 
         found = self._stage("frames", make, fingerprint([path]))
-        check_prompts(options, found)
+        self.options = placed_prompts(options, found)
+        check_prompts(self.options, found)
         width = options.width or self._smaller_width(found)
         self.video = open_frames(path, width, known=found)
+        known_lens(self.options, self.video)  # before anything slow
 
     def _smaller_width(self, found: FrameList) -> int | None:
         """Of frames that are larger than what can be seen of them in a clip."""
@@ -191,9 +201,13 @@ class Pipeline:
             self._prompts(*((self.options.object,) if self.reader.of_both else ())),
         ]
         self.worth_keeping |= any(kind not in beside for kind in used)
-        self.raw = self._stage(
-            "evidence", lambda: self.reader.landmarks_and_masks(self.stages.advance), made_from
-        )
+        try:
+            self.raw = self._stage(
+                "evidence", lambda: self.reader.landmarks_and_masks(self.stages.advance), made_from
+            )
+        except NobodyFoundError:
+            self.worth_keeping = False
+            raise
 
     def _prompts(self, *names: str) -> dict[str, Any]:
         """The prompts of the person and of `names`, as JSON."""
@@ -232,7 +246,9 @@ class Pipeline:
             }
 
     def _cameras(self) -> None:
-        known = [p for p in (self.source.colmap, self.source.cameras) if p is not None]
+        calibration = self.options.calibration
+        lens = None if calibration is None else calibration_file(calibration)[0]
+        known = [p for p in (self.source.colmap, self.source.cameras, lens) if p is not None]
         files = [[str(path), fingerprint([path])] for path in known]
         folder = self.work.unfinished("cameras", self._key("cameras", files))
         chosen = self._stage(
@@ -274,7 +290,7 @@ class Pipeline:
     def _body(self) -> None:
         def make() -> FittedBody:
             found, video = self.estimates, self.video
-            times = torch.tensor(video.indices) / video.list.rate
+            times = torch.tensor(video.times)
             person = fit_person(
                 found.landmarks, self.track, self.body, self.options.fit_steps,
                 self.stages.advance, self.raw.landmarks.source, found.masks.persons(found.ball),
@@ -346,8 +362,9 @@ class Pipeline:
         options = self.options
         made = make_object(
             self.estimates.ball, self.masks.object, self.masks.human, self.cameras,
-            self.person.joints, self.images, way=options.object_track, radius=options.ball_radius,
-            count=options.object_points, fps=self.video.fps, progress=self.stages.advance,
+            self.person.joints, self.body.parents, self.images, way=options.object_track,
+            radius=options.ball_radius, count=options.object_points, fps=self.video.fps,
+            progress=self.stages.advance,
         )  # fmt: skip
         self.provenance["object"] = made.track.provenance
         self.warnings += doubts(self.masks.object, self.estimates.landmarks.image)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -21,6 +22,7 @@ from hoigs.preparation.estimates import Estimators
 from hoigs.preparation.estimator_plan import EstimatorPlan, plan_estimators
 from hoigs.preparation.options import PrepareOptions, Preset
 from hoigs.preparation.pipeline import Pipeline
+from hoigs.preparation.prompt_file import with_stored
 from hoigs.preparation.prompts import with_prompts
 from hoigs.preparation.readiness import Consent, agree, get_ready
 from hoigs.preparation.report.report import PrepareReport
@@ -29,7 +31,7 @@ from hoigs.preparation.stages.cleanup import Cleanup
 from hoigs.preparation.stages.plan import PLAN, check_stage, with_dependents
 from hoigs.preparation.stages.progress import Stages
 from hoigs.preparation.stages.work_folder import WorkFolder
-from hoigs.preparation.video.source import SourceError, find_source
+from hoigs.preparation.video.source import SourceError, find_source, find_video
 
 __all__ = ["PrepareOptions", "PrepareReport", "prepare", "prepare_until", "work_folder"]
 
@@ -49,7 +51,11 @@ def prepare(
     max_frames: int | None = None,
     every: int | None = None,
     fps: float | None = None,
+    start: str | float | None = None,
+    end: str | float | None = None,
     focal: float | None = None,
+    intrinsics: str | Sequence[float] | None = None,
+    calibration: str | Path | None = None,
     keep_black: bool | None = None,
     overwrite: bool | None = None,
     object: str | Sequence[str] = (),
@@ -75,10 +81,12 @@ def prepare(
             video in it.
         out: the clip folder to make, with report.json, report.md and overlay.mp4 in it; it
             appears when it is whole.
-        width, camera, max_frames, every, fps, focal, keep_black, overwrite: fields of
-            `PrepareOptions`, laid over `options`; None leaves a field as it is.
+        width, camera, max_frames, every, fps, start, end, focal, intrinsics, calibration,
+            keep_black, overwrite: fields of `PrepareOptions`, laid over `options`; None leaves a
+            field as it is.
         object: where the object is, in place of its prompt in `options`: "640,402@0", or several
-            such (`prompts.parse_prompts`); "none": there is none.
+            such (`prompts.parse_prompts`); "none": there is none. Without it, the clicks that
+            `annotate` stored beside the video hold.
         overrides: any field likewise: "estimators.masks.use=estimator:masks-files".
         options: ready-made, or a YAML or TOML file.
         body: the model to fit, whose key is `options.body`; by default it is made from that key.
@@ -100,12 +108,14 @@ def prepare(
     """
     flags = {
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
-        "focal": focal, "keep_black": keep_black, "overwrite": overwrite,
+        "start": start, "end": end, "focal": focal, "intrinsics": intrinsics,
+        "calibration": None if calibration is None else str(calibration),
+        "keep_black": keep_black, "overwrite": overwrite,
     }  # fmt: skip
     options = with_prompts(load_options(options, overrides, flags), object, estimators)
-    replace = options.overwrite or bool(redo)
+    may_replace = options.overwrite or bool(redo)
     _, report = _run(
-        source, out, body, options, progress, redo, estimators, None, replace, allow_commands,
+        source, out, body, options, progress, redo, estimators, None, may_replace, allow_commands,
         agree if yes else consent, announce,
     )  # fmt: skip
     assert report is not None  # the last stage makes it
@@ -156,7 +166,7 @@ def _run(
     redo: Sequence[str],
     estimators: Estimators | Preset | None,
     until: str | None,
-    replace: bool,
+    may_replace: bool,
     allow_commands: bool,
     consent: Consent | None,
     announce: Callable[[EstimatorPlan], object] | None,
@@ -164,7 +174,8 @@ def _run(
     source, out = Path(source), Path(out)
     for name in redo:
         check_stage(name)
-    _check_paths(source, out, replace)
+    _check_paths(source, out, may_replace)
+    options, stored = with_stored(options, find_video(source))
     named = installed_estimators(options)
     if not allow_commands:
         refuse_commands(named)  # `estimators` are the caller's own code
@@ -174,7 +185,7 @@ def _run(
         source, human=options.human, object_name=options.object, given=set(chosen),
         own_cameras=options.camera in ("static", "sfm"), complete=options.preset == "files",
     )  # fmt: skip
-    plan = plan_estimators(found, options, set(chosen))
+    plan = replace(plan_estimators(found, options, set(chosen)), notes=stored)
     specs = plan.specs()
     for kind, spec in found.beside.items():
         specs[kind] = spec

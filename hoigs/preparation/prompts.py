@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from hoigs.core.errors import SpecError
 from hoigs.preparation.options import PrepareOptions, Prompt, PromptAt
@@ -13,8 +13,9 @@ _NUMBER = r"\d+(?:\.\d+)?"
 _PLACE = re.compile(rf"\s*([-!]?)\s*({_NUMBER}(?:\s*,\s*{_NUMBER})+)\s*(?:@\s*(\d+))?\s*")
 NONE = "none"
 HOW = (
-    '"640,402" is a point on it in frame 0, "640,402@120" in frame 120, "-700,380" a point that is '
-    'not on it, "600,350,700,450" its box x0,y0,x1,y1, "none" that there is no object'
+    '"640,402" is a point on it in the first frame used, "640,402@120" in frame 120 of the '
+    'video, "-700,380" a point that is not on it, "600,350,700,450" its box x0,y0,x1,y1, '
+    '"none" that there is no object'
 )
 
 
@@ -25,14 +26,15 @@ def parse_prompts(texts: Sequence[str], what: str = "--object") -> Prompt:
         SpecError: a text is neither, two boxes or two descriptions are given, or a frame has
             points beside the entity only.
     """
-    by_frame: dict[int, PromptAt] = {}
+    by_frame: dict[int | None, PromptAt] = {}
     words = None
     for text in texts:
         found = _PLACE.fullmatch(text)
         if found is None:
             words = _words(text, words, what)
             continue
-        sign, numbers, frame = found[1], [float(n) for n in found[2].split(",")], int(found[3] or 0)
+        sign, numbers = found[1], [float(n) for n in found[2].split(",")]
+        frame = None if found[3] is None else int(found[3])
         at = by_frame.get(frame, PromptAt(frame=frame))
         if len(numbers) == 2:
             point = (numbers[0], numbers[1], not sign)
@@ -46,7 +48,12 @@ def parse_prompts(texts: Sequence[str], what: str = "--object") -> Prompt:
             raise SpecError(
                 f"{what}: only points that are not on it are given; add one that is: {HOW}"
             )
-    first, *further = [by_frame[frame] for frame in sorted(by_frame)] or [PromptAt()]
+    return _prompt(by_frame.values(), words)
+
+
+def _prompt(places: Iterable[PromptAt], words: str | None) -> Prompt:
+    """One prompt from places in different frames, the earliest first."""
+    first, *further = sorted(places, key=lambda at: at.frame or 0) or [PromptAt()]
     return Prompt(
         text=words, points=first.points, box=first.box, frame=first.frame, further=further
     )
@@ -63,7 +70,7 @@ def _words(text: str, words: str | None, what: str) -> str:
 def _boxed(at: PromptAt, numbers: list[float], text: str, what: str) -> PromptAt:
     x0, y0, x1, y1 = numbers
     if at.box is not None:
-        raise SpecError(f"{what} {text!r}: frame {at.frame} has a box already; one a frame")
+        raise SpecError(f"{what} {text!r}: {_frame(at)} has a box already; one a frame")
     if x1 <= x0 or y1 <= y0:
         raise SpecError(
             f"{what} {text!r}: a box is x0,y0,x1,y1 with x0 < x1 and y0 < y1, in pixels"
@@ -86,8 +93,33 @@ def with_prompts(
     return PrepareOptions.model_validate({**options.model_dump(), **update}) if update else options
 
 
+def _frame(at: PromptAt) -> str:
+    return "the first frame" if at.frame is None else f"frame {at.frame}"
+
+
+def placed_prompts(options: PrepareOptions, found: FrameList) -> PrepareOptions:
+    """Options whose prompts all have a frame: the first that is used, where none is given.
+
+    Raises:
+        SpecError: this frame has two boxes.
+    """
+    prompts = {}
+    for name, prompt in options.prompts.items():
+        by_frame: dict[int | None, PromptAt] = {}
+        for at in prompt.places():
+            frame = found.first if at.frame is None else at.frame
+            known = by_frame.get(frame, PromptAt(frame=frame))
+            if known.box is not None and at.box is not None:
+                raise SpecError(f"the prompt of {name}: frame {frame} has two boxes; one a frame")
+            by_frame[frame] = PromptAt(
+                frame=frame, points=[*known.points, *at.points], box=known.box or at.box
+            )
+        prompts[name] = _prompt(by_frame.values() or [PromptAt(frame=found.first)], prompt.text)
+    return options.model_copy(update={"prompts": prompts})
+
+
 def check_prompts(options: PrepareOptions, found: FrameList) -> None:
-    """That clicks and boxes lie in the picture, and in frames that there are.
+    """That clicks and boxes lie in the picture, and in frames that are used.
 
     Raises:
         SpecError: naming the first that does not.
@@ -95,10 +127,11 @@ def check_prompts(options: PrepareOptions, found: FrameList) -> None:
     width, height = found.native_width, found.native_height
     for name, prompt in options.prompts.items():
         for at in prompt.places():
-            if at.frame >= found.total:
+            if at.frame is not None and not found.first <= at.frame < found.total:
                 raise SpecError(
                     f"the prompt of {name} is in frame {at.frame}; the frames of the video that "
-                    f"are used are 0 to {found.total - 1}"
+                    f"are used are {found.first} to {found.total - 1} (they are counted from the "
+                    "video's first one, whatever --start is)"
                 )
             corners = [] if at.box is None else [at.box[:2], at.box[2:]]
             for x, y in [*((x, y) for x, y, _ in at.points), *corners]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from hoigs.core.errors import SpecError
 from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.prompts import check_prompts, parse_prompts, with_prompts
+from hoigs.preparation.prompts import check_prompts, parse_prompts, placed_prompts, with_prompts
 from hoigs.preparation.video.frames import FrameList
 
 FOUND = FrameList(64, 48, 30.0, 30.0, 10, list(range(10)), [1.0] * 10)
@@ -14,7 +16,7 @@ FOUND = FrameList(64, 48, 30.0, 30.0, 10, list(range(10)), [1.0] * 10)
 
 def test_clicks_by_frame() -> None:
     prompt = parse_prompts(["30,20", "-10, 5", "!11,6", "12.5,7@4", "1,2,30,40@4"])
-    assert prompt.frame == 0 and prompt.box is None
+    assert prompt.frame is None and prompt.box is None
     assert prompt.points == [(30, 20, True), (10, 5, False), (11, 6, False)]
     (other,) = prompt.further
     assert other.frame == 4 and other.points == [(12.5, 7, True)] and other.box == (1, 2, 30, 40)
@@ -59,5 +61,17 @@ def test_prompts_become_options() -> None:
 )
 def test_prompts_outside_of_the_video(text: str, message: str) -> None:
     with pytest.raises(SpecError, match=message):
-        check_prompts(with_prompts(PrepareOptions(), text), FOUND)
+        check_prompts(placed_prompts(with_prompts(PrepareOptions(), text), FOUND), FOUND)
     check_prompts(with_prompts(PrepareOptions(), ["64,48", "3,4@9"]), FOUND)
+
+
+def test_prompts_count_frames_of_the_video_wherever_it_is_started() -> None:
+    late = replace(FOUND, first=4, indices=[4, 6, 8])
+    options = with_prompts(PrepareOptions(), ["3,4", "9,9@8", "-1,1@4"])
+    prompt = placed_prompts(options, late).prompts["object"]
+    assert [at.frame for at in prompt.places()] == [4, 8]
+    assert prompt.points == [(3, 4, True), (1, 1, False)]
+    with pytest.raises(SpecError, match=r"in frame 2; .* are 4 to 9 .* whatever --start is"):
+        check_prompts(with_prompts(PrepareOptions(), "3,4@2"), late)
+    with pytest.raises(SpecError, match="frame 4 has two boxes"):
+        placed_prompts(with_prompts(PrepareOptions(), ["0,0,3,4", "0,0,5,6@4"]), late)

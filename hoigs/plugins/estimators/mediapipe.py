@@ -80,9 +80,9 @@ class MediapipeEstimator(Estimator):
     """Landmarks and mask of the one person of a video by MediaPipe, in one pass over it.
 
     It follows a person from frame to frame and loses one that jumps, so it is given every frame
-    up to the last wanted one. Where no landmarks are found it looks again with a border above the
-    frame, and landmarks that are not on the person's mask are dropped. The mask is the mean of the
-    segmentation of the frame, of the person's part of it, and of the pose's own.
+    from the first wanted one to the last. Where no landmarks are found it looks again with a
+    border above the frame, and landmarks that are not on the person's mask are dropped. The mask is
+    the mean of the segmentation of the frame, of the person's part of it, and of the pose's own.
     """
 
     Config: ClassVar = MediapipeConfig
@@ -118,22 +118,25 @@ class MediapipeEstimator(Estimator):
                 f"estimator:mediapipe finds one person, {len(people)} are requested; run it on a "
                 "video of each, or use estimator:landmarks-files"
             )
-        count = max(video.numbers, default=-1) + 1
+        first = min(video.numbers, default=0)
+        count = max(video.numbers, default=-1) + 1 - first
         settings = {"pose": self._settings(), "frames": count, "masks": self.config.masks}
+        settings |= {"first": first} if first else {}
         # what other versions of the scripts found is not taken
         settings["scripts"] = [zlib.crc32(path.read_bytes()) for path in (SCRIPT, GUIDED)]
         out = video.work / f"mediapipe-{settings_key(settings)}.npz"
         if not out.is_file():
-            self._run(self._python(video), out, count, video, progress)
+            self._run(self._python(video), out, range(first, first + count), video, progress)
         with np.load(out, allow_pickle=False) as file:
             found = {name: file[name] for name in file.files}
-        image, world = (self._spread(found[k], count, video) for k in ("image_xyzv", "world_xyzv"))
+        given = range(first, first + count)
+        image, world = (self._spread(found[k], given, video) for k in ("image_xyzv", "world_xyzv"))
         progress(1.0, "landmarks")
         text = f"MediaPipe Pose, complexity {self._complexity()}"
         landmarks = {people[0]: Landmarks(image, world, text)}
         if not self.config.masks:
             return Estimates(landmarks=landmarks)
-        person = _frames_of(found["person"], found["size"], video)
+        person = _frames_of(found["person"], found["size"], first, video)
         text = "MediaPipe's segmentation of selfies and of poses; it takes in what is held"
         return Estimates(EntityMasks({people[0]: person}, None, text), landmarks)
 
@@ -147,12 +150,12 @@ class MediapipeEstimator(Estimator):
         return python
 
     def _run(
-        self, python: Path, out: Path, count: int, video: VideoRequest, progress: Progress
+        self, python: Path, out: Path, given: range, video: VideoRequest, progress: Progress
     ) -> None:
         out.parent.mkdir(parents=True, exist_ok=True)
         half = out.with_suffix(".part")
         settings = {
-            "width": video.width, "height": video.height, "count": count, "longest": LONGEST,
+            "width": video.width, "height": video.height, "count": len(given), "longest": LONGEST,
             "masks": self.config.masks, "pose": self._settings(), "out": str(half.absolute()),
         }  # fmt: skip
         # -I: the script's own folder, where modules of hoigs lie, is not searched for imports
@@ -160,40 +163,41 @@ class MediapipeEstimator(Estimator):
         log = out.with_suffix(".log")
         try:
             run_tool(
-                argv, what="estimator:mediapipe", log=log, images=_frames(video, count, progress)
+                argv, what="estimator:mediapipe", log=log, images=_frames(video, given, progress)
             )
         except HoigsError as error:
             lacking = log.is_file() and "has no mediapipe" in log.read_text(errors="replace")
             raise HoigsError(f"{error}\n{INSTALL}" if lacking else str(error)) from error
         half.replace(out)
 
-    def _spread(self, rows: np.ndarray, count: int, video: VideoRequest) -> np.ndarray:
-        """The first rows among those of the whole video."""
-        if rows.shape != (count, 33, 4):
+    def _spread(self, rows: np.ndarray, given: range, video: VideoRequest) -> np.ndarray:
+        """The rows of the given frames among those of the whole video."""
+        if rows.shape != (len(given), 33, 4):
             raise HoigsError(
-                f"estimator:mediapipe wrote an array of shape {rows.shape} for {count} frames; "
-                "expected 33 landmarks of 4 numbers in each"
+                f"estimator:mediapipe wrote an array of shape {rows.shape} for {len(given)} "
+                "frames; expected 33 landmarks of 4 numbers in each"
             )
         spread = np.full((video.frames, 33, 4), np.nan, np.float32)
-        spread[:count] = rows
+        spread[given.start : given.stop] = rows
         return spread
 
 
-def _frames(video: VideoRequest, count: int, progress: Progress) -> Iterator[np.ndarray]:
-    """The first frames, reporting progress."""
-    for i in range(count):
-        progress(i / count, "landmarks")
+def _frames(video: VideoRequest, given: range, progress: Progress) -> Iterator[np.ndarray]:
+    """The given frames, reporting progress."""
+    for i in given:
+        progress((i - given.start) / len(given), "landmarks")
         yield video.frame(i)
 
 
-def _frames_of(bits: np.ndarray, size: np.ndarray, video: VideoRequest) -> LazyFrames:
-    """Masks of the video's size from bits; empty ones beyond the last frame that was looked at."""
+def _frames_of(bits: np.ndarray, size: np.ndarray, first: int, video: VideoRequest) -> LazyFrames:
+    """Masks of the video's size from bits, whose first row is of frame `first`; empty ones of
+    frames that were not looked at."""
     width, height = (video.width, video.height)
 
     def read(i: int) -> Bool[np.ndarray, "H W"]:
-        if i >= len(bits):
+        if not 0 <= i - first < len(bits):
             return np.zeros((height, width), dtype=bool)
-        mask = np.unpackbits(bits[i], axis=1, count=int(size[0])).astype(bool)
+        mask = np.unpackbits(bits[i - first], axis=1, count=int(size[0])).astype(bool)
         if mask.shape == (height, width):
             return mask
         large = Image.fromarray(mask.astype(np.uint8) * 255)

@@ -59,20 +59,33 @@ class CameraTrack:
         return not len(self.points)  # only a camera that moves has measured any
 
 
-def static_cameras(video: Frames, focal: float, how: str = "given") -> CameraTrack:
+def pinhole(video: Frames, focal: float) -> Lens:
+    """A lens without distortion whose axis meets the middle of the video's frames.
+
+    Args:
+        focal: pixels at the video's own size.
+    """
+    width, height = video.native_width, video.native_height
+    return Lens("PINHOLE", (focal, focal, width / 2, height / 2), width, height)
+
+
+def static_cameras(video: Frames, lens: Lens, how: str = "given") -> CameraTrack:
     """One camera at the origin for all frames: the world is its frame, y down, z forward.
 
     Args:
-        focal: pixels at the video's own size. how: where it comes from, for the provenance.
+        lens: at the video's own size. how: where it comes from, for the provenance.
     """
-    f = focal * video.width / video.native_width
-    K = torch.tensor([[f, 0, video.width / 2], [0, f, video.height / 2], [0, 0, 1]])
+    K = _intrinsics(lens, video.width, video.height)
     camera = Camera(K, torch.eye(4), video.width, video.height)
-    provenance = f"static camera at the origin, focal {focal:.0f} px ({how})"
+    focal = float(lens.K[0, 0])
+    shift = lens.undistortion((video.width, video.height)).shift
+    removed = f", distortion up to {shift:.2f} px removed" if shift else ""
+    provenance = f"static camera at the origin, focal {focal:.0f} px ({how}){removed}"
     none = torch.zeros(0, 3)
     return CameraTrack(
-        [camera] * len(video), none, none, provenance, metric=True,
+        [camera] * len(video), none, none, provenance, metric=True, lens=lens,
         positions=tuple(range(len(video))),
+        figures={"distortion_px": round(shift, 3)} if shift else {},
     )  # fmt: skip
 
 
@@ -170,7 +183,7 @@ def _intrinsics(lens: Lens, width: int, height: int) -> Float[Tensor, "3 3"]:
     scale = torch.tensor([[width / lens.width], [height / lens.height], [1.0]], dtype=torch.float64)
     if abs(float(scale[0] / scale[1]) - 1) > 0.02:
         raise SourceError(
-            f"COLMAP saw {lens.width}x{lens.height} images, the frames are {width}x{height}: "
+            f"the lens is of {lens.width}x{lens.height} images, the frames are {width}x{height}: "
             "another shape"
         )
     return (lens.K * scale).float()

@@ -6,14 +6,24 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from hoigs.preparation.cameras.camera_track import CameraTrack, colmap_cameras, static_cameras
+import numpy as np
+
+from hoigs.core.values.lens import Lens
+from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
+from hoigs.preparation.cameras.camera_track import (
+    CameraTrack,
+    colmap_cameras,
+    pinhole,
+    static_cameras,
+)
 from hoigs.preparation.cameras.given_cameras import given_cameras
-from hoigs.preparation.cameras.motion import background_motion
+from hoigs.preparation.cameras.motion import BackgroundMotion, background_motion
 from hoigs.preparation.cameras.sfm import structure_from_motion
 from hoigs.preparation.cameras.static_focal import static_focal
 from hoigs.preparation.given import GivenMasks, RawLandmarks
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames
+from hoigs.preparation.video.source import SourceError
 
 
 @dataclass(frozen=True)
@@ -45,55 +55,119 @@ def choose_cameras(
     Raises:
         SourceError: the model does not fit, or structure from motion fails.
     """
+    lens = known_lens(options, video)
+    beside = None if options.camera in {"static", "sfm"} else given or model
+    if lens is not None and beside is not None:
+        raise SourceError(
+            f"{beside.name} beside the video has a lens already: leave {lens[1]} out, or use "
+            "--camera sfm or static to make the cameras anew"
+        )
     if options.camera not in {"static", "sfm"} and given is not None:
         return ChosenCameras(given_cameras(video, given))
     if options.camera not in {"static", "sfm"} and model is not None:
         return ChosenCameras(colmap_cameras(video, model))
-    if options.camera == "static":
-        return _static(video, landmarks, options, "", {})
-    if options.camera == "auto":
+    if options.camera in {"auto", "static"}:
         motion = background_motion(video, masks)
-        if motion.static:
-            figures = {"displacement_px": round(motion.largest, 3)} if motion.known else {}
-            how = (
-                f"; features outside the masks move by up to {motion.largest:.2f} px at a width "
-                "of 640"
-                if motion.known
-                else ""
+        if options.camera == "static" or motion.static:
+            return _static(video, landmarks, options, lens, motion)
+        if motion.turned is not None:
+            raise SourceError(
+                f"{_turns(motion)}: without a change of place structure from motion finds no "
+                "depth, and hoigs does not solve such cameras. Choose a part in which it stands "
+                "still (--start, --end), use --camera static if it hardly turns, or --camera "
+                "moving if it does walk"
             )
-            chosen = _static(video, landmarks, options, how, figures)
-            if not motion.known:
-                chosen.warnings.append(
-                    f"only {motion.features} features lie outside the masks, too few to tell "
-                    "whether the camera moves: it is taken to stand still (--camera moving if not)"
-                )
-            return chosen
-    return _from_motion(video, masks, options, folder, progress)
+    return _from_motion(video, masks, options, lens, folder, progress)
+
+
+def _turns(motion: BackgroundMotion) -> str:
+    return (
+        f"the camera turns on its spot (by {motion.turned:.1f} degrees between two of the compared "
+        f"frames; the background moves by up to {motion.largest:.0f} px at a width of 640)"
+    )
+
+
+def known_lens(options: PrepareOptions, video: Frames) -> tuple[Lens, str] | None:
+    """The lens that `options.intrinsics` or `calibration` gives, at the video's own size, and
+    which of them.
+
+    Raises:
+        SourceError: the file cannot be read, or the lens does not fit the video.
+    """
+    size = (video.native_width, video.native_height)
+    if options.intrinsics is not None:
+        how = "--intrinsics"
+        return fitting(given_intrinsics(options.intrinsics, size), size, how), how
+    if options.calibration is None:
+        return None
+    lens, what = read_calibration(options.calibration, size)
+    return fitting(lens, size, f"--calibration {what}"), f"--calibration {what}"
 
 
 def _static(
     video: Frames,
     landmarks: RawLandmarks,
     options: PrepareOptions,
-    how: str,
-    figures: dict[str, float],
+    lens: tuple[Lens, str] | None,
+    motion: BackgroundMotion,
 ) -> ChosenCameras:
-    found = static_focal(video, landmarks, options.focal)
-    track = static_cameras(video, found.pixels, found.how)
-    figures = {**figures, **found.figures}
-    track = replace(track, provenance=track.provenance + how, figures=figures)
-    return ChosenCameras(track, warnings=list(found.warnings))
+    figures, warnings, how = {}, _doubts(motion, options.camera == "static"), ""
+    if motion.known:
+        figures = {"displacement_px": round(motion.largest, 3)}
+        how = (
+            f"; features outside the masks move by up to {motion.largest:.2f} px at a width of 640"
+        )
+    if lens is not None:
+        track = static_cameras(video, *lens)
+    else:
+        found = static_focal(video, landmarks, options.focal)
+        track = static_cameras(video, pinhole(video, found.pixels), found.how)
+        figures |= found.figures
+        warnings += found.warnings
+    track = replace(track, provenance=track.provenance + how, figures={**track.figures, **figures})
+    return ChosenCameras(track, warnings=warnings)
+
+
+def _doubts(motion: BackgroundMotion, declared: bool) -> list[str]:
+    """A sentence for the report if a camera that is taken to stand still may not do so."""
+    if not motion.known and declared:
+        return []
+    if not motion.known:
+        return [
+            f"only {motion.features} features lie outside the masks, too few to tell "
+            "whether the camera moves: it is taken to stand still (--camera moving if not)"
+        ]
+    if motion.static:
+        return []
+    if motion.turned is not None:
+        return [f"{_turns(motion)}, but was declared static: the scene is blurred by as much"]
+    seen = np.isfinite(motion.displacement).sum()
+    return [
+        f"the camera was declared static, but it moves: the background by up to "
+        f"{motion.largest:.1f} px at a width of 640, in {seen} of {len(motion.displacement)} "
+        "compared frames that show it again; without --camera static hoigs finds its way"
+    ]
 
 
 def _from_motion(
     video: Frames,
     masks: GivenMasks,
     options: PrepareOptions,
+    lens: tuple[Lens, str] | None,
     folder: Path,
     progress: Callable[[float], None],
 ) -> ChosenCameras:
     focal = options.focal and options.focal * video.width / video.native_width
-    model = structure_from_motion(video, masks, folder / "sfm", focal=focal, progress=progress)
+    try:
+        model = structure_from_motion(
+            video, masks, folder / "sfm", focal=focal, lens=None if lens is None else lens[0],
+            progress=progress,
+        )  # fmt: skip
+    except SourceError as error:
+        motion = background_motion(video, masks)
+        if motion.turned is None:
+            raise
+        raise SourceError(f"{_turns(motion)}. {error}") from error
     track = colmap_cameras(video, model, partial=True)
     track = replace(
         track, provenance=f"structure from motion without the masked pixels: {track.provenance}"

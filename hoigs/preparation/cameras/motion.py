@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -10,6 +11,7 @@ from PIL import Image
 from scipy import ndimage
 
 from hoigs.preparation.cameras.colmap_log import quiet_colmap
+from hoigs.preparation.cameras.turning import SHARE, Pair, turn_share
 from hoigs.preparation.given import GivenMasks
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.resizing import shrink, shrink_mask
@@ -30,11 +32,14 @@ class BackgroundMotion:
             NaN where too few features were found again.
         matches: features found again, of each compared frame.
         features: in the first frame.
+        turned: degrees that the camera turns by at most, if turns alone explain where the features
+            of neighbouring compared frames went; None if they do not, or cannot be known.
     """
 
     displacement: Float[np.ndarray, " C"]
     matches: list[int]
     features: int
+    turned: float | None = None
 
     @property
     def known(self) -> bool:
@@ -67,14 +72,31 @@ def background_motion(video: Frames, masks: GivenMasks) -> BackgroundMotion:
     chosen = sorted(set(np.linspace(0, len(video) - 1, FRAMES + 1).round().astype(int).tolist()))
     pairs = zip(chosen, video.subset(chosen), strict=True)
     found = [_features(sift, image, masks.moving(i)) for i, image in pairs]
-    first, rest = found[0], found[1:]
     displacement, matches = [], []
-    for other in rest:
-        again = _matches(first[1], other[1])
-        matches.append(len(again))
-        moved = np.linalg.norm(first[0][again[:, 0]] - other[0][again[:, 1]], axis=-1)
-        displacement.append(float(np.median(moved)) if len(again) >= ENOUGH else np.nan)
-    return BackgroundMotion(np.array(displacement), matches, len(first[0]))
+    for other in found[1:]:
+        one, two = _paired(found[0], other)
+        matches.append(len(one))
+        moved = np.linalg.norm(one - two, axis=-1)
+        displacement.append(float(np.median(moved)) if len(one) >= ENOUGH else np.nan)
+    motion = BackgroundMotion(np.array(displacement), matches, len(found[0][0]))
+    if motion.static:
+        return motion
+    size = (WIDTH, round(video.height * WIDTH / video.width))
+    return replace(motion, turned=_turned([_paired(a, b) for a, b in pairwise(found)], size))
+
+
+def _turned(pairs: list[Pair], size: tuple[int, int]) -> float | None:
+    """Degrees of the largest turn between neighbours, if turns explain them all; else None."""
+    if min(len(one) for one, _ in pairs) < ENOUGH:
+        return None
+    share, degrees = turn_share(pairs, size)
+    return degrees if share >= SHARE else None
+
+
+def _paired(one: tuple[np.ndarray, np.ndarray], two: tuple[np.ndarray, np.ndarray]) -> Pair:
+    """Positions of the features that are found in both images."""
+    rows = _matches(one[1], two[1])
+    return one[0][rows[:, 0]], two[0][rows[:, 1]]
 
 
 def _features(

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from hoigs.core.diagnostics import ranges
+from hoigs.core.values.lens import Lens
 from hoigs.preparation.cameras.camera_track import ASSUMED_FOCAL
 from hoigs.preparation.cameras.colmap_log import quiet_colmap
 from hoigs.preparation.cameras.motion import grown
@@ -32,6 +33,7 @@ def structure_from_motion(
     folder: Path,
     *,
     focal: float | None = None,
+    lens: Lens | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Path:
     """A COLMAP model of the chosen frames, the largest that was found.
@@ -46,6 +48,7 @@ def structure_from_motion(
         folder: to work in; images, databases and models are left there. Features and matches
             that an earlier run of the same frames and masks left are used again.
         focal: pixels of the frames' size, if known; it is still refined.
+        lens: of the video, if calibrated; it is not refined.
         progress: called with 0..1.
 
     Returns:
@@ -62,33 +65,35 @@ def structure_from_motion(
         shutil.rmtree(folder / name, ignore_errors=True)
     _write_images(video, masks, folder, lambda done: report(0.1 * done))
     longer = max(video.width, video.height)
+    if lens is not None:
+        lens = lens.resized(video.width, video.height)
+        focal = float(lens.K[0, 0])
     tried = (focal,) if focal else tuple(share * longer for share in (ASSUMED_FOCAL, *FURTHER))
     best, count = None, 0
     with quiet_colmap():
         if not features.is_file():
-            _extract(pycolmap, features, images, _reader(pycolmap, video, folder, tried[0]))
+            _extract(pycolmap, features, images, _reader(pycolmap, video, folder, tried[0], lens))
         for number, length in enumerate(tried):
             begun = 0.4 + 0.6 * number / len(tried)
             report(begun)
             matches = folder / f"matches-{number}.db"
             if not matches.is_file():
-                _match(pycolmap, features, matches, length)
+                _match(pycolmap, features, matches, None if lens else length)
             report(begun + 0.3 / len(tried))
-            found = _mapped(pycolmap, matches, images, folder / "models" / str(number))
+            found = _mapped(pycolmap, matches, images, folder / "models" / str(number), lens)
             if found is not None and found.num_reg_images() > count:
                 best, count = found, found.num_reg_images()
             if count >= SMALLEST_SHARE * len(video):
                 break
     if best is None or count < SMALLEST_SHARE * len(video):
         lengths = ", ".join(f"{length:.0f}" for length in tried)
-        some = "" if best is None else f" ({_registered(best)})"
         raise SourceError(
-            f"structure from motion gave cameras to {count} of {len(video)} frames{some}, with "
-            f"focal lengths of {lengths} px to start from. If the camera stands still or only "
-            "turns, use --camera static; if you know the focal length, give --focal; else the "
-            "background may lack texture, be blurred or be hidden by the masks: look at the masks, "
-            "take sharper or more frames, or put a COLMAP model of your own beside the video, as "
-            "sparse/"
+            f"structure from motion gave cameras to {count} of {len(video)} frames, with focal "
+            f"lengths of {lengths} px to start from. {_what_to_do(best, video)}if the camera "
+            "stands still, use --camera static; if you know the lens, give --focal or "
+            "--calibration; else the background may lack texture, be blurred or be hidden by the "
+            "masks: look at the masks, take sharper or more frames, or put a COLMAP model of your "
+            "own beside the video, as sparse/"
         )
     kept = folder / "largest"
     kept.mkdir()
@@ -125,13 +130,15 @@ def _extract(pycolmap: Any, features: Path, images: Path, reader: Any) -> None:
     half.replace(features)
 
 
-def _match(pycolmap: Any, features: Path, matches: Path, focal: float) -> None:
-    """A database with features, and matches that hold for a focal length, likewise."""
+def _match(pycolmap: Any, features: Path, matches: Path, focal: float | None) -> None:
+    """A database with features, and matches that hold for a focal length (None: that of the
+    database), likewise."""
     half = _copy(features, matches)
     database = pycolmap.Database.open(half)
     for camera in database.read_all_cameras():
-        camera.focal_length = focal
-        database.update_camera(camera)
+        if focal is not None:
+            camera.focal_length = focal
+            database.update_camera(camera)
     database.close()
     pycolmap.match_sequential(
         half,
@@ -142,18 +149,33 @@ def _match(pycolmap: Any, features: Path, matches: Path, focal: float) -> None:
     half.replace(matches)
 
 
-def _mapped(pycolmap: Any, matches: Path, images: Path, folder: Path) -> Any:
+def _mapped(pycolmap: Any, matches: Path, images: Path, folder: Path, lens: Lens | None) -> Any:
     """The reconstruction with the most cameras, or None."""
     folder.mkdir(parents=True)
     models = pycolmap.incremental_mapping(
-        _copy(matches), images, folder, options=_mapping(pycolmap)
+        _copy(matches), images, folder, options=_mapping(pycolmap, lens is not None)
     )
     return max(models.values(), key=lambda m: m.num_reg_images(), default=None)
 
 
-def _registered(model: Any) -> str:
-    """The frames that have a camera."""
-    return "frames " + ranges(sorted(int(Path(i.name).stem) for i in model.images.values()))
+def _what_to_do(model: Any, video: Frames) -> str:
+    """The frames that have a camera, and how to use the longest part of them."""
+    if model is None:
+        return "To go on: "
+    known = sorted(int(Path(image.name).stem) for image in model.images.values())
+    order = {number: place for place, number in enumerate(video.indices)}
+    runs = [known[:1]]
+    for number in known[1:]:
+        if order[number] == order[runs[-1][-1]] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    longest = max(runs, key=len)
+    seconds = video.times[order[longest[-1]]] - video.times[order[longest[0]]]
+    return (
+        f"Frames {ranges(known)} of the video have one; --start {longest[0]}f --end "
+        f"{longest[-1] + 1}f uses the longest part of them, {seconds:.1f} s. To have more: "
+    )
 
 
 def _copy(database: Path | None, name: Path | None = None) -> Path:
@@ -171,10 +193,15 @@ def _copy(database: Path | None, name: Path | None = None) -> Path:
     return half
 
 
-def _reader(pycolmap: Any, video: Frames, folder: Path, focal: float | None) -> Any:
+def _reader(
+    pycolmap: Any, video: Frames, folder: Path, focal: float | None, lens: Lens | None
+) -> Any:
     f = focal or ASSUMED_FOCAL * max(video.width, video.height)
     options = pycolmap.ImageReaderOptions(mask_path=str(folder / "masks"), camera_model=LENS)
     options.camera_params = f"{f},{video.width / 2},{video.height / 2},0"
+    if lens is not None:
+        options.camera_model = lens.model
+        options.camera_params = ",".join(map(repr, lens.params))
     return options
 
 
@@ -184,9 +211,10 @@ def _extraction(pycolmap: Any) -> Any:
     return options
 
 
-def _mapping(pycolmap: Any) -> Any:
+def _mapping(pycolmap: Any, calibrated: bool) -> Any:
     options = pycolmap.IncrementalPipelineOptions(num_threads=_threads(), random_seed=0)
     # a video adds its frames in order: the whole need not be solved anew after every tenth
+    options.ba_refine_focal_length = options.ba_refine_extra_params = not calibrated
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3
     return options
 

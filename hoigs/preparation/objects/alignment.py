@@ -27,10 +27,10 @@ SAMPLES = 1200
 FACING = 0.2  # cosine between normal and view from which a point counts as seen
 TURN_RATE, SHIFT_RATE, SHAPE_RATE = 0.02, 0.01, 0.004
 ACCELERATION, SPIN = 6.0, 40.0  # metres and radians a second squared that cost one unit
-OUTLINE, HAND, REST = 0.006, 0.04, 0.004  # metres off that cost one unit
+OUTLINE, HAND, REST = 0.006, 0.03, 0.004  # metres off that cost one unit
 REST_TURN = 0.03  # of a rotation matrix, likewise
 RARELY = 0.08  # of the frames: a vertex that fewer show has no shape of its own
-PHOTO, HANDS, SMOOTH, BEND, SHRINK = 1.0, 0.1, 0.02, 2.0, 2.0
+PHOTO, HANDS, SMOOTH, BEND, SHRINK = 1.0, 1.0, 0.02, 2.0, 2.0
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from PIL import Image
 from scipy import ndimage
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from hoigs.core.maths.series import fill_gaps
@@ -19,6 +20,7 @@ from hoigs.preparation.masks.separate import Images
 
 MARGIN = 1.6  # side of a crop over the longer side of the mask's box
 EDGES = 96  # pixels of the outline that a crop keeps
+LIMB, NEAR = 0.08, 0.05  # metres: about a limb's bone, and in front of the camera
 DARK = 0.05  # added before logarithms of brightness
 
 
@@ -29,7 +31,8 @@ class Crops:
     Attributes:
         frames: numbers of the frames that show the object. images: RGB in [0, 1].
         K, world_to_camera: of the crops' own cameras.
-        masks: the object's. hidden: the person's, who may hide a part of the object.
+        masks: the object's. hidden: pixels of the person that may hide a part of the object, and
+            those beyond the image.
         outside: pixels from the nearest one on which the object may be: its own, or the person's.
         edges: pixels of the mask's outline against the background, repeated to a fixed number.
     """
@@ -116,8 +119,15 @@ def make_crops(
     cameras: Sequence[Camera],
     shown: Bool[np.ndarray, " F"],
     size: int,
+    body: Float[Tensor, "F B 3"],
+    behind: Float[np.ndarray, " F"],
 ) -> Crops:
-    """Crops of the frames in `shown`, `size` pixels wide (an object is 0.6 of that)."""
+    """Crops of the frames in `shown`, `size` pixels wide (an object is 0.6 of that).
+
+    Args:
+        body: points of the person, world, metres. behind: depths from which on the person is
+            behind all of the object, and hides nothing of it.
+    """
     boxes = _boxes(masks, shown)
     rows: dict[str, list[np.ndarray]] = {
         name: [] for name in ("image", "K", "view", "mask", "hidden", "outside", "edges", "share")
@@ -128,11 +138,12 @@ def make_crops(
         box = boxes[i]
         scale = size / (box[2] - box[0])
         mask = _cut(masks[i], box, size)
-        hidden = _cut(humans[i], box, size) & ~mask
         inside = _cut(np.ones_like(masks[i]), box, size)
         K = cameras[i].K.double().numpy().copy()
         K[:2, 2] -= box[:2]
         K[:2] *= scale
+        hidden = _cut(humans[i], box, size) & ~mask
+        hidden &= _nearest_depths(hidden, K, cameras[i].to_camera(body[i])) < behind[i]
         cut = Image.fromarray(image).crop(tuple(box.round().astype(int)))
         edges, share = _edges(mask, hidden | ~inside, i)
         rows["image"].append(np.asarray(cut.resize((size, size), Image.Resampling.BOX)) / 255.0)
@@ -174,6 +185,24 @@ def _cut(mask: Bool[np.ndarray, "H W"], box: Float[np.ndarray, " 4"], size: int)
     """A mask's part in a box, resized; nothing outside the image."""
     cut = Image.fromarray(mask.astype(np.uint8) * 255).crop(tuple(box.round().astype(int)))
     return np.asarray(cut.resize((size, size), Image.Resampling.BILINEAR)) > 127
+
+
+def _nearest_depths(
+    pixels: Bool[np.ndarray, "S S"], K: Float[np.ndarray, "3 3"], body: Float[Tensor, "B 3"]
+) -> Float[np.ndarray, "S S"]:
+    """Depth of the person at some pixels: the least of the points within `LIMB` in the image, or
+    that of the nearest point; infinite elsewhere."""
+    depths = np.full(pixels.shape, np.inf)
+    rows, columns = np.nonzero(pixels)
+    seen = body.double().numpy()
+    seen = seen[seen[:, 2] > NEAR]
+    if not len(rows) or not len(seen):
+        return np.where(pixels, 0.0, depths)
+    xy = seen[:, :2] / seen[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2]
+    away = cdist(np.stack((columns, rows), -1) + 0.5, xy) / K[0, 0] * seen[:, 2]
+    close = away <= np.maximum(away.min(1, keepdims=True), LIMB)
+    depths[rows, columns] = np.where(close, seen[:, 2], np.inf).min(1)
+    return depths
 
 
 def _edges(

@@ -23,9 +23,11 @@ ANKLES, HEAD = (7, 8), 15
 UPRIGHT = 0.25  # of the frames: those in which the body stands straightest
 REACH = 0.13  # metres in the image between a palm and what it holds
 STILL = 0.07  # metres a second: an object that moves less rests
+HIDDEN = 0.6  # of the median area of its masks: under this most of the object is hidden
 SHORTEST = 0.2  # seconds of a grasp or a rest
 RELEASE = 0.12  # seconds for which hands are near what they have let go
-STEADY = 0.45  # seconds over which the hands' noise is smoothed
+STEADY = 0.45  # seconds over which the distance of the nearest wrist is smoothed
+ALONG = 5  # points of a bone
 
 
 @dataclass(frozen=True)
@@ -73,13 +75,13 @@ def hand_motion(
     still in the world does.
     """
     window = max(5, round(STEADY * fps) | 1)
-    places = smooth(joints.double().numpy(), window)
+    places = joints.double().numpy()
     first = places.shape[1] - HAND_JOINTS
     wrists = places[:, [LEFT_WRIST, RIGHT_WRIST]]
     middle = places[:, [first + MIDDLE, first + HAND_JOINTS // 2 + MIDDLE]]
     palms = (wrists + middle) / 2
     away = _palm_distances(palms, masks, cameras)
-    near = _cleaned(away < REACH, round(SHORTEST * fps))
+    near = _kept_while_hidden(_cleaned(away < REACH, round(SHORTEST * fps)), outlines)
     depths = hand_depths(masks, cameras, joints[:, [LEFT_WRIST, RIGHT_WRIST]])
     depths = smooth(depths, window)
     rests = _cleaned(_rests(outlines, depths, cameras, fps)[:, None], round(SHORTEST * fps))[:, 0]
@@ -94,6 +96,17 @@ def hand_motion(
     if known.any():
         depths = fill_gaps(palm_depths, known)
     return HandMotion(held, rests, rotations, depths, palms, near, pieces, _up(places))
+
+
+def along_bones(joints: Float[Tensor, "F J 3"], parents: Sequence[int]) -> Float[Tensor, "F B 3"]:
+    """Points along the body's bones, world."""
+    import torch
+
+    child = torch.tensor([j for j, parent in enumerate(parents) if parent >= 0])
+    parent = torch.tensor(parents)[child]
+    parts = torch.linspace(0, 1, ALONG)[:, None]
+    bones = torch.lerp(joints[:, parent, None], joints[:, child, None], parts)
+    return bones.flatten(1, 2)
 
 
 def _up(places: Float[np.ndarray, "F J 3"]) -> Float[np.ndarray, " 3"]:
@@ -157,6 +170,20 @@ def _cleaned(flags: Bool[np.ndarray, "F N"], shortest: int) -> Bool[np.ndarray, 
     closed = ndimage.binary_closing(padded, structure)
     opened = ndimage.binary_opening(closed, structure)
     return opened[len(structure) : -len(structure)]
+
+
+def _kept_while_hidden(
+    near: Bool[np.ndarray, "F 2"], outlines: Outlines
+) -> Bool[np.ndarray, "F 2"]:
+    """A hand that is at the object before and after most of it is hidden is so meanwhile."""
+    hidden = ~(outlines.areas >= HIDDEN * np.median(outlines.areas[outlines.observed]))
+    labels, count = ndimage.label(hidden)
+    kept = near.copy()
+    for run in range(1, count + 1):
+        rows = np.flatnonzero(labels == run)
+        if rows[0] > 0 and rows[-1] + 1 < len(near):
+            kept[rows] |= near[rows[0] - 1] & near[rows[-1] + 1]
+    return kept
 
 
 def _hand_frames(

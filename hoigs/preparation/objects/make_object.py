@@ -128,6 +128,7 @@ def make_object(
     humans: MaskStack,
     cameras: Sequence[Camera],
     joints: Float[Tensor, "F J 3"],
+    parents: Sequence[int],
     images: Images,
     *,
     way: ObjectWay,
@@ -140,9 +141,10 @@ def make_object(
     be, and the confidence names why.
 
     Args:
-        joints: of the body, world, metres. way: how; "auto": as a ball where all masks are round,
-            or else by texture. radius: of a ball, metres; None: a football's for a tracked ball,
-            and for a round mask that which the limbs at it give. count: of points.
+        joints: of the body, world, metres. parents: of the joints. way: how; "auto": as a ball
+            where all masks are round, or else by texture. radius: of a ball, metres; None: a
+            football's for a tracked ball, and for a round mask that which the limbs at it give.
+            count: of points.
     """
     if ball is not None:
         track, normals, spread = ball_object(ball, cameras, radius or FOOTBALL, count)
@@ -165,7 +167,7 @@ def make_object(
         if way == "outline":
             raise UntrackableError("object_track is outline")
         track, normals, confidence = tracked_object(
-            masks, humans, cameras, joints, images, count, fps, progress
+            masks, humans, cameras, joints, parents, images, count, fps, progress
         )
         spread = float(np.nanmean(confidence.outline) / track.points.norm(dim=-1).mean())
         if not spread < FARTHEST_OUTLINE:

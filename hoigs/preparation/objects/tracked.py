@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hoigs.core.maths.rotations import matrices_to_quats, quats_to_matrices, slerp
-from hoigs.core.maths.series import fill_gaps
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.preparation.masks.mask_stack import MaskStack
@@ -28,7 +27,7 @@ from hoigs.preparation.objects.alignment import (
 )
 from hoigs.preparation.objects.crops import Crops, make_crops
 from hoigs.preparation.objects.flights import flights_by_texture
-from hoigs.preparation.objects.hands import HandMotion, hand_motion
+from hoigs.preparation.objects.hands import HandMotion, along_bones, hand_motion
 from hoigs.preparation.objects.search import grasps_by_texture
 from hoigs.preparation.objects.surface import hull, with_samples
 
@@ -36,6 +35,7 @@ FEWEST = 8  # frames that show the object whole
 SMALLEST = 10  # pixels across, median
 AGREES = 0.5  # correlation of textures from which a pose is trusted
 FAINTEST, BLUR = 0.02, 2.5  # relative contrast of texture; pixels of a crop it is blurred by
+BEHIND = 0.5  # of its radius behind the hands: from there on the person hides nothing of it
 SIDE = 96  # of the crops, pixels
 SAMPLES = 1200
 
@@ -78,6 +78,7 @@ def tracked_object(
     humans: MaskStack,
     cameras: Sequence[Camera],
     joints: Float[Tensor, "F J 3"],
+    parents: Sequence[int],
     images: Images,
     count: int,
     fps: float,
@@ -98,7 +99,11 @@ def tracked_object(
     _check(outlines)
     hands = hand_motion(joints, masks, outlines, cameras, fps)
     shown = outlines.observed
-    crops = make_crops(images, masks, humans, cameras, shown, SIDE)
+    radius = _radius(outlines, hands, cameras)
+    behind = hands.depths + BEHIND * radius
+    crops = make_crops(
+        images, masks, humans, cameras, shown, SIDE, along_bones(joints, parents), behind
+    )
     contrast = crops.contrast(BLUR)
     if contrast < FAINTEST:
         raise UntrackableError(
@@ -106,7 +111,6 @@ def tracked_object(
             f"({100 * FAINTEST:.0f} % are needed)"
         )
     start = _start(hands, outlines, cameras, shown)
-    radius = _radius(outlines, hands, cameras)
     held = _held(hands, shown)
     surface, found = _aligned(crops, start, held, hands, radius, fps, levels, progress)
     agreement = _over_frames(found.agreement, shown)
@@ -233,7 +237,7 @@ def _result(
     dense = with_samples(found.vertices, surface.faces, count)
     points, normals = dense.points(found.vertices), dense.normals(found.vertices)
     middle = (points.max(0).values + points.min(0).values) / 2
-    rotations, translations = _between(found.poses, middle, shown)
+    rotations, translations = between(found.poses, middle, shown, hands)
     points = points - middle
     distance = np.full(len(shown), np.nan)
     for i in np.flatnonzero(hands.held).tolist():
@@ -268,22 +272,32 @@ def _result(
     )
 
 
-def _between(
-    poses: Poses, middle: Float[Tensor, " 3"], shown: Bool[np.ndarray, " F"]
+def between(
+    poses: Poses, middle: Float[Tensor, " 3"], shown: Bool[np.ndarray, " F"], hands: HandMotion
 ) -> tuple[Float[Tensor, "F 3 3"], Float[Tensor, "F 3"]]:
-    """Poses of all frames about the object's middle; frames that do not show it interpolate."""
-    places = poses.translations + poses.rotations @ middle
-    filled = np.zeros((len(shown), 3))
-    filled[shown] = places.numpy()
-    translations = torch.from_numpy(fill_gaps(filled, shown)).float()
-    quats, rows = matrices_to_quats(poses.rotations), np.flatnonzero(shown)
-    frames = np.arange(len(shown))
-    after = np.searchsorted(rows, frames).clip(0, len(rows) - 1)
-    before = np.where(rows[after] == frames, after, (after - 1).clip(0))
-    gap = np.maximum(rows[after] - rows[before], 1)
-    part = ((frames - rows[before]) / gap).clip(0, 1)
-    mixed = slerp(quats[before], quats[after], torch.from_numpy(part).float()[:, None])
-    return quats_to_matrices(mixed), translations
+    """Poses of all frames about the object's middle. Between two frames that show it, poses are
+    interpolated: in the frame of the hands that hold it all the while, or else in the world."""
+    rows = np.flatnonzero(shown)
+    nearest = torch.from_numpy(np.searchsorted(rows, np.arange(len(shown))).clip(0, len(rows) - 1))
+    rotations = poses.rotations[nearest]
+    places = (poses.translations + poses.rotations @ middle)[nearest]
+    rotations[rows[-1] :], places[rows[-1] :] = rotations[rows[-1]], places[rows[-1]]
+    for first, last in zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True):
+        gap = np.arange(first, last + 1)
+        turns, points = torch.eye(3).expand(len(gap), 3, 3), torch.zeros(len(gap), 3)
+        holding = hands.near[gap].all(0) & hands.held[gap].all()
+        if len(gap) > 2 and holding.any():
+            turns = torch.from_numpy(hands.rotations[gap]).float()
+            points = torch.from_numpy(hands.palms[gap][:, holding].mean(1)).float()
+        ends, part = [0, -1], torch.linspace(0, 1, len(gap))[:, None]
+        back = turns[ends].mT
+        quats = matrices_to_quats(back @ rotations[gap[ends]])
+        start, end = (back @ (places[gap[ends]] - points[ends])[..., None])[..., 0]
+        rotations[gap] = turns @ quats_to_matrices(
+            slerp(*quats[:, None].expand(2, len(gap), 4), part)
+        )
+        places[gap] = points + (turns @ torch.lerp(start, end, part)[..., None])[..., 0]
+    return rotations, places
 
 
 def _signed_distances(

@@ -25,10 +25,12 @@ class Stage:
 
 
 PLAN = {
-    "frames": Stage(2, (), ("width", "every", "fps", "max_frames", "pick", "folder_fps")),
+    "frames": Stage(
+        2, (), ("width", "every", "fps", "max_frames", "pick", "folder_fps", "start", "end")
+    ),
     "evidence": Stage(30, ("frames",), ("human", "object"), slow=True),
     "object_masks": Stage(30, ("evidence",), (), slow=True),
-    "cameras": Stage(3, ("frames", "evidence"), ("camera", "focal")),
+    "cameras": Stage(3, ("frames", "evidence"), ("camera", "focal", "intrinsics", "calibration")),
     "inputs": Stage(6, ("evidence", "cameras"), ("find_object",)),
     "body": Stage(40, ("inputs",), ("body", "fit_steps"), slow=True),
     "masks": Stage(10, ("inputs", "body", "object_masks"), ("keep_black",), slow=True),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from jaxtyping import UInt8
@@ -15,8 +15,11 @@ from jaxtyping import UInt8
 from hoigs.preparation.video.pictures import FilePicture, Picture, VideoPicture
 from hoigs.preparation.video.sharpness import sharpness
 from hoigs.preparation.video.source import IMAGE_SUFFIXES, SourceError, numbered_frames
+from hoigs.preparation.video.span import Span
 
 Pick = Literal["sharpest", "first"]
+UNEVEN = 0.1  # of the gap between frames: times that are so far from even ones are kept
+LATE = 0.05  # of a window: a frame this little before it belongs to it, for times are rounded
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,8 @@ class FrameList:
         total: frames in the source, up to the last one looked at.
         indices: frame number of each chosen one.
         sharpness: of each chosen one; see `sharpness.sharpness`.
+        times: of each chosen one, seconds since the source's first frame.
+        first: number of the first frame that could be chosen.
     """
 
     native_width: int
@@ -38,6 +43,8 @@ class FrameList:
     total: int
     indices: list[int]
     sharpness: list[float]
+    times: list[float] = field(default_factory=list)
+    first: int = 0
 
 
 class Frames(ABC):
@@ -50,12 +57,15 @@ class Frames(ABC):
         fps: frames a second to choose, in place of `every`.
         pick: which frame of a window: its first, or its sharpest.
         rate: of a source that has none of its own.
+        span: the part of the source to choose from.
         known: what an earlier survey found; the source is then not looked at again.
 
     Attributes:
         native_width, native_height: of the source as displayed (rotation applied).
         width, height: of the frames given out.
-        fps: of the frames given out, `every` allowed for.
+        fps: of the frames given out, `every` allowed for; the mean of uneven ones.
+        times: of the frames given out, seconds since the source's first frame. uneven: whether
+            they are not `fps` frames a second, evenly.
         indices: the source's frame number of each frame given out.
         total: frames in the source, up to the last one looked at.
         sharpness: of each frame given out.
@@ -74,10 +84,12 @@ class Frames(ABC):
         fps: float | None = None,
         pick: Pick = "first",
         rate: float = 30.0,
+        span: Span | None = None,
         known: FrameList | None = None,
     ) -> None:
         self.path, self._rate = Path(path), rate
-        self.list = known or self._survey(_Windows(every, fps, max_frames, pick))
+        windows = _Windows(every, fps, max_frames, pick)
+        self.list = known or self._survey(windows, span or Span())
         if width and width > self.native_width:
             raise SourceError(
                 f"width {width} is larger than the video's {self.native_width}; "
@@ -89,10 +101,24 @@ class Frames(ABC):
 
     native_width = property(lambda self: self.list.native_width)
     native_height = property(lambda self: self.list.native_height)
-    fps = property(lambda self: self.list.fps)
+    times = property(lambda self: self.list.times)
     total = property(lambda self: self.list.total)
     indices = property(lambda self: self.list.indices)
     sharpness = property(lambda self: self.list.sharpness)
+
+    @property
+    def uneven(self) -> bool:
+        times = np.array(self.times)
+        if len(times) < 3:
+            return False
+        even = np.linspace(times[0], times[-1], len(times))
+        return bool(np.abs(times - even).max() > UNEVEN * (even[1] - even[0]))
+
+    @property
+    def fps(self) -> float:
+        if not self.uneven:
+            return self.list.fps
+        return (len(self.times) - 1) / (self.times[-1] - self.times[0])
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -108,6 +134,7 @@ class Frames(ABC):
             self.list,
             indices=[self.indices[i] for i in positions],
             sharpness=[self.sharpness[i] for i in positions],
+            times=[self.times[i] for i in positions],
         )
         part._reading = None
         return part
@@ -140,10 +167,11 @@ class Frames(ABC):
             if number == last:
                 return
 
-    def _survey(self, windows: _Windows) -> FrameList:
-        """Looks at every frame, so that damage shows before any work."""
+    def _survey(self, windows: _Windows, span: Span) -> FrameList:
+        """Looks at every frame of the span, so that damage shows before any work."""
         native: tuple[int, int] | None = None
-        count = 0
+        count, begun, seconds = 0, -1.0, -1.0
+        first: int | None = None
         for number, picture in enumerate(self._pictures()):
             windows.rate = self._rate
             native = native or picture.size()
@@ -152,58 +180,72 @@ class Frames(ABC):
                     f"{self.path}: frame {number} is {picture.size()[0]}x{picture.size()[1]}, "
                     f"the first {native[0]}x{native[1]}; a clip has one size"
                 )
-            if windows.beyond(number):
+            begun = (picture.seconds or 0.0) if number == 0 else begun
+            shown = None if picture.seconds is None else picture.seconds - begun
+            if shown is None or shown <= seconds:  # no clock, or a broken one
+                shown = number / self._rate if shown is None else seconds + 1 / self._rate
+            if span.over(number, shown):
                 break
-            count = number + 1
-            windows.offer(number, picture)
-            if windows.full(number):
-                break
+            if span.begun(number, shown):
+                first = number if first is None else first
+                if not windows.offer(number, shown, picture):
+                    break
+            count, seconds = number + 1, shown
         if native is None:
             raise SourceError(f"{self.path} holds no video frame: it is empty or cut off")
+        if first is None:
+            raise SourceError(
+                f"{span} leaves no frame of {self.path}: it has frames 0 to {count - 1}, the last "
+                f"at {max(seconds, 0):.2f} s"
+            )
         return FrameList(
-            *native, self._rate, windows.fps(), count, windows.indices, windows.sharpnesses
-        )
+            *native, self._rate, windows.fps(), count, windows.indices, windows.sharpnesses,
+            windows.times, first,
+        )  # fmt: skip
 
 
 class _Windows:
-    """Cuts a stream of frames into windows and keeps one frame of each."""
+    """Cuts a stream of frames into windows, the first of which begins with the first frame, and
+    keeps one frame of each."""
 
     def __init__(self, every: int, fps: float | None, max_frames: int | None, pick: Pick) -> None:
         self.every, self.wanted_fps, self.max_frames, self.pick = every, fps, max_frames, pick
         self.rate = 0.0
         self.indices: list[int] = []
         self.sharpnesses: list[float] = []
+        self.times: list[float] = []
+        self._begun: tuple[int, float] | None = None
+        self._window = -1
 
     def fps(self) -> float:
         return self.rate / self.every if self.wanted_fps is None else self.wanted_fps
 
-    def of(self, number: int) -> int:
+    def _of(self, number: int, seconds: float) -> int:
+        self._begun = self._begun or (number, seconds)
         if self.wanted_fps is None:
-            return number // self.every
-        if self.wanted_fps > self.rate:
+            return (number - self._begun[0]) // self.every
+        if self.wanted_fps > 1.01 * self.rate:
             raise SourceError(
                 f"fps {self.wanted_fps:g} is more than the video's {self.rate:g}; "
                 "frames are not invented"
             )
-        return int(number * self.wanted_fps / self.rate + 1e-6)
+        return int((seconds - self._begun[1]) * self.wanted_fps + LATE)
 
-    def beyond(self, number: int) -> bool:
-        return self.max_frames is not None and self.of(number) >= self.max_frames
-
-    def full(self, number: int) -> bool:
-        """Whether no later frame can be chosen."""
-        return self.beyond(number + 1 if self.pick == "sharpest" else number + self.every)
-
-    def offer(self, number: int, picture: Picture) -> None:
-        new = self.of(number) == len(self.indices)
+    def offer(self, number: int, seconds: float, picture: Picture) -> bool:
+        """Takes the frame, or not; False if neither it nor any later one can be chosen."""
+        window = self._of(number, seconds)
+        new = window != self._window
+        if new and self.max_frames is not None and len(self.indices) >= self.max_frames:
+            return False
         if not new and self.pick == "first":
-            return
+            return True
+        self._window = window
         value = sharpness(picture)
-        if new:
-            self.indices.append(number)
-            self.sharpnesses.append(value)
-        elif value > self.sharpnesses[-1]:
-            self.indices[-1], self.sharpnesses[-1] = number, value
+        if not new and value <= self.sharpnesses[-1]:
+            return True
+        at = len(self.indices) if new else len(self.indices) - 1
+        self.indices[at:], self.sharpnesses[at:], self.times[at:] = [number], [value], [seconds]
+        return True
 
 
 class VideoFrames(Frames):
@@ -215,7 +257,9 @@ class VideoFrames(Frames):
         try:
             with av.open(str(self.path)) as container:
                 if not container.streams.video:
-                    raise SourceError(f"{self.path} has no video stream")
+                    raise SourceError(
+                        f"{self.path} has no video stream, {_listed(container.streams)} only"
+                    )
                 stream = container.streams.video[0]
                 stream.thread_type = "AUTO"
                 self._rate = float(stream.average_rate or stream.guessed_rate or 30)
@@ -226,6 +270,10 @@ class VideoFrames(Frames):
                 f"{self.path} ({size} bytes) is not a readable video: {error}; "
                 "re-encode it, for example with `ffmpeg -i VIDEO -c:v libx264 fixed.mp4`"
             ) from error
+
+
+def _listed(streams: Iterable[Any]) -> str:
+    return " and ".join(sorted({stream.type for stream in streams})) or "nothing"
 
 
 class FolderFrames(Frames):
@@ -254,8 +302,11 @@ def open_frames(
     fps: float | None = None,
     pick: Pick = "first",
     rate: float = 30.0,
+    span: Span | None = None,
     known: FrameList | None = None,
 ) -> Frames:
     """A video file's or a folder's frames; see `Frames`."""
     kind = FolderFrames if Path(path).is_dir() else VideoFrames
-    return kind(path, width, every, max_frames, fps=fps, pick=pick, rate=rate, known=known)
+    return kind(
+        path, width, every, max_frames, fps=fps, pick=pick, rate=rate, span=span, known=known
+    )

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
-UNEVEN = 1.5  # a gap between frames this many times as long as the middle one is not even
-FEW = 0.02  # of the gaps: a frame dropped now and then is nothing
+MOST = 0.97  # of the header's frames, which are an estimate where it gives seconds only
 
 
 def video_header(path: Path) -> tuple[int, float] | None:
@@ -25,27 +22,11 @@ def video_header(path: Path) -> tuple[int, float] | None:
         return None
 
 
-def uneven_share(path: Path) -> float:
-    """Part of the gaps between a video's frames that are not of one length, 0..1."""
-    import av
-
-    with av.open(str(path)) as container:
-        stream = container.streams.video[0]
-        times = sorted(p.pts for p in container.demux(stream) if p.pts is not None)
-    gaps = np.diff(times)
-    if len(gaps) < 2:
-        return 0.0
-    middle = float(np.median(gaps))
-    return float(((gaps > UNEVEN * middle) | (gaps * UNEVEN < middle)).mean())
-
-
-def uneven_times(path: Path, fps: float) -> list[str]:
-    """A sentence for the report if a video has a variable frame rate, else nothing."""
-    share = uneven_share(path)
-    if share <= FEW:
+def missing_frames(path: Path, found: int) -> list[str]:
+    """A sentence for the report if a video's header has more frames than were found."""
+    header = video_header(path)
+    if header is None or found >= MOST * header[0]:
         return []
     return [
-        f"the video has a variable frame rate ({100 * share:.0f} % of the gaps between its frames "
-        f"are longer or shorter): the clip counts them evenly, at {fps:.4g} a second, and motion "
-        "is uneven in it; `ffmpeg -i VIDEO -vf fps=30 even.mp4` makes it even"
+        f"the video's header gives {header[0]} frames, {found} were found: the file may be cut off"
     ]

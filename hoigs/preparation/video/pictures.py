@@ -13,7 +13,13 @@ from hoigs.preparation.video.source import SourceError
 
 
 class Picture(Protocol):
-    """One frame of a source, not yet converted."""
+    """One frame of a source, not yet converted.
+
+    Attributes:
+        seconds: when it is shown, by the source's clock; None where it has none.
+    """
+
+    seconds: float | None
 
     def size(self) -> tuple[int, int]:
         """Width and height, upright."""
@@ -30,6 +36,7 @@ class VideoPicture:
 
     def __init__(self, frame) -> None:
         self.frame, self.turns = frame, quarter_turns(frame)
+        self.seconds: float | None = frame.time
 
     def size(self) -> tuple[int, int]:
         size = (self.frame.width, self.frame.height)
@@ -55,6 +62,8 @@ class VideoPicture:
 
 class FilePicture:
     """An image file, opened when its pixels are read."""
+
+    seconds: float | None = None
 
     def __init__(self, path: Path) -> None:
         self.path = path

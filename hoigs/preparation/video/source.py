@@ -33,6 +33,10 @@ class SourceError(HoigsError):
     """A video or its estimators that are absent, unreadable or do not fit together."""
 
 
+class NobodyFoundError(SourceError):
+    """No person is seen in any frame: nothing that was kept of this video is of use."""
+
+
 @dataclass(frozen=True)
 class Source:
     """Where each input of `prepare` lies.
@@ -138,6 +142,17 @@ def find_source(
 
 def _files(kind: EstimateKind, path: str, **settings: Any) -> ComponentSpec:
     return ComponentSpec(use=f"estimator:{kind}-files", path=path, **settings)
+
+
+def find_video(path: Path) -> Path | None:
+    """The video of a source, or its folder of frames; None if it has neither.
+
+    Raises:
+        SourceError: there are several videos.
+    """
+    if path.is_file():
+        return path
+    return _find_video(path, []) if path.is_dir() else None
 
 
 def _find_video(folder: Path, missing: list[str]) -> Path | None:

@@ -13,6 +13,7 @@ from tiny import FRAMES, HEIGHT, WIDTH
 from hoigs.preparation.cameras.camera_track import (
     colmap_cameras,
     parallax,
+    pinhole,
     static_cameras,
 )
 from hoigs.preparation.video.frames import VideoFrames
@@ -105,7 +106,7 @@ def test_a_damaged_model(tiny_video: Path, tmp_path: Path) -> None:
 
 def test_static_camera(tiny_video: Path) -> None:
     video = VideoFrames(tiny_video, width=WIDTH // 2)
-    given = static_cameras(video, 120.0)
+    given = static_cameras(video, pinhole(video, 120.0))
     assert float(given.cameras[0].K[1, 1]) == pytest.approx(60) and "given" in given.provenance
     assert parallax(given.cameras, torch.tensor([0.0, 0, 3])) == pytest.approx(0, abs=1e-3)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -12,7 +13,7 @@ from scipy import ndimage
 
 from hoigs.preparation.cameras.choose import choose_cameras
 from hoigs.preparation.cameras.motion import background_motion
-from hoigs.preparation.cameras.sfm import structure_from_motion
+from hoigs.preparation.cameras.sfm import _what_to_do, structure_from_motion
 from hoigs.preparation.given import GivenMasks, RawLandmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.options import PrepareOptions
@@ -83,7 +84,7 @@ def test_a_camera_that_stands_still(tmp_path: Path) -> None:
 def test_a_camera_that_moves_and_one_that_shows_nothing(tmp_path: Path) -> None:
     video, masks = recorded(tmp_path / "moves", [0.08 * i for i in range(COUNT)])
     motion = background_motion(video, masks)
-    assert motion.known and not motion.static and motion.largest > 5
+    assert motion.known and not motion.static and motion.largest > 5 and motion.turned is None
     hidden = GivenMasks(together=MaskStack([np.ones((HEIGHT, WIDTH), bool)] * COUNT))
     nothing = background_motion(video, hidden)
     assert not nothing.known and nothing.static
@@ -91,6 +92,33 @@ def test_a_camera_that_moves_and_one_that_shows_nothing(tmp_path: Path) -> None:
         video, nobody(COUNT), hidden, None, PrepareOptions(), tmp_path, lambda _: None
     )
     assert any("too few to tell" in warning for warning in chosen.warnings)
+
+
+def test_a_camera_that_turns_on_its_spot(tmp_path: Path) -> None:
+    folder = tmp_path / "turns"
+    folder.mkdir()
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    rays = np.stack(((x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)), -1)
+    for i in range(3):
+        c, s = np.cos(np.radians(6 * i)), np.sin(np.radians(6 * i))
+        wall = rays @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+        at = wall[..., 1::-1] / wall[..., 2:] * 440 + 450
+        grey = ndimage.map_coordinates(WALLS[0][1], at.transpose(2, 0, 1), order=1, mode="mirror")
+        Image.fromarray(np.stack([grey.astype(np.uint8)] * 3, -1)).save(folder / f"{i}.png")
+    video = open_frames(folder)
+    nothing = GivenMasks(together=MaskStack([np.zeros((HEIGHT, WIDTH), bool)] * 3))
+
+    def choose(camera: str):
+        options = PrepareOptions(focal=FOCAL, camera=camera)
+        return choose_cameras(video, nobody(3), nothing, None, options, tmp_path, lambda _: None)
+
+    with pytest.raises(
+        SourceError, match=r"turns on its spot \(by 6\.\d degrees .* --camera static"
+    ):
+        choose("auto")
+    chosen = choose("static")
+    assert chosen.track.figures["displacement_px"] > 50
+    assert any("turns on its spot" in w and "declared static" in w for w in chosen.warnings)
 
 
 def test_the_way_of_a_moving_camera(tmp_path: Path) -> None:
@@ -111,7 +139,15 @@ def test_the_way_of_a_moving_camera(tmp_path: Path) -> None:
     assert off.max() < 0.03 * np.linalg.norm(way[-1])
 
 
-def test_a_turning_camera_is_refused_with_advice(tmp_path: Path) -> None:
+def test_frames_with_a_camera_are_named_by_the_videos_numbers() -> None:
+    video = SimpleNamespace(indices=[4, 6, 8, 10, 12, 14], times=[0.4, 0.6, 0.8, 1.0, 1.2, 1.4])
+    images = [SimpleNamespace(name=f"{i:05d}.png") for i in (14, 4, 8, 10)]
+    advice = _what_to_do(SimpleNamespace(images=dict(enumerate(images))), video)
+    assert advice.startswith("Frames 4, 8, 10, 14 of the video have one")
+    assert "--start 8f --end 11f uses the longest part of them, 0.2 s" in advice
+
+
+def test_frames_without_features_are_refused_with_advice(tmp_path: Path) -> None:
     folder = tmp_path / "flat"
     folder.mkdir()
     for i in range(4):

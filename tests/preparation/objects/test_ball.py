@@ -11,7 +11,7 @@ from tiny import BALL, FRAMES, HEIGHT, WIDTH, masks
 
 from hoigs.core.maths.series import smooth
 from hoigs.core.values.undistortion import Undistortion
-from hoigs.preparation.cameras.camera_track import static_cameras
+from hoigs.preparation.cameras.camera_track import pinhole, static_cameras
 from hoigs.preparation.objects.ball import ball_centers, load_ball, refine_ball
 from hoigs.preparation.objects.sphere import outline_rays
 from hoigs.preparation.video.frames import VideoFrames
@@ -56,7 +56,7 @@ def test_refinement_finds_the_round_edge(tiny_source: Path) -> None:
 def test_distance_is_metric(tiny_source: Path) -> None:
     video = VideoFrames(tiny_source / "video.mp4")
     ball = load_ball(tiny_source / "ball_track.npz", video, Undistortion())
-    cameras = static_cameras(video, 0.8 * WIDTH).cameras
+    cameras = static_cameras(video, pinhole(video, 0.8 * WIDTH)).cameras
     centers = ball_centers(ball, cameras, radius=0.11)
     turns = np.linspace(0, 2 * np.pi, 9)
     ring = np.stack((np.cos(turns), np.sin(turns)), -1)

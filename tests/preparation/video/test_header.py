@@ -2,40 +2,22 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
 
-import av
-import numpy as np
 import pytest
+from tiny import FRAMES
 
 from hoigs.preparation.pipeline import Pipeline
 from hoigs.preparation.video.frames import FrameList
-from hoigs.preparation.video.header import uneven_times, video_header
+from hoigs.preparation.video.header import missing_frames, video_header
 
 
-def write(path: Path, times: list[int]) -> Path:
-    """A video whose frames are shown at these multiples of 1/300 s."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("h264", rate=30)
-        stream.width, stream.height = 64, 48
-        stream.time_base = stream.codec_context.time_base = Fraction(1, 300)
-        for time in times:
-            frame = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
-            frame.pts, frame.time_base = time, Fraction(1, 300)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    return path
-
-
-def test_a_variable_frame_rate_is_named(tmp_path: Path) -> None:
-    even = write(tmp_path / "even.mp4", [10 * i for i in range(20)])
-    assert uneven_times(even, 30.0) == []
-    assert video_header(even) == (20, pytest.approx(30.0, rel=0.06))
-    uneven = write(tmp_path / "uneven.mp4", [10 * i + (i // 3) * 25 for i in range(20)])
-    (sentence,) = uneven_times(uneven, 30.0)
-    assert "variable frame rate (32 % of the gaps" in sentence and "ffmpeg" in sentence
+def test_a_video_that_is_shorter_than_its_header_says(tiny_video: Path) -> None:
+    assert video_header(tiny_video) == (FRAMES, pytest.approx(12))
+    assert missing_frames(tiny_video, FRAMES) == []
+    (sentence,) = missing_frames(tiny_video, 5)
+    assert "12 frames, 5 were found" in sentence
 
 
 def test_a_file_that_is_no_video_has_no_header(tmp_path: Path) -> None:

@@ -1,0 +1,73 @@
+"""A preparation in a process of its own, which writes what happens as lines of JSON.
+
+It is started by `jobs.Job` as `python -m hoigs.annotation.worker JSON`. The clicks are read from
+their file beside the video, as `hoigs prepare` reads them.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from hoigs.core.environments.managed import EnvironmentAbsentError
+from hoigs.core.errors import HoigsError
+from hoigs.preparation.estimator_plan import EstimatorPlan
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.prepare import prepare, prepare_until
+from hoigs.preparation.stages.plan import PLAN
+
+TRACKED = "object_masks"  # the stage after which all masks are there
+
+
+def run(video: Path, out: Path, options: dict[str, Any], whole: bool, yes: bool) -> None:
+    """Masks alone, or the whole clip."""
+    share = 1.0 if whole else _share(TRACKED)
+
+    def progress(done: float, what: str) -> None:
+        _say(done=min(1.0, done / share), text=what)
+
+    def announce(plan: EstimatorPlan) -> None:
+        _say(plan=plan.rows(), notes=plan.notes)
+
+    given = PrepareOptions.model_validate({**options, "overwrite": True})
+    if not whole:
+        prepare_until(
+            TRACKED, video, out, options=given, yes=yes, announce=announce, progress=progress
+        )
+        return
+    report = prepare(
+        video, out, options=given, yes=yes, announce=announce, progress=progress
+    )  # fmt: skip
+    _say(rows=report.rows(), warnings=list(report.warnings))
+
+
+def _share(stage: str) -> float:
+    """How much of a whole preparation is done after a stage, 0..1."""
+    names = list(PLAN)
+    weights = [PLAN[name].weight for name in names]
+    return sum(weights[: names.index(stage) + 1]) / sum(weights)
+
+
+def _say(**event: Any) -> None:
+    print(json.dumps(event), flush=True)
+
+
+def main() -> None:
+    given = json.loads(sys.argv[1])
+    try:
+        run(
+            Path(given["video"]), Path(given["out"]), given["options"], given["whole"],
+            given["yes"],
+        )  # fmt: skip
+    except EnvironmentAbsentError as error:
+        _say(error=str(error), absent=True)
+    except HoigsError as error:
+        _say(error=str(error))
+    else:
+        _say(finished=True)
+
+
+if __name__ == "__main__":
+    main()
