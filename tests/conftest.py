@@ -6,11 +6,14 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+import jaxtyping
 import pytest
 import torch
 from jaxtyping import install_import_hook
+from shapecheck import only_arrays
 
 # Annotations are promises: every call in these modules is checked against its shapes and types.
 # hoigs.rasterizers.warp is left out, because Warp reads the source of its kernels; the modules
@@ -32,6 +35,7 @@ CHECKED = (
     "hoigs.viewing",
 )
 install_import_hook(list(CHECKED), "shapecheck.check")
+jaxtyping.jaxtyped = only_arrays(jaxtyping.jaxtyped)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -78,7 +82,21 @@ class Outcome:
 
 
 @pytest.fixture
-def hoigs(monkeypatch, capsys) -> Callable[..., Outcome]:
+def few_renders(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The render time of 5 renders, not 110, and an orbit of 4, not 36: most of a tiny run's cost.
+
+    tests/evaluation has the orbit at full length, and render times as they are configured.
+    """
+    from hoigs.evaluation.report import media
+    from hoigs.workflows import evaluate_run as workflow
+
+    quick = partial(workflow.evaluate, timing_frames=4, timing_warmup=1)
+    monkeypatch.setattr(workflow, "evaluate", quick)
+    monkeypatch.setattr(media, "ORBIT_FRAMES", 4)
+
+
+@pytest.fixture
+def hoigs(monkeypatch, capsys, few_renders) -> Callable[..., Outcome]:
     """Run `hoigs ARGS…` in this process."""
     from hoigs.cli.main import main
 

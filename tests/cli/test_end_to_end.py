@@ -11,6 +11,9 @@ import hoigs as h
 from hoigs.viewing.films import film_views, playback_of
 
 SMALL = ("--set", "train.steps=60", "--set", "train.preview_every=30")
+# a render of the default numbers takes 0.4 s, and an evaluation with its report makes 200 of them
+FEW = ("--set", "model.scene.points=1000", "--set", "model.human.points=800",
+       "--set", "model.object.points=200")  # fmt: skip
 
 
 @pytest.mark.slow
@@ -18,7 +21,7 @@ def test_train_evaluate_and_render_from_python(hoigs, tiny_clip, tmp_path):
     """As the commands do it, with progress through callbacks and nothing on stdout."""
     run, lines, starts, steps, shares = tmp_path / "run", [], [], [], []
     done = h.train(
-        tiny_clip, "hoigs", out=run, overrides=SMALL[1::2], rasterizer="warp", device="cpu",
+        tiny_clip, "hoigs", out=run, overrides=(SMALL + FEW)[1::2], rasterizer="warp", device="cpu",
         on_start=starts.append, on_step=steps.append, progress=lambda f, _: shares.append(f),
         report=lines.append,
     )  # fmt: skip
@@ -70,7 +73,7 @@ def test_resume_equals_the_unbroken_run(hoigs, tiny_clip, tmp_path, request):
     torch.set_num_threads(1)
     request.addfinalizer(lambda: torch.set_num_threads(threads))
 
-    settings = ("--set", "train.steps=8", "--set", "train.checkpoint_every=4", "--no-eval")
+    settings = ("--set", "train.steps=8", "--set", "train.checkpoint_every=4", "--no-eval", *FEW)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     assert hoigs("train", tiny_clip, "--out", whole, *settings).code == 0
     assert hoigs("train", tiny_clip, "--out", broken, *settings).code == 0

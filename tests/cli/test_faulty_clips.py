@@ -9,6 +9,8 @@ import pytest
 from PIL import Image
 
 SMALL = ("--set", "train.steps=4", "--set", "train.preview_every=2")
+FEW = ("--set", "model.scene.points=500", "--set", "model.human.points=400",
+       "--set", "model.object.points=100")  # fmt: skip
 
 
 def spoil(clip) -> None:
@@ -31,7 +33,7 @@ def test_training_goes_on_and_names_each_fault(hoigs, clip_copy, tmp_path):
     run = tmp_path / "run"
     refused = hoigs("train", clip_copy, "--spec", "hoigs", "--out", run, *SMALL)
     assert refused.code == 2 and "--allow-faults" in refused.err and not run.exists()
-    done = hoigs("train", clip_copy, "--spec", "hoigs", "--out", run, "--allow-faults", *SMALL)
+    done = hoigs("train", clip_copy, "--out", run, "--allow-faults", *SMALL, *FEW)
     assert done.code == 0, done.err
     for words in ("masks/object/00004.png", "are empty in frames 6", "images/", "NaN, infinite"):
         assert any(x.startswith("warning: ") and words in x for x in done.err.splitlines()), words
@@ -45,7 +47,7 @@ def test_training_goes_on_and_names_each_fault(hoigs, clip_copy, tmp_path):
 @pytest.mark.slow
 def test_scores_under_another_protocol_stand_beside_the_runs_own(hoigs, tiny_clip, tmp_path):
     run = tmp_path / "run"
-    settings = ("--set", "train.steps=4", "--set", "train.preview_every=0")
+    settings = ("--set", "train.steps=4", "--set", "train.preview_every=0", *FEW[:2])
     assert hoigs("train", tiny_clip, "--spec", "static", "--out", run, *settings).code == 0
     page = (run / "report.html").stat().st_mtime_ns
     assert "What is wrong" not in (run / "report.html").read_text()

@@ -71,6 +71,7 @@ def blocks_of(page: Path) -> list[Block]:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_renders")
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_blocks_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -17,7 +17,8 @@ from hoigs.runs.run_folder import RunFolder
 from hoigs.training.session import Session
 
 ROOT = Path(__file__).parents[3]
-SETTINGS = ["train.steps=12", "train.checkpoint_every=4", "train.log_every=1"]
+SETTINGS = ["train.steps=12", "train.checkpoint_every=4", "train.log_every=1",
+            "model.scene.points=500"]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +80,8 @@ def test_killed_while_it_writes_it_ends_as_the_unbroken_run(
 
     command = [sys.executable, "-c", "from hoigs.cli.main import main; main()", "train"]
     command += [str(folder), "--spec", "static", "--device", "cpu", "--no-eval"]
-    for setting in ("train.steps=10", "train.checkpoint_every=1", "train.preview_every=0"):
+    for setting in ("train.steps=10", "train.checkpoint_every=1", "train.preview_every=0",
+                    "model.scene.points=500"):  # fmt: skip
         command += ["--set", setting]
     started = time.perf_counter()
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
