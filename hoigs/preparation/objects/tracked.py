@@ -293,9 +293,7 @@ def between(
         back = turns[ends].mT
         quats = matrices_to_quats(back @ rotations[gap[ends]])
         start, end = (back @ (places[gap[ends]] - points[ends])[..., None])[..., 0]
-        rotations[gap] = turns @ quats_to_matrices(
-            slerp(*quats[:, None].expand(2, len(gap), 4), part)
-        )
+        rotations[gap] = turns @ quats_to_matrices(slerp(quats[0], quats[1], part))
         places[gap] = points + (turns @ torch.lerp(start, end, part)[..., None])[..., 0]
     return rotations, places
 
