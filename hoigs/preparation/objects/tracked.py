@@ -291,11 +291,9 @@ def between(
             points = torch.from_numpy(hands.palms[gap][:, holding].mean(1)).float()
         ends, part = [0, -1], torch.linspace(0, 1, len(gap))[:, None]
         back = turns[ends].mT
-        quats = matrices_to_quats(back @ rotations[gap[ends]])
+        quats = matrices_to_quats(back @ rotations[gap[ends]])[:, None].expand(2, len(gap), 4)
         start, end = (back @ (places[gap[ends]] - points[ends])[..., None])[..., 0]
-        rotations[gap] = turns @ quats_to_matrices(
-            slerp(*quats[:, None].expand(2, len(gap), 4), part)
-        )
+        rotations[gap] = turns @ quats_to_matrices(slerp(quats[0], quats[1], part))
         places[gap] = points + (turns @ torch.lerp(start, end, part)[..., None])[..., 0]
     return rotations, places
 
