@@ -101,5 +101,6 @@ def from_texts(stored: StoredPrompts) -> list[Marked]:
 
 
 def _marks(at: PromptAt) -> list[Mark]:
-    boxes = [] if at.box is None else [Mark(frame=at.frame, box=at.box)]
-    return [*boxes, *(Mark(frame=at.frame, x=x, y=y, inside=i) for x, y, i in at.points)]
+    frame = at.frame or 0  # without one, the first
+    boxes = [] if at.box is None else [Mark(frame=frame, box=at.box)]
+    return [*boxes, *(Mark(frame=frame, x=x, y=y, inside=i) for x, y, i in at.points)]

@@ -70,6 +70,13 @@ def train(
             "prune and compress the model.",
         ),
     ] = False,
+    budget: Annotated[
+        str | None,
+        typer.Option(
+            "--budget",
+            help="A time, 90s, 20m or 2h: width and steps that fit it on this machine.",
+        ),
+    ] = None,
     evaluate: Annotated[
         bool, typer.Option("--eval/--no-eval", help="Score the run and write its report.")
     ] = True,
@@ -93,12 +100,16 @@ def train(
             "on_start": show.started, "on_step": show.step,
             "progress": show.fraction, "report": show.line,
         }  # fmt: skip
+        if auto and budget is not None:
+            raise typer.BadParameter("--auto has a budget of its own: leave --budget out")
         if auto:
             named = _clip_for_auto(clip, reader, reader_set)
             made = train_auto(named, spec, on_found=print_needs, **given)
             run = made.run
         else:
-            run = train_spec(clip, spec, reader=reader, reader_settings=reader_set or (), **given)
+            run = train_spec(
+                clip, spec, reader=reader, reader_settings=reader_set or (), budget=budget, **given
+            )
     if auto:
         _print_after(made.after)
     if run.evaluated is not None:

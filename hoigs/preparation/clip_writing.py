@@ -42,6 +42,8 @@ def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
         if made.object is not None:
             writer.set_object(options.object, made.object)
         writer.set_points(made.scene.points, made.scene.colors)
+        if made.video.uneven:
+            writer.set_times(made.video.times)
         if made.track.model is not None:
             writer.set_colmap(made.track.model)
         writer.provenance.update(

@@ -161,6 +161,12 @@ class Pipeline:
             require_pictures(frames)
             if path.is_file() and span.end is None and options.max_frames is None:
                 self.warnings += missing_frames(path, frames.total)
+            if frames.uneven:
+                self.warnings.append(
+                    f"the chosen frames are not evenly spaced (a variable frame rate, or the "
+                    f"sharpest of each few): the clip keeps their true times, {frames.fps:.4g} a "
+                    "second on average"
+                )
             return frames.list
 
         found = self._stage("frames", make, fingerprint([path]))

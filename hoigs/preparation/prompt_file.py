@@ -108,7 +108,9 @@ def with_stored(
         name = split[0][0] or (options.object if kind == "object" else options.human)
         names["object" if kind == "object" else "human"] = name
         prompts[name] = parse_prompts([place for _, place in split], f"--{kind}")
-        frames = ", ".join(str(at.frame) for at in prompts[name].places())
+        frames = ", ".join(
+            "first" if at.frame is None else str(at.frame) for at in prompts[name].places()
+        )
         said.append(f"{file}, beside the video: {name} in frame {frames}")
     given = {**options.model_dump(), **names, "prompts": prompts}
     return PrepareOptions.model_validate(given), tuple(said)

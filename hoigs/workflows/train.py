@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import shlex
 import signal
+import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
-from hoigs.core.errors import Interrupted
+from hoigs.core.errors import HoigsError, Interrupted
 from hoigs.core.folder_lock import FolderLock
 from hoigs.core.progress import Progress
 from hoigs.core.spec.schema import Spec
+from hoigs.evaluation.report.sections import clock
 from hoigs.training.session import Session
 from hoigs.training.trainer import StepReport
 from hoigs.viewing.live import LiveView
 from hoigs.viewing.viewer.server import LOCAL
+from hoigs.workflows.budget import plan_budget
 from hoigs.workflows.evaluate_run import EvaluatedRun, evaluate_run
 
 OnStart = Callable[[Session], None]
@@ -56,6 +59,7 @@ def train(
     reader: str | None = None,
     reader_settings: Sequence[str] = (),
     evaluate: bool = True,
+    budget: str | float | None = None,
     plugins: Sequence[Path | str] = (),
     view: bool = False,
     port: int = 8090,
@@ -79,6 +83,8 @@ def train(
         reader: reads the clip; by default the one that recognises its layout. reader_settings:
             of the reader, "masks=false".
         evaluate: score the run and write its report.
+        budget: a time, "90s", "20m", "2h": image width and steps are chosen so that training and
+            scores take about that long here. Not with `resume`.
         plugins: Python files to load (and run) first.
         view: show the training in the browser while it lasts, by a process of its own that reads
             checkpoints, of which one is then written about every 10 seconds. port: of its address
@@ -92,6 +98,17 @@ def train(
         HoigsError: the input is wrong; then nothing has been written.
         Interrupted: Ctrl-C or SIGTERM; the message has the command that continues.
     """
+    began, plan = time.perf_counter(), None
+    if budget is not None:
+        if resume:
+            raise HoigsError("--budget plans a new run; a resumed one keeps its width and steps")
+        spec, plan = plan_budget(
+            clip, spec, budget, overrides=overrides, rasterizer=rasterizer, device=device,
+            allow_faults=allow_faults, reader=reader, reader_settings=reader_settings,
+            plugins=plugins,
+        )  # fmt: skip
+        overrides, rasterizer = (), None  # the spec has them
+        report(plan.sentence())
     live = LiveView(port, device=device, rasterizer=rasterizer, plugins=plugins) if view else None
     session = Session.open(
         clip, spec, out=out, overrides=overrides, rasterizer=rasterizer, device=device,
@@ -103,7 +120,11 @@ def train(
             session.trainer.viewed = True
             live.start(session.run.path)
             report(f"view: http://{LOCAL}:{live.port}, after the first step and until the end")
-        return _trained(session, device, evaluate, plugins, on_start, on_step, progress, report)
+        trained = _trained(session, device, evaluate, plugins, on_start, on_step, progress, report)
+    if plan is not None:
+        took = clock(time.perf_counter() - began)
+        report(f"budget {clock(plan.limit_s)}: it took {took}")
+    return trained
 
 
 def _trained(

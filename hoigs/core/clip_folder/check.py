@@ -39,6 +39,7 @@ from hoigs.core.errors import ClipError
 from hoigs.core.npz import ArrayHeader, array_headers, load_arrays
 
 ROTATION_TOLERANCE = 1e-3  # of R R^T - I, generous to float16 and text files
+RATE_TOLERANCE = 0.01  # of fps, against the mean rate of times
 LARGEST = 1e7  # absolute value of any number: float32 has no centimetres left there
 MOST_TEXT = 100_000
 MOST_ABSENT = 10_000  # images; where more are absent, the number of frames is wrong
@@ -56,7 +57,7 @@ def check_clip(folder: Path) -> list[FileDiagnostic]:
     header, messages = parse_header(folder / HEADER, ClipHeader)
     if header is None:
         return [wrong(HEADER, message) for message in messages]
-    problems = [*_check_split(header), *_check_truth(folder, header)]
+    problems = [*_check_split(header), *_check_times(header), *_check_truth(folder, header)]
     view = _View("", header.width, header.height, header.frames)
     problems += _check_views(folder, view, header)
     sizes = {"F": header.frames}
@@ -131,6 +132,22 @@ def _check_split(header: ClipHeader) -> Iterator[FileDiagnostic]:
     both = sorted(set(train) & set(test))
     if both:
         yield wrong(HEADER, f"split has frames {ranges(both)} in both train and test")
+
+
+def _check_times(header: ClipHeader) -> Iterator[FileDiagnostic]:
+    times = header.times
+    if times is None:
+        return
+    if len(times) != header.frames or len(times) < 2:
+        yield wrong(HEADER, f"times has {len(times)} entries for {header.frames} frames")
+        return
+    gaps = np.diff(times)
+    if times[0] != 0 or not np.isfinite(times).all() or gaps.min() <= 0:
+        yield wrong(HEADER, "times has to begin with 0 and to ascend, in seconds")
+        return
+    rate = len(gaps) / times[-1]
+    if abs(rate / header.fps - 1) > RATE_TOLERANCE:
+        yield wrong(HEADER, f"fps is {header.fps:g}, but times have {rate:g} frames a second")
 
 
 def _check_truth(folder: Path, header: ClipHeader) -> Iterator[FileDiagnostic]:

@@ -78,6 +78,11 @@ class ClipHeader(_Strict):
         default="none",
         description='"metric" (metres), "affine-disparity" (up to scale and shift) or "none"',
     )
+    times: list[float] | None = Field(
+        default=None,
+        description="of frames that are not evenly spaced: seconds of each since the first; `fps` "
+        "is then their mean rate",
+    )
     provenance: dict[str, Any] = Field(
         default_factory=dict, description="free: where each part came from"
     )

@@ -196,7 +196,10 @@ def _gaps(clip: Clip) -> Iterator[Diagnostic]:
     for name, track in clip.objects.items():
         turns = 0.1 * track.rotations.flatten(1)
         tracks[f'"{name}"'] = torch.cat((track.translations, turns), 1)
-    votes = [_standing_out(path) for path in tracks.values()]
+    gaps = torch.ones(max(len(clip) - 1, 0))
+    if clip.frame_times is not None and len(clip) == clip.num_frames:
+        gaps = torch.tensor(clip.frame_times).diff() * (clip.num_frames - 1)
+    votes = [_standing_out(path, gaps) for path in tracks.values()]
     steps = (torch.stack(votes).sum(0) >= 2).nonzero().squeeze(1).tolist()
     if steps:
         where: Sequence[str] = [f"{s} and {s + 1}" for s in steps[:6]]
@@ -204,21 +207,21 @@ def _gaps(clip: Clip) -> Iterator[Diagnostic]:
             "missing-frames",
             f"frames are missing between {', '.join(where)}{', …' if len(steps) > 6 else ''}: what "
             "moves goes much further there than in the steps before and after",
-            "take the frames from the video again without dropping any, as times are taken to be "
-            "even; motion is interpolated across the gaps",
+            "take the frames from the video again without dropping any, or give the clip its times "
+            "(docs/reference/clip.md); motion is interpolated across the gaps",
             tuple(steps),
         )
 
 
-def _standing_out(path: Float[Tensor, "F D"]) -> Int[Tensor, " S"]:
+def _standing_out(path: Float[Tensor, "F D"], gaps: Float[Tensor, " S"]) -> Int[Tensor, " S"]:
     """Votes of one track for a gap at each step: 1 where it goes much further than in the steps
     about it, 2 where it does so though it is steady everywhere else.
 
     Much further than the second largest of the four about it: not than the largest, so that two
     gaps close together do not hide each other; not than the middle one, so that a start from rest
-    is none.
+    is none. Steps are divided by the time that they took, `gaps`.
     """
-    steps = (path[1:] - path[:-1]).norm(dim=-1)
+    steps = (path[1:] - path[:-1]).norm(dim=-1) / gaps
     if len(steps) < 5 or float(steps.median()) < 1e-4:
         return torch.zeros(len(steps), dtype=torch.long)
     padded = torch.cat((steps[[2, 1]], steps, steps[[-2, -3]]))

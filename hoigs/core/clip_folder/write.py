@@ -158,6 +158,7 @@ class ClipWriter:
         self._points: tuple[np.ndarray, np.ndarray] | None = None
         self._split: Mapping[str, Sequence[int]] | None = None
         self._colmap: Path | None = None
+        self._times: list[float] | None = None
         self._held_out_frames: list[int] = []
         refuse_to_overwrite(self.folder)
 
@@ -239,6 +240,11 @@ class ClipWriter:
         """ "train" and "test" frame numbers; `uniform_test_split` when never called."""
         self._split = split
 
+    def set_times(self, seconds: Sequence[float]) -> None:
+        """When each frame was taken, ascending, if they are not evenly spaced; `fps` is then their
+        mean rate, whatever it was."""
+        self._times = [float(s - seconds[0]) for s in seconds]
+
     def set_colmap(self, model: Path) -> None:
         """A COLMAP model folder to keep beside the clip, as colmap/."""
         self._colmap = Path(model)
@@ -278,9 +284,15 @@ class ClipWriter:
                 raise ClipError(f'no body track for "{name}": call set_body before leaving')
             body = self._bodies[name].model if kind == "human" else None
             entities[name] = EntityHeader(kind=kind, body=body)
+        times = self._times
+        if times is not None and not (len(times) == self.frames and times[-1] > 0):
+            raise ClipError(
+                f"{len(times)} times for {self.frames} frames; expected one for each, ascending"
+            )
         return ClipHeader(
             name=self.name,
-            fps=self.fps,
+            fps=self.fps if times is None else (len(times) - 1) / times[-1],
+            times=times,
             width=self._main.size[0],
             height=self._main.size[1],
             frames=self.frames,
@@ -317,6 +329,9 @@ def write_clip(clip: Clip, folder: str | Path, **options: Any) -> None:
         for name, track in clip.objects.items():
             writer.set_object(name, track)
         writer.set_points(clip.points, clip.point_colors)
+        if clip.frame_times is not None:
+            duration = (clip.num_frames - 1) / clip.fps
+            writer.set_times([float(m.time) * duration for m in clip.moments])
         writer.set_split(clip.split)
         writer.provenance.update(clip.provenance)
 

@@ -1,4 +1,4 @@
-"""The nearest neighbours of points."""
+"""The nearest neighbours of points, and the surface that they lie on."""
 
 from __future__ import annotations
 
@@ -30,6 +30,20 @@ def nearest(
         torch.as_tensor(indices, dtype=torch.int64, device=points.device),
         torch.as_tensor(distances, device=points.device),
     )
+
+
+def surface_normals(points: Float[Tensor, "N 3"], neighbours: int = 12) -> Float[Tensor, "N 3"]:
+    """Unit normals, of either sign, of the planes through each point and its nearest neighbours.
+
+    The direction of least variance (Hoppe et al. 1992). It is any direction for fewer than three
+    points, or where they lie on a line.
+    """
+    if len(points) < 3:
+        return points.new_tensor([0.0, 0.0, 1.0]).repeat(len(points), 1)
+    near = points[nearest(points, min(neighbours, len(points) - 1))[0]]
+    around = torch.cat((points[:, None], near), 1)
+    around = (around - around.mean(1, keepdim=True)).double()
+    return torch.linalg.eigh(around.mT @ around)[1][..., 0].to(points)
 
 
 def _array(points: Float[Tensor, "N 3"]) -> np.ndarray:

@@ -234,12 +234,16 @@ def initial_gaussians(
     appearance: dict[str, Any] = {"opacity": block.opacity, "sh_degree": block.sh_degree}
     clip = context.clip
     assert clip is not None
+    if kind != "scene":
+        appearance["thickness"] = block.thickness
     if kind == "human":
         return _human(context, deformation, block.points, appearance)
     if kind == "object":
         return _object(context, deformation, block.points, appearance)
     if len(clip.points) == 0:
         raise ValueError("the clip has no scene points to start from (points.npz is empty)")
+    if block.thickness != 1.0:
+        raise ValueError("thickness belongs to surfaces, of people and objects; remove it here")
     rows = _subset(len(clip.points), block.points, context.seed)
     return Gaussians.from_points(clip.points[rows], clip.point_colors[rows], **appearance)
 
@@ -252,12 +256,14 @@ def _human(
     betas = track.poses.betas
     betas = betas if betas.dim() == 1 else betas.mean(0)
     surface = body.surface(count, betas, context.seed)
-    points = surface.points
+    points, normals = surface.points, surface.normals
     if deformation.input_space == "world":
         pose = track.poses.frame(len(track.poses.transl) // 2)
         corners = body(pose).vertices[body.faces[surface.faces]]
         points = (corners * surface.barycentric[..., None]).sum(1)
-    return Gaussians.from_points(points.detach(), scales=surface.spacing.detach(), **appearance)
+        normals = None
+    spacing = surface.spacing.detach()
+    return Gaussians.from_points(points.detach(), scales=spacing, normals=normals, **appearance)
 
 
 def _object(

@@ -51,7 +51,7 @@ __all__ = [
 MODEL_SECTIONS = ("interaction", "entities", "model")
 # settings of an entity that decide no tensor's existence: how training changes the count, and where
 # opacities start. `points` is not among them: penalties between neighbours depend on first points.
-TRAINING_ONLY = ("density", "opacity")
+TRAINING_ONLY = ("density", "opacity", "thickness")
 
 
 class _Strict(BaseModel):
@@ -93,6 +93,10 @@ class EntitySpec(_Strict):
     them."""
     opacity: float = Field(default=0.1, gt=0, lt=1)
     """Opacity of every Gaussian at the start."""
+    thickness: float = Field(default=1.0, gt=0, le=1)
+    """Thickness of every Gaussian of a person or object at the start, along the surface's normal,
+    as a share of its width; 1 is isotropic (3DGS). Flat ones stay sharp in views beside the
+    filmed path."""
 
 
 class Spec(_Strict):

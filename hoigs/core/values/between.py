@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.maths.frame_times import frame_at, time_of
 from hoigs.core.maths.rotations import (
     axis_angle_to_quats,
     matrices_to_quats,
@@ -31,7 +32,7 @@ def frame_numbers(
     fps: float | None = None,
     slow: float = 1.0,
 ) -> tuple[list[float], float]:
-    """Frame numbers from `start` to `end`, evenly spaced, and how many a second there are.
+    """Frame numbers from `start` to `end`, evenly spaced in time, and how many a second there are.
 
     Args:
         start, end: by default the first and the last. fps: by default the clip's.
@@ -48,10 +49,18 @@ def frame_numbers(
     if not (0 < rate < math.inf and 0 < slow < math.inf):
         raise HoigsError(f"fps {rate:g} and slow {slow:g}: expected positive numbers")
     step = clip.fps / (rate * slow)
-    count = math.floor((final - first) / step + 1e-6) + 1
-    if count > MOST_MOMENTS:
-        raise HoigsError(f"{count} moments are more than {MOST_MOMENTS}; lower fps or slow")
-    return [_whole(first + i * step) for i in range(count)], rate
+    count, times = clip.num_frames, clip.frame_times
+    # in mean gaps between frames: the frame numbers themselves, where frames are evenly spaced
+    begin, finish = (time_of(frame, count, times) * last for frame in (first, final))
+    if times is None:
+        begin, finish = first, final
+    found = math.floor((finish - begin) / step + 1e-6) + 1
+    if found > MOST_MOMENTS:
+        raise HoigsError(f"{found} moments are more than {MOST_MOMENTS}; lower fps or slow")
+    places = [begin + i * step for i in range(found)]
+    if times is not None:
+        places = [float(frame_at(place / last, count, times)) for place in places]
+    return [_whole(place) for place in places], rate
 
 
 def _whole(frame: float) -> float:
@@ -61,7 +70,9 @@ def _whole(frame: float) -> float:
 
 def frame_of(clip: Clip, moment: Moment) -> float:
     """The frame number of a moment, between frames a fraction."""
-    return float(moment.time) * max(clip.num_frames - 1, 1)
+    if clip.frame_times is None:
+        return float(moment.time) * max(clip.num_frames - 1, 1)
+    return float(frame_at(float(moment.time), clip.num_frames, clip.frame_times))
 
 
 def moment_between(clip: Clip, frame: float) -> Moment:
@@ -70,7 +81,7 @@ def moment_between(clip: Clip, frame: float) -> Moment:
     Before the first frame and after the last, the pose is theirs.
     """
     low, high, r = _neighbours(clip, frame)
-    time = min(max(frame / max(clip.num_frames - 1, 1), 0.0), 1.0)
+    time = time_of(frame, clip.num_frames, clip.frame_times)
     before, after = clip.moments[low], clip.moments[high]
     index = (before if r < 0.5 else after).index
     if r == 0.0:

@@ -5,18 +5,22 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from hoigs.core.diagnostics import Diagnostic
+from hoigs.core.maths.frame_times import FrameTimes
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind
 
+EVEN = 1e-5  # of the clip: times this near to even ones are even
 # keys of Clip.provenance
 CAMERAS_REFINED = "cameras_refined_in_training"
 POSES_ESTIMATED = "poses_estimated"  # body poses were estimated from the frames, test ones too
@@ -124,6 +128,7 @@ class ObjectTrack:
         provenance: who made the track, for reports.
         moving: of an object in two parts, the points that belong to the moving one; None if
             that is not known, or there are no parts.
+        times: of the frames, in [0, 1]; None if they are evenly spaced.
     """
 
     points: Float[Tensor, "P 3"]
@@ -133,6 +138,7 @@ class ObjectTrack:
     observed: Bool[Tensor, " F"]
     provenance: str = "unknown"
     moving: Bool[Tensor, " P"] | None = None
+    times: FrameTimes = None
 
 
 @dataclass(frozen=True)
@@ -195,6 +201,21 @@ class Clip:
     def num_frames(self) -> int:
         """N_f of the paper: frames of the whole video, held-out views not counted."""
         return max(m.index for m in self.moments) + 1
+
+    @cached_property
+    def frame_times(self) -> FrameTimes:
+        """The time of every frame number in [0, 1]; None where frames are evenly spaced, or their
+        times do not ascend.
+
+        Frame numbers that the clip does not hold lie evenly between their neighbours.
+        """
+        known = sorted({m.index: float(m.time) for m in self.moments}.items())
+        count = self.num_frames
+        if all(abs(time - index / max(count - 1, 1)) < EVEN for index, time in known):
+            return None
+        indices, times = zip(*known, strict=True)
+        every = np.interp(np.arange(count), indices, times)
+        return tuple(every.tolist()) if (np.diff(every) > 0).all() else None
 
     def frame(self, position: int) -> Frame:
         return self[position]

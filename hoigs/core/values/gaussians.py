@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from hoigs.core.cuda_graphs.device_constants import constant
 from hoigs.core.errors import NotFiniteError
+from hoigs.core.maths.nearest import nearest, surface_normals
 from hoigs.core.maths.rotations import multiply_quats, normalize_quats, quats_to_matrices
 
 SH_C0 = 0.28209479177387814  # Y_00, so that color = 0.5 + SH_C0 * sh[:, 0]
@@ -154,8 +156,10 @@ class Gaussians:
         scales: Float[Tensor, " N"] | float | None = None,
         opacity: float = 0.1,
         sh_degree: int = 0,
+        thickness: float = 1.0,
+        normals: Float[Tensor, "N 3"] | None = None,
     ) -> Gaussians:
-        """Isotropic Gaussians at points, by 3DGS's rule (Kerbl et al. 2023, sec. 5.1).
+        """Gaussians at points, isotropic by 3DGS's rule (Kerbl et al. 2023, sec. 5.1), or flat.
 
         Args:
             points: metres.
@@ -164,6 +168,9 @@ class Gaussians:
                 nearest neighbours.
             opacity: initial opacity in (0, 1).
             sh_degree: bands to allocate; all but the first start at zero.
+            thickness: standard deviation along the surface's normal, as a share of `scales`.
+            normals: of the surface, unit, of either sign; by default those of the plane through
+                each point's nearest neighbours. Not used where `thickness` is 1.
         """
         count = points.shape[0]
         if scales is None:
@@ -176,23 +183,30 @@ class Gaussians:
             sh[:, 0] = (colors.to(points) - 0.5) / SH_C0
         quats = points.new_zeros(count, 4)
         quats[:, 0] = 1.0
+        log_scales = scales.log()[:, None].repeat(1, 3)
+        if thickness != 1.0:
+            quats = _facing(surface_normals(points) if normals is None else normals)
+            log_scales[:, 2] += math.log(thickness)
         logit = torch.logit(torch.tensor(opacity)).item()
         return Gaussians(
             means=points.clone(),
             quats=quats,
-            log_scales=scales.log()[:, None].repeat(1, 3),
+            log_scales=log_scales,
             opacity_logits=points.new_full((count,), logit),
             sh=sh,
         )
 
 
+def _facing(normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 4"]:
+    """Rotations that take the z axis to `normals` or to their opposites, wxyz."""
+    x, y, z = torch.where(normals[:, 2:] < 0, -normals, normals).unbind(-1)
+    return torch.nn.functional.normalize(
+        torch.stack((1 + z, -y, x, torch.zeros_like(z)), -1), dim=-1
+    )
+
+
 def neighbour_distances(points: Float[Tensor, "N 3"], neighbours: int = 3) -> Float[Tensor, " N"]:
     """Mean distance to the nearest neighbours, metres; 0.01 where there are too few points."""
-    from scipy.spatial import cKDTree  # on use: scipy takes a while to import
-
-    count = points.shape[0]
-    if count <= neighbours:
-        return points.new_full((count,), 0.01)
-    array = points.detach().cpu().double().numpy()
-    distances, _ = cKDTree(array).query(array, k=neighbours + 1)
-    return torch.as_tensor(distances[:, 1:].mean(1)).to(points)
+    if len(points) <= neighbours:
+        return points.new_full((len(points),), 0.01)
+    return nearest(points, neighbours)[1].mean(1).to(points)

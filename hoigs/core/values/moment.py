@@ -102,7 +102,8 @@ class Moment:
     """A time, and the pose of every body at it.
 
     Attributes:
-        time: in [0, 1] over the clip, frame / (frames - 1). Under CUDA graphs it is a 0-d tensor on
+        time: in [0, 1] over the clip: frame / (frames - 1), or the frame's true time where a clip
+            has one (`Clip.frame_times`). Under CUDA graphs it is a 0-d tensor on
             the device (`hoigs.core.cuda_graphs.device_constants`); `float(moment.time)` is a number
             in either case, but no CUDA graph can capture it.
         index: frame number; for a time between frames, the nearest.

@@ -27,6 +27,7 @@ from hoigs.core.clip_folder.format import (
 )
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
+from hoigs.core.maths.frame_times import FrameTimes, time_of
 from hoigs.core.npz import load_arrays
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
@@ -58,13 +59,16 @@ class ClipFolderReader(ClipReader):
         header, problems = usable_clip(folder, self.allow_faults)
         unusable = frozenset(p.path for p in problems if p.unusable)
         size = (header.height, header.width)
+        times = None if header.times is None else tuple(t / header.times[-1] for t in header.times)
         bodies, objects = {}, {}
         for name, entity in header.entities.items():
             if entity.kind == "human":
                 bodies[name] = _read_body(folder / "bodies" / f"{name}.npz")
             else:
-                objects[name] = _read_object(folder / "objects" / f"{name}.npz")
-        moments = [_moment(i, header.frames, bodies) for i in range(header.frames)]
+                objects[name] = _read_object(folder / "objects" / f"{name}.npz", times)
+        moments = [
+            _moment(i, time_of(i, header.frames, times), bodies) for i in range(header.frames)
+        ]
         scene = _tensors(folder / "points.npz")
         shared: dict[str, Any] = {
             "kinds": _kinds(header),
@@ -243,15 +247,15 @@ def _read_body(path: Path) -> BodyTrack:
     )
 
 
-def _read_object(path: Path) -> ObjectTrack:
+def _read_object(path: Path, times: FrameTimes) -> ObjectTrack:
     provenance = str(load_arrays(path).get("provenance", "unknown"))
     fields = ("points", "colors", "rotations", "translations", "observed")
     tensors = _tensors(path)
     return ObjectTrack(
-        **{f: tensors[f] for f in fields}, provenance=provenance, moving=tensors.get("moving")
-    )
+        **{f: tensors[f] for f in fields}, provenance=provenance, moving=tensors.get("moving"),
+        times=times,
+    )  # fmt: skip
 
 
-def _moment(index: int, count: int, bodies: Mapping[str, BodyTrack]) -> Moment:
-    time = index / (count - 1) if count > 1 else 0.0
+def _moment(index: int, time: float, bodies: Mapping[str, BodyTrack]) -> Moment:
     return Moment(time, index, {name: track.poses.frame(index) for name, track in bodies.items()})

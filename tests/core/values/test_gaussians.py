@@ -167,3 +167,22 @@ def test_detach_and_clone() -> None:
 
 def test_base_colour_constant() -> None:
     assert pytest.approx((1 / (4 * torch.pi)) ** 0.5) == SH_C0
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_flat_gaussians_lie_in_the_surface(given: bool) -> None:
+    torch.manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(800, 3), dim=-1)
+    flat = Gaussians.from_points(
+        directions, scales=0.05, thickness=0.2, normals=directions if given else None
+    )
+    axes = quats_to_matrices(flat.quats) * flat.log_scales.exp()[:, None, :]
+    along = (axes.mT @ directions[..., None]).norm(dim=1)[:, 0]  # standard deviations
+    assert torch.allclose(along.median(), torch.tensor(0.01), rtol=0.05)
+    assert along.max() < (0.0101 if given else 0.03)
+    assert torch.allclose(flat.log_scales[:, :2].exp(), torch.tensor(0.05))
+
+
+def test_flat_gaussians_of_one_and_two_points() -> None:
+    for count in (1, 2, 3):
+        assert Gaussians.from_points(torch.rand(count, 3), thickness=0.5).quats.isfinite().all()

@@ -195,7 +195,7 @@ class HexPlaneSkinning(SurfaceBody):
     def scale_center(self, pelvis: Float[Tensor, " 3"], moment: Moment) -> Float[Tensor, " 3"]:
         if self.config.scale_about == "pelvis" or self.camera_centers is None:
             return pelvis
-        return at_frame(self.camera_centers, moment.time)
+        return at_frame(self.camera_centers, moment.time, self.frame_times)
 
     def template(self, canonical: Gaussians) -> Template:
         attributes, _ = self._attributes(canonical)

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hoigs.core.cuda_graphs.device_constants import Time
+from hoigs.core.maths.frame_times import FrameTimes
 from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.deformation.avatars.trained_frames import TrainedFrames
 
@@ -20,16 +21,23 @@ class PoseRefinement(nn.Module):
     from the nearest trained frames, so that the image of a test frame does not change its pose.
 
     Args:
-        num_frames: F, uniform over [0, 1]. betas: number of shape coefficients of the body.
+        num_frames: F. betas: number of shape coefficients of the body.
         trained: frames that are trained on; all by default.
+        times: of the F frames, in [0, 1]; None: uniform.
     """
 
-    def __init__(self, num_frames: int, betas: int, trained: Sequence[int] | None = None) -> None:
+    def __init__(
+        self,
+        num_frames: int,
+        betas: int,
+        trained: Sequence[int] | None = None,
+        times: FrameTimes = None,
+    ) -> None:
         super().__init__()
         self.pose = nn.Parameter(torch.zeros(num_frames, 52, 3))
         self.transl = nn.Parameter(torch.zeros(num_frames, 3))
         self.betas = nn.Parameter(torch.zeros(betas))
-        self.frames = TrainedFrames(num_frames, trained)
+        self.frames = TrainedFrames(num_frames, trained, times)
 
     def forward(self, pose: BodyPose, time: Time) -> BodyPose:
         """`pose` with the corrections at `time`.

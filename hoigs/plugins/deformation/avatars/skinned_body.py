@@ -22,6 +22,7 @@ from hoigs.core.interfaces.body import (
 )
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.maths.frame_times import FrameTimes, frame_at
 from hoigs.core.maths.skinning import ancestor_table, transform_points
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import Gaussians
@@ -70,6 +71,7 @@ class SkinnedBody(DeformationModel):
         trained_frames: frames whose poses are refined; all by default. The others follow
             (PoseRefinement).
         camera_centers: [F, 3], world, metres; needed to scale about the camera.
+        frame_times: of the frames, in [0, 1]; None: uniform.
 
     Raises:
         ValueError: `refine_poses` without `num_frames`.
@@ -100,8 +102,10 @@ class SkinnedBody(DeformationModel):
         num_frames: int | None = None,
         trained_frames: Sequence[int] | None = None,
         camera_centers: Float[Tensor, "F 3"] | None = None,
+        frame_times: FrameTimes = None,
     ) -> None:
         super().__init__()
+        self.frame_times = frame_times
         self.config = config or self.Config()
         # in a tuple, so that the body is no submodule: its data belongs to no checkpoint
         self._body = (body,)
@@ -115,7 +119,9 @@ class SkinnedBody(DeformationModel):
                     "refine_poses needs num_frames, the length of the clip; give it, or set "
                     "refine_poses to false"
                 )
-            self.refinement = PoseRefinement(num_frames, body.num_betas, trained_frames)
+            self.refinement = PoseRefinement(
+                num_frames, body.num_betas, trained_frames, frame_times
+            )
         betas = torch.zeros(body.num_betas) if betas is None else betas.detach().clone()
         with torch.no_grad():
             vertices, joints = body.shaped(betas)
@@ -304,13 +310,18 @@ def checked_surface(surface: BodySurface, canonical: Gaussians) -> BodySurface:
     return surface
 
 
-def at_frame(values: Float[Tensor, "F ..."], time: Time) -> Float[Tensor, "..."]:
-    """The value of the frame that is nearest to a time in [0, 1]."""
-    last = len(values) - 1
-    if isinstance(time, Tensor):
-        nearest = (time * last).round().clamp(0, last).long()
-        return values.index_select(0, nearest).squeeze(0)
-    return values[min(max(round(time * last), 0), last)]
+def at_frame(
+    values: Float[Tensor, "F ..."], time: Time, times: FrameTimes = None
+) -> Float[Tensor, "..."]:
+    """The value of the frame that is nearest to a time in [0, 1].
+
+    Args:
+        times: of the frames; None: uniform.
+    """
+    frame = frame_at(time, len(values), times)
+    if isinstance(frame, Tensor):
+        return values.index_select(0, frame.round().long()).squeeze(0)
+    return values[round(frame)]
 
 
 def clip_settings(clip: Clip) -> dict[str, Any]:
@@ -320,5 +331,6 @@ def clip_settings(clip: Clip) -> dict[str, Any]:
     return {
         "num_frames": clip.num_frames,
         "trained_frames": sorted(train),
+        "frame_times": clip.frame_times,
         "camera_centers": torch.stack([by_frame[i].center for i in sorted(by_frame)]),
     }

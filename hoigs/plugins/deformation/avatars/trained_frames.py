@@ -10,28 +10,32 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hoigs.core.cuda_graphs.device_constants import Time, constant
+from hoigs.core.maths.frame_times import FrameTimes, frame_at
 from hoigs.core.maths.rotations import axis_angle_to_quats
 from hoigs.core.maths.splines import neighbours
 
 
 class TrainedFrames:
-    """Which of F frames, uniform over [0, 1], are trained on.
+    """Which of F frames are trained on.
 
     Args:
         count: F. trained: frames that are trained on; all by default.
+        times: of the F frames, in [0, 1]; None: uniform.
 
     Raises:
         ValueError: no frame is trained on, or one that the clip does not have.
     """
 
-    def __init__(self, count: int, trained: Sequence[int] | None = None) -> None:
+    def __init__(
+        self, count: int, trained: Sequence[int] | None = None, times: FrameTimes = None
+    ) -> None:
         frames = sorted(set(range(count) if trained is None else trained))
         if not frames or frames[0] < 0 or frames[-1] >= count:
             raise ValueError(
                 f"trained frames must be some of 0..{count - 1}, got "
                 f"{f'{frames[0]}..{frames[-1]}' if frames else 'none'}"
             )
-        self.count, self.trained = count, frames
+        self.count, self.trained, self.times = count, frames, times
 
     def neighbours(self, time: Time) -> tuple[Any, Any, Any]:
         """The trained frames before and after `time` and the position between them in [0, 1].
@@ -41,7 +45,7 @@ class TrainedFrames:
         """
         if isinstance(time, Tensor):
             return self._neighbours_on_device(time)
-        frame = min(max(time, 0.0), 1.0) * (self.count - 1)
+        frame = frame_at(time, self.count, self.times)
         if abs(frame - round(frame)) < 1e-4:  # times in float32 must still match their own frame
             frame = round(frame)
         low, high, r = neighbours(frame, self.trained)
@@ -49,7 +53,7 @@ class TrainedFrames:
 
     def _neighbours_on_device(self, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         trained = constant(tuple(self.trained), time, torch.long)
-        frame = time.clamp(0.0, 1.0) * (self.count - 1)
+        frame = frame_at(time, self.count, self.times)
         frame = torch.where((frame - frame.round()).abs() < 1e-4, frame.round(), frame)
         after = torch.searchsorted(trained, frame.ceil().long())  # the first that is not earlier
         high = trained.index_select(0, after.clamp_max(len(trained) - 1)).squeeze(0)
@@ -72,14 +76,16 @@ class FrameCorrections(nn.Module):
     Between trained frames they are interpolated, as in PoseRefinement.
 
     Args:
-        count, trained: as TrainedFrames.
+        count, trained, times: as TrainedFrames.
     """
 
-    def __init__(self, count: int, trained: Sequence[int] | None = None) -> None:
+    def __init__(
+        self, count: int, trained: Sequence[int] | None = None, times: FrameTimes = None
+    ) -> None:
         super().__init__()
         self.turns = nn.Parameter(torch.zeros(count, 3))
         self.shifts = nn.Parameter(torch.zeros(count, 3))
-        self.frames = TrainedFrames(count, trained)
+        self.frames = TrainedFrames(count, trained, times)
 
     def forward(self, time: Time) -> tuple[Float[Tensor, " 4"], Float[Tensor, " 3"]]:
         """Rotation (wxyz) and translation, metres."""

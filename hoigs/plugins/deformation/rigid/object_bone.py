@@ -14,6 +14,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST, BodyModel
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.maths.frame_times import FrameTimes, time_of
 from hoigs.core.maths.rotations import (
     matrices_to_quats,
     move_rigidly,
@@ -92,6 +93,7 @@ class ObjectBone(DeformationModel):
         transitions: Sequence[float] = (),
         num_frames: int,
         trained_frames: Sequence[int] | None = None,
+        frame_times: FrameTimes = None,
     ) -> None:
         super().__init__()
         self.config = config or ObjectBoneConfig()
@@ -115,7 +117,9 @@ class ObjectBone(DeformationModel):
         self.offset_quats = nn.Parameter(torch.stack([a.quat for a in attachments]))
         self.offset_translations = nn.Parameter(torch.stack([a.place for a in attachments]))
         refine = self.config.refine
-        self.corrections = FrameCorrections(num_frames, trained_frames) if refine else None
+        self.corrections = (
+            FrameCorrections(num_frames, trained_frames, frame_times) if refine else None
+        )
 
     @classmethod
     def from_config(cls, config: ObjectBoneConfig, context: BuildContext) -> Self:
@@ -142,6 +146,7 @@ class ObjectBone(DeformationModel):
             transitions=times,
             num_frames=len(track.rotations),
             trained_frames=clip_settings(clip)["trained_frames"],
+            frame_times=track.times,
         )
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -223,7 +228,7 @@ def attachments_of(
     if rule == "steadiest":
         still = torch.eye(3).expand(frames, 3, 3)
         bones[WORLD] = Frames(still, torch.zeros(frames, 3))
-    states = [state_of(f / max(1, frames - 1), transitions) for f in range(frames)]
+    states = [state_of(time_of(f, frames, track.times), transitions) for f in range(frames)]
     found = []
     for state in range(len(transitions) + 1):
         chosen = torch.tensor([s == state for s in states])

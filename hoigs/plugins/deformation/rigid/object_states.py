@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from hoigs.core.maths.frame_times import time_of
 from hoigs.core.maths.rotations import matrices_to_quats, normalize_quats, quats_to_matrices
 from hoigs.core.values.clip import ObjectTrack
 
@@ -52,6 +53,8 @@ def rest_transitions(track: ObjectTrack, fps: float) -> list[float]:
     steps = track.translations.diff(dim=0).norm(dim=-1) * fps
     if len(steps) == 0:
         return []
+    if track.times is not None:  # gaps in mean ones
+        steps = steps / (steps.new_tensor(track.times).diff() * len(steps))
     padded = torch.nn.functional.pad(steps[None], (2, 2), mode="replicate")[0]
     moving = (padded.unfold(0, 5, 1).median(-1).values > STILL).tolist()
     shortest = max(1, round(SHORTEST * fps))
@@ -62,7 +65,7 @@ def rest_transitions(track: ObjectTrack, fps: float) -> list[float]:
                 starts.pop()  # too short to be a state: the state before it goes on
             elif f >= shortest and len(moving) - f >= shortest:
                 starts.append(f)
-    return [f / len(moving) for f in starts[1:]]
+    return [time_of(f, len(track.rotations), track.times) for f in starts[1:]]
 
 
 def state_of(time: float, transitions: Sequence[float]) -> int:

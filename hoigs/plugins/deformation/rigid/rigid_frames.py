@@ -52,7 +52,7 @@ class RigidFrames(DeformationModel):
         super().__init__()
         self.config = config or RigidFramesConfig()
         self.track = RigidTrack(track)
-        self.corrections = FrameCorrections(len(track.rotations), trained_frames)
+        self.corrections = FrameCorrections(len(track.rotations), trained_frames, track.times)
 
     @classmethod
     def from_config(cls, config: RigidFramesConfig, context: BuildContext) -> Self:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hoigs.core.cuda_graphs.device_constants import Time
+from hoigs.core.cuda_graphs.device_constants import Time, constant
+from hoigs.core.maths.frame_times import frame_at
 from hoigs.core.maths.knots import Knots, uniform_times
 from hoigs.core.maths.rotations import (
     matrices_to_quats,
@@ -15,14 +19,14 @@ from hoigs.core.maths.rotations import (
     slerp,
     turn_between,
 )
-from hoigs.core.maths.splines import catmull_rom, keyframe_position, knot_pair
+from hoigs.core.maths.splines import Interval, catmull_rom, keyframe_position, knot_pair
 from hoigs.core.values.clip import ObjectTrack
 
 
 class RigidTrack(nn.Module):
     """Poses of an ObjectTrack between its frames: slerp of rotations, CHS of translations.
 
-    Its frames are taken as uniform over [0, 1]; a track of a single frame stands still.
+    Its frames are uniform over [0, 1] unless it has times; a track of a single frame stands still.
     """
 
     quats: Tensor
@@ -32,6 +36,7 @@ class RigidTrack(nn.Module):
 
     def __init__(self, track: ObjectTrack) -> None:
         super().__init__()
+        self.times = track.times if len(track.rotations) > 1 else None
         for name, value in {
             "quats": matrices_to_quats(track.rotations),
             "translations": track.translations,
@@ -44,11 +49,27 @@ class RigidTrack(nn.Module):
 
     def at(self, time: Time) -> tuple[Float[Tensor, " 4"], Float[Tensor, " 3"]]:
         """Rotation (wxyz) and translation, object to world, at `time` in [0, 1]."""
-        place = catmull_rom(self.translations[None], keyframe_position(time, len(self.quats)))
+        place = catmull_rom(self.translations[None], self._position(time))
         return self._rotation(time), place[0]
 
+    def _position(self, time: Time) -> Interval:
+        """The frames about a time, and the place between them."""
+        if self.times is None:
+            return keyframe_position(time, len(self.quats))
+        last = len(self.quats) - 1
+        return keyframe_position(frame_at(time, last + 1, self.times) / last, last + 1)
+
+    def _frames_per_time(self, k: Any) -> Any:
+        """Frames a unit of time from frame k to the next; k is a number or a 0-d tensor."""
+        if self.times is None:
+            return len(self.turns)
+        rates = tuple(1 / (b - a) for a, b in pairwise(self.times))
+        if isinstance(k, Tensor):
+            return constant(rates, self.translations).index_select(0, k).squeeze(0)
+        return rates[k]
+
     def _rotation(self, time: Time) -> Float[Tensor, " 4"]:
-        k, r, _ = keyframe_position(time, len(self.quats))
+        k, r, _ = self._position(time)
         return slerp(*knot_pair(self.quats[None], k), r)[0]
 
     def carry(self, means: Float[Tensor, "N 3"], time: Time) -> Float[Tensor, "N 3"]:
@@ -71,9 +92,9 @@ class RigidTrack(nn.Module):
             means, own: positions and velocities in the object's frame.
             unit: of time, as a share of the clip.
         """
-        at = keyframe_position(time, len(self.quats))
+        at = self._position(time)
         turn = self.turns.index_select(0, at.k)[0] if isinstance(at.k, Tensor) else self.turns[at.k]
-        frames = len(self.turns) * unit
+        frames = self._frames_per_time(at.k) * unit
         moving = frames * catmull_rom(self.translations[None], at, derivative=True)
         # slerp turns evenly, and its axis is the same in the frames of both ends
         within = own + torch.linalg.cross((frames * turn).expand_as(means), means)
@@ -100,7 +121,7 @@ class RigidTrack(nn.Module):
         weigh a tenth."""
         entries = torch.cat((quats_to_matrices(self.quats).flatten(1), self.translations), dim=1)
         knots, weights = Knots(keyframes).to(entries.device), 0.1 + 0.9 * self.observed
-        times = uniform_times(len(entries))
+        times = uniform_times(len(entries)) if self.times is None else list(self.times)
         return knots.fit(entries, times, free_tangents=free_tangents, weights=weights)
 
     def rigid_knots(
