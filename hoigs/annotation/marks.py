@@ -11,8 +11,8 @@ from hoigs.core.errors import SpecError
 from hoigs.core.interfaces.estimator import FramePrompt, PromptPoint
 from hoigs.core.names import NAME
 from hoigs.preparation.options import PromptAt
-from hoigs.preparation.prompt_file import StoredPrompts, split_name
-from hoigs.preparation.prompts import parse_prompts
+from hoigs.preparation.prompt_file import StoredPrompts
+from hoigs.preparation.prompts import parse_prompts, split_name
 
 Kind = Literal["object", "person"]
 DEFAULT: dict[Kind, str] = {"object": "object", "person": "human"}

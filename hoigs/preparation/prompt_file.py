@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import SpecError
 from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.prompts import parse_prompts
+from hoigs.preparation.prompts import parse_prompts, split_name
 
 ENDING = ".prompts.json"
 VERSION = 1
@@ -117,13 +116,6 @@ def with_stored(
     return PrepareOptions.model_validate(given), tuple(said)
 
 
-def split_name(text: str) -> tuple[str, str]:
-    """NAME=640,402@0 as its name, "" without one, and the place."""
-    named = _NAMED.fullmatch(text)
-    return (named[1], named[2]) if named else ("", text)
-
-
-_NAMED = re.compile(r"\s*([A-Za-z][A-Za-z0-9_.-]*)\s*=(.*)", re.DOTALL)
 _REMEDY = "move it away, or click anew with `hoigs annotate`"
 
 

@@ -15,8 +15,15 @@ NONE = "none"
 HOW = (
     '"640,402" is a point on it in the first frame used, "640,402@120" in frame 120 of the '
     'video, "-700,380" a point that is not on it, "600,350,700,450" its box x0,y0,x1,y1, '
-    '"none" that there is no object'
+    '"none" that there is no object; "kettle=640,402" also names it'
 )
+_NAMED = re.compile(r"\s*([A-Za-z][A-Za-z0-9_.-]*)\s*=(.*)", re.DOTALL)
+
+
+def split_name(text: str) -> tuple[str, str]:
+    """NAME=640,402@0 as its name, "" without one, and the place."""
+    named = _NAMED.fullmatch(text)
+    return (named[1], named[2]) if named else ("", text)
 
 
 def parse_prompts(texts: Sequence[str], what: str = "--object") -> Prompt:
@@ -81,16 +88,39 @@ def _boxed(at: PromptAt, numbers: list[float], text: str, what: str) -> PromptAt
 def with_prompts(
     options: PrepareOptions, texts: str | Sequence[str], preset: object = None
 ) -> PrepareOptions:
-    """Options with the object's prompt from texts, and a preset if `preset` is the name of one."""
+    """Options with the object's prompt from texts, and a preset if `preset` is the name of one.
+
+    The name before a text's "=" becomes that of the object.
+
+    Raises:
+        SpecError: a text is wrong, or they name several objects, or the person.
+    """
     texts = [texts] if isinstance(texts, str) else list(texts)
     update: dict[str, object] = {"preset": preset} if isinstance(preset, str) else {}
-    if NONE in texts:
-        if len(texts) > 1:
-            raise SpecError("--object none says that there is no object: leave the others out")
+    named = [split_name(text) for text in texts]
+    if any(place.strip() == NONE for _, place in named):
+        if len(texts) > 1 or named[0][0]:
+            raise SpecError(
+                "--object none says that there is no object: leave the others out, and names"
+            )
         update["find_object"] = False
     elif texts:
-        update["prompts"] = {**options.prompts, options.object: parse_prompts(texts)}
+        name = _one_name([name or options.object for name, _ in named], options.human)
+        prompt = parse_prompts([place for _, place in named])
+        update |= {"object": name, "prompts": {**options.prompts, name: prompt}}
     return PrepareOptions.model_validate({**options.model_dump(), **update}) if update else options
+
+
+def _one_name(names: Sequence[str], human: str) -> str:
+    different = list(dict.fromkeys(names))
+    if len(different) > 1:
+        raise SpecError(
+            f"--object gives {len(different)} objects, {' and '.join(different)}, and prepare "
+            "follows one: leave the others out, and give all places on it the same name"
+        )
+    if different[0] == human:
+        raise SpecError(f"--object {human}=: {human} is the person's name; give the object another")
+    return different[0]
 
 
 def _frame(at: PromptAt) -> str:

@@ -36,6 +36,11 @@ def test_clicks_by_frame() -> None:
         (["-3,4"], "only points that are not on it"),
         (["0,0,3,4", "0,0,5,6"], "has a box already"),
         (["none", "3,4"], "leave the others out"),
+        (["kettle=none"], "leave the others out, and names"),
+        (["kettle=1,2", "mug=3,4"], "2 objects, kettle and mug, and prepare follows one"),
+        (["kettle=1,2", "3,4@5"], "2 objects, kettle and object, "),
+        (["human=1,2"], "human is the person's name"),
+        (["kettle="], "neither a point, a box nor words"),
     ],
 )
 def test_what_is_wrong_is_named(texts: list[str], message: str) -> None:
@@ -47,6 +52,11 @@ def test_prompts_become_options() -> None:
     options = with_prompts(PrepareOptions(), "3,4@2", "offline")
     assert options.prompts["object"].frame == 2 and options.preset == "offline"
     assert with_prompts(PrepareOptions(), ["none"]).find_object is False
+    named = with_prompts(PrepareOptions(), ["kettle=3,4", " kettle = -5,6@7"])
+    assert named.object == "kettle" and [at.frame for at in named.prompts["kettle"].places()] == [
+        None,
+        7,
+    ]
     untouched = PrepareOptions()
     assert with_prompts(untouched, (), {"masks": object()}) is untouched
 

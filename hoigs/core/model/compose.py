@@ -256,7 +256,8 @@ def _human(
     betas = track.poses.betas
     betas = betas if betas.dim() == 1 else betas.mean(0)
     surface = body.surface(count, betas, context.seed)
-    points, normals = surface.points, surface.normals
+    points = surface.points
+    normals: Tensor | None = surface.normals
     if deformation.input_space == "world":
         pose = track.poses.frame(len(track.poses.transl) // 2)
         corners = body(pose).vertices[body.faces[surface.faces]]
