@@ -46,7 +46,8 @@ class TrackedMasks:
                     self._stacks[name] = stack
         sure: dict[str, np.ndarray | None] = {}
         if isinstance(found, FoundObject):
-            self._stacks[object_name], sure[object_name] = found.masks, found.confidence
+            for name, thing in {object_name: found, **found.further}.items():
+                self._stacks[name], sure[name] = thing.masks, thing.confidence
         for name, stack in self._stacks.items():
             seen = stack.bits.any(axis=(1, 2)).astype(float)
             given = sure.get(name)

@@ -28,8 +28,7 @@ def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
     """Writes and checks what the other stages made, and gives the folder its name."""
     options = made.options
     entities: dict[str, Literal["human", "object"]] = {options.human: "human"}
-    if made.object is not None:
-        entities[options.object] = "object"
+    entities |= dict.fromkeys(made.objects_made, "object")
     with ClipWriter(
         made.out, fps=made.video.fps, entities=entities, image_format=options.image_format,
         quality=options.quality, depth_kind="none" if made.depth is None else "metric",
@@ -39,8 +38,8 @@ def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
         with made.stages.stage("writing"):
             _write_frames(made, writer)
         writer.set_body(options.human, made.body_track)
-        if made.object is not None:
-            writer.set_object(options.object, made.object)
+        for name, thing in made.objects_made.items():
+            writer.set_object(name, thing.track)
         writer.set_points(made.scene.points, made.scene.colors)
         if made.video.uneven:
             writer.set_times(made.video.times)
@@ -66,22 +65,22 @@ def _write_frames(made: Pipeline, writer: ClipWriter) -> None:
     )
     with overlay:
         rows = zip(
-            made.images(), made.cameras, made.masks.human, made.masks.object, made.masks.blank,
+            made.images(), made.cameras, made.masks.human, made.masks.blank,
             made.person.posed(made.body), strict=True,
         )  # fmt: skip
-        for i, (image, camera, human, object_mask, blank, (vertices, _)) in enumerate(
+        for i, (image, camera, human, blank, (vertices, _)) in enumerate(
             made.stages.track(rows, len(made.video))
         ):
-            masks = {options.human: human}
-            points = torch.zeros(0, 3)
-            if made.object is not None:
-                masks[options.object] = object_mask
-                points = made.object.points @ made.object.rotations[i].mT
-                points = points + made.object.translations[i]
+            tracks = {name: thing.track for name, thing in made.objects_made.items()}
+            masks = {options.human: human} | {n: made.object_masks(n)[i] for n in tracks}
+            points = [t.points @ t.rotations[i].mT + t.translations[i] for t in tracks.values()]
             writer.add_frame(image, camera, masks, made.metres(i), blank)
+            objects = made.masks.objects(i)
             if i == picture:
-                save_object_picture(writer.root, image, object_mask)
-            overlay.add(image, camera, vertices, human, object_mask, points)
+                save_object_picture(writer.root, image, objects)
+            overlay.add(
+                image, camera, vertices, human, objects, torch.cat([torch.zeros(0, 3), *points])
+            )
 
 
 def _object_picture(made: Pipeline) -> int | None:
@@ -100,9 +99,9 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
     coverage = {options.human: made.masks.human}
     pelvis = person.joints[:, PELVIS]
     moving = person.joints[:, :BODY_JOINTS]
-    if made.object is not None:
-        coverage[options.object] = made.masks.object
-        moving = torch.cat((moving, made.object.translations[:, None]), 1)
+    for held, thing in made.objects_made.items():
+        coverage[held] = made.object_masks(held)
+        moving = torch.cat((moving, thing.track.translations[:, None]), 1)
     focal, depth = float(made.cameras[0].K[0, 0]), made.depth
     return PrepareReport(
         name=name,
@@ -135,6 +134,15 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         depth_residuals=[] if depth is None else _numbers(depth.residual, 4),
         depth_against="" if depth is None else depth.against,
         **({} if made.object_made is None else _object_measures(made.object_made)),
+        further_objects={
+            other: {
+                "object_observed": float(thing.track.observed.float().mean()),
+                "object_scale_spread": thing.spread,
+                **_object_measures(thing),
+            }
+            for other, thing in made.objects_made.items()
+            if other != options.object
+        },
         omega=angular_factor(made.cameras, pelvis, made.video.fps),
         big_omega=full_factor(made.cameras, moving),
     )

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from hoigs.preparation.given import GivenMasks
@@ -17,15 +17,46 @@ from hoigs.preparation.objects.ball import BallTrack
 
 @dataclass(frozen=True)
 class EntityMasks:
-    """The final masks: of the person, of the object, and of pixels that show no scene."""
+    """The final masks: of the person, of the object, of pixels that show no scene, and of `further`
+    objects by name."""
 
     human: MaskStack
     object: MaskStack
     blank: MaskStack
+    further: dict[str, MaskStack] = field(default_factory=dict)
+
+    def objects(self, frame: int) -> Bool[np.ndarray, "H W"]:
+        """Pixels of a frame that show any object."""
+        further = (masks[frame] for masks in self.further.values())
+        return np.logical_or.reduce([self.object[frame], *further])
+
+    def except_object(self, name: str | None = None) -> MaskStack:
+        """Whatever may hide an object: the person and the other objects. None: that of `object`."""
+        others = [self.human, *(m for n, m in self.further.items() if n != name)]
+        others += [] if name is None else [self.object]
+        return MaskStack(np.logical_or.reduce(rows) for rows in zip(*others, strict=True))
 
     def moving(self, frame: int) -> Bool[np.ndarray, "H W"]:
         """Pixels of a frame that show no scene that stands still."""
-        return self.human[frame] | self.object[frame] | self.blank[frame]
+        return self.human[frame] | self.objects(frame) | self.blank[frame]
+
+
+def disjoint(
+    stacks: Sequence[MaskStack], confidence: Sequence[Float[np.ndarray, " F"] | None]
+) -> list[MaskStack]:
+    """Masks of several objects without common pixels: the one followed most surely in a frame
+    keeps them, of equals the first."""
+    found = [MaskStack() for _ in stacks]
+    for frame in range(len(stacks[0])):
+        sure = [0.0 if c is None else float(np.nan_to_num(c[frame])) for c in confidence]
+        taken = np.zeros_like(stacks[0][frame])
+        kept = {}
+        for k in sorted(range(len(stacks)), key=lambda k: -sure[k]):
+            kept[k] = stacks[k][frame] & ~taken
+            taken |= kept[k]
+        for k, stack in enumerate(found):
+            stack.append(kept[k])
+    return found
 
 
 def entity_masks(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import (
+    EntityMasks,
     EntityRequest,
     EstimateKind,
     Estimates,
@@ -52,6 +53,7 @@ class FoundObject:
         boxes: frame of the video and box x0, y0, x1, y1 in its pixels where the object was proposed
             because no prompt said where it is.
         notes: for the report.
+        further: other objects by name (`PrepareOptions.further_objects`).
     """
 
     masks: MaskStack
@@ -59,6 +61,7 @@ class FoundObject:
     confidence: Float[np.ndarray, " F"] | None = None
     boxes: list[tuple[float, ...]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    further: dict[str, FoundObject] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -92,27 +95,35 @@ class EstimateReader:
         )
 
     def object_masks(self, progress: Callable[[float], None]) -> FoundObject:
-        """Masks of the object alone, from an estimator that has seen the person's.
+        """Masks of each object alone, from an estimator that has seen the person's.
 
         Raises:
-            SourceError: it gave no masks of the object.
+            SourceError: it gave no masks of one of them.
         """
         found = self.estimate("object", progress).masks
         assert found is not None  # `checked` saw to it
-        name = self.options.object
+        first, *further = (
+            self._found(found, name)
+            for name in (self.options.object, *self.options.further_objects)
+        )
+        names = self.options.further_objects
+        return replace(
+            first, notes=list(found.notes), further=dict(zip(names, further, strict=True))
+        )
+
+    def _found(self, found: EntityMasks, name: str) -> FoundObject:
+        who = _name(self.estimators["object"])
         if name not in found.entities:
             raise SourceError(
-                f"estimators.object: {_name(self.estimators['object'])} gave masks of "
-                f"{_listed(found.entities)}, not of {name}"
+                f"estimators.object: {who} gave masks of {_listed(found.entities)}, not of {name}"
             )
         confidence = found.confidence.get(name)
         chosen = found.chosen.get(name, ())
         return FoundObject(
             self._stack(found.entities[name]),
-            found.provenance or _name(self.estimators["object"]),
+            found.provenance or who,
             None if confidence is None else np.asarray(confidence)[self.video.indices],
             [(at.frame, *at.box) for at in chosen if at.box is not None],
-            list(found.notes),
         )
 
     def estimate(self, role: Place, progress: Callable[[float], None]) -> Estimates:
@@ -174,7 +185,7 @@ class EstimateReader:
         person = _request(options, options.human, "human")
         thing = _request(options, options.object, "object")
         if kind == "object":
-            return (thing,)
+            return (thing, *(_request(options, n, "object") for n in options.further_objects))
         if kind == "masks" and kind in self.source.beside:
             return tuple(e for e in (person, thing) if e.name in self.source.masked)
         if not self.of_both:

@@ -197,15 +197,23 @@ def _of_preset(place: Place, options: PrepareOptions) -> Choice:
         if options.preset == "auto":
             why += " (--estimators hub: networks to download)"
     if place == "object":
-        prompt = options.prompts.get(options.object)
-        where = prompt.places() if prompt else []
-        frames = ", ".join("first" if at.frame is None else str(at.frame) for at in where)
-        why = f"--object in frame {frames}" if where else "proposed: moves, near the hands"
-        if prompt is not None and prompt.text:
-            why = f'"{prompt.text}"'
+        why = "; ".join(_shown(name, options) for name in options.objects)
         if not _installed(spec.use):
             return Choice(place, "none", f"{spec.use} is not installed", 0.0)
     return Choice(place, spec.use, why, COST.get(spec.use), spec)
+
+
+def _shown(name: str, options: PrepareOptions) -> str:
+    """Where an object's prompt is."""
+    prompt = options.prompts.get(name)
+    if prompt is not None and prompt.text:
+        return f'"{prompt.text}"'
+    where = prompt.places() if prompt else []
+    if not where:
+        return "proposed: moves, near the hands"
+    what = name if options.further_objects else "--object"
+    frames = ", ".join("first" if at.frame is None else str(at.frame) for at in where)
+    return f"{what} in frame {frames}"
 
 
 def _installed(key: str) -> bool:
@@ -217,17 +225,17 @@ def _installed(key: str) -> bool:
 
 
 def _check_prompt(found: Mapping[Place, Choice], options: PrepareOptions) -> None:
-    prompt = options.prompts.get(options.object)
     choice = found.get("object")
-    if prompt is None or choice is None or choice.spec is None:
+    if choice is None or choice.spec is None:
         return
-    if choice.use == _OFFLINE["object"].use and prompt.text is not None:
-        raise SpecError(
-            f'--object "{prompt.text}": words need a network that reads them; point at it, such as '
-            "--object 640,402, or use --estimators hub"
-        )
-    if choice.use == _HUB["object"].use and len(prompt.places()) > 1:
-        raise SpecError(
-            "--object: SAM 2 takes points and a box of one frame; give those of one, or use "
-            "--estimators offline"
-        )
+    for prompt in (options.prompts[name] for name in options.objects if name in options.prompts):
+        if choice.use == _OFFLINE["object"].use and prompt.text is not None:
+            raise SpecError(
+                f'--object "{prompt.text}": words need a network that reads them; point at it, '
+                "such as --object 640,402, or use --estimators hub"
+            )
+        if choice.use == _HUB["object"].use and len(prompt.places()) > 1:
+            raise SpecError(
+                "--object: SAM 2 takes points and a box of one frame; give those of one, or use "
+                "--estimators offline"
+            )

@@ -129,6 +129,10 @@ class PrepareOptions(ComponentConfig):
     )
     human: str = Field(default="human", description="name of the person's entity")
     object: str = Field(default="object", description="name of the object's entity")
+    further_objects: tuple[str, ...] = Field(
+        default=(),
+        description="names of more objects, each with a prompt; estimators.object follows them all",
+    )
     object_track: ObjectWay = Field(
         default="auto",
         description='how the object\'s poses are found: "ball": as those of a sphere, whose '
@@ -161,6 +165,11 @@ class PrepareOptions(ComponentConfig):
     overlay_width: int = Field(
         default=640, ge=0, description="width of overlay.mp4, pixels; 0 writes none"
     )
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of all objects, the first one's first."""
+        return (self.object, *self.further_objects)
 
     @field_validator("intrinsics", mode="before")
     @classmethod

@@ -19,7 +19,7 @@ from hoigs.core.values.clip import BodyTrack
 from hoigs.preparation.body.silhouette import silhouette
 from hoigs.preparation.cameras.calibration import calibration_file
 from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras, known_lens
-from hoigs.preparation.entity_masks import EntityMasks, entity_masks
+from hoigs.preparation.entity_masks import EntityMasks, disjoint, entity_masks
 from hoigs.preparation.estimates import (
     EstimateReader,
     Estimators,
@@ -55,7 +55,7 @@ from hoigs.preparation.video.header import missing_frames
 from hoigs.preparation.video.source import NobodyFoundError, Source, SourceError
 from hoigs.preparation.video.span import Span
 
-FORMAT = 7  # of what the stages keep; another number makes older results unread
+FORMAT = 8  # of what the stages keep; another number makes older results unread
 LARGEST, REDUCED = 1920, 1280  # longer sides, pixels: of frames that are kept, and of smaller ones
 T = TypeVar("T")
 
@@ -226,11 +226,17 @@ class Pipeline:
         made_from = None
         if estimator is not None:
             files = fingerprint(paths_of(estimator, self.source.folder))
-            made_from = [identity(estimator), files, self._prompts(self.options.object)]
+            made_from = [identity(estimator), files, self._prompts(*self.options.objects)]
         self.found_object = self._stage("object_masks", self._find_object, made_from)
 
     def _find_object(self) -> FoundObject | None:
         if "object" not in self.estimators:
+            if self.options.further_objects:
+                raise SourceError(
+                    f"{len(self.options.objects)} objects are given, "
+                    f"{' and '.join(self.options.objects)}; an estimator that follows them is "
+                    "needed: leave out the masks beside the video, and use --estimators offline"
+                )
             return None
         found = self.reader.object_masks(self.stages.advance)
         self.warnings += found.notes
@@ -317,9 +323,12 @@ class Pipeline:
                 self._given_masks(), self.estimates.ball, self.images, self._silhouettes,
                 self.person.found,
             )  # fmt: skip
-            found = self.found_object
+            found, further = self.found_object, {}
             self.provenance["masks"] = text if found is None else f"{text}: {found.provenance}"
-            return EntityMasks(human, object_masks, self._blank(human, object_masks))
+            if found is not None and found.further:
+                human, object_masks, further = self._further(human, object_masks, found)
+            masks = EntityMasks(human, object_masks, human, further)
+            return replace(masks, blank=self._blank(masks))
 
         self.masks = self._stage("masks", make)
 
@@ -334,11 +343,33 @@ class Pipeline:
         masks = MaskStack(undistort.mask(found.masks[i]) for i in self.track.positions)
         return replace(given, object=masks)
 
-    def _blank(self, humans: MaskStack, objects: MaskStack) -> MaskStack:
-        rows = zip(self.images(), humans, objects, strict=True)
+    def _further(
+        self, human: MaskStack, first: MaskStack, found: FoundObject
+    ) -> tuple[MaskStack, MaskStack, dict[str, MaskStack]]:
+        """The masks of person and objects without common pixels; the objects' win."""
+        undistort, rows = self.track.undistort, list(self.track.positions)
+        stacks = [
+            MaskStack(undistort.mask(other.masks[i]) for i in rows)
+            for other in found.further.values()
+        ]
+        sure = [
+            None if other.confidence is None else other.confidence[rows]
+            for other in (found, *found.further.values())
+        ]
+        first, *stacks = disjoint([first, *stacks], sure)
+        human = MaskStack(
+            person & ~np.logical_or.reduce(held)
+            for person, *held in zip(human, *stacks, strict=True)
+        )
+        return human, first, dict(zip(found.further, stacks, strict=True))
+
+    def _blank(self, masks: EntityMasks) -> MaskStack:
         if self.options.keep_black:
-            return MaskStack(np.zeros_like(human) for _, human, _ in rows)
-        blank = MaskStack(blank_pixels(image, human | held) for image, human, held in rows)
+            return MaskStack(np.zeros_like(human) for human in masks.human)
+        blank = MaskStack(
+            blank_pixels(image, masks.human[i] | masks.objects(i))
+            for i, image in enumerate(self.images())
+        )
         coverage = blank.coverage()
         if coverage.any():
             self.warnings.append(
@@ -353,39 +384,73 @@ class Pipeline:
         return MaskStack(silhouette(v, self.body.faces, c) for (v, _), c in pairs)
 
     def _object(self) -> None:
-        self.object_made = self._stage("object", self._place_object)
+        self.objects_made = self._stage("object", self._place_objects)
+        self.object_made = self.objects_made.get(self.options.object)
         self.object = None if self.object_made is None else self.object_made.track
 
-    def _place_object(self) -> MadeObject | None:
-        if self.estimates.ball is None and not self.masks.object.coverage().any():
-            self.provenance["object"] = "none: the clip shows the person alone"
-            if self.options.find_object:
-                self.warnings.append(
-                    "no object was found, so the clip has none; point at it with --object X,Y, or "
-                    "say that there is none with --object none"
-                )
-            return None
+    def _place_objects(self) -> dict[str, MadeObject]:
+        """By name, those that are seen at all."""
+        masks, count = self.masks, len(self.options.objects)
+        stacks = {self.options.object: masks.object, **masks.further}
+        found = {}
+        for k, (name, stack) in enumerate(stacks.items()):
+            first = name == self.options.object
+            ball = self.estimates.ball if first else None
+            what = "the object" if count == 1 else f"the object {name}"
+            if ball is None and not stack.coverage().any():
+                self._without(name, what, count)
+                continue
+            found[name] = self._place_object(
+                ball, stack, masks.except_object(None if first else name), what,
+                lambda done, k=k: self.stages.advance((k + done) / count),
+            )  # fmt: skip
+            key = "object" if first else f"object {name}"
+            self.provenance[key] = found[name].track.provenance
+        return found
+
+    def _without(self, name: str, what: str, count: int) -> None:
+        """Says that an object is not in the clip."""
+        if count > 1:
+            self.warnings.append(
+                f"{what} was not found, so the clip has none of that name; point at it in another "
+                f"frame: --object {name}=X,Y@FRAME"
+            )
+            return
+        self.provenance["object"] = "none: the clip shows the person alone"
+        if self.options.find_object:
+            self.warnings.append(
+                "no object was found, so the clip has none; point at it with --object X,Y, or "
+                "say that there is none with --object none"
+            )
+
+    def _place_object(
+        self,
+        ball: BallTrack | None,
+        masks: MaskStack,
+        hiding: MaskStack,
+        what: str,
+        progress: Callable[[float], None],
+    ) -> MadeObject:
         options = self.options
         made = make_object(
-            self.estimates.ball, self.masks.object, self.masks.human, self.cameras,
-            self.person.joints, self.body.parents, self.images, way=options.object_track,
-            radius=options.ball_radius, count=options.object_points, fps=self.video.fps,
-            progress=self.stages.advance,
+            ball, masks, hiding, self.cameras, self.person.joints, self.body.parents, self.images,
+            way=options.object_track, radius=options.ball_radius, count=options.object_points,
+            fps=self.video.fps, progress=progress,
         )  # fmt: skip
-        self.provenance["object"] = made.track.provenance
-        self.warnings += doubts(self.masks.object, self.estimates.landmarks.image)
+        said = doubts(masks, self.estimates.landmarks.image)
         lost = (~made.track.observed).nonzero().flatten().tolist()
         if lost:
-            self.warnings.append(f"the object is not seen in {len(lost)} frames: {ranges(lost)}")
-        if made.confidence.way == "ball" and self.estimates.ball is None:
-            self.warnings.append(
+            said.append(f"the object is not seen in {len(lost)} frames: {ranges(lost)}")
+        if made.confidence.way == "ball" and ball is None:
+            said.append(
                 f"the object: {made.confidence.reason}; if it is none, --set object_track=texture"
             )
         if made.confidence.way == "outline":
-            self.warnings.append(
+            said.append(
                 "the object's rotation is not tracked but for its roll, and its shape is a cushion "
                 f"inflated from one outline: {made.confidence.reason}. Training has to find both"
             )
+        self.warnings += [text.replace("the object", what) for text in said]
         return made
 
     def _depth(self) -> None:
@@ -457,6 +522,10 @@ class Pipeline:
         depth = self.metres(frame)
         assert depth is not None
         return depth
+
+    def object_masks(self, name: str) -> MaskStack:
+        """The final masks of an object."""
+        return self.masks.object if name == self.options.object else self.masks.further[name]
 
     @property
     def body_track(self) -> BodyTrack:

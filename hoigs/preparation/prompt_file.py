@@ -9,7 +9,7 @@ from typing import Any
 
 from hoigs.core.errors import SpecError
 from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.prompts import parse_prompts, split_name
+from hoigs.preparation.prompts import named_objects, parse_prompts, split_name
 
 ENDING = ".prompts.json"
 VERSION = 1
@@ -84,36 +84,43 @@ def with_stored(
     Prompts that `options` have come before those of the file.
 
     Raises:
-        SpecError: the file cannot be read, or names several objects.
+        SpecError: the file cannot be read, or names several persons.
     """
     stored = None if video is None else read_prompts(video)
     if video is None or stored is None:
         return options, ()
     file = prompt_file(video).name
-    prompts, names, said = dict(options.prompts), {}, []
+    prompts, said = options.prompts, []
     explicit = {"object": options.object in prompts or not options.find_object,
                 "person": options.human in prompts}  # fmt: skip
-    for kind, texts in (("object", stored.object), ("person", stored.person)):
+    for kind, texts in (("person", stored.person), ("object", stored.object)):
         if not texts:
             continue
         if explicit[kind]:
             said.append(f"{file} has the {kind}, too, which is not used: your options come first")
             continue
         split = [split_name(text) for text in texts]
-        if len({name for name, _ in split}) > 1:
-            raise SpecError(
-                f"{file} has {len({n for n, _ in split})} {kind}s; prepare follows one: remove the "
-                "others with `hoigs annotate`"
+        if kind == "person":
+            if len({name for name, _ in split}) > 1:
+                raise SpecError(
+                    f"{file} has {len({n for n, _ in split})} persons; prepare follows one: remove "
+                    "the others with `hoigs annotate`"
+                )
+            name = split[0][0] or options.human
+            prompt = parse_prompts([place for _, place in split], "--person")
+            found: dict[str, Any] = {"human": name, "prompts": {**options.prompts, name: prompt}}
+            names = [name]
+        else:
+            found = named_objects(split, options)
+            names = [found["object"], *found["further_objects"]]
+        options = PrepareOptions.model_validate({**options.model_dump(), **found})
+        for name in names:
+            frames = ", ".join(
+                "first" if at.frame is None else str(at.frame)
+                for at in options.prompts[name].places()
             )
-        name = split[0][0] or (options.object if kind == "object" else options.human)
-        names["object" if kind == "object" else "human"] = name
-        prompts[name] = parse_prompts([place for _, place in split], f"--{kind}")
-        frames = ", ".join(
-            "first" if at.frame is None else str(at.frame) for at in prompts[name].places()
-        )
-        said.append(f"{file}, beside the video: {name} in frame {frames}")
-    given = {**options.model_dump(), **names, "prompts": prompts}
-    return PrepareOptions.model_validate(given), tuple(said)
+            said.append(f"{file}, beside the video: {name} in frame {frames}")
+    return options, tuple(said)
 
 
 _REMEDY = "move it away, or click anew with `hoigs annotate`"

@@ -88,12 +88,12 @@ def _boxed(at: PromptAt, numbers: list[float], text: str, what: str) -> PromptAt
 def with_prompts(
     options: PrepareOptions, texts: str | Sequence[str], preset: object = None
 ) -> PrepareOptions:
-    """Options with the object's prompt from texts, and a preset if `preset` is the name of one.
+    """Options with the objects' prompts from texts, and a preset if `preset` is the name of one.
 
-    The name before a text's "=" becomes that of the object.
+    The name before a text's "=" is that of its object; texts of one name are places on one object.
 
     Raises:
-        SpecError: a text is wrong, or they name several objects, or the person.
+        SpecError: a text is wrong, or they name the person.
     """
     texts = [texts] if isinstance(texts, str) else list(texts)
     update: dict[str, object] = {"preset": preset} if isinstance(preset, str) else {}
@@ -105,22 +105,33 @@ def with_prompts(
             )
         update["find_object"] = False
     elif texts:
-        name = _one_name([name or options.object for name, _ in named], options.human)
-        prompt = parse_prompts([place for _, place in named])
-        update |= {"object": name, "prompts": {**options.prompts, name: prompt}}
+        update |= named_objects(named, options)
     return PrepareOptions.model_validate({**options.model_dump(), **update}) if update else options
 
 
-def _one_name(names: Sequence[str], human: str) -> str:
-    different = list(dict.fromkeys(names))
-    if len(different) > 1:
+def named_objects(
+    named: Sequence[tuple[str | None, str]], options: PrepareOptions
+) -> dict[str, object]:
+    """Names and prompts, as fields of the options, of objects given by (name, place).
+
+    Raises:
+        SpecError: a place is wrong, or an object has the person's name.
+    """
+    places: dict[str, list[str]] = {}
+    for name, place in named:
+        places.setdefault(name or options.object, []).append(place)
+    if options.human in places:
         raise SpecError(
-            f"--object gives {len(different)} objects, {' and '.join(different)}, and prepare "
-            "follows one: leave the others out, and give all places on it the same name"
+            f"--object {options.human}=: {options.human} is the person's name; give the object "
+            "another"
         )
-    if different[0] == human:
-        raise SpecError(f"--object {human}=: {human} is the person's name; give the object another")
-    return different[0]
+    prompts = {name: parse_prompts(texts) for name, texts in places.items()}
+    first, *further = prompts
+    return {
+        "object": first,
+        "further_objects": tuple(further),
+        "prompts": {**options.prompts, **prompts},
+    }
 
 
 def _frame(at: PromptAt) -> str:

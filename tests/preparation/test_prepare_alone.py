@@ -99,7 +99,7 @@ class Balls(Estimator):
         pass
 
     def estimate(self, video, progress=None) -> Estimates:
-        assert [e.name for e in video.entities] == ["object"]
+        assert [e.name for e in video.entities] in (["object"], ["object", "box"])
         assert set(video.known.masks.entities) == set(video.known.landmarks) == {"human"}
         right = all(
             masks(at.frame)[1][int(y), int(x)]
@@ -107,7 +107,18 @@ class Balls(Estimator):
             for x, y in [(p.x, p.y) for p in at.points]
         )
         shown = LazyFrames(video.frames, lambda i: masks(i)[1] & right)
-        return Estimates(EntityMasks({"object": shown}, notes=("a note on the ball",)))
+        boxes = LazyFrames(video.frames, boxed) if len(video.entities) > 1 else None
+        found = {"object": shown} | ({} if boxes is None else {"box": boxes})
+        sure = {name: np.full(video.frames, 0.5 + 0.3 * (name == "box")) for name in found}
+        return Estimates(EntityMasks(found, confidence=sure, notes=("a note on the ball",)))
+
+
+def boxed(frame: int) -> np.ndarray:
+    """A second thing, which touches the ball."""
+    x = int(np.flatnonzero(masks(frame)[1].any(0))[-1])
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[8:17, max(0, x - 4) : x + 5] = True
+    return mask
 
 
 def made(out: Path) -> dict[str, int]:
@@ -149,6 +160,25 @@ def test_another_click_makes_only_the_object_again(
     assert report.object_observed == 1 and "a note on the ball" in report.warnings
     assert (out / "object.jpg").is_file() and "object.jpg" in (out / "report.html").read_text()
     assert check_clip(out) == []
+
+
+def test_two_objects_are_followed(alone: Path, environment: None, tmp_path: Path) -> None:
+    out = tmp_path / "clip"
+    report = prepare(
+        alone, out, object=["20,36", "box=30,12@3"], options=OPTIONS, body=AnnyBody(),
+        estimators={"object": Balls()},
+    )  # fmt: skip
+    assert check_clip(out) == []
+    clip = ClipFolderReader().read(out)
+    assert set(clip.objects) == {"object", "box"} and set(clip.bodies) == {"human"}
+    for i in range(FRAMES):
+        human, ball, box = (clip[i].masks[n].numpy() > 0 for n in ("human", "object", "box"))
+        assert not (human & ball).any() and not (human & box).any()
+        assert (box == boxed(i)).all()  # it is surer
+        assert (ball == (masks(i)[1] & ~boxed(i))).all()
+    assert report.further_objects["box"]["object_observed"] == 1
+    assert {"object", "object box"} <= set(report.provenance)
+    assert {"box seen", "box's poses", "mask of box"} <= {row[0] for row in report.rows()}
 
 
 def test_without_the_environment_nothing_is_done(alone: Path, tmp_path: Path) -> None:

@@ -22,10 +22,13 @@ def test_stored_clicks_are_what_options_say(tmp_path: Path) -> None:
     options, said = with_stored(PrepareOptions(), video)
     assert options.prompts["object"] == with_prompts(PrepareOptions(), TEXTS).prompts["object"]
     assert options.prompts["human"].points == [(7, 8, True)]
-    assert said[0] == "my.prompts.json, beside the video: object in frame 0, 4"
+    assert "my.prompts.json, beside the video: object in frame 0, 4" in said
     write_prompts(video, StoredPrompts(("ball=3,4@1",)))
     named, _ = with_stored(PrepareOptions(), video)
     assert named.object == "ball" and named.prompts["ball"].frame == 1
+    write_prompts(video, StoredPrompts(("cup=1,2@0", "pot=3,4@0")))
+    both, said = with_stored(PrepareOptions(), video)
+    assert both.objects == ("cup", "pot") and len(said) == 2
     write_prompts(video, StoredPrompts())
     assert not prompt_file(video).exists()
 
@@ -41,8 +44,8 @@ def test_options_come_first(tmp_path: Path) -> None:
 
 def test_what_cannot_be_used_is_named(tmp_path: Path) -> None:
     video = tmp_path / "my.mp4"
-    write_prompts(video, StoredPrompts(("cup=1,2@0", "pot=3,4@0")))
-    with pytest.raises(SpecError, match="has 2 objects; prepare follows one"):
+    write_prompts(video, StoredPrompts((), ("ann=1,2@0", "ben=3,4@0")))
+    with pytest.raises(SpecError, match="has 2 persons; prepare follows one"):
         with_stored(PrepareOptions(), video)
     for text, message in (("[]", "version None"), ('{"version": 1, "object": [3]}', "a list of")):
         prompt_file(video).write_text(text)

@@ -37,8 +37,6 @@ def test_clicks_by_frame() -> None:
         (["0,0,3,4", "0,0,5,6"], "has a box already"),
         (["none", "3,4"], "leave the others out"),
         (["kettle=none"], "leave the others out, and names"),
-        (["kettle=1,2", "mug=3,4"], "2 objects, kettle and mug, and prepare follows one"),
-        (["kettle=1,2", "3,4@5"], "2 objects, kettle and object, "),
         (["human=1,2"], "human is the person's name"),
         (["kettle="], "neither a point, a box nor words"),
     ],
@@ -57,6 +55,9 @@ def test_prompts_become_options() -> None:
         None,
         7,
     ]
+    both = with_prompts(PrepareOptions(), ["kettle=3,4", "5,6@7", "kettle=7,8@9"])
+    assert both.objects == ("kettle", "object") and set(both.prompts) == set(both.objects)
+    assert len(both.prompts["kettle"].places()) == 2
     untouched = PrepareOptions()
     assert with_prompts(untouched, (), {"masks": object()}) is untouched
 

@@ -38,6 +38,10 @@ class PrepareReport(Measures):
             rows.append(("object seen", f"{100 * self.object_observed:.0f} %", "of the frames"))
             rows.append(("object scale spread", spread, "so its depth's"))
             rows.append(("object's poses", self.object_way, self.object_reason))
+        for name, measured in self.further_objects.items():
+            seen = f"{100 * measured['object_observed']:.0f} %"
+            rows.append((f"{name} seen", seen, "of the frames"))
+            rows.append((f"{name}'s poses", measured["object_way"], measured["object_reason"]))
         rows.append(("scene points", f"{self.scene_points}", ""))
         if self.depth_residual is not None:
             rows.append(

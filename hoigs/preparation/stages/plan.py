@@ -29,7 +29,7 @@ PLAN = {
         2, (), ("width", "every", "fps", "max_frames", "pick", "folder_fps", "start", "end")
     ),
     "evidence": Stage(30, ("frames",), ("human", "object"), slow=True),
-    "object_masks": Stage(30, ("evidence",), (), slow=True),
+    "object_masks": Stage(30, ("evidence",), ("object", "further_objects"), slow=True),
     "cameras": Stage(3, ("frames", "evidence"), ("camera", "focal", "intrinsics", "calibration")),
     "inputs": Stage(6, ("evidence", "cameras"), ("find_object",)),
     "body": Stage(40, ("inputs",), ("body", "fit_steps"), slow=True),
