@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -323,7 +324,8 @@ class Pipeline:
                 self._given_masks(), self.estimates.ball, self.images, self._silhouettes,
                 self.person.found,
             )  # fmt: skip
-            found, further = self.found_object, {}
+            found = self.found_object
+            further: dict[str, MaskStack] = {}
             self.provenance["masks"] = text if found is None else f"{text}: {found.provenance}"
             if found is not None and found.further:
                 human, object_masks, further = self._further(human, object_masks, found)
@@ -402,11 +404,15 @@ class Pipeline:
                 continue
             found[name] = self._place_object(
                 ball, stack, masks.except_object(None if first else name), what,
-                lambda done, k=k: self.stages.advance((k + done) / count),
+                partial(self._advance, k, count),
             )  # fmt: skip
             key = "object" if first else f"object {name}"
             self.provenance[key] = found[name].track.provenance
         return found
+
+    def _advance(self, number: int, count: int, done: float) -> None:
+        """The progress of one of several equal works."""
+        self.stages.advance((number + done) / count)
 
     def _without(self, name: str, what: str, count: int) -> None:
         """Says that an object is not in the clip."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from hoigs.core.errors import SpecError
 from hoigs.preparation.options import PrepareOptions, Prompt, PromptAt
@@ -96,7 +97,7 @@ def with_prompts(
         SpecError: a text is wrong, or they name the person.
     """
     texts = [texts] if isinstance(texts, str) else list(texts)
-    update: dict[str, object] = {"preset": preset} if isinstance(preset, str) else {}
+    update: dict[str, Any] = {"preset": preset} if isinstance(preset, str) else {}
     named = [split_name(text) for text in texts]
     if any(place.strip() == NONE for _, place in named):
         if len(texts) > 1 or named[0][0]:
@@ -111,7 +112,7 @@ def with_prompts(
 
 def named_objects(
     named: Sequence[tuple[str | None, str]], options: PrepareOptions
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Names and prompts, as fields of the options, of objects given by (name, place).
 
     Raises:
