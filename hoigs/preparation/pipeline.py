@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,7 +12,6 @@ import numpy as np
 import torch
 
 import hoigs
-from hoigs.core.diagnostics import ranges
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.clip import BodyTrack
@@ -32,10 +30,10 @@ from hoigs.preparation.estimates import (
 from hoigs.preparation.given import GivenMasks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack, load_ball, refine_ball
-from hoigs.preparation.objects.doubts import doubts
-from hoigs.preparation.objects.make_object import MadeObject, make_object
+from hoigs.preparation.objects.make_object import MadeObject
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.person import FittedBody, fit_person
+from hoigs.preparation.place_objects import place_objects
 from hoigs.preparation.prompts import check_prompts, placed_prompts
 from hoigs.preparation.saved import from_result, to_result
 from hoigs.preparation.scene.depth import (
@@ -391,73 +389,14 @@ class Pipeline:
         self.object = None if self.object_made is None else self.object_made.track
 
     def _place_objects(self) -> dict[str, MadeObject]:
-        """By name, those that are seen at all."""
-        masks, count = self.masks, len(self.options.objects)
-        stacks = {self.options.object: masks.object, **masks.further}
-        found = {}
-        for k, (name, stack) in enumerate(stacks.items()):
-            first = name == self.options.object
-            ball = self.estimates.ball if first else None
-            what = "the object" if count == 1 else f"the object {name}"
-            if ball is None and not stack.coverage().any():
-                self._without(name, what, count)
-                continue
-            found[name] = self._place_object(
-                ball, stack, masks.except_object(None if first else name), what,
-                partial(self._advance, k, count),
-            )  # fmt: skip
-            key = "object" if first else f"object {name}"
-            self.provenance[key] = found[name].track.provenance
-        return found
-
-    def _advance(self, number: int, count: int, done: float) -> None:
-        """The progress of one of several equal works."""
-        self.stages.advance((number + done) / count)
-
-    def _without(self, name: str, what: str, count: int) -> None:
-        """Says that an object is not in the clip."""
-        if count > 1:
-            self.warnings.append(
-                f"{what} was not found, so the clip has none of that name; point at it in another "
-                f"frame: --object {name}=X,Y@FRAME"
-            )
-            return
-        self.provenance["object"] = "none: the clip shows the person alone"
-        if self.options.find_object:
-            self.warnings.append(
-                "no object was found, so the clip has none; point at it with --object X,Y, or "
-                "say that there is none with --object none"
-            )
-
-    def _place_object(
-        self,
-        ball: BallTrack | None,
-        masks: MaskStack,
-        hiding: MaskStack,
-        what: str,
-        progress: Callable[[float], None],
-    ) -> MadeObject:
-        options = self.options
-        made = make_object(
-            ball, masks, hiding, self.cameras, self.person.joints, self.body.parents, self.images,
-            way=options.object_track, radius=options.ball_radius, count=options.object_points,
-            fps=self.video.fps, progress=progress,
+        placed = place_objects(
+            self.masks, self.estimates.ball, self.estimates.landmarks.image, self.cameras,
+            self.person.joints, self.body.parents, self.images, self.options, self.video.fps,
+            self.stages.advance,
         )  # fmt: skip
-        said = doubts(masks, self.estimates.landmarks.image)
-        lost = (~made.track.observed).nonzero().flatten().tolist()
-        if lost:
-            said.append(f"the object is not seen in {len(lost)} frames: {ranges(lost)}")
-        if made.confidence.way == "ball" and ball is None:
-            said.append(
-                f"the object: {made.confidence.reason}; if it is none, --set object_track=texture"
-            )
-        if made.confidence.way == "outline":
-            said.append(
-                "the object's rotation is not tracked but for its roll, and its shape is a cushion "
-                f"inflated from one outline: {made.confidence.reason}. Training has to find both"
-            )
-        self.warnings += [text.replace("the object", what) for text in said]
-        return made
+        self.provenance |= placed.provenance
+        self.warnings += placed.warnings
+        return placed.objects
 
     def _depth(self) -> None:
         estimator, self.depth_maps = self.estimators.get("depth"), None
