@@ -1,4 +1,4 @@
-"""A headless Chromium, for tests of what is seen; imported by conftest.py of their folders."""
+"""A headless Chromium, for tests of what is seen: fixtures of tests/conftest.py."""
 
 from __future__ import annotations
 

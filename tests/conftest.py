@@ -12,8 +12,11 @@ from pathlib import Path
 import jaxtyping
 import pytest
 import torch
+from browser import chromium, window
 from jaxtyping import install_import_hook
 from shapecheck import only_arrays
+
+__all__ = ["chromium", "window"]  # fixtures: one browser a worker, whoever needs it
 
 # Annotations are promises: every call in these modules is checked against its shapes and types.
 # hoigs.rasterizers.warp is left out, because Warp reads the source of its kernels; the modules

@@ -40,10 +40,11 @@ RENAMED = {
 CHOOSING = {("train", "auto"), ("prepare", "stage"), ("doctor", "json")}
 # options of a command that the second of its functions is without, and why
 WITHOUT = {
-    hoigs.auto: {"reader", "reader_settings"},  # a clip is read by the reader that it looks like
+    # a clip is read by the reader that it looks like, and the search has a budget of its own
+    hoigs.auto: {"reader", "reader_settings", "budget"},
     # the options of prepare_until are ready-made
     hoigs.prepare_until: {"width", "camera", "max_frames", "every", "fps", "focal", "keep_black",
-                          "overwrite", "overrides"},
+                          "overwrite", "overrides", "start", "end", "intrinsics", "calibration"},
 }  # fmt: skip
 # arguments that only a Python caller can give: objects and callbacks
 PYTHON = {"on_start", "on_step", "on_found", "progress", "report", "body", "estimators",

@@ -8,9 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from browser import chromium, window
-
-__all__ = ["chromium", "window"]
 
 SMALL = ("model.scene.points=2000", "model.human.points=1500", "model.object.points=500")
 
