@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
-from typing import Any
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
 
 import pytest
+
+T = TypeVar("T")
 
 
 @pytest.fixture(scope="session")
@@ -59,3 +63,38 @@ def window(chromium: Any) -> Iterator[Any]:
     yield make
     for one in opened:
         one.context.close()
+
+
+@contextmanager
+def in_thread(
+    serve: Callable[[Callable[[T], None]], None], stop: Callable[[T], None]
+) -> Iterator[T]:
+    """The server that `serve` gives to its argument, while it runs in a thread.
+
+    Its own errors, and a server that does not end when it is stopped, fail the test.
+    """
+    got: list[T] = []
+    failed: list[BaseException] = []
+    ready = threading.Event()
+
+    def started(server: T) -> None:
+        got.append(server)
+        ready.set()
+
+    def work() -> None:
+        try:
+            serve(started)
+        except BaseException as error:
+            failed.append(error)
+        finally:
+            ready.set()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    assert ready.wait(120) and got, failed
+    try:
+        yield got[0]
+    finally:
+        stop(got[0])
+        thread.join(30)
+    assert not thread.is_alive() and not failed, failed

@@ -100,10 +100,8 @@ def train(
             "on_start": show.started, "on_step": show.step,
             "progress": show.fraction, "report": show.line,
         }  # fmt: skip
-        if auto and budget is not None:
-            raise typer.BadParameter("--auto has a budget of its own: leave --budget out")
         if auto:
-            named = _clip_for_auto(clip, reader, reader_set)
+            named = _clip_for_auto(clip, reader, reader_set, budget)
             made = train_auto(named, spec, on_found=print_needs, **given)
             run = made.run
         else:
@@ -116,13 +114,17 @@ def train(
         print_scores(run.evaluated)
 
 
-def _clip_for_auto(clip: Path | None, reader: str | None, reader_set: list[str] | None) -> Path:
-    """The clip of `--auto`, which is required and read without --reader."""
+def _clip_for_auto(
+    clip: Path | None, reader: str | None, reader_set: list[str] | None, budget: str | None
+) -> Path:
+    """The clip of `--auto`, which is required and read without --reader; nor is there --budget."""
     from hoigs.core.errors import HoigsError
     from hoigs.runs.resuming import NO_CLIP
 
     if clip is None:
         raise HoigsError(f"{NO_CLIP}; without --auto, --resume takes the run's own")
+    if budget is not None:
+        raise HoigsError("--auto has a budget of its own: leave --budget out")
     if reader or reader_set:
         raise HoigsError(
             "--auto takes no --reader and no --reader-set: it chooses the reader of CLIP"

@@ -134,6 +134,7 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         depth_residuals=[] if depth is None else _numbers(depth.residual, 4),
         depth_against="" if depth is None else depth.against,
         **({} if made.object_made is None else _object_measures(made.object_made)),
+        object_name=options.object,
         further_objects={
             other: {
                 "object_observed": float(thing.track.observed.float().mean()),

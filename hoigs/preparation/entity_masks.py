@@ -30,11 +30,12 @@ class EntityMasks:
         further = (masks[frame] for masks in self.further.values())
         return np.logical_or.reduce([self.object[frame], *further])
 
-    def except_object(self, name: str | None = None) -> MaskStack:
-        """Whatever may hide an object: the person and the other objects. None: that of `object`."""
-        others = [self.human, *(m for n, m in self.further.items() if n != name)]
+    def other_objects(self, name: str | None = None) -> MaskStack:
+        """Pixels of all objects but one: that of `further` by name; None: that of `object`."""
+        others = [m for n, m in self.further.items() if n != name]
         others += [] if name is None else [self.object]
-        return MaskStack(np.logical_or.reduce(rows) for rows in zip(*others, strict=True))
+        nothing = MaskStack(np.zeros_like(mask) for mask in self.human)
+        return MaskStack(np.logical_or.reduce(rows) for rows in zip(nothing, *others, strict=True))
 
     def moving(self, frame: int) -> Bool[np.ndarray, "H W"]:
         """Pixels of a frame that show no scene that stands still."""

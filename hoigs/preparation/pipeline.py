@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -327,8 +327,8 @@ class Pipeline:
             self.provenance["masks"] = text if found is None else f"{text}: {found.provenance}"
             if found is not None and found.further:
                 human, object_masks, further = self._further(human, object_masks, found)
-            masks = EntityMasks(human, object_masks, human, further)
-            return replace(masks, blank=self._blank(masks))
+            blank = self._blank([human, object_masks, *further.values()])
+            return EntityMasks(human, object_masks, blank, further)
 
         self.masks = self._stage("masks", make)
 
@@ -363,12 +363,12 @@ class Pipeline:
         )
         return human, first, dict(zip(found.further, stacks, strict=True))
 
-    def _blank(self, masks: EntityMasks) -> MaskStack:
+    def _blank(self, entities: Sequence[MaskStack]) -> MaskStack:
         if self.options.keep_black:
-            return MaskStack(np.zeros_like(human) for human in masks.human)
+            return MaskStack(np.zeros_like(human) for human in entities[0])
         blank = MaskStack(
-            blank_pixels(image, masks.human[i] | masks.objects(i))
-            for i, image in enumerate(self.images())
+            blank_pixels(image, np.logical_or.reduce(shown))
+            for image, *shown in zip(self.images(), *entities, strict=True)
         )
         coverage = blank.coverage()
         if coverage.any():

@@ -62,8 +62,8 @@ def place_objects(
             continue
         assert stack is not None
         made = make_object(
-            disc, stack, masks.except_object(None if first else name), cameras, joints, parents,
-            images, way=options.object_track, radius=options.ball_radius,
+            disc, stack, masks.human, masks.other_objects(None if first else name), cameras,
+            joints, parents, images, way=options.object_track, radius=options.ball_radius,
             count=options.object_points, fps=fps, progress=partial(_share, progress, k, count),
         )  # fmt: skip
         placed.objects[name] = made

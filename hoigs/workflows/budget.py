@@ -33,7 +33,8 @@ FRAME = 2.0  # time of scoring a frame, in steps
 PROBES = (128, 256)  # widths at which steps are timed
 WARM, TIMED = 3, 5  # steps; on CUDA four times as many
 
-_TIME = re.compile(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s)?")
+_NUMBER = r"(\d+(?:\.\d+)?)"
+_TIME = re.compile(f"(?:{_NUMBER}h)?(?:{_NUMBER}m)?(?:{_NUMBER}s?)?")
 
 
 def seconds_of(text: str | float) -> float:
@@ -43,16 +44,9 @@ def seconds_of(text: str | float) -> float:
         SpecError: it is neither, or nothing.
     """
     found = _TIME.fullmatch(str(text).strip())
-    parts = [float(part or 0) for part in found.groups()] if found and str(text).strip() else []
-    total = (
-        sum(part * unit for part, unit in zip(parts, (3600, 60, 1), strict=True)) if parts else 0
-    )
-    if not parts:
-        try:
-            total = float(text)
-        except ValueError:
-            total = 0.0
-    if not 0 < total < float("inf"):
+    parts = [float(part or 0) for part in found.groups()] if found else [0.0, 0.0, 0.0]
+    total = 3600 * parts[0] + 60 * parts[1] + parts[2]
+    if total == 0:
         raise SpecError(f"--budget {text!r} is not a time; give 90s, 20m, 2h or 1h30m")
     return total
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import http.client
 import json
 import shutil
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from browser import in_thread
 from PIL import Image
 from tiny import BALL, FRAMES, landmarks, masks, picture
 
@@ -42,33 +42,11 @@ def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder / "my.mp4"
 
 
-@contextmanager
-def served(video: Path, **options: Any) -> Iterator[PageServer]:
-    got: list[PageServer] = []
-    failed: list[BaseException] = []
-    ready = threading.Event()
+def served(video: Path, **options: Any) -> AbstractContextManager[PageServer]:
+    def serve(started: Callable[[PageServer], None]) -> None:
+        annotate(video, port=0, report=lambda line: None, started=started, **options)
 
-    def started(server: PageServer) -> None:
-        got.append(server)
-        ready.set()
-
-    def work() -> None:
-        try:
-            annotate(video, port=0, report=lambda line: None, started=started, **options)
-        except BaseException as error:
-            failed.append(error)
-        finally:
-            ready.set()
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    assert ready.wait(60) and got, failed
-    try:
-        yield got[0]
-    finally:
-        got[0].shutdown()
-        thread.join(30)
-    assert not thread.is_alive() and not failed, failed
+    return in_thread(serve, PageServer.shutdown)
 
 
 def until(check: Callable[[], Any], page: Any, what: str, seconds: float = 60) -> Any:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browser import in_thread
 
 import hoigs
 from hoigs.core.errors import HoigsError
@@ -28,30 +29,13 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def served(*what: Path, **options: Any) -> Iterator[tuple[Viewer, str, list[str]]]:
     """A viewer that runs in a thread, its address, and the lines that it reports."""
     lines: list[str] = []
-    got: list[Viewer] = []
-    failed: list[BaseException] = []
-    ready = threading.Event()
 
-    def started(viewer: Viewer) -> None:
-        got.append(viewer)
-        ready.set()
+    def serve(started: Callable[[Viewer], None]) -> None:
+        hoigs.view(*what, port=0, device="cpu", report=lines.append, started=started, **options)
 
-    def work() -> None:
-        try:
-            hoigs.view(*what, port=0, device="cpu", report=lines.append, started=started, **options)
-        except BaseException as error:
-            failed.append(error)
-        finally:
-            ready.set()
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    assert ready.wait(120) and got, (lines, failed)
-    address = next(line.split()[1] for line in lines if line.startswith("open http"))
-    yield got[0], address, lines
-    got[0].stop()
-    thread.join(30)
-    assert not thread.is_alive() and not failed, failed
+    with in_thread(serve, Viewer.stop) as viewer:
+        address = next(line.split()[1] for line in lines if line.startswith("open http"))
+        yield viewer, address, lines
 
 
 def until(check: Callable[[], bool], page: Any, what: str, seconds: float = 40) -> None:

@@ -31,9 +31,9 @@ class Crops:
     Attributes:
         frames: numbers of the frames that show the object. images: RGB in [0, 1].
         K, world_to_camera: of the crops' own cameras.
-        masks: the object's. hidden: pixels of the person that may hide a part of the object, and
-            those beyond the image.
-        outside: pixels from the nearest one on which the object may be: its own, or the person's.
+        masks: the object's. hidden: pixels of the person or of other objects that may hide a part
+            of it, and those beyond the image.
+        outside: pixels from the nearest one on which the object may be: its own, or hidden ones.
         edges: pixels of the mask's outline against the background, repeated to a fixed number.
     """
 
@@ -116,6 +116,7 @@ def make_crops(
     images: Images,
     masks: MaskStack,
     humans: MaskStack,
+    others: MaskStack,
     cameras: Sequence[Camera],
     shown: Bool[np.ndarray, " F"],
     size: int,
@@ -125,6 +126,7 @@ def make_crops(
     """Crops of the frames in `shown`, `size` pixels wide (an object is 0.6 of that).
 
     Args:
+        others: pixels of other objects, whose depth is unknown: they hide whatever they cover.
         body: points of the person, world, metres. behind: depths from which on the person is
             behind all of the object, and hides nothing of it.
     """
@@ -142,8 +144,9 @@ def make_crops(
         K = cameras[i].K.double().numpy().copy()
         K[:2, 2] -= box[:2]
         K[:2] *= scale
-        hidden = _cut(humans[i], box, size) & ~mask
-        hidden &= _nearest_depths(hidden, K, cameras[i].to_camera(body[i])) < behind[i]
+        person = _cut(humans[i], box, size) & ~mask
+        depths = _nearest_depths(person, K, cameras[i].to_camera(body[i]))
+        hidden = person & (depths < behind[i]) | _cut(others[i], box, size) & ~mask
         cut = Image.fromarray(image).crop(tuple(box.round().astype(int)))
         edges, share = _edges(mask, hidden | ~inside, i)
         rows["image"].append(np.asarray(cut.resize((size, size), Image.Resampling.BOX)) / 255.0)

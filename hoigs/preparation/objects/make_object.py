@@ -126,6 +126,7 @@ def make_object(
     ball: BallTrack | None,
     masks: MaskStack,
     humans: MaskStack,
+    others: MaskStack,
     cameras: Sequence[Camera],
     joints: Float[Tensor, "F J 3"],
     parents: Sequence[int],
@@ -141,24 +142,26 @@ def make_object(
     be, and the confidence names why.
 
     Args:
+        others: pixels of other objects, which hide this one wherever the person's limbs are.
         joints: of the body, world, metres. parents: of the joints. way: how; "auto": as a ball
             where all masks are round, or else by texture. radius: of a ball, metres; None: a
             football's for a tracked ball, and for a round mask that which the limbs at it give.
             count: of points.
     """
+    hiding = MaskStack(h | o for h, o in zip(humans, others, strict=True))
     if ball is not None:
         track, normals, spread = ball_object(ball, cameras, radius or FOOTBALL, count)
         confidence = ObjectConfidence.none("ball", len(cameras), "a ball's spin is not tracked")
-        return _colored(track, normals, spread, confidence, masks, humans, cameras, images)
+        return _colored(track, normals, spread, confidence, masks, hiding, cameras, images)
     reasons = []
     if way in ("auto", "ball"):
         try:
-            cones = ball_cones(masks, humans, cameras)
+            cones = ball_cones(masks, hiding, cameras)
             if way == "auto":
                 require_round(cones, cameras)
             track, normals, confidence = round_object(cones, cameras, joints, radius, count)
             return _colored(
-                track, normals, cones.jitter, confidence, masks, humans, cameras, images
+                track, normals, cones.jitter, confidence, masks, hiding, cameras, images
             )
         except NoBallError as reason:
             if way == "ball":
@@ -167,7 +170,7 @@ def make_object(
         if way == "outline":
             raise UntrackableError("object_track is outline")
         track, normals, confidence = tracked_object(
-            masks, humans, cameras, joints, parents, images, count, fps, progress
+            masks, humans, others, cameras, joints, parents, images, count, fps, progress
         )
         spread = float(np.nanmean(confidence.outline) / track.points.norm(dim=-1).mean())
         if not spread < FARTHEST_OUTLINE:
@@ -180,7 +183,7 @@ def make_object(
         track, normals, spread = held_object(masks, list(cameras), wrists, count)
         reasons.append(str(reason))
         confidence = ObjectConfidence.none("outline", len(cameras), "; ".join(reasons))
-    return _colored(track, normals, spread, confidence, masks, humans, cameras, images)
+    return _colored(track, normals, spread, confidence, masks, hiding, cameras, images)
 
 
 def _colored(

@@ -76,6 +76,7 @@ class ObjectConfidence:
 def tracked_object(
     masks: MaskStack,
     humans: MaskStack,
+    others: MaskStack,
     cameras: Sequence[Camera],
     joints: Float[Tensor, "F J 3"],
     parents: Sequence[int],
@@ -102,7 +103,7 @@ def tracked_object(
     radius = _radius(outlines, hands, cameras)
     behind = hands.depths + BEHIND * radius
     crops = make_crops(
-        images, masks, humans, cameras, shown, SIDE, along_bones(joints, parents), behind
+        images, masks, humans, others, cameras, shown, SIDE, along_bones(joints, parents), behind
     )
     contrast = crops.contrast(BLUR)
     if contrast < FAINTEST:

@@ -42,6 +42,7 @@ class Measures:
         object_held, object_rests: parts of the frames in which hands move it, and it rests.
         hand_distance_m: of each frame, from the nearest palm to its surface while held; negative
             inside.
+        object_name: of the object that the measures above are of.
         further_objects: by name, the same measures of the other objects.
         omega, big_omega: effective multi-view factors (`multiview`).
     """
@@ -81,6 +82,7 @@ class Measures:
     object_held: float = 0.0
     object_rests: float = 0.0
     hand_distance_m: list[float | None] = field(default_factory=list)
+    object_name: str = "object"
     further_objects: dict[str, dict[str, Any]] = field(default_factory=dict)
     omega: float | None = None
     big_omega: float | None = None

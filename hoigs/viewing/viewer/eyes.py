@@ -12,7 +12,6 @@ from hoigs.viewing.viewer.resolution import Resolution
 from hoigs.viewing.viewer.views import View
 
 STILL_S = 0.25  # a picture is drawn in full once nothing has changed for so long
-ECHO_S = 10.0  # for so long a browser may still answer with a camera that was replaced
 
 
 class Eye:
@@ -34,7 +33,7 @@ class Eye:
         self.drawn: object = None
         self.full, self.changed = False, 0.0
         self.rates: deque[float] = deque(maxlen=20)
-        self._set: deque[tuple[float, View]] = deque(maxlen=400)
+        self._set: deque[np.ndarray] = deque(maxlen=400)  # positions of cameras
         self._answered = False  # whether the browser has taken a camera that was set
 
     @property
@@ -47,26 +46,23 @@ class Eye:
     def view(self) -> View:
         return View.of_client(self.client.camera)
 
-    def look(self, view: View, now: float) -> None:
+    def look(self, view: View) -> None:
         """Set the browser's camera."""
-        self._set.append((now, view))
+        self._set.append(view.position)
         with self.client.atomic():
             view.apply(self.client.camera)
 
-    def moved(self, now: float) -> None:
-        """The browser has sent a camera: `dragged` is called unless it is one that was set.
+    def moved(self) -> None:
+        """The browser has sent a camera: `dragged` is called unless it is where one was set.
 
-        Position and target may be of different ones: a browser takes them one after the other.
-        What comes before the browser has taken the first one is its own start.
+        A busy browser answers seconds later, and with the position of one camera and the target
+        of another, as it takes them one after the other; whatever the mouse does to the camera
+        moves its position. What comes before the browser has taken the first one that was set is
+        its own start.
         """
-        given = list(self._set)
-        replaced = [t for t, _ in given[1:]] + [now]  # when each was followed by another
-        lately = [v for (_, v), t in zip(given, replaced, strict=False) if now - t < ECHO_S]
         seen = self.view
         scale = 0.01 * max(float(np.linalg.norm(seen.target - seen.position)), 1e-3)
-        placed = any(np.linalg.norm(seen.position - view.position) < scale for view in lately)
-        aimed = any(np.linalg.norm(seen.target - view.target) < scale for view in lately)
-        if placed and aimed:
+        if any(np.linalg.norm(seen.position - position) < scale for position in self._set):
             self._answered = True
         elif self._answered:
             self._dragged(self)

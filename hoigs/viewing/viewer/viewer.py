@@ -122,7 +122,7 @@ class Viewer:
             self._send(settings, frame)
         drew = False
         for eye in list(self._eyes.values()):
-            self._follow(eye, settings, frame, now)
+            self._follow(eye, settings, frame)
             drew |= self._clear(eye) if browser else self._draw_for(eye, settings, frame, now)
         self._anchor = (settings.follow, frame)
         return drew
@@ -145,7 +145,7 @@ class Viewer:
 
         @client.camera.on_update
         def _(_: Any) -> None:
-            eye.moved(time.monotonic())
+            eye.moved()
             self._wake.set()
 
         self._wake.set()
@@ -158,22 +158,22 @@ class Viewer:
         elif self.settings.video and not self.drawings[0].anywhere:
             self.controls.leave_video()
 
-    def _follow(self, eye: Eye, settings: Settings, frame: float, now: float) -> None:
+    def _follow(self, eye: Eye, settings: Settings, frame: float) -> None:
         """Bring the browser's camera to that of the video, or along with what it orbits."""
         if settings.video:
             camera = camera_between(self.clip, frame)
             view = View.of_camera(camera, self._distance, eye.canvas)
             if not view.near(eye.view, 1e-4) or abs(view.fov - eye.view.fov) > 1e-4:
-                eye.look(view, now)
+                eye.look(view)
         elif settings.follow is not None:
             whom, since = self._anchor
             goal = takes.center(self.drawings[0], settings.follow, frame)
             view = eye.view
             if whom != settings.follow:
-                eye.look(takes.turned_to(view, goal, self.up), now)
+                eye.look(takes.turned_to(view, goal, self.up))
             elif since != frame:
                 before = takes.center(self.drawings[0], settings.follow, since)
-                eye.look(view.moved(goal - before), now)
+                eye.look(view.moved(goal - before))
 
     def _draw_for(self, eye: Eye, settings: Settings, frame: float, now: float) -> bool:
         if not self.drawings[0].anywhere and not settings.video:

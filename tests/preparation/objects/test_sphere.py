@@ -94,8 +94,8 @@ def test_limbs_give_the_radius_and_the_rotation_stays_unknown() -> None:
     assert found[1] == FRAMES and found[2] < 0.05
     images = [np.full((HEIGHT, WIDTH, 3), 90, np.uint8)] * FRAMES
     made = make_object(
-        None, balls(), NOBODY, CAMERAS, joints, (-1, *range(51)), lambda: iter(images), way="auto",
-        radius=None, count=200, fps=12.0, progress=lambda _: None,
+        None, balls(), NOBODY, NOBODY, CAMERAS, joints, (-1, *range(51)), lambda: iter(images),
+        way="auto", radius=None, count=200, fps=12.0, progress=lambda _: None,
     )  # fmt: skip
     assert made.confidence.way == "ball" and "no outline shows" in made.confidence.reason
     assert "rotation is unknown" in made.track.provenance

@@ -85,6 +85,7 @@ def test_turning_and_shape_of_a_held_box() -> None:
     track, normals, confidence = tracked_object(
         objects,
         humans,
+        humans,
         [CAMERA] * FRAMES,
         joints,
         PARENTS,
@@ -111,8 +112,8 @@ def test_what_has_no_texture_is_refused() -> None:
     noisy = np.clip(images + rng.normal(size=images.shape) * 4, 0, 255).astype(np.uint8)
     with pytest.raises(UntrackableError, match="hardly any texture"):
         tracked_object(
-            objects, humans, [CAMERA] * FRAMES, joints, PARENTS, lambda: iter(noisy), 99, FPS,
-            lambda _: None, levels=((5.0, 6, 20), (2.0, 2, 20)),
+            objects, humans, humans, [CAMERA] * FRAMES, joints, PARENTS, lambda: iter(noisy), 99,
+            FPS, lambda _: None, levels=((5.0, 6, 20), (2.0, 2, 20)),
         )  # fmt: skip
 
 
@@ -120,8 +121,8 @@ def test_what_is_seen_briefly_goes_the_old_way_by_name() -> None:
     images, objects, humans, joints = filmed()
     brief = MaskStack(m if i < 5 else np.zeros_like(m) for i, m in enumerate(objects))
     made = make_object(
-        None, brief, humans, [CAMERA] * FRAMES, joints, PARENTS, lambda: iter(images), way="auto",
-        radius=0.1, count=200, fps=FPS, progress=lambda _: None,
+        None, brief, humans, humans, [CAMERA] * FRAMES, joints, PARENTS, lambda: iter(images),
+        way="auto", radius=0.1, count=200, fps=FPS, progress=lambda _: None,
     )  # fmt: skip
     assert made.confidence.way == "outline" and "5 frames" in made.confidence.reason
     assert "roll" in made.track.provenance
@@ -157,14 +158,15 @@ def test_what_is_hidden_moves_with_the_hands_that_hold_it() -> None:
     torch.testing.assert_close(moved, places, atol=1e-4, rtol=0)
 
 
-def test_a_person_behind_the_object_hides_nothing_of_it() -> None:
-    images, objects, _, _ = filmed()
+def test_a_person_behind_the_object_hides_nothing_of_it_but_other_objects_do() -> None:
+    images, objects, nothing, _ = filmed()
     around = MaskStack(~mask for mask in objects)
     shown = np.ones(FRAMES, bool)
-    for depth, share in ((3.0, 0.0), (1.5, 1.0)):
+    cases = ((3.0, around, nothing, 0.0), (1.5, around, nothing, 1.0), (3.0, nothing, around, 1.0))
+    for depth, person, others, share in cases:
         body = torch.tensor([0.0, 0.0, depth]).expand(FRAMES, 1, 3)
         crops = make_crops(
-            lambda: iter(images), objects, around, [CAMERA] * FRAMES, shown, 32, body,
+            lambda: iter(images), objects, person, others, [CAMERA] * FRAMES, shown, 32, body,
             np.full(FRAMES, 2.2),
         )  # fmt: skip
         assert float(crops.hidden[crops.masks == 0].mean()) == share
@@ -180,7 +182,7 @@ def test_a_spin_in_flight_is_found_by_texture() -> None:
     images, objects, humans, _ = filmed(motion=(rotations, places))
     cameras = [CAMERA] * FRAMES
     crops = make_crops(
-        lambda: iter(images), objects, humans, cameras, np.ones(FRAMES, bool), 64,
+        lambda: iter(images), objects, humans, humans, cameras, np.ones(FRAMES, bool), 64,
         torch.zeros(FRAMES, 0, 3), np.ones(FRAMES),
     )  # fmt: skip
     known = np.array([i for i in range(FRAMES) if not 3 <= i < 9])
@@ -209,7 +211,7 @@ def test_a_shape_far_off_its_masks_is_refused(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(making, "tracked_object", collapsed)
     made = make_object(
-        None, objects, humans, [CAMERA] * FRAMES, joints, PARENTS, lambda: iter(images),
+        None, objects, humans, humans, [CAMERA] * FRAMES, joints, PARENTS, lambda: iter(images),
         way="texture", radius=None, count=200, fps=FPS, progress=lambda _: None,
     )  # fmt: skip
     assert made.confidence.way == "outline" and "off its masks" in made.confidence.reason
