@@ -34,11 +34,9 @@ class PrepareReport(Measures):
         if self.object_observed is None or self.object_scale_spread is None:
             rows.append((self.object_name, "none", ""))
         else:
-            spread = f"{100 * self.object_scale_spread:.1f} %"
-            rows.append(
-                (f"{self.object_name} seen", f"{100 * self.object_observed:.0f} %", "of the frames")
-            )
-            rows.append((f"{self.object_name}'s scale spread", spread, "so its depth's"))
+            name, spread = self.object_name, f"{100 * self.object_scale_spread:.1f} %"
+            rows.append((f"{name} seen", f"{100 * self.object_observed:.0f} %", "of the frames"))
+            rows.append((f"{name}'s scale spread", spread, "so its depth's"))
             rows.append((f"{name}'s poses", self.object_way, self.object_reason))
         for name, measured in self.further_objects.items():
             seen = f"{100 * measured['object_observed']:.0f} %"
