@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import torch
+
 from hoigs.core.progress import Progress
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.rasterizers.warp.rasterizer import WarpRasterizer
+from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_folder
 from hoigs.runs.run_folder import RunFolder
 from hoigs.workflows.train import OnStart, OnStep, Report, TrainedRun, silent, train
@@ -69,7 +76,10 @@ def demo(
             f"fast: 32 frames of 128x128, {steps} steps, a small model; without --fast the demo is "
             "larger, better and compared with a static model"
         )
-    clip = clip_folder(FAST_CLIP if fast else CLIP)
+    with ThreadPoolExecutor(1) as other_core:
+        if pick_device(device) == "cpu" and rasterizer in (None, "warp"):
+            other_core.submit(_compile_kernels)
+        clip = clip_folder(FAST_CLIP if fast else CLIP)
     return {
         spec: train(
             clip, spec, out=folder,
@@ -79,3 +89,14 @@ def demo(
         )
         for spec, folder in folders.items()
     }  # fmt: skip
+
+
+def _compile_kernels() -> None:
+    """Draws a few Gaussians: the first render on a machine compiles the kernels of training.
+
+    An error here is none of the demo's: training meets it again, and says it.
+    """
+    gaussians = Gaussians.from_points(torch.rand(4, 3), scales=0.1)
+    camera = Camera.look_at(torch.full((3,), 3.0), torch.zeros(3), width=16, height=16, fov_y=1.0)
+    sh = gaussians.sh.requires_grad_()
+    WarpRasterizer().render(gaussians.replace(sh=sh), camera).color.sum().backward()
