@@ -19,13 +19,11 @@ def demo(
     out: Annotated[Path, typer.Option("--out", help="Run folder.")] = Path("runs/demo"),
     fast: Annotated[
         bool,
-        typer.Option(
-            "--fast", help="A first look in about a minute and a half: smaller, less sharp."
-        ),
+        typer.Option("--fast", help="A first look in about a minute: smaller, less sharp."),
     ] = False,
     steps: Annotated[
         int | None,
-        typer.Option("--steps", help="Training steps of each model; 800, with --fast 300."),
+        typer.Option("--steps", help="Training steps of each model; 800, with --fast 200."),
     ] = None,
     settings: SetOption = None,
     rasterizer: RasterizerOption = None,

@@ -9,6 +9,9 @@ gradient-domain inpainting, Perez et al. 2003), which keeps what was seen.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -19,6 +22,7 @@ from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.maths.nearest import nearest
 from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import SH_C0, Gaussians
 
@@ -51,33 +55,47 @@ def seen_weights(
     """Blending weights of each entity's Gaussians, summed over pixels and training frames, inside
     the entity's mask and outside it."""
     positions = clip.split["train"]
+    names = [name for name in model.entities if model.entity(name).kind != "scene"]
     sums: dict[str, tuple[Tensor, Tensor]] = {}
-    for position in positions[:: max(1, len(positions) // frames)]:
+    for position in positions[:: math.ceil(len(positions) / frames)]:
         frame = clip[position]
         moment, camera = frame.moment.to(model.device), frame.camera.to(model.device)
         with torch.no_grad():
             state = model(moment)
-        drawn = state.joined().detach()
-        # the derivative of a colour by a degree-0 coefficient is its blending weight times Y_00
-        sh = torch.zeros(len(drawn), 1, 3, device=model.device, requires_grad=True)
-        with torch.enable_grad():
-            color = model.rasterizer.render(drawn.replace(sh=sh), camera, RenderRequest()).color
-            total = _weights(color.sum(), sh)
-            for name, rows in state.slices().items():
-                if model.entity(name).kind == "scene":
-                    continue
-                inside = total
-                if name in frame.masks:
-                    mask = frame.masks[name].to(model.device)[..., None] > 0
-                    inside = _weights((color * mask).sum(), sh)
+        everywhere = torch.ones(camera.height, camera.width, device=model.device)
+        within = [frame.masks[name] > 0 if name in frame.masks else everywhere for name in names]
+        total, *inside = _weights(
+            model,
+            state.joined().detach(),
+            camera,
+            [everywhere, *(m.to(everywhere) for m in within)],
+        )
+        for name, rows in state.slices().items():
+            if name in names:
+                mine = inside[names.index(name)]
                 known = sums.get(name, (0.0, 0.0))
-                sums[name] = (known[0] + inside[rows], known[1] + (total - inside)[rows])
+                sums[name] = (known[0] + mine[rows], known[1] + (total - mine)[rows])
     return sums
 
 
-def _weights(total: Float[Tensor, ""], sh: Float[Tensor, "N 1 3"]) -> Float[Tensor, " N"]:
-    (gradient,) = torch.autograd.grad(total, sh, retain_graph=True)
-    return gradient[:, 0].mean(-1) / SH_C0
+def _weights(
+    model: SceneModel, drawn: Gaussians, camera: Camera, maps: Sequence[Float[Tensor, "H W"]]
+) -> list[Float[Tensor, " N"]]:
+    """Blending weights of the Gaussians, summed over pixels by each of `maps`.
+
+    The derivative of a colour by its degree-0 coefficient is the weight times Y_00, and the three
+    channels have coefficients of their own: one backward gives the weights of three maps.
+    """
+    sh = torch.zeros(len(drawn), 1, 3, device=model.device, requires_grad=True)
+    found: list[Tensor] = []
+    with torch.enable_grad():
+        color = model.rasterizer.render(drawn.replace(sh=sh), camera, RenderRequest()).color
+        for at in range(0, len(maps), 3):
+            some = torch.stack(list(maps[at : at + 3]), -1)
+            total = (color[..., : some.shape[-1]] * some).sum()
+            (gradient,) = torch.autograd.grad(total, sh, retain_graph=True)
+            found += (gradient[:, 0, : some.shape[-1]] / SH_C0).unbind(-1)
+    return found
 
 
 def confidence(

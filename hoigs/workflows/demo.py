@@ -19,7 +19,7 @@ from hoigs.workflows.train import OnStart, OnStep, Report, TrainedRun, silent, t
 
 STEPS = 800
 CLIP = "builtin:lift-and-swing"
-FAST_STEPS = 300
+FAST_STEPS = 200
 FAST_CLIP = f"{CLIP}?width=128&frames=32&test_frames=8&held_out_views=4"
 FAST_POINTS = {
     "hoigs": (
@@ -52,8 +52,8 @@ def demo(
     Args:
         out: the run folder; that of the static model is OUT-static.
         fast: half the frames, at half the width, and a third of the Gaussians: a first look in
-            about a minute and a half. Its scores are not those of the whole demo.
-        steps: of each training; by default 800, or 300 with `fast`.
+            a minute. Its scores are not those of the whole demo.
+        steps: of each training; by default 800, or 200 with `fast`.
         baseline: also train a static model, to compare with; by default not with `fast`.
         overwrite: replace earlier runs in these folders.
         overrides, rasterizer, device, on_start, on_step, progress, report: as for `train`.
