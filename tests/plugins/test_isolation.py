@@ -262,7 +262,8 @@ def test_a_name_that_is_not_there(registry):
 def test_stdout_is_the_commands_own_when_classes_are_imported(tmp_path):
     install(tmp_path, "late-talker", OFFER.format(fields="'density:talk', target='talker:Mine'"))
     (tmp_path / "talker.py").write_text(
-        "print('hello')\nfrom hoigs.core.interfaces.density import DensityControl as Mine\n"
+        "print('hello')\nfrom hoigs.core.interfaces.density import DensityControl\n"
+        "class Mine(DensityControl):\n    def refine(self, *given): ...\n"
     )
     done = hoigs(tmp_path, "plugins", "show", "density:talk", "--json")
     assert json.loads(done.stdout)[0]["status"] == "ok" and "hello" in done.stderr

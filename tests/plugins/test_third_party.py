@@ -287,7 +287,7 @@ def test_a_plugin_file_by_explicit_flag(tmp_path):
     path = tmp_path / "mine.py"
     path.write_text(
         "import hoigs\nfrom hoigs.core.interfaces.density import DensityControl\n"
-        "class Mine(DensityControl): ...\n"
+        "class Mine(DensityControl):\n    def refine(self, *given): ...\n"
         "@hoigs.hookimpl\ndef hoigs_components():\n"
         "    yield hoigs.Component('density:mine', target=f'{__name__}:Mine')\n"
     )

@@ -122,7 +122,7 @@ class _Builder:
     def part(self, place: tuple[str, ...], part: ComponentSpec, context: BuildContext) -> Any:
         """One component, built from its settings."""
         config = self.registry.config_class(part.use).model_validate(part.settings)
-        component = self.registry.get(part.use)
+        component = self.registry.concrete(part.use)
         with _errors_at(self.spec, *place) if place else nullcontext():
             return component.from_config(config, context)
 

@@ -63,6 +63,19 @@ class Registry:
             )
         return loaded
 
+    def concrete(self, key: str) -> type[Any]:
+        """The class of `key`, to be built.
+
+        Raises:
+            PluginError: as `get`, or it lacks methods of its interface.
+        """
+        loaded = self.get(key)
+        if missing := ", ".join(sorted(getattr(loaded, "__abstractmethods__", ()))):
+            offer = self._offer(key)
+            interface = INTERFACES[offer.component.kind].replace(":", ".")
+            self._break(offer, f"{offer.component.target} lacks {missing} of {interface}")
+        return loaded
+
     def config_class(self, key: str) -> type[Any]:
         """The ComponentConfig class of `key`; one without settings has the bare class.
 
@@ -116,7 +129,7 @@ class Registry:
         if offer.status is not Status.OK:
             return
         try:
-            self.get(offer.exact)
+            self.concrete(offer.exact)
             self.config_class(offer.exact)
         except PluginError as error:
             if offer.status is Status.OK:

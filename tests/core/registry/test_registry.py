@@ -30,6 +30,8 @@ class UseConfig(ComponentConfig):
 
 class Stranger: ...
 
+class Bare(DensityControl): ...
+
 @hookimpl
 def hoigs_components():
     def component(name, target, config=None, kind="density"):
@@ -39,6 +41,7 @@ def hoigs_components():
     return [
         component("good", "Good", "GoodConfig"),
         component("plain", "Good"),
+        component("bare", "Bare"),
         component("stranger", "Stranger", "GoodConfig"),
         component("function", "hoigs_components"),
         component("absent", "Goood", "GoodConfig"),
@@ -128,6 +131,13 @@ def test_a_target_that_is_wrong_costs_only_itself(registry, key, words):
     assert registry.get("density:good")
 
 
+def test_a_class_that_lacks_methods_is_refused_where_it_is_built(registry):
+    assert registry.get("density:bare").__name__ == "Bare"  # settings are read without building
+    said = refusal(registry.concrete, "density:bare")
+    assert said.endswith("lacks refine of hoigs.core.interfaces.density.DensityControl")
+    assert registry.concrete("density:good").__name__ == "Good"
+
+
 def test_a_target_that_needs_an_extra(registry):
     assert "pip install 'parts[gpu]'" in refusal(registry.get, "density:extra")
     offer = next(o for o in registry.manager.offers if o.key == "density:extra")
@@ -158,7 +168,7 @@ def test_loading_everything_finds_what_checking_cannot(registry):
             registry.try_loading(offer)
     offers = [o for o in registry.manager.offers if o.plugin.dist == "parts"]
     found = {o.key for o in offers if o.status is not Status.OK}
-    names = ("stranger", "function", "absent", "no-config", "use", "heavy", "extra")
+    names = ("bare", "stranger", "function", "absent", "no-config", "use", "heavy", "extra")
     assert found == {f"density:{name}" for name in names}
 
 
