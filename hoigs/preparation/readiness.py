@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 
+from hoigs.core.environments import hub
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import Estimator
 from hoigs.core.progress import Progress
@@ -43,33 +43,30 @@ def get_ready(
             environment.python()  # raises, with what to do
         environment.install(progress)
     wanted = _not_cached(plan)
-    if wanted:
-        question = (
-            f"These networks are downloaded from the Hugging Face hub: {', '.join(wanted)}; "
-            f"licences: {HUB_LICENCES}. Download them?"
+    if not wanted:
+        return
+    names = ", ".join(wanted)
+    question = (
+        f"These networks are downloaded from the Hugging Face hub: {names}; licences: "
+        f"{HUB_LICENCES}. Download them?"
+    )
+    if hub.offline():
+        raise HoigsError(
+            f"--estimators hub: HF_HUB_OFFLINE is set and {names} are not whole in the hub's "
+            "cache; use --estimators offline, or unset it"
         )
-        if os.environ.get("HF_HUB_OFFLINE", "0").lower() in ("1", "true", "yes", "on"):
-            raise HoigsError(
-                f"--estimators hub: HF_HUB_OFFLINE is set and {', '.join(wanted)} are not in the "
-                "hub's cache; use --estimators offline, or unset it"
-            )
-        if consent is None or not consent(question):
-            raise HoigsError(
-                f"--estimators hub needs {', '.join(wanted)}, which are not in the hub's cache; "
-                "add --yes to download them, or use --estimators offline"
-            )
+    if consent is None or not consent(question):
+        raise HoigsError(
+            f"--estimators hub needs {names}, which are not whole in the hub's cache (licences: "
+            f"{HUB_LICENCES}); add --yes to download them, or use --estimators offline"
+        )
+    for done, name in enumerate(wanted):
+        progress(done / len(wanted), f"downloading {name}")
+        hub.fetched(name)
 
 
 def _not_cached(plan: EstimatorPlan) -> list[str]:
     """Checkpoints of the plan's networks that have to be downloaded."""
     settings = [spec.settings for spec in plan.specs().values()]
     names = {s[key] for s in settings for key in ("checkpoint", "detector") if key in s}
-    if not names:
-        return []
-    try:
-        from huggingface_hub import try_to_load_from_cache
-    except ImportError as error:
-        raise HoigsError(
-            f"--estimators hub needs transformers ({error}); pip install 'hoigs[estimators]'"
-        ) from error
-    return sorted(n for n in names if not isinstance(try_to_load_from_cache(n, "config.json"), str))
+    return sorted(name for name in names if hub.cached(name) is None)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tiny import FRAMES, HEIGHT, WIDTH, landmarks, masks
+from tiny_mediapipe import FAKE
 
 from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.environments.managed import MARKER, EnvironmentAbsentError
@@ -27,36 +28,6 @@ from hoigs.preparation.video.source import SourceError, find_source
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 OPTIONS = PrepareOptions(fit_steps=30, scene_points=400, overlay_width=0, camera="static")
-FAKE = f"""
-from types import SimpleNamespace as Box
-import numpy as np
-known = np.load("KNOWN")
-class Selfie:
-    def __init__(self, **settings):
-        pass
-    def process(self, image):
-        near = abs(image.astype(int) - (90, 30, 110)).max(-1) < 30
-        return Box(segmentation_mask=near.astype("float32"))
-class Pose:
-    def __init__(self, **settings):
-        self.frame = -1
-    def reset(self):
-        pass
-    def process(self, image):
-        self.frame += 1
-        points = [
-            [Box(x=p[0] / size[0], y=p[1] / size[1], z=p[2] / size[0], visibility=p[3])
-             for p in rows]
-            for rows, size in (
-                (known["image_xyzv"][self.frame], ({WIDTH}, {HEIGHT})),
-                (known["world_xyzv"][self.frame], (1, 1)),
-            )
-        ]
-        own = Selfie().process(image).segmentation_mask
-        return Box(pose_landmarks=Box(landmark=points[0]), segmentation_mask=own,
-                   pose_world_landmarks=Box(landmark=points[1]))
-solutions = Box(pose=Box(Pose=Pose), selfie_segmentation=Box(SelfieSegmentation=Selfie))
-"""
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ import json
 import os
 import shutil
 import subprocess
+import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -104,7 +105,7 @@ class ManagedEnvironment:
             return False
         with FileLock(self._root / "lock"):
             if self.folder.is_dir():
-                self.folder.rename(self._part)  # unusable at once, whatever happens next
+                self.folder.rename(self._fresh_part())  # unusable at once, whatever happens next
         shutil.rmtree(self._root)
         return True
 
@@ -116,9 +117,9 @@ class ManagedEnvironment:
     def _digest(self) -> str:
         return hashlib.sha256(self.requirements.read_bytes()).hexdigest()[:12]
 
-    @property
-    def _part(self) -> Path:
-        return self._root / f".{self._digest}.part"
+    def _fresh_part(self) -> Path:
+        """A name of its own: a pip whose parent was killed may go on writing under an older one."""
+        return self._root / f".{self._digest}.{uuid.uuid4().hex[:8]}.part"
 
     def _marker(self) -> dict[str, Any]:
         path = self.folder / MARKER
@@ -129,8 +130,9 @@ class ManagedEnvironment:
 
     def _make(self, progress: Progress) -> None:
         python = find_python(self.pythons)
-        part, packages = self._part, self._root / "packages"
-        shutil.rmtree(part, ignore_errors=True)
+        part, packages = self._fresh_part(), self._root / "packages"
+        for old in self._root.glob(".*.part"):
+            shutil.rmtree(old, ignore_errors=True)
         what = f"installing {self.name}"
         progress(0.02, f"{what}: making an environment with {python}")
         _run([str(python), "-I", "-m", "venv", str(part)], f"{what}: venv")

@@ -44,48 +44,9 @@ def transformers_sam2(**settings: Any) -> TransformersSam2Estimator:
     return TransformersSam2Estimator(TransformersSam2Estimator.Config(**settings))
 
 
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory) -> Path:
-    """A SAM 2 for 128x128 images, of some hundred thousand random weights."""
-    backbone = transformers.Sam2HieraDetConfig(
-        hidden_size=12, image_size=[128, 128], embed_dim_per_stage=[12, 24, 48, 96],
-        num_attention_heads_per_stage=[1, 2, 4, 8], blocks_per_stage=[1, 2, 2, 1],
-        window_positional_embedding_background_size=[4, 4], global_attention_blocks=[4],
-        window_size_per_stage=[8, 4, 8, 4],
-    )  # fmt: skip
-    vision = transformers.Sam2VisionConfig(
-        backbone_config=backbone, backbone_channel_list=[96, 48, 24, 12], fpn_hidden_size=128,
-        backbone_feature_sizes=[[32, 32], [16, 16], [8, 8]],
-    )  # fmt: skip
-    prompts = transformers.Sam2VideoPromptEncoderConfig(
-        hidden_size=128, image_size=128, patch_size=16, mask_input_channels=8
-    )
-    decoder = transformers.Sam2VideoMaskDecoderConfig(
-        hidden_size=128, mlp_dim=32, num_attention_heads=2, iou_head_hidden_dim=16
-    )
-    config = transformers.Sam2VideoConfig(
-        vision_config=vision.to_dict(), prompt_encoder_config=prompts.to_dict(),
-        mask_decoder_config=decoder.to_dict(), image_size=128, memory_attention_hidden_size=128,
-        memory_attention_num_layers=1, memory_attention_feed_forward_hidden_size=32,
-        memory_attention_rope_feat_sizes=[8, 8], memory_encoder_hidden_size=128,
-        memory_encoder_output_channels=64, mask_downsampler_embed_dim=128,
-        memory_fuser_embed_dim=128, memory_fuser_intermediate_dim=32, memory_fuser_num_layers=1,
-        num_maskmem=3, max_object_pointers_in_encoder=3,
-    )  # fmt: skip
-    torch.manual_seed(0)
-    model = transformers.Sam2VideoModel(config)
-    with torch.no_grad():  # as it starts, every mask is the same everywhere
-        for parameter in model.parameters():
-            parameter.add_(0.1 * torch.randn_like(parameter))
-        model.mask_decoder.pred_obj_score_head.proj_out.bias.fill_(5.0)  # sure that it is there
-    folder = tmp_path_factory.mktemp("sam2")
-    model.save_pretrained(folder)
-    return folder
-
-
-def in_memory(checkpoint: Path, entities, images: list[np.ndarray], start: int, reverse: bool):
+def in_memory(sam2: Path, entities, images: list[np.ndarray], start: int, reverse: bool):
     """The masks of transformers itself, whose session holds the whole video."""
-    model = transformers.Sam2VideoModel.from_pretrained(checkpoint).eval()
+    model = transformers.Sam2VideoModel.from_pretrained(sam2).eval()
     rgb = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
     rgb = torch.nn.functional.interpolate(rgb, (128, 128), mode="bilinear", antialias=True)
     mean, std = torch.tensor(MEAN).view(1, 3, 1, 1), torch.tensor(STD).view(1, 3, 1, 1)
@@ -118,18 +79,18 @@ def in_memory(checkpoint: Path, entities, images: list[np.ndarray], start: int, 
     return found
 
 
-def test_masks_are_those_of_transformers_own_propagation(tmp_path, checkpoint):
+def test_masks_are_those_of_transformers_own_propagation(tmp_path, sam2):
     video = request(tmp_path, entities=PROMPTED)
-    estimator = transformers_sam2(checkpoint=str(checkpoint), device="cpu")
+    estimator = transformers_sam2(checkpoint=str(sam2), device="cpu")
     masks = checked(estimator.estimate(video), video, estimator).masks.entities
     images = [frame(i) for i in range(FRAMES)]
-    expected = in_memory(checkpoint, PROMPTED, images, 2, reverse=False)
+    expected = in_memory(sam2, PROMPTED, images, 2, reverse=False)
     assert set(expected) == {2, 3, 4}
     for i, both in expected.items():
         for k, name in enumerate(("human", "object")):
             assert np.array_equal(masks[name][i], both[k]), (name, i)
     # backwards is forwards through the frames in the other order
-    turned = in_memory(checkpoint, PROMPTED, images[2::-1], 0, reverse=False)
+    turned = in_memory(sam2, PROMPTED, images[2::-1], 0, reverse=False)
     for step, both in turned.items():
         for k, name in enumerate(("human", "object")):
             assert np.array_equal(masks[name][2 - step], both[k]), (name, step)
@@ -137,9 +98,9 @@ def test_masks_are_those_of_transformers_own_propagation(tmp_path, checkpoint):
     assert min(shares) > 0 and max(shares) < 1 and len(set(shares)) > 5  # it is no blank
 
 
-def test_what_the_model_no_longer_looks_at_is_forgotten(tmp_path, checkpoint):
+def test_what_the_model_no_longer_looks_at_is_forgotten(tmp_path, sam2):
     video = request(tmp_path, frames=12, read=lambda i: frame(i % FRAMES))
-    model = transformers.Sam2VideoModel.from_pretrained(checkpoint).eval()
+    model = transformers.Sam2VideoModel.from_pretrained(sam2).eval()
     tracker, sessions = _Tracker(model, video), []
     step = tracker._step
     tracker._step = lambda session, *rest: sessions.append(session) or step(session, *rest)
@@ -148,14 +109,14 @@ def test_what_the_model_no_longer_looks_at_is_forgotten(tmp_path, checkpoint):
     assert not sessions[0].processed_frames
     kept = sessions[0].output_dict_per_obj[0]["non_cond_frame_outputs"]
     assert len(kept) <= tracker.reach < 11
-    whole = in_memory(checkpoint, entities, [frame(i % FRAMES) for i in range(12)], 0, False)
+    whole = in_memory(sam2, entities, [frame(i % FRAMES) for i in range(12)], 0, False)
     for i in range(12):
         assert np.array_equal(followed[i], whole[i][0]), i
 
 
-def test_masks_are_kept_and_a_run_that_was_cut_short_is_done_again(tmp_path, checkpoint):
+def test_masks_are_kept_and_a_run_that_was_cut_short_is_done_again(tmp_path, sam2):
     video = request(tmp_path, entities=PROMPTED[:1])
-    estimator = transformers_sam2(checkpoint=str(checkpoint))
+    estimator = transformers_sam2(checkpoint=str(sam2))
     first = estimator.estimate(video).masks.entities["human"][3]
 
     def refuse(i):
@@ -168,10 +129,10 @@ def test_masks_are_kept_and_a_run_that_was_cut_short_is_done_again(tmp_path, che
         estimator.estimate(blind)
     moved = {"human": {"frame": 1, "box": PROMPTED[0].box}}
     with pytest.raises(AssertionError, match="estimated again"):
-        transformers_sam2(checkpoint=str(checkpoint), prompts=moved).estimate(blind)
+        transformers_sam2(checkpoint=str(sam2), prompts=moved).estimate(blind)
 
 
-def test_prompts_from_a_spec_and_what_is_wrong_with_them(tmp_path, checkpoint):
+def test_prompts_from_a_spec_and_what_is_wrong_with_them(tmp_path, sam2):
     registry = default_registry()
     key, config = (
         "estimator:transformers-sam2",
@@ -179,7 +140,7 @@ def test_prompts_from_a_spec_and_what_is_wrong_with_them(tmp_path, checkpoint):
     )
 
     def build(**settings):
-        values = config.model_validate({"checkpoint": str(checkpoint)} | settings)
+        values = config.model_validate({"checkpoint": str(sam2)} | settings)
         return registry.get(key).from_config(values, BuildContext())
 
     video = request(tmp_path)
@@ -198,7 +159,7 @@ def test_prompts_from_a_spec_and_what_is_wrong_with_them(tmp_path, checkpoint):
         build(prompts={"human": {"frame": 1}})
 
 
-def test_a_checkpoint_of_something_else_is_refused(tmp_path, checkpoint):
+def test_a_checkpoint_of_something_else_is_refused(tmp_path, sam2):
     video = request(tmp_path, entities=PROMPTED)
     with pytest.raises(HoigsError, match=r"no such file or folder.*a name on the hub"):
         transformers_sam2(checkpoint="weights").estimate(video)

@@ -8,7 +8,6 @@ own size and place, kinds of depth, boxes, and keeping results.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,82 +35,7 @@ def transformers_depth(**settings: Any) -> TransformersDepthEstimator:
     return TransformersDepthEstimator(TransformersDepthEstimator.Config(**settings))
 
 
-def saved(model, processor, folder: Path, noise: float = 0.05, **biases: float) -> Path:
-    """A model whose random weights are large enough to tell images apart, and its processor.
-
-    `biases` sets those of the layers that have such a word in their name.
-    """
-    with torch.no_grad():
-        for name, parameter in model.named_parameters():
-            parameter.add_(noise * torch.randn_like(parameter))
-            for word, value in biases.items():
-                if word in name and name.endswith("bias"):
-                    parameter.fill_(value)
-    model.save_pretrained(folder)
-    processor.save_pretrained(folder)
-    return folder
-
-
-def depth_model(folder: Path, **settings) -> Path:
-    torch.manual_seed(0)
-    backbone = transformers.Dinov2Config(
-        image_size=28, patch_size=14, hidden_size=16, num_hidden_layers=4, num_attention_heads=2,
-        out_indices=[1, 2, 3, 4], reshape_hidden_states=False, apply_layernorm=True,
-    )  # fmt: skip
-    config = transformers.DepthAnythingConfig(
-        backbone_config=backbone, reassemble_hidden_size=16, neck_hidden_sizes=[8, 8, 8, 8],
-        fusion_hidden_size=8, head_hidden_size=8, **settings,
-    )  # fmt: skip
-    processor = transformers.DPTImageProcessorPil(
-        size={"height": 28, "width": 28}, keep_aspect_ratio=True, ensure_multiple_of=14
-    )
-    model = transformers.DepthAnythingForDepthEstimation(config)
-    return saved(model, processor, folder, 0.3, conv3=1.0)
-
-
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture(scope="module")
-def depth(tmp_path_factory) -> Path:
-    return depth_model(tmp_path_factory.mktemp("depth"))
-
-
-@pytest.fixture(scope="module")
-def vitpose(tmp_path_factory) -> Path:
-    torch.manual_seed(0)
-    backbone = transformers.VitPoseBackboneConfig(
-        image_size=[64, 48], hidden_size=16, num_hidden_layers=1, num_attention_heads=2,
-        out_indices=[1],
-    )  # fmt: skip
-    config = transformers.VitPoseConfig(backbone_config=backbone, num_labels=17)
-    processor = transformers.VitPoseImageProcessorPil(size={"height": 64, "width": 48})
-    model = transformers.VitPoseForPoseEstimation(config)
-    return saved(model, processor, tmp_path_factory.mktemp("vitpose"))
-
-
-@pytest.fixture(scope="module")
-def rtdetr(tmp_path_factory) -> Path:
-    torch.manual_seed(0)
-    backbone = transformers.RTDetrResNetConfig(
-        embedding_size=8, hidden_sizes=[8, 8, 8, 8], depths=[1, 1, 1, 1],
-        out_features=["stage2", "stage3", "stage4"], layer_type="basic",
-    )  # fmt: skip
-    config = transformers.RTDetrConfig(
-        backbone_config=backbone, encoder_hidden_dim=16, encoder_in_channels=[8, 8, 8],
-        encoder_ffn_dim=16, encoder_attention_heads=2, d_model=16, num_queries=12,
-        decoder_in_channels=[16, 16, 16], decoder_ffn_dim=16, decoder_layers=1,
-        decoder_attention_heads=2, num_denoising=0, id2label={0: "person", 1: "sports ball"},
-        label2id={"person": 0, "sports ball": 1},
-    )  # fmt: skip
-    processor = transformers.RTDetrImageProcessorPil(size={"height": 64, "width": 64})
-    model = transformers.RTDetrForObjectDetection(config)
-    folder = saved(model, processor, tmp_path_factory.mktemp("rtdetr"), 0.3)
-    with torch.no_grad():  # as likely to see a person as a ball
-        logits = model.eval()(**processor(images=frame(0), return_tensors="pt")).logits[0]
-        model.model.decoder.class_embed[-1].bias -= logits.mean(0) + 1
-    model.save_pretrained(folder)
-    return folder
 
 
 def test_depth_of_each_frame_at_the_videos_size(tmp_path, depth):
@@ -150,6 +74,8 @@ def test_depth_goes_on_where_it_was_cut_short(tmp_path, depth):
 
 
 def test_metric_models_say_so_and_unknown_ones_are_asked_for(tmp_path, vitpose):
+    from tiny_networks import depth_model
+
     metric = depth_model(tmp_path / "metric", depth_estimation_type="metric", max_depth=20)
     video = request(tmp_path)
     depth = transformers_depth(checkpoint="metric").estimate(video).depth

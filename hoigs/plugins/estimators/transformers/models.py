@@ -15,6 +15,7 @@ import torch
 from pydantic import Field
 
 from hoigs.core.config import ComponentConfig
+from hoigs.core.environments import hub
 from hoigs.core.errors import HoigsError, PluginError
 from hoigs.core.interfaces.estimator import VideoRequest
 from hoigs.plugins.estimators.common.frame_files import absent
@@ -61,15 +62,17 @@ def device_of(device: Device) -> torch.device:
 
 
 def place_of(checkpoint: str, video: VideoRequest, key: str) -> str:
-    """A folder's path, or a name on the hub.
+    """A folder's path, or that in the hub's cache of a name on the hub, which is downloaded where
+    it is not there yet.
 
     Raises:
-        HoigsError: neither, or a folder that holds no model with safetensors.
+        HoigsError: neither, or a folder that holds no model with safetensors; or the hub's cannot
+            be had.
     """
     folder = video.resolve(Path(checkpoint))
     if not folder.is_dir():
         if _HUB.fullmatch(checkpoint):
-            return checkpoint
+            return str(hub.fetched(checkpoint))
         raise HoigsError(
             f"{key}: {absent(folder)}; expected the folder of a transformers model, with "
             "config.json and .safetensors in it, or a name on the hub, such as owner/model"
