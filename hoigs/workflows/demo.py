@@ -11,6 +11,7 @@ import torch
 from hoigs.core.progress import Progress
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
+from hoigs.metrics.ssim import ssim
 from hoigs.rasterizers.warp.rasterizer import WarpRasterizer
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_folder
@@ -92,11 +93,12 @@ def demo(
 
 
 def _compile_kernels() -> None:
-    """Draws a few Gaussians: the first render on a machine compiles the kernels of training.
+    """Draws a few Gaussians: the first picture on a machine compiles the kernels of training.
 
     An error here is none of the demo's: training meets it again, and says it.
     """
     gaussians = Gaussians.from_points(torch.rand(4, 3), scales=0.1)
     camera = Camera.look_at(torch.full((3,), 3.0), torch.zeros(3), width=16, height=16, fov_y=1.0)
     sh = gaussians.sh.requires_grad_()
-    WarpRasterizer().render(gaussians.replace(sh=sh), camera).color.sum().backward()
+    color = WarpRasterizer().render(gaussians.replace(sh=sh), camera).color
+    ssim(color, torch.zeros_like(color), backend="warp").backward()
