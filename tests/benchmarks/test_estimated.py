@@ -11,6 +11,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import estimated
+from estimates import figures
 
 
 def test_figures_of_the_smallest_clip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,11 +37,11 @@ def test_chamfer_finds_the_turn_and_names_the_size() -> None:
     rng = np.random.default_rng(0)
     box = (rng.random((4000, 3)) - 0.5) * (0.3, 0.2, 0.1)
     turned = box @ np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], float).T + 0.4
-    distance, size = estimated.chamfer(1.1 * turned, box)
+    distance, size = figures.chamfer(1.1 * turned, box)
     assert distance < 0.01 and size == pytest.approx(1.1, abs=1e-6)
 
 
 def test_mean_rotation_is_the_constant_between_two_tracks() -> None:
     turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], float)
-    assert np.allclose(estimated.angles(estimated.mean_rotation(turn[None]), turn), 0)
-    assert np.allclose(estimated.angles(turn, np.eye(3)), 90)
+    assert np.allclose(figures.angles(figures.mean_rotation(turn[None]), turn), 0)
+    assert np.allclose(figures.angles(turn, np.eye(3)), 90)

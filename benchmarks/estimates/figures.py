@@ -1,0 +1,143 @@
+"""How far a prepared clip is from the truth: the object's rotation, place and shape, the body."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+World = tuple[np.ndarray, np.ndarray]  # rotation and shift from the clip's world to the true one
+
+
+def object_figures(made: Any, truth: Any, truth_folder: Path, world: World) -> dict[str, Any]:
+    """Rotation, place and shape of the object; degrees and millimetres."""
+    from hoigs.core.npz import load_arrays
+
+    arrays = load_arrays(truth_folder / "truth.npz")
+    track = made.objects["object"]
+    rotations = world[0] @ track.rotations.double().numpy()
+    true_rotations = arrays["object_rotations"]
+    points = track.points.double().numpy()
+    middle = (np.quantile(points, 0.01, axis=0) + np.quantile(points, 0.99, axis=0)) / 2
+    places = track.translations.double().numpy() @ world[0].T + world[1] + rotations @ middle
+    seen = truth.objects["object"].observed.numpy()
+    first = int(np.flatnonzero(seen)[0])
+    turned = rotations @ rotations[first].T
+    true_turned = true_rotations @ true_rotations[first].T
+    off = angles(turned, true_turned)[seen]
+    offset = mean_rotation(np.swapaxes(rotations, 1, 2) @ true_rotations)
+    best = angles(rotations @ offset, true_rotations)[seen]
+    error = places - arrays["object_translations"]
+    centers = np.stack([c.center.numpy() for c in truth.cameras]).astype(float)
+    view = arrays["object_translations"] - centers
+    view /= np.linalg.norm(view, axis=-1, keepdims=True)
+    along = (error * view).sum(-1)[seen]
+    across = np.linalg.norm(error - (error * view).sum(-1, keepdims=True) * view, axis=-1)[seen]
+    place = np.linalg.norm(error, axis=-1)[seen]
+    truth_points = surface(arrays["object_vertices"], arrays["object_faces"])
+    aligned = (points - middle) @ offset
+    distance, scale = chamfer(aligned, truth_points)
+    turn = np.median(angles(true_turned, np.eye(3)))
+    return {
+        "rotation_deg": _spread(off), "rotation_best_frame_deg": _spread(best),
+        "rotation_none_at_all_deg": round(float(turn), 2),
+        "place_mm": _spread(1000 * place, mean=True),
+        "place_along_view_mm": round(float(1000 * np.abs(along).mean()), 1),
+        "place_across_view_mm": round(float(1000 * across.mean()), 1),
+        "chamfer_mm": round(1000 * distance, 1), "size_ratio": round(scale, 3),
+        "size_mm": [round(float(v)) for v in 1000 * np.ptp(points, axis=0)],
+    }  # fmt: skip
+
+
+def body_figures(made: Any, truth: Any, body: Any, world: World) -> dict[str, Any]:
+    """Joints after aligning the pelvis, wrists in the world, and accelerations of joints."""
+    one, two = _joints(body, made) @ world[0].T + world[1], _joints(body, truth)
+    off = np.linalg.norm((one - one[:, :1]) - (two - two[:, :1]), axis=-1)
+    wrists = np.linalg.norm(one - two, axis=-1)[:, [20, 21]]
+    bend = np.diff(one - two, n=2, axis=0) * truth.fps**2
+    return {
+        "root_aligned_joints_mm": round(float(1000 * off.mean()), 1),
+        "joints_mm": round(float(1000 * np.linalg.norm(one - two, axis=-1).mean()), 1),
+        "wrists_mm": round(float(1000 * wrists.mean()), 1),
+        "acceleration_error_m_s2": round(float(np.linalg.norm(bend, axis=-1).mean()), 2),
+    }
+
+
+def _joints(body: Any, clip: Any) -> np.ndarray:
+    """The joints of body, without those of the hands."""
+    from hoigs.preparation.body.silhouette import posed
+
+    joints = [j.double().numpy() for _, j in posed(body, clip.bodies["human"].poses)]
+    return np.stack(joints)[:, :22]
+
+
+def camera_motion(made: Any, truth: Any) -> World:
+    """The rigid motion that takes a clip's cameras nearest to the true ones. It has no scale: an
+    error of the world's scale stays in the figures."""
+    ours, true = (
+        np.stack([c.world_to_camera.double().numpy() for c in clip.cameras])
+        for clip in (made, truth)
+    )
+    turn = mean_rotation(np.swapaxes(true[:, :3, :3], 1, 2) @ ours[:, :3, :3])
+    centers, target = (-np.einsum("fji,fj->fi", m[:, :3, :3], m[:, :3, 3]) for m in (ours, true))
+    return turn, (target - centers @ turn.T).mean(0)
+
+
+def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Degrees between rotations."""
+    cosine = (np.einsum("...ij,...ij->...", a, b) - 1) / 2
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def mean_rotation(rotations: np.ndarray) -> np.ndarray:
+    """The rotation nearest to all (chordal distance)."""
+    u, _, vt = np.linalg.svd(rotations.sum(0))
+    return u @ np.diag((1, 1, np.linalg.det(u @ vt))) @ vt
+
+
+def surface(vertices: np.ndarray, faces: np.ndarray, count: int = 6000) -> np.ndarray:
+    """Evenly spread random points of a mesh."""
+    rng = np.random.default_rng(0)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=-1)
+    chosen = rng.choice(len(faces), count, p=area / area.sum())
+    u, v = rng.random((2, count, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    return a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
+
+
+def chamfer(points: np.ndarray, true: np.ndarray) -> tuple[float, float]:
+    """Mean of the mean distances both ways after rigid ICP from 25 starts, and the ratio of sizes
+    (root mean square distances from the middle)."""
+    from scipy.spatial import cKDTree
+    from scipy.spatial.transform import Rotation
+
+    points, true = points - points.mean(0), true - true.mean(0)
+    rng = np.random.default_rng(0)
+    few = points[rng.permutation(len(points))[:1500]]
+    tree, best, result = cKDTree(true), np.inf, (np.eye(3), np.zeros(3))
+    starts = [np.eye(3), *Rotation.create_group("O").as_matrix()]
+    for start in starts:
+        turn, shift = start, np.zeros(3)
+        for _ in range(15):
+            moved = few @ turn.T + shift
+            distance, at = tree.query(moved)
+            target = true[at]
+            a, b = few - few.mean(0), target - target.mean(0)
+            turn = mean_rotation((b.T @ a)[None])
+            shift = target.mean(0) - turn @ few.mean(0)
+        back, _ = cKDTree(moved).query(true[::4])
+        both = (distance.mean() + back.mean()) / 2
+        if both < best:
+            best, result = both, (turn, shift)
+    moved = points @ result[0].T + result[1]
+    both = (tree.query(moved)[0].mean() + cKDTree(moved).query(true)[0].mean()) / 2
+    sizes = [np.sqrt((p**2).sum(-1).mean()) for p in (points, true)]
+    return float(both), float(sizes[0] / sizes[1])
+
+
+def _spread(values: np.ndarray, *, mean: bool = False) -> dict[str, float]:
+    middle = ("mean", values.mean()) if mean else ("median", np.median(values))
+    found = (middle, ("p95", np.quantile(values, 0.95)), ("worst", values.max()))
+    return {name: round(float(value), 2) for name, value in found}
