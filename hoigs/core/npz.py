@@ -54,6 +54,14 @@ def array_headers(path: Path) -> dict[str, ArrayHeader]:
         raise _unreadable("npz", error) from error
 
 
+def holds(path: Path, names: Collection[str]) -> bool:
+    """Whether a file is an npz with arrays of these names; False for what cannot be read."""
+    try:
+        return set(names) <= set(array_headers(path))
+    except (OSError, ValueError):
+        return False
+
+
 def load_arrays(path: Path, only: Collection[str] | None = None) -> dict[str, np.ndarray]:
     """The arrays of an npz; pickled content is refused (it could run code).
 

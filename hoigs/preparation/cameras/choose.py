@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hoigs.core.npz import holds
 from hoigs.core.values.lens import Lens
 from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
 from hoigs.preparation.cameras.camera_track import (
@@ -17,13 +18,14 @@ from hoigs.preparation.cameras.camera_track import (
     static_cameras,
 )
 from hoigs.preparation.cameras.given_cameras import given_cameras
+from hoigs.preparation.cameras.megasam import megasam_cameras
 from hoigs.preparation.cameras.motion import BackgroundMotion, background_motion
 from hoigs.preparation.cameras.sfm import structure_from_motion
 from hoigs.preparation.cameras.static_focal import static_focal
 from hoigs.preparation.given import GivenMasks, RawLandmarks
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames
-from hoigs.preparation.video.source import SourceError
+from hoigs.preparation.video.source import MEGASAM, SourceError
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ def choose_cameras(
 
     Args:
         landmarks, masks: of the raw frames. model: a COLMAP model that is there already, or None.
-        given: cameras.npz, or None.
+        given: cameras.npz or MegaSaM's npz, or None.
         folder: to work in; it may be removed when the result has been kept.
 
     Raises:
@@ -63,7 +65,8 @@ def choose_cameras(
             "--camera sfm or static to make the cameras anew"
         )
     if options.camera not in {"static", "sfm"} and given is not None:
-        return ChosenCameras(given_cameras(video, given))
+        read = megasam_cameras if holds(given, MEGASAM) else given_cameras
+        return ChosenCameras(read(video, given))
     if options.camera not in {"static", "sfm"} and model is not None:
         return ChosenCameras(colmap_cameras(video, model))
     if options.camera in {"auto", "static"}:

@@ -43,7 +43,7 @@ def colmap_scene(
     images: Images,
     count: int,
 ) -> ScenePoints:
-    """COLMAP's points without those that lie on the person or the object, and more between them.
+    """The points that came with the cameras, without those that lie on the person or the object, and more between them.
 
     A point goes if, of the frames that see its place, at least half see it inside a mask.
 
@@ -62,8 +62,8 @@ def colmap_scene(
         inside[seen] += moving[row, column]
     keep = inside < 0.5 * visible.clamp_min(1)
     if not keep.any():
-        raise SourceError("every COLMAP point lies on the person or the object")
-    text = f"COLMAP points, {int((~keep).sum())} of {len(points)} on the person or object dropped"
+        raise SourceError("every scene point lies on the person or the object")
+    text = f"points that came with the cameras, {int((~keep).sum())} of {len(points)} on the person or object dropped"
     points, colors = points[keep], colors[keep]
     chosen = keyframes(len(cameras))
     shown = {i: image for i, image in enumerate(images()) if i in chosen}

@@ -9,12 +9,14 @@ from typing import Any
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import EstimateKind
+from hoigs.core.npz import holds
 from hoigs.core.spec.schema import ComponentSpec
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 LANDMARKS = "pose_mediapipe.npz"
 CAMERAS = "cameras.npz"
+MEGASAM = frozenset({"images", "depths", "intrinsic", "cam_c2w"})  # arrays of its npz
 FRAME_FOLDERS = ("frames", "images")  # where a folder of frames may keep them
 _COLMAP_FILES = ("cameras", "images", "points3D")
 _LAYOUT = """  FOLDER/
@@ -24,7 +26,7 @@ _LAYOUT = """  FOLDER/
                          from a video segmenter; or masks/human/ and masks/object/ apart
     depth/               depth maps as .npz, in an array named metric_depth or disparity
     sparse/              a COLMAP model, or cameras.npz (K, world_to_camera, points, in metres),
-                         if you have one; else hoigs checks whether the camera
+                         or MegaSaM's npz, if you have one; else hoigs checks whether the camera
                          moves, and then runs structure from motion itself
     ball_track.npz       xyr [F, 3] pixels, if the object is a ball: centre and radius"""
 
@@ -47,7 +49,7 @@ class Source:
             gives.
         masked: entities whose masks `beside` reads.
         colmap: folder of a COLMAP model, or None.
-        cameras: cameras.npz, or None. ball: ball_track.npz, or None.
+        cameras: cameras.npz or MegaSaM's npz, or None. ball: ball_track.npz, or None.
         absent: which of "landmarks", "masks" (the person's) and "object" (the object's masks, or
             its track) are not there and given by no other estimator.
     """
@@ -118,7 +120,7 @@ def find_source(
     if (folder / "depth").is_dir():
         beside["depth"] = _files("depth", "depth")
     colmap = None if own_cameras else _find_colmap(folder, missing)
-    cameras = folder / CAMERAS
+    cameras = None if own_cameras else _find_cameras(folder)
     if missing:
         lines = "\n".join(f"  - {line}" for line in missing)
         raise SourceError(
@@ -134,7 +136,7 @@ def find_source(
         beside,
         masked,
         colmap,
-        cameras if cameras.is_file() and not own_cameras else None,
+        cameras,
         ball if ball.is_file() else None,
         frozenset(absent - set(given)),
     )
@@ -205,6 +207,17 @@ def _find_colmap(folder: Path, missing: list[str]) -> Path | None:
         "run `colmap mapper`, or delete the folder, or use --camera sfm or static"
     )
     return None
+
+
+def _find_cameras(folder: Path) -> Path | None:
+    """cameras.npz, or else the one file that holds MegaSaM's arrays, whatever its name."""
+    if (folder / CAMERAS).is_file():
+        return folder / CAMERAS
+    found = [path for path in sorted(folder.glob("*.npz")) if holds(path, MEGASAM)]
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise SourceError(f"{folder} holds cameras of MegaSaM in {names}: leave one there")
+    return found[0] if found else None
 
 
 def numbered_frames(folder: Path) -> list[Path]:

@@ -1,0 +1,79 @@
+"""MegaSaM's npz beside a video: cameras, and points of what stands still."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hoigs.preparation.cameras.megasam import megasam_cameras
+from hoigs.preparation.video.frames import open_frames
+from hoigs.preparation.video.source import SourceError, find_source
+from tests.preparation.tiny import FRAMES, HEIGHT, WIDTH, picture
+
+FOCAL, WALL, NEAR = 500.0, 4.0, 2.0
+
+
+@pytest.fixture
+def video(tmp_path: Path):
+    (tmp_path / "frames").mkdir()
+    for i in range(FRAMES):
+        Image.fromarray(picture(i)).save(tmp_path / f"frames/{i:05d}.png")
+    return open_frames(tmp_path / "frames", WIDTH // 2, every=2)
+
+
+def arrays(frames: int = FRAMES) -> dict[str, np.ndarray]:
+    """A camera goes right along a wall, something before it left."""
+    grown = (384 * 512 / (WIDTH * HEIGHT)) ** 0.5
+    width, height = int(WIDTH * grown) // 8 * 8, int(HEIGHT * grown) // 8 * 8
+    depths = np.full((frames, height, width), WALL, np.float16)
+    images = np.full((frames, height, width, 3), 60, np.uint8)
+    back = np.tile(np.eye(4), (frames, 1, 1))
+    back[:, 0, 3] = 0.05 * np.arange(frames)
+    for i in range(frames):
+        left = width - 120 - 30 * i
+        depths[i, 50:150, left : left + 100] = NEAR
+        images[i, 50:150, left : left + 100] = 255
+    K = np.array([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1]])
+    return {"images": images, "depths": depths, "intrinsic": K, "cam_c2w": back}
+
+
+def test_cameras_at_the_chosen_width_and_points_of_the_wall_alone(tmp_path, video):
+    np.savez(tmp_path / "clip_sgd_cvd_hr.npz", **arrays())
+    track = megasam_cameras(video, tmp_path / "clip_sgd_cvd_hr.npz")
+    grown = (384 * 512 / (WIDTH * HEIGHT)) ** 0.5
+    assert float(track.cameras[0].K[0, 0]) == pytest.approx(FOCAL / grown / 2, rel=0.01)
+    places = [float(c.center[0]) for c in track.cameras]
+    assert places == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5], abs=1e-6)
+    assert not track.metric and not track.static and len(track.points) > 1000
+    assert track.points[:, 2].numpy() == pytest.approx(WALL, rel=1e-3)
+    assert track.colors.max() < 0.3
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        (arrays(3), "has 3 frames, and the video's last one is 10"),
+        ({"cam_c2w": np.tile(np.eye(4), (3, 1, 1))}, "its arrays are"),
+        ({"cam_c2w": np.full((FRAMES, 4, 4), np.nan)}, "not finite"),
+        ({"depths": np.zeros_like(arrays()["depths"])}, "no point of its depth"),
+    ],
+)
+def test_what_does_not_fit_is_named(tmp_path, video, changes, named):
+    np.savez(tmp_path / "m.npz", **{**arrays(), **changes})
+    with pytest.raises(SourceError, match=named):
+        megasam_cameras(video, tmp_path / "m.npz")
+
+
+def test_a_source_recognises_it_by_its_arrays(tmp_path, video):
+    given = {"masks", "landmarks"}
+    (tmp_path / "broken.npz").write_bytes(b"PK")
+    np.savez(tmp_path / "any name.npz", **arrays(1))
+    assert find_source(tmp_path, given=given).cameras == tmp_path / "any name.npz"
+    np.savez(tmp_path / "another.npz", **arrays(1))
+    with pytest.raises(SourceError, match=r"another.npz, any name.npz: leave"):
+        find_source(tmp_path, given=given)
+    np.savez(tmp_path / "cameras.npz", K=np.eye(3))
+    assert find_source(tmp_path, given=given).cameras == tmp_path / "cameras.npz"
