@@ -44,7 +44,7 @@ from hoigs.preparation.scene.depth import (
     seen_points,
     seen_surface,
 )
-from hoigs.preparation.scene.scene_points import ScenePoints, colmap_scene, static_scene
+from hoigs.preparation.scene.scene_points import ScenePoints, camera_scene, static_scene
 from hoigs.preparation.stages.plan import PLAN
 from hoigs.preparation.stages.progress import Stages
 from hoigs.preparation.stages.work_folder import Result, WorkFolder, digest, fingerprint
@@ -444,7 +444,7 @@ class Pipeline:
     def _find_scene(self) -> ScenePoints:
         if not self.track.static:
             scale = self.person.scene_scale
-            scene = colmap_scene(
+            scene = camera_scene(
                 self.track.points * scale, self.track.colors, self.masks, self.cameras, self.images,
                 self.options.scene_points,
             )  # fmt: skip

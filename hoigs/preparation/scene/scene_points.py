@@ -35,7 +35,7 @@ class ScenePoints:
     provenance: str
 
 
-def colmap_scene(
+def camera_scene(
     points: Float[Tensor, "P 3"],
     colors: Float[Tensor, "P 3"],
     masks: EntityMasks,
@@ -43,7 +43,8 @@ def colmap_scene(
     images: Images,
     count: int,
 ) -> ScenePoints:
-    """The points that came with the cameras, without those that lie on the person or the object, and more between them.
+    """The points that came with the cameras but for those on the person or the object, and more
+    between them.
 
     A point goes if, of the frames that see its place, at least half see it inside a mask.
 
@@ -63,7 +64,8 @@ def colmap_scene(
     keep = inside < 0.5 * visible.clamp_min(1)
     if not keep.any():
         raise SourceError("every scene point lies on the person or the object")
-    text = f"points that came with the cameras, {int((~keep).sum())} of {len(points)} on the person or object dropped"
+    dropped = f"{int((~keep).sum())} of {len(points)} on the person or object dropped"
+    text = f"points that came with the cameras, {dropped}"
     points, colors = points[keep], colors[keep]
     chosen = keyframes(len(cameras))
     shown = {i: image for i, image in enumerate(images()) if i in chosen}
