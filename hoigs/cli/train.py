@@ -117,7 +117,7 @@ def train(
 def _clip_for_auto(
     clip: Path | None, reader: str | None, reader_set: list[str] | None, budget: str | None
 ) -> Path:
-    """The clip of `--auto`, which is required and read without --reader; nor is there --budget."""
+    """The clip of `--auto`, which has to be there; --budget and --reader do not go with it."""
     from hoigs.core.errors import HoigsError
     from hoigs.runs.resuming import NO_CLIP
 

@@ -218,7 +218,7 @@ def _body(key: str) -> BodyModel:
         HoigsError: no body model has this key, or it has no defaults: its files have to be named.
     """
     registry = default_registry()
-    component, config_class = registry.get(key), registry.config_class(key)
+    component, config_class = registry.concrete(key), registry.config_class(key)
     try:
         config = config_class()
     except ValidationError as error:

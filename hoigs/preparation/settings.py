@@ -71,7 +71,8 @@ def installed_estimators(
         place = ("estimators", role)
         at = f"{document.where((*place, 'use'))} estimators.{role}.use"
         try:
-            component, config_class = registry.get(spec.use), registry.config_class(spec.use)
+            component = registry.concrete(spec.use)
+            config_class = registry.config_class(spec.use)
         except PluginError as error:
             problems.append(f"{at}: {error}")
             continue

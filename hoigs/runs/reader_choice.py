@@ -57,7 +57,7 @@ def choose_reader(
     """
     key = _detected(folder, registry) if name is None else name
     key = key if ":" in key else f"{KIND}:{key}"
-    reader = registry.get(key)  # raises for an unknown name
+    reader = registry.concrete(key)  # raises for an unknown name
     if not issubclass(reader, ClipReader):
         raise ClipError(f"--reader {name}: {key} is no reader; readers: {_known(registry)}")
     if isinstance(settings, Mapping):

@@ -55,33 +55,28 @@ def seen_weights(
     """Blending weights of each entity's Gaussians, summed over pixels and training frames, inside
     the entity's mask and outside it."""
     positions = clip.split["train"]
-    names = [name for name in model.entities if model.entity(name).kind != "scene"]
+    names = (*model.names("human"), *model.names("object"))
     sums: dict[str, tuple[Tensor, Tensor]] = {}
-    for position in positions[:: math.ceil(len(positions) / frames)]:
+    for position in positions[:: max(1, math.ceil(len(positions) / frames))]:
         frame = clip[position]
         moment, camera = frame.moment.to(model.device), frame.camera.to(model.device)
         with torch.no_grad():
             state = model(moment)
         everywhere = torch.ones(camera.height, camera.width, device=model.device)
-        within = [frame.masks[name] > 0 if name in frame.masks else everywhere for name in names]
-        total, *inside = _weights(
-            model,
-            state.joined().detach(),
-            camera,
-            [everywhere, *(m.to(everywhere) for m in within)],
-        )
-        for name, rows in state.slices().items():
-            if name in names:
-                mine = inside[names.index(name)]
-                known = sums.get(name, (0.0, 0.0))
-                sums[name] = (known[0] + mine[rows], known[1] + (total - mine)[rows])
+        masks = [(frame.masks[n] > 0).to(everywhere) if n in frame.masks else everywhere
+                 for n in names]  # fmt: skip
+        total, *within = _weights(model, state.joined().detach(), camera, [everywhere, *masks])
+        for name, inside in zip(names, within, strict=True):
+            rows = state.slices()[name]
+            known = sums.get(name, (0.0, 0.0))
+            sums[name] = (known[0] + inside[rows], known[1] + (total - inside)[rows])
     return sums
 
 
 def _weights(
     model: SceneModel, drawn: Gaussians, camera: Camera, maps: Sequence[Float[Tensor, "H W"]]
 ) -> list[Float[Tensor, " N"]]:
-    """Blending weights of the Gaussians, summed over pixels by each of `maps`.
+    """Blending weights of the Gaussians, summed over the pixels, which each of `maps` weighs.
 
     The derivative of a colour by its degree-0 coefficient is the weight times Y_00, and the three
     channels have coefficients of their own: one backward gives the weights of three maps.

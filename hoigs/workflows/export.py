@@ -102,7 +102,7 @@ def make_exporter(format: str, settings: Sequence[str], registry: Registry) -> t
         hint = did_you_mean(key.partition(":")[2], offered)
         raise HoigsError(f'no format "{format}"{hint}; there are {", ".join(sorted(offered))}')
     config = validated(registry.config_class(key), parse_settings(settings, "--set"), key)
-    made: Exporter = registry.get(key)(config)
+    made: Exporter = registry.concrete(key)(config)
     return made, key.partition(":")[2]
 
 

@@ -12,7 +12,7 @@ from hoigs.core.spec.schema import Spec
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.synthesis import SceneConfig, builtin_clip
-from hoigs.training.unseen import confidence, fill_unseen, seen_weights, spread
+from hoigs.training.unseen import _weights, confidence, fill_unseen, seen_weights, spread
 
 
 def ring(count: int) -> torch.Tensor:
@@ -60,6 +60,12 @@ def test_colours_of_unseen_sides_change_and_images_of_training_frames_do_not(
     noise = torch.rand(3000, 3, generator=torch.Generator().manual_seed(0))
     human.sh.data[:, 0] += noise - 0.5
     seen = confidence(*seen_weights(model, clip)["human"])
+    moment, camera = clip[0].moment, clip[0].camera
+    drawn = model(moment).joined().detach()
+    maps = list(torch.rand(4, camera.height, camera.width))  # more than a picture has channels
+    together = _weights(model, drawn, camera, maps)
+    apart = [_weights(model, drawn, camera, [one])[0] for one in maps]
+    torch.testing.assert_close(torch.stack(together), torch.stack(apart))
     assert seen is not None and 0.2 < (seen > 0.5).float().mean() < 0.8
     before = human.sh.detach().clone()[:, 0]
     frame = clip[clip.split["train"][0]]

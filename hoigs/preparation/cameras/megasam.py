@@ -26,8 +26,9 @@ def megasam_cameras(video: Frames, path: Path) -> CameraTrack:
     """Cameras of NAME_sgd_cvd_hr.npz, in a unit of their own, and scene points of its depth.
 
     A row is a frame of the video. MegaSaM resizes frames to about 384x512 pixels and cuts off
-    what is beyond multiples of 8, at the right and at the bottom; its intrinsics are of that image.
-    Points are kept where the depth of other frames agrees, which what moves does not.
+    what is beyond multiples of 8, at the right and at the bottom; its intrinsics are of that image,
+    whose first pixel's centre is at (0, 0), and of all frames. Points are kept where the depth of
+    other frames agrees; that of what moves does not.
 
     Raises:
         SourceError: the file is unreadable, or does not fit the video.
@@ -36,18 +37,17 @@ def megasam_cameras(video: Frames, path: Path) -> CameraTrack:
         arrays = load_arrays(path, only=MEGASAM)
     except ValueError as error:
         raise SourceError(f"{path}: {error}; {EXPECTED}") from error
-    K, views = _checked(arrays, video, path)
+    K, scale, views = _checked(arrays, video, path)
     depths, images = arrays["depths"], arrays["images"]
     chosen = np.unique(np.linspace(0, len(video) - 1, VIEWS).round().astype(int))
     rows = [video.indices[i] for i in chosen]
-    points, colors = _scene(
-        depths[rows].astype(np.float64), images[rows], arrays["intrinsic"], views[chosen]
-    )
+    points, colors = _scene(depths[rows].astype(np.float64), images[rows], K, views[chosen])
     if not len(points):
         raise SourceError(f"{path}: no point of its depth is seen alike by two frames")
+    own = torch.from_numpy(K * np.append(scale, 1.0)[:, None]).float()
     poses = torch.from_numpy(views).float()
     return CameraTrack(
-        [Camera(K, pose, video.width, video.height) for pose in poses],
+        [Camera(own, pose, video.width, video.height) for pose in poses],
         torch.from_numpy(points).float(),
         torch.from_numpy(colors).float(),
         f"MegaSaM's, given in {path.name}, with {len(points)} points of its depth",
@@ -58,8 +58,9 @@ def megasam_cameras(video: Frames, path: Path) -> CameraTrack:
 
 def _checked(
     arrays: dict[str, np.ndarray], video: Frames, path: Path
-) -> tuple[Float[torch.Tensor, "3 3"], Float[np.ndarray, "F 4 4"]]:
-    """Intrinsics at the size of the frames given out, and world_to_camera of the chosen frames."""
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 2"], Float[np.ndarray, "F 4 4"]]:
+    """Intrinsics with the first pixel's centre at (0.5, 0.5), width and height of the frames given
+    out over those of MegaSaM's image before the cut, and world_to_camera of the chosen frames."""
     shapes = {name: values.shape for name, values in arrays.items()}
     frames, height, width = (*shapes["depths"], 0, 0, 0)[:3]
     right = {
@@ -87,8 +88,9 @@ def _checked(
                 "one is not the other, resized"
             )
     scale = np.array([video.width, video.height]) / resized
-    K = arrays["intrinsic"] * np.array([[scale[0]], [scale[1]], [1.0]])
-    return torch.from_numpy(K).float(), np.linalg.inv(back)
+    K = arrays["intrinsic"].astype(np.float64)
+    K[:2, 2] += 0.5
+    return K, scale, np.linalg.inv(back)
 
 
 def _scene(

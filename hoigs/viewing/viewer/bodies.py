@@ -69,7 +69,7 @@ def bodies_of_clip(clip: Clip, registry: Registry) -> tuple[dict[str, PosedBody]
         try:
             config = registry.config_class(track.model)()
             context = BuildContext(entity=name, clip=clip, body_track=track)
-            body = registry.get(track.model).from_config(config, context)
+            body = registry.concrete(track.model).from_config(config, context)
         except (HoigsError, ValidationError) as error:
             missing[name] = f"no body mesh: {track.model}: {str(error).splitlines()[0]}"
             continue

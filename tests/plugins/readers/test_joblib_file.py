@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import pickle
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from hoigs.core.errors import ClipError
+from hoigs.plugins.readers.common import joblib_file
 from hoigs.plugins.readers.common.joblib_file import load_joblib
 
 joblib = pytest.importorskip("joblib", reason="pip install joblib: it writes what is read here")
@@ -57,6 +59,13 @@ def test_code_is_not_run(tmp_path: Path, monkeypatch: Any, content: Any) -> None
     with pytest.raises(ClipError, match=r"x\.pkl cannot be read: it "):
         load_joblib(tmp_path / "x.pkl")
     assert not (tmp_path / "ran").exists()
+
+
+def test_what_unfolds_without_end_is_refused(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(joblib_file, "SMALL_BYTES", 2**20)
+    (tmp_path / "x.pkl").write_bytes(gzip.compress(bytes(2**22)))
+    with pytest.raises(ClipError, match="bytes unfold to more than"):
+        load_joblib(tmp_path / "x.pkl")
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:

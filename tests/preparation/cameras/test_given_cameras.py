@@ -2,24 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from PIL import Image
 
 from hoigs.preparation.cameras.given_cameras import given_cameras
-from hoigs.preparation.video.frames import open_frames
 from hoigs.preparation.video.source import SourceError, find_source
-from tests.preparation.tiny import FRAMES, HEIGHT, WIDTH, picture
-
-
-@pytest.fixture
-def video(tmp_path: Path):
-    (tmp_path / "frames").mkdir()
-    for i in range(FRAMES):
-        Image.fromarray(picture(i)).save(tmp_path / f"frames/{i:05d}.png")
-    return open_frames(tmp_path / "frames", WIDTH // 2, every=2)
+from tests.preparation.tiny import FRAMES, HEIGHT, WIDTH
 
 
 def cameras(**changes: np.ndarray) -> dict[str, np.ndarray]:

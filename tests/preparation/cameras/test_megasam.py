@@ -2,26 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from PIL import Image
 
 from hoigs.preparation.cameras.megasam import megasam_cameras
-from hoigs.preparation.video.frames import open_frames
 from hoigs.preparation.video.source import SourceError, find_source
-from tests.preparation.tiny import FRAMES, HEIGHT, WIDTH, picture
+from tests.preparation.tiny import FRAMES, HEIGHT, WIDTH
 
 FOCAL, WALL, NEAR = 500.0, 4.0, 2.0
-
-
-@pytest.fixture
-def video(tmp_path: Path):
-    (tmp_path / "frames").mkdir()
-    for i in range(FRAMES):
-        Image.fromarray(picture(i)).save(tmp_path / f"frames/{i:05d}.png")
-    return open_frames(tmp_path / "frames", WIDTH // 2, every=2)
 
 
 def arrays(frames: int = FRAMES) -> dict[str, np.ndarray]:
@@ -44,7 +32,11 @@ def test_cameras_at_the_chosen_width_and_points_of_the_wall_alone(tmp_path, vide
     np.savez(tmp_path / "clip_sgd_cvd_hr.npz", **arrays())
     track = megasam_cameras(video, tmp_path / "clip_sgd_cvd_hr.npz")
     grown = (384 * 512 / (WIDTH * HEIGHT)) ** 0.5
-    assert float(track.cameras[0].K[0, 0]) == pytest.approx(FOCAL / grown / 2, rel=0.01)
+    width = int(WIDTH * grown)
+    K = track.cameras[0].K
+    assert float(K[0, 0]) == pytest.approx(FOCAL * (WIDTH // 2) / width)
+    center = (width // 8 * 8 / 2 + 0.5) * (WIDTH // 2) / width
+    assert float(K[0, 2]) == pytest.approx(center, abs=1e-4)
     places = [float(c.center[0]) for c in track.cameras]
     assert places == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5], abs=1e-6)
     assert not track.metric and not track.static and len(track.points) > 1000

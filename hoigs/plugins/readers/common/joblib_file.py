@@ -7,7 +7,6 @@ its pure-Python version is extended here to read them.
 
 from __future__ import annotations
 
-import gzip
 import io
 import pickle
 import zlib
@@ -17,6 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from hoigs.core.errors import ClipError
+from hoigs.core.npz import MOST_RATIO, SMALL_BYTES
 from hoigs.plugins.readers.common.pickles import ALLOWED
 
 WRAPPER = ("joblib.numpy_pickle", "NumpyArrayWrapper")
@@ -73,6 +73,18 @@ class _Unpickler(_PythonUnpickler):
         return values.reshape(wrapper.shape)
 
 
+def _decompressed(content: bytes) -> bytes:
+    """What zlib or gzip packed, in bounds: a small file may unfold to any size."""
+    most = max(SMALL_BYTES, MOST_RATIO * len(content))
+    unpack = zlib.decompressobj(wbits=zlib.MAX_WBITS | 32)  # either of both
+    found = unpack.decompress(content, most)
+    if not unpack.eof:
+        if len(found) < most:
+            raise EOFError("the file is cut off")
+        raise ValueError(f"its {len(content)} bytes unfold to more than {most / 2**30:.2g} GiB")
+    return found
+
+
 def load_joblib(path: Path) -> Any:
     """The content of a .pkl of joblib.dump: plain values and numpy arrays.
 
@@ -83,10 +95,8 @@ def load_joblib(path: Path) -> Any:
     """
     try:
         content = path.read_bytes()
-        if content[:2] == b"\x1f\x8b":
-            content = gzip.decompress(content)
-        elif content[:1] == b"\x78":
-            content = zlib.decompress(content)
+        if content[:2] == b"\x1f\x8b" or content[:1] == b"\x78":
+            content = _decompressed(content)
         return _Unpickler(io.BytesIO(content)).load()
     except Exception as error:  # a damaged pickle raises anything
         raise ClipError(f"{path} cannot be read: {error or type(error).__name__}") from error

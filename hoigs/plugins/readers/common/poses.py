@@ -60,4 +60,4 @@ def body_model(key: str, path: Path, **settings: Any) -> BodyModel:
     """The body model of a registry key, from the user's file."""
     registry = default_registry()
     config = registry.config_class(key)(path=path, **settings)
-    return registry.get(key).from_config(config, BuildContext())
+    return registry.concrete(key).from_config(config, BuildContext())

@@ -24,7 +24,7 @@ def component(key: str, **settings: Any) -> Any:
     """A component of hoigs by its key, with these settings and no clip."""
     registry = default_registry()
     config = registry.config_class(key).model_validate(settings)
-    return registry.get(key).from_config(config, BuildContext())
+    return registry.concrete(key).from_config(config, BuildContext())
 
 
 class Pictures(FrameStore):
