@@ -1,10 +1,11 @@
 """What a training costs beside other programs: CPU seconds alone, and with busy processes.
 
-    python benchmarks/busy_machine.py --load 8 --json benchmarks/results/busy-machine.json
+    python benchmarks/busy_machine.py --load 4 --json benchmarks/results/busy-machine.json
 
-Each training runs in a process of its own, with `OMP_WAIT_POLICY` as hoigs sets it (passive) and as
-it is without (active waiting for some milliseconds). The first run of each is not counted: it fills
-the caches. CPU seconds are those of the training's own process and threads, of all its steps alone.
+Each training runs in a process of its own: with threads that sleep while they wait, as hoigs sets
+it beside busy programs; that spin shortly, as it sets it on an idle machine; that spin for
+milliseconds, libgomp's default; and with one thread. CPU seconds are those of the training's own
+process and threads, of its steps alone after the first tenth, in which kernels are loaded.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ def worker(clip: str, steps: int) -> None:
             "train.preview_every=0",
             "train.checkpoint_every=100000",
         ]
-        session = Session.open(clip, "static", out=Path(folder) / "run", overrides=settings)
+        session = Session.open(Path(clip), "hoigs", out=Path(folder) / "run", overrides=settings)
         session.trainer.train(until=max(1, steps // 10))  # kernels are loaded
         before, began = resource.getrusage(resource.RUSAGE_SELF), time.perf_counter()
-        session.train()
+        session.trainer.train()
         after = resource.getrusage(resource.RUSAGE_SELF)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     print(json.dumps({"wall_s": time.perf_counter() - began, "cpu_s": cpu}))
@@ -43,7 +44,9 @@ def worker(clip: str, steps: int) -> None:
 
 def measured(clip: Path, steps: int, load: int, settings: dict[str, str]) -> dict[str, float]:
     """One training beside `load` busy processes."""
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("OMP_")} | settings
+    environment = {
+        k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "GOMP_"))
+    } | settings
     busy = [subprocess.Popen([sys.executable, "-c", SPIN]) for _ in range(load)]
     try:
         command = [sys.executable, __file__, "--worker", str(clip), "--steps", str(steps)]
@@ -66,12 +69,19 @@ def main() -> None:
     if arguments.worker:
         worker(arguments.worker, arguments.steps)
         return
+    from hoigs.core.machine.cpus import SHORT_SPIN
     from hoigs.plugins.bodies.anny import AnnyBody
     from hoigs.synthesis import SceneConfig, builtin_clip
 
-    clip = builtin_clip(AnnyBody(), SceneConfig.tiny())
+    clip = builtin_clip(AnnyBody(), SceneConfig())
     rows = []
-    for settings in ({"OMP_WAIT_POLICY": "PASSIVE"}, {}, {"OMP_NUM_THREADS": "1"}):
+    ways = (
+        {"OMP_WAIT_POLICY": "PASSIVE"},
+        {"GOMP_SPINCOUNT": SHORT_SPIN},
+        {},
+        {"OMP_NUM_THREADS": "1"},
+    )
+    for settings in ways:
         for load in sorted({0, arguments.load}):
             average = round(os.getloadavg()[0], 1)
             times = measured(clip, arguments.steps, load, settings)

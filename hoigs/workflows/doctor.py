@@ -49,8 +49,12 @@ def doctor() -> list[Inspected]:
 
 def _devices() -> list[Inspected]:
     threads = f"{torch.get_num_threads()} torch threads for {available_cpus()} processors"
-    waiting = os.environ.get("OMP_WAIT_POLICY", "not set").lower()
-    rows = [Inspected("cpu", "ok", f"{threads}; OMP_WAIT_POLICY {waiting}")]
+    waiting = [
+        f"{name}={os.environ[name]}"
+        for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
+        if name in os.environ
+    ]
+    rows = [Inspected("cpu", "ok", "; ".join([threads, *waiting]))]
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     rows.append(Inspected("disk", "ok" if free > 1 else "failed: nearly full", f"{free:.1f} GB"))
     if torch.cuda.is_available():
