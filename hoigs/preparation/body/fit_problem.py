@@ -249,21 +249,29 @@ class FitProblem:
         return residuals, weight, cost
 
     def _shared_priors(self, unknowns: Unknowns, equations: NormalEquations | None) -> float:
-        """Of shape and offsets."""
-        betas = len(unknowns.pose.betas)
-        precision = torch.cat(
+        """Of shape, offsets and unit. Offsets count in parts of the body's size: in metres, those
+        that landmarks have by definition would be cheaper on a smaller body closer by."""
+        betas, unit = unknowns.pose.betas, self.offset_spread.new_tensor([unknowns.unit])
+        size, by_betas = self.kinematics.size(betas)
+        spread = self.offset_spread.repeat_interleave(3) * size
+        values = torch.cat(
             (
-                torch.full((betas,), self.options.shape**-2, dtype=torch.float64),
-                self.offset_spread.pow(-2).repeat_interleave(3),
-                self.offset_spread.new_tensor([self.options.unit**-2]),
+                betas / self.options.shape,
+                unknowns.offsets.flatten() / spread,
+                unit / self.options.unit,
             )
         )
-        unit = self.offset_spread.new_tensor([unknowns.unit])
-        values = torch.cat((unknowns.pose.betas, unknowns.offsets.flatten(), unit))
         if equations is not None:
-            equations.by_shared[:-1] += precision * values
-            equations.shared.diagonal()[:-1] += precision
-        return float((precision * values.square()).sum())
+            shape, widths = (
+                torch.full_like(betas, self.options.shape),
+                unit.new_tensor([self.options.unit]),
+            )
+            derivatives = torch.diag(torch.cat((shape, spread, widths)).reciprocal())
+            offsets = slice(len(betas), -1)
+            derivatives[offsets, : len(betas)] = -values[offsets, None] * by_betas / size
+            equations.by_shared[:-1] += derivatives.mT @ values
+            equations.shared[:-1, :-1] += derivatives.mT @ derivatives
+        return float(values.square().sum())
 
     def result(self, unknowns: Unknowns) -> BodyFit:
         points = self.posed(unknowns, derivatives=False).points

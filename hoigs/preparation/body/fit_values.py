@@ -39,7 +39,7 @@ class FitOptions:
     space: float = 0.05
     unit: float = 0.015
     smooth: float = 6.0
-    shape: float = 0.6
+    shape: float = 0.3
     offset: float = 0.003
     masks: float = 10.0
     mask_spread: float = 0.03
