@@ -23,6 +23,7 @@ from hoigs.preparation.objects.sphere import (
     Cones,
     NoBallError,
     ball_cones,
+    clear_radius,
     contact_radius,
     require_round,
 )
@@ -53,6 +54,7 @@ def round_object(
     cones: Cones,
     cameras: Sequence[Camera],
     joints: Float[Tensor, "F J 3"],
+    parents: Sequence[int],
     radius: float | None,
     count: int,
 ) -> tuple[ObjectTrack, Float[Tensor, "P 3"], ObjectConfidence]:
@@ -68,6 +70,13 @@ def round_object(
         )
     else:
         size, text = FOOTBALL, f"no limb comes near it: its radius is taken as {FOOTBALL} m"
+    clear = None if radius is not None else clear_radius(cones, joints, parents, cameras)
+    if clear is not None and clear[0] < size:
+        size = clear[0]
+        text += (
+            f", but only {size:.3f} m keep it in front of the limbs that it hides "
+            f"({clear[1]} frames)"
+        )
     places, off = cones.places(cameras, size), f"{100 * max(0.01, np.median(cones.judged)):.0f} %"
     track, normals = _sphere_track(
         places, cones.observed, size, count,
@@ -159,7 +168,9 @@ def make_object(
             cones = ball_cones(masks, hiding, cameras)
             if way == "auto":
                 require_round(cones, cameras)
-            track, normals, confidence = round_object(cones, cameras, joints, radius, count)
+            track, normals, confidence = round_object(
+                cones, cameras, joints, parents, radius, count
+            )
             return _colored(
                 track, normals, cones.jitter, confidence, masks, hiding, cameras, images
             )

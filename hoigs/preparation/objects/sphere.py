@@ -22,6 +22,7 @@ from hoigs.core.values.camera import Camera, pinhole_rays
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.masks.outlines import outlines_of
 
+BODY_JOINTS = 22  # without those of the fingers
 LIMBS = (7, 8, 10, 11, 15, LEFT_WRIST, RIGHT_WRIST)  # ankles, feet, head, wrists
 ROUND, MOSTLY = 0.05, 0.12  # off a circle, of its radius: median of the frames, and 80 % of them
 RASTER = 0.35  # pixels that a mask's outline is off by, for its pixels alone
@@ -30,6 +31,9 @@ SMALLEST = 3.0  # pixels of the radius, median
 FEWEST, FEWEST_EDGES = 8, 12  # frames; edges of pixels along the outline
 SHOWN, ENOUGH = 0.6, 0.35  # of the circle: to judge by it; to find the centre by it
 TOUCHES = 0.09  # metres in the image from a joint to the ball's outline, at the joint's distance
+ALONG = (0.25, 0.5, 0.75, 1.0)  # of a bone, where it is looked at
+FLESH = 0.05  # metres about a bone
+WITHIN, CLEAR = 0.7, 0.2  # of the ball's disc, that hides a bone; share of frames that may differ
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,36 @@ def contact_radius(
         return None
     low, middle, high = np.quantile(found, (0.16, 0.5, 0.84))
     return float(middle), len(found), float((high - low) / 2 / middle)
+
+
+def clear_radius(
+    cones: Cones,
+    joints: Float[Tensor, "F J 3"],
+    parents: Sequence[int],
+    cameras: Sequence[Camera],
+) -> tuple[float, int] | None:
+    """Metres of the largest radius with which the ball stays in front of the bones that it hides.
+
+    A ball that is seen whole lies before the limbs behind its disc; a larger one would lie farther
+    off, in them or behind them.
+
+    Returns:
+        the radius that keeps clear in four of five frames, and the number of frames; None where
+        too few show the ball before a limb.
+    """
+    children = [j for j in range(1, min(len(parents), BODY_JOINTS)) if parents[j] >= 0]
+    starts, found = [parents[j] for j in children], []
+    for i, camera in enumerate(cameras):
+        if not (cones.observed[i] and cones.off[i] <= ROUND):
+            continue
+        local = camera.to_camera(joints[i]).double().numpy()
+        bones = np.concatenate([t * local[children] + (1 - t) * local[starts] for t in ALONG])
+        away = np.linalg.norm(bones, axis=-1)
+        angle = np.arccos(np.clip(bones @ cones.directions[i] / away, -1, 1))
+        hidden = away[angle < WITHIN * cones.angles[i]]
+        if len(hidden):
+            found.append((hidden.min() - FLESH) / (1 / np.sin(cones.angles[i]) + 1))
+    return (float(np.quantile(found, CLEAR)), len(found)) if len(found) >= FEWEST else None
 
 
 def fit_cone(

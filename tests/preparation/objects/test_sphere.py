@@ -10,8 +10,10 @@ from hoigs.core.values.camera import Camera
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.make_object import make_object
 from hoigs.preparation.objects.sphere import (
+    FLESH,
     NoBallError,
     ball_cones,
+    clear_radius,
     contact_radius,
     fit_cone,
     require_round,
@@ -83,6 +85,19 @@ def test_cones_ignore_rays_far_off() -> None:
     axis, angle, _ = fit_cone(ring)
     clean, sure, _ = fit_cone(ring[8:])
     assert np.linalg.norm(axis - clean) < 0.003 and abs(angle - sure) < 0.003
+
+
+def test_a_ball_seen_whole_stays_in_front_of_the_limbs_that_it_hides() -> None:
+    cones = ball_cones(balls(), NOBODY, CAMERAS)
+    joints = torch.zeros(FRAMES, 22, 3) + torch.tensor([0.0, 9, 9])  # far beside the ball
+    parents = (-1, *range(21))
+    assert clear_radius(cones, joints, parents, CAMERAS) is None
+    centers = torch.from_numpy(CENTERS).float()
+    behind = centers / centers.norm(dim=-1, keepdim=True)  # the cameras stand at the origin
+    joints[:, 10] = centers + behind * (RADIUS + FLESH)  # touches the ball's far side
+    found = clear_radius(cones, joints, parents, CAMERAS)
+    assert found is not None and found[1] > FRAMES / 2
+    assert found[0] == pytest.approx(RADIUS, rel=0.05)
 
 
 def test_limbs_give_the_radius_and_the_rotation_stays_unknown() -> None:
