@@ -209,9 +209,14 @@ class GroupedAdam:
         }
 
     def load_tensors(self, tensors: dict[str, torch.Tensor]) -> None:
+        """Restore what `tensors` gave, onto the devices of the parameters.
+
+        Raises:
+            ValueError: moments have another shape than their parameter.
+        """
         for name, parameter in self.names.items():
             state = {
-                key: tensors[f"{name}.{key}"].clone()
+                key: tensors[f"{name}.{key}"].to(parameter.device, copy=True)
                 for key in ("step", "exp_avg", "exp_avg_sq")
                 if f"{name}.{key}" in tensors
             }

@@ -105,6 +105,29 @@ def test_moments_follow_rows_and_fresh_rows_start_at_zero():
     assert float(old[1].abs().min()) > 0
 
 
+@pytest.mark.parametrize(
+    "device",
+    [
+        "meta",
+        pytest.param(
+            "cuda",
+            marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
+        ),
+    ],
+)
+def test_restored_moments_lie_where_their_parameters_do(device):
+    model = make_model()
+    optimizer = GroupedAdam(model, RatesSpec(), WarmupSpec(), 1.0)
+    for parameter in optimizer.names.values():
+        parameter.grad = torch.ones_like(parameter)
+    optimizer.step()
+    stored = {name: tensor.cpu() for name, tensor in optimizer.tensors().items()}
+    moved = GroupedAdam(make_model().to(device), RatesSpec(), WarmupSpec(), 1.0)
+    moved.load_tensors(stored)
+    assert {tensor.device.type for tensor in moved.tensors().values()} == {device}
+    assert moved.tensors().keys() == stored.keys()
+
+
 def test_which_rates_are_in_units_of_the_extent():
     model = make_model()
     rates = RatesSpec(means=1e-3, opacity=0.05, by_extent=("opacity",))

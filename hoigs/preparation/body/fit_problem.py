@@ -249,24 +249,19 @@ class FitProblem:
         return residuals, weight, cost
 
     def _shared_priors(self, unknowns: Unknowns, equations: NormalEquations | None) -> float:
-        """Of shape, offsets and unit. Offsets count in parts of the body's size: in metres, those
-        that landmarks have by definition would be cheaper on a smaller body closer by."""
+        """Cost of shape, offsets and unit, twice the negative logarithm of their density.
+
+        Offsets count in parts of the body's size. In metres, those that landmarks have by
+        definition would be cheaper on a smaller body closer by.
+        """
         betas, unit = unknowns.pose.betas, self.offset_spread.new_tensor([unknowns.unit])
         size, by_betas = self.kinematics.size(betas)
         spread = self.offset_spread.repeat_interleave(3) * size
-        values = torch.cat(
-            (
-                betas / self.options.shape,
-                unknowns.offsets.flatten() / spread,
-                unit / self.options.unit,
-            )
-        )
+        shape = torch.full_like(betas, self.options.shape)
+        spreads = torch.cat((shape, spread, torch.full_like(unit, self.options.unit)))
+        values = torch.cat((betas, unknowns.offsets.flatten(), unit)) / spreads
         if equations is not None:
-            shape, widths = (
-                torch.full_like(betas, self.options.shape),
-                unit.new_tensor([self.options.unit]),
-            )
-            derivatives = torch.diag(torch.cat((shape, spread, widths)).reciprocal())
+            derivatives = torch.diag(spreads.reciprocal())
             offsets = slice(len(betas), -1)
             derivatives[offsets, : len(betas)] = -values[offsets, None] * by_betas / size
             equations.by_shared[:-1] += derivatives.mT @ values

@@ -28,7 +28,7 @@ class FitOptions:
             ones cost less than their square (a throw is no error).
         shape: standard deviation of the shape coefficients, in those of the body model.
         offset: standard deviation of the distance from a landmark to the body's own point that
-            stands for it, metres.
+            stands for it, metres on a body of the mean size.
         masks: number of landmarks that a mask weighs as much as. mask_spread: residual at which a
             pixel or a point begins to count as an outlier there, in image widths.
         scale: find the cameras' unit in metres too (a moving camera of unknown scale).

@@ -52,6 +52,7 @@ def ball_object(
 
 def round_object(
     cones: Cones,
+    masks: MaskStack,
     cameras: Sequence[Camera],
     joints: Float[Tensor, "F J 3"],
     parents: Sequence[int],
@@ -70,7 +71,7 @@ def round_object(
         )
     else:
         size, text = FOOTBALL, f"no limb comes near it: its radius is taken as {FOOTBALL} m"
-    clear = None if radius is not None else clear_radius(cones, joints, parents, cameras)
+    clear = None if radius is not None else clear_radius(cones, masks, joints, parents, cameras)
     if clear is not None and clear[0] < size:
         size = clear[0]
         text += (
@@ -169,7 +170,7 @@ def make_object(
             if way == "auto":
                 require_round(cones, cameras)
             track, normals, confidence = round_object(
-                cones, cameras, joints, parents, radius, count
+                cones, masks, cameras, joints, parents, radius, count
             )
             return _colored(
                 track, normals, cones.jitter, confidence, masks, hiding, cameras, images

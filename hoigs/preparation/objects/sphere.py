@@ -22,7 +22,6 @@ from hoigs.core.values.camera import Camera, pinhole_rays
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.masks.outlines import outlines_of
 
-BODY_JOINTS = 22  # without those of the fingers
 LIMBS = (7, 8, 10, 11, 15, LEFT_WRIST, RIGHT_WRIST)  # ankles, feet, head, wrists
 ROUND, MOSTLY = 0.05, 0.12  # off a circle, of its radius: median of the frames, and 80 % of them
 RASTER = 0.35  # pixels that a mask's outline is off by, for its pixels alone
@@ -33,7 +32,7 @@ SHOWN, ENOUGH = 0.6, 0.35  # of the circle: to judge by it; to find the centre b
 TOUCHES = 0.09  # metres in the image from a joint to the ball's outline, at the joint's distance
 ALONG = (0.25, 0.5, 0.75, 1.0)  # of a bone, where it is looked at
 FLESH = 0.05  # metres about a bone
-WITHIN, CLEAR = 0.7, 0.2  # of the ball's disc, that hides a bone; share of frames that may differ
+WITHIN, CLEAR = 0.7, 0.2  # of the disc's radius, that hides bones; share of frames that may differ
 
 
 @dataclass(frozen=True)
@@ -148,28 +147,34 @@ def contact_radius(
 
 def clear_radius(
     cones: Cones,
+    masks: MaskStack,
     joints: Float[Tensor, "F J 3"],
     parents: Sequence[int],
     cameras: Sequence[Camera],
 ) -> tuple[float, int] | None:
     """Metres of the largest radius with which the ball stays in front of the bones that it hides.
 
-    A ball that is seen whole lies before the limbs behind its disc; a larger one would lie farther
-    off, in them or behind them.
+    Where a bone's image lies in the ball's mask, the ball is before it; a larger ball would lie
+    farther off, in the limb or behind it.
+
+    Args:
+        masks: of the ball. joints: world, metres. parents: of the joints, -1 for the root.
 
     Returns:
         the radius that keeps clear in four of five frames, and the number of frames; None where
         too few show the ball before a limb.
     """
-    children = [j for j in range(1, min(len(parents), BODY_JOINTS)) if parents[j] >= 0]
-    starts, found = [parents[j] for j in children], []
+    starts, found = list(parents[1:]), []
     for i, camera in enumerate(cameras):
-        if not (cones.observed[i] and cones.off[i] <= ROUND):
+        if not cones.observed[i]:
             continue
-        local = camera.to_camera(joints[i]).double().numpy()
-        bones = np.concatenate([t * local[children] + (1 - t) * local[starts] for t in ALONG])
-        away = np.linalg.norm(bones, axis=-1)
-        angle = np.arccos(np.clip(bones @ cones.directions[i] / away, -1, 1))
+        bones = torch.cat([t * joints[i, 1:] + (1 - t) * joints[i, starts] for t in ALONG])
+        pixels, depth = camera.project(bones)
+        x, y = pixels[camera.shows(pixels, depth)].long().T
+        shown = bones[camera.shows(pixels, depth)][torch.from_numpy(masks[i])[y, x]]
+        local = camera.to_camera(shown).double().numpy()
+        away = np.linalg.norm(local, axis=-1)
+        angle = np.arccos(np.clip(local @ cones.directions[i] / away, -1, 1))
         hidden = away[angle < WITHIN * cones.angles[i]]
         if len(hidden):
             found.append((hidden.min() - FLESH) / (1 / np.sin(cones.angles[i]) + 1))

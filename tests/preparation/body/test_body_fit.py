@@ -17,11 +17,13 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_values import BodyFit, FitOptions
+from hoigs.preparation.body.fit_problem import FitProblem
+from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Unknowns
 from hoigs.preparation.body.ground_scale import ground_scale
 from hoigs.preparation.body.joint_limits import beyond
 from hoigs.preparation.body.landmarks import LandmarkTrack, points_of
 from hoigs.preparation.body.limb_start import limb_pose
+from hoigs.preparation.body.normal_equations import NormalEquations
 from hoigs.preparation.report.mesh_overlay import overlay_frame
 
 FRAMES, WIDTH, HEIGHT, FOCAL = 9, 640, 480, 600.0
@@ -297,3 +299,42 @@ def test_real_landmarks_of_a_juggler(shared_data) -> None:
     assert limit_penalty(fit.poses.body) < 0.05
     depth = fit.poses.transl[:, 2]
     assert depth.min() > 3.5 and depth.max() < 5.0
+
+
+def test_offsets_are_as_likely_on_a_small_body_as_on_a_large_one() -> None:
+    """And the prior's equations are its derivatives."""
+    problem = FitProblem(
+        body(), seen_by([camera()] * FRAMES, truth()), [camera()] * FRAMES,
+        torch.arange(FRAMES) / 24, QUICK,
+    )  # fmt: skip
+    draw = torch.Generator().manual_seed(0)
+    pairs = len(problem.offset_spread)
+    start = problem.begin
+    offsets = torch.randn(pairs, 3, generator=draw, dtype=torch.float64) * 0.05
+    betas = torch.randn(body().num_betas, generator=draw, dtype=torch.float64)
+    size, _ = problem.kinematics.size(betas)
+
+    def at(betas: Tensor, offsets: Tensor, unit: float) -> Unknowns:
+        return replace(start, pose=start.pose.replace(betas=betas), offsets=offsets, unit=unit)
+
+    shape_alone = problem._shared_priors(at(betas, 0 * offsets, 0.0), None)
+    mean = problem._shared_priors(at(0 * betas, offsets, 0.0), None)
+    other = problem._shared_priors(at(betas, size * offsets, 0.0), None)
+    assert other - shape_alone == pytest.approx(mean)
+    count = len(betas) + offsets.numel() + 2
+    equations = NormalEquations(1, 1, count)
+    problem._shared_priors(at(betas, offsets, 0.01), equations)
+    by = torch.randn(count, generator=draw, dtype=torch.float64) * 1e-6
+    by[-1] = 0.0
+    costs = [
+        problem._shared_priors(
+            at(
+                betas + s * by[: len(betas)],
+                offsets + s * by[len(betas) : -2].view(-1, 3),
+                0.01 + s * float(by[-2]),
+            ),
+            None,
+        )
+        for s in (1, -1)
+    ]
+    assert (costs[0] - costs[1]) / 4 == pytest.approx(float(equations.by_shared @ by), rel=1e-5)

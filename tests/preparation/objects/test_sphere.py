@@ -88,16 +88,19 @@ def test_cones_ignore_rays_far_off() -> None:
 
 
 def test_a_ball_seen_whole_stays_in_front_of_the_limbs_that_it_hides() -> None:
-    cones = ball_cones(balls(), NOBODY, CAMERAS)
+    masks = balls()
+    cones = ball_cones(masks, NOBODY, CAMERAS)
     joints = torch.zeros(FRAMES, 22, 3) + torch.tensor([0.0, 9, 9])  # far beside the ball
     parents = (-1, *range(21))
-    assert clear_radius(cones, joints, parents, CAMERAS) is None
+    assert clear_radius(cones, masks, joints, parents, CAMERAS) is None
     centers = torch.from_numpy(CENTERS).float()
     behind = centers / centers.norm(dim=-1, keepdim=True)  # the cameras stand at the origin
     joints[:, 10] = centers + behind * (RADIUS + FLESH)  # touches the ball's far side
-    found = clear_radius(cones, joints, parents, CAMERAS)
+    found = clear_radius(cones, masks, joints, parents, CAMERAS)
     assert found is not None and found[1] > FRAMES / 2
     assert found[0] == pytest.approx(RADIUS, rel=0.05)
+    # where the mask is not, the limb hides the ball
+    assert clear_radius(cones, NOBODY, joints, parents, CAMERAS) is None
 
 
 def test_limbs_give_the_radius_and_the_rotation_stays_unknown() -> None:
