@@ -249,7 +249,7 @@ class FitProblem:
         return residuals, weight, cost
 
     def _shared_priors(self, unknowns: Unknowns, equations: NormalEquations | None) -> float:
-        """Cost of shape, offsets and unit, twice the negative logarithm of their density.
+        """Cost of shape, size, offsets and unit, twice the negative logarithm of their density.
 
         Offsets count in parts of the body's size. In metres, those that landmarks have by
         definition would be cheaper on a smaller body closer by.
@@ -260,13 +260,17 @@ class FitProblem:
         shape = torch.full_like(betas, self.options.shape)
         spreads = torch.cat((shape, spread, torch.full_like(unit, self.options.unit)))
         values = torch.cat((betas, unknowns.offsets.flatten(), unit)) / spreads
+        larger = (size - 1) / self.options.size
         if equations is not None:
             derivatives = torch.diag(spreads.reciprocal())
             offsets = slice(len(betas), -1)
             derivatives[offsets, : len(betas)] = -values[offsets, None] * by_betas / size
             equations.by_shared[:-1] += derivatives.mT @ values
             equations.shared[:-1, :-1] += derivatives.mT @ derivatives
-        return float(values.square().sum())
+            by_size = by_betas / self.options.size
+            equations.by_shared[: len(betas)] += by_size * larger
+            equations.shared[: len(betas), : len(betas)] += torch.outer(by_size, by_size)
+        return float(values.square().sum()) + larger**2
 
     def result(self, unknowns: Unknowns) -> BodyFit:
         points = self.posed(unknowns, derivatives=False).points

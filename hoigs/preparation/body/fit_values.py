@@ -27,6 +27,10 @@ class FitOptions:
         smooth: acceleration of points of the body in the world, m/s^2, that is ordinary; larger
             ones cost less than their square (a throw is no error).
         shape: standard deviation of the shape coefficients, in those of the body model.
+        size: standard deviation of the body's size about the model's mean, in parts of it. Adults
+            differ by 4 %, but 3D landmarks by a network do not measure size, and one still camera
+            shows none: the mean is the best guess, which only plain evidence may move (cameras in
+            metres that move, see the body from several sides).
         offset: standard deviation of the distance from a landmark to the body's own point that
             stands for it, metres on a body of the mean size.
         masks: number of landmarks that a mask weighs as much as. mask_spread: residual at which a
@@ -40,6 +44,7 @@ class FitOptions:
     unit: float = 0.015
     smooth: float = 6.0
     shape: float = 0.3
+    size: float = 0.005
     offset: float = 0.003
     masks: float = 10.0
     mask_spread: float = 0.03
