@@ -28,7 +28,8 @@ from hoigs.preparation.objects.search import (
 SPIN = 9.0  # radians a second in flight that cost one unit
 MOST_TURNS, SLACK = 1.3, 0.6  # of a flight; radians between its end and the next known rotation
 TURNING = 0.02  # weight of that against the texture
-GRAVITY, PULL, RAY = 9.81, 1.5, 0.02  # metres a second squared, and its spread; metres of a ray
+GRAVITY, PULL = 9.81, 0.7  # metres a second squared, and its spread: `up` is 2 degrees off or more
+RAY, RELEASE = 0.02, 0.1  # metres: of a ray, of a throw's ends
 
 
 def flights_by_texture(
@@ -64,7 +65,7 @@ def flights_by_texture(
             spins: Tensor | None = None
             for search in seen.depths():
                 middles = places + rotations @ search.middle
-                middles[rows] = _ballistic(crops, middles, rows, up, fps)
+                middles[rows] = ballistic(crops, middles, rows, up, fps)
                 flight = _flight(search, rows, rotations, middles, fps)
                 spins = flight.likely() if spins is None else spins
                 cost, turns = flight.best(spins)
@@ -139,33 +140,36 @@ class _Flight:
         return fast + search.costs_together(self.rows, self._turned(spins), self.places)
 
 
-def _ballistic(
+def ballistic(
     crops: Crops,
     places: Float[Tensor, "C 3"],
     rows: np.ndarray,
     up: Float[np.ndarray, " 3"],
     fps: float,
 ) -> Float[Tensor, "N 3"]:
-    """Places of a flight between two known ones: a constant acceleration, near that of gravity,
-    by which the object passes the rays through the middles of its masks.
+    """Places of a flight between two known ones: a parabola under gravity, of which the masks show
+    the rays through its middles.
 
-    With both ends known it is linear in the acceleration a:
-    p(t) = line(t) + a (t - t0) (t - t1) / 2.
+    A hand lets go, or catches, at any moment between two frames, and until then it moves the object
+    as it likes: the parabola passes the known places only nearly. Linear in its ends p0 and p1 and
+    the acceleration a: p(t) = line from p0 to p1 + a (t - t0) (t - t1) / 2.
     """
     ends = [rows[0] - 1, rows[-1] + 1]
     times = crops.frames[rows] / fps
     t0, t1 = crops.frames[ends] / fps
-    first, last = places[ends].double().numpy()
-    line = first + ((times - t0) / (t1 - t0))[:, None] * (last - first)
-    bend = (times - t0) * (times - t1) / 2
+    known = places[ends].double().numpy().reshape(-1)
+    share, bend = (times - t0) / (t1 - t0), (times - t0) * (times - t1) / 2
+    moves = np.stack((1 - share, share, bend), -1)[:, None, :, None] * np.eye(3)[:, None]
+    moves = moves.reshape(-1, 3, 9)  # of a place by p0, p1 and a
     centers, rays = crops.centers()[rows].double().numpy(), crops.middles(rows)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # what a ray sees of a shift
-    matrix = (bend[:, None, None] * across / RAY).reshape(-1, 3)
-    target = -np.einsum("nij,nj->ni", across, line - centers).reshape(-1) / RAY
-    matrix = np.concatenate((matrix, np.eye(3) / PULL))
-    target = np.concatenate((target, -GRAVITY * up / PULL))
-    acceleration = np.linalg.lstsq(matrix, target, rcond=None)[0]
-    return torch.from_numpy(line + bend[:, None] * acceleration).float()
+    matrix = (across @ moves / RAY).reshape(-1, 9)
+    target = np.einsum("nij,nj->ni", across, centers).reshape(-1) / RAY
+    spread = np.repeat((RELEASE, PULL), (6, 3))
+    matrix = np.concatenate((matrix, np.diag(1 / spread)))
+    target = np.concatenate((target, np.concatenate((known, -GRAVITY * up)) / spread))
+    found = np.linalg.lstsq(matrix, target, rcond=None)[0]
+    return torch.from_numpy(moves @ found).float()
 
 
 def _apart(spins: Float[Tensor, "R 3"], costs: Float[Tensor, " R"]) -> list[int]:

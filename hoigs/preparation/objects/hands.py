@@ -19,7 +19,8 @@ from hoigs.preparation.objects.track import hand_depths
 
 HAND_JOINTS = 30  # the last joints of a body: fifteen of each hand, three a finger, index first
 MIDDLE, INDEX, LITTLE = 3, 0, 6  # first joints of these fingers within a hand
-ANKLES, HEAD = (7, 8), 15
+FEET = (7, 8, 10, 11)  # ankles and balls of the feet
+MASS = {0: 0.4, 9: 0.3, 16: 0.15, 17: 0.15}  # about: pelvis, chest, shoulders; the centre of mass
 UPRIGHT = 0.25  # of the frames: those in which the body stands straightest
 REACH = 0.13  # metres in the image between a palm and what it holds
 STILL = 0.07  # metres a second: an object that moves less rests
@@ -40,8 +41,8 @@ class HandMotion:
             that follow each other in a grasp or a rest; constant while the object rests.
         depths: of the hands along the view, metres, interpolated where they do not hold it.
         palms: left and right, world, metres. near: which of them are at the object.
-        up: against gravity, unit, world: from the ankles to the head, where
-            they are farthest apart.
+        up: against gravity, unit, world: from the feet to the centre of mass, where the body
+            stands straightest.
         pieces: number of each frame's piece: within one the rotations are known against each
             other, between two they are not (a flight lies between them).
     """
@@ -110,7 +111,9 @@ def along_bones(joints: Float[Tensor, "F J 3"], parents: Sequence[int]) -> Float
 
 
 def _up(places: Float[np.ndarray, "F J 3"]) -> Float[np.ndarray, " 3"]:
-    body = places[:, HEAD] - places[:, list(ANKLES)].mean(1)
+    """From the middle of the feet to the centre of mass, which balance keeps above it."""
+    mass = np.einsum("j,fjc->fc", np.array(list(MASS.values())), places[:, list(MASS)])
+    body = mass - places[:, list(FEET)].mean(1)
     tall = np.linalg.norm(body, axis=-1)
     up = body[tall >= np.quantile(tall, 1 - UPRIGHT)].mean(0)
     return up / max(float(np.linalg.norm(up)), 1e-9)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from hoigs.preparation.masks.outlines import outlines_of
 from hoigs.preparation.objects import make_object as making
 from hoigs.preparation.objects.alignment import Aligned, Poses
 from hoigs.preparation.objects.crops import make_crops
-from hoigs.preparation.objects.flights import flights_by_texture
+from hoigs.preparation.objects.flights import ballistic, flights_by_texture
 from hoigs.preparation.objects.hands import hand_motion
 from hoigs.preparation.objects.make_object import make_object
 from hoigs.preparation.objects.surface import hull
@@ -195,6 +196,24 @@ def test_a_spin_in_flight_is_found_by_texture() -> None:
     found = flights_by_texture(crops, surface, first, guess, np.array([0.0, -1, 0]), FPS)
     assert float(angles(found.rotations[flight], rotations[flight]).max()) < 25
     assert float(angles(guess.rotations[flight], rotations[flight]).max()) > 120
+
+
+def test_a_throw_need_not_leave_the_hand_at_a_frame() -> None:
+    """Hands move it until then; its place along the view comes from gravity."""
+    times = torch.arange(12) / 16
+    flight = torch.stack(
+        (0.3 * times, 0.2 + 3.4 * times - 9.81 / 2 * times**2, 3.5 + 0.2 * times), -1
+    )
+    known = flight.clone()
+    known[[0, -1], 1] += 0.12  # in the hand, which has not got that far
+    rays = torch.nn.functional.normalize(flight, dim=-1)
+    crops = SimpleNamespace(
+        frames=np.arange(12), centers=lambda: torch.zeros(12, 3),
+        middles=lambda rows: rays[rows].double().numpy(),
+    )  # fmt: skip
+    rows = np.arange(1, 11)
+    found = ballistic(crops, known, rows, np.array([0.0, 1.0, 0.0]), 16.0)  # type: ignore[arg-type]
+    assert float((found - flight[rows]).norm(dim=-1).max()) < 0.02
 
 
 def test_a_shape_far_off_its_masks_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
