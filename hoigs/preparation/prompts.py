@@ -112,8 +112,14 @@ def with_prompts(
     elif texts:
         update |= named_objects(named, options)
     if person := [person] if isinstance(person, str) else list(person):
-        prompt = parse_prompts(person, "--person")
-        update["prompts"] = {**update.get("prompts", options.prompts), options.human: prompt}
+        split = [split_name(text) for text in person]
+        names = sorted({name for name, _ in split if name})
+        if len(names) > 1:
+            raise SpecError(f"--person: {' and '.join(names)} are given; one person is fitted")
+        human = names[0] if names else options.human
+        prompt = parse_prompts([place for _, place in split], "--person")
+        prompts = {**update.get("prompts", options.prompts), human: prompt}
+        update |= {"human": human, "prompts": prompts}
     return PrepareOptions.model_validate({**options.model_dump(), **update}) if update else options
 
 
