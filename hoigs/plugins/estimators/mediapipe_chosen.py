@@ -31,7 +31,7 @@ class ChosenPose:
 
     def __init__(self, graph, rect, prompts, back) -> None:
         self.graph, self.rect, self.prompts, self.back = graph, rect, prompts, back
-        self.square: tuple[float, float, float] | None = None
+        self.square = (0.0, 0.0, 0.0)  # x, y of the middle and side, pixels: until it is found
         self.first: tuple[float, float, float] | None = None
 
     def process(self, number, image):
@@ -40,7 +40,7 @@ class ChosenPose:
         Raises:
             LookupError: nobody is found where the first prompt says.
         """
-        if number == self.back:
+        if number == self.back and self.first is not None:
             self.square = self.first
         if number in self.prompts:
             found = self.search(image, *self.prompts[number])

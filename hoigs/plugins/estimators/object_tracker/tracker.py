@@ -213,8 +213,8 @@ class _Walk:
         valid = window.inside(self.footage.shape)
         near = histogram(bins_of(colors), (prior < 0.3) * valid * 1.0)
         shape = np.log((prior + 0.03) / (1.03 - prior)) * (0.4 + 0.6 * similar)
-        here = histogram(bins_of(colors), np.where(prior > OURS, prior, 0) * valid)
-        here = here if (prior > OURS).any() else None
+        ours = np.where(prior > OURS, prior, 0)
+        here = histogram(bins_of(colors), ours * valid) if ours.any() else None
         odds = shape + self._odds(i, window, colors, away, near, here, prior)
         odds = np.where(valid, odds, -9)
         return walked(odds, colors), prior
