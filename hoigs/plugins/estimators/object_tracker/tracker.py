@@ -214,7 +214,7 @@ class _Walk:
         valid = window.inside(self.footage.shape)
         near = histogram(bins_of(colors), (prior < 0.3) * valid * 1.0)
         shape = np.log((prior + 0.03) / (1.03 - prior)) * (0.4 + 0.6 * similar)
-        here = None
+        here: np.ndarray | None = None
         sure, person = prior > OURS, window.cut(self.footage.person[i]) > 0.5
         # before the person alone: in flight, a blurred thing's surroundings would be learnt
         if apart < SAME and sure.any() and person[sure].mean() > 0.5:
