@@ -206,15 +206,19 @@ class _Walk:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Soft mask, and what other frames alone say of it."""
         colors = self._colors(i, window)
-        known = [matched(colors, self.last.colors, self.last.soft)[:2]]
+        *moved, apart = matched(colors, self.last.colors, self.last.soft)
+        known = [(moved[0], moved[1])]
         if self.first is not self.last and self.first.window.n == window.n:
             known.append((self.first.colors, self.first.soft))
         prior, similar = transferred(colors, known)
         valid = window.inside(self.footage.shape)
         near = histogram(bins_of(colors), (prior < 0.3) * valid * 1.0)
         shape = np.log((prior + 0.03) / (1.03 - prior)) * (0.4 + 0.6 * similar)
-        ours = np.where(prior > OURS, prior, 0)
-        here = histogram(bins_of(colors), ours * valid) if ours.any() else None
+        here: np.ndarray | None = None
+        sure, person = prior > OURS, window.cut(self.footage.person[i]) > 0.5
+        # before the person alone: in flight, a blurred thing's surroundings would be learnt
+        if apart < SAME and sure.any() and person[sure].mean() > 0.5:
+            here = histogram(bins_of(colors), np.where(sure, prior, 0) * valid)
         odds = shape + self._odds(i, window, colors, away, near, here, prior)
         odds = np.where(valid, odds, -9)
         return walked(odds, colors), prior
