@@ -17,7 +17,7 @@ import numpy as np
 
 from hoigs.core.errors import ClipError
 from hoigs.core.npz import MOST_RATIO, SMALL_BYTES
-from hoigs.plugins.readers.common.pickles import ALLOWED
+from hoigs.core.unpickling.pickles import ALLOWED
 
 WRAPPER = ("joblib.numpy_pickle", "NumpyArrayWrapper")
 
