@@ -19,7 +19,7 @@ def write_bodies(
     seed: int = 0, frames: Sequence[int] | None = None,
 ) -> Path:  # fmt: skip
     """hmr4d_results.pt ("gvhmr") or wham_output.pkl ("wham"), as the program would have written it
-    had it found the true pose, up to noise, with true intrinsics where it keeps any.
+    had it found the true pose, up to noise; GVHMR's intrinsics are the true ones.
 
     Args:
         degrees, cm: standard deviation of each joint's rotation and of the place, each frame.
@@ -53,6 +53,9 @@ def write_bodies(
             {"smpl_params_global": params, "smpl_params_incam": params, "K_fullimg": K}, path
         )
         return path
+    # WHAM assumes a focal length, and a place at which the body is as large in the image
+    width, height = clip.cameras[0].width, clip.cameras[0].height
+    pelvis[:, 2] *= math.hypot(width, height) / torch.stack([c.K[0, 0] for c in clip.cameras])
     rows = np.arange(len(turns)) if frames is None else np.asarray(frames)
     people: defaultdict[int, dict[str, np.ndarray]] = defaultdict(dict)
     pose = np.concatenate((turns.flatten(1).numpy(), np.zeros((len(turns), 6), np.float32)), 1)
