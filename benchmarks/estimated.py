@@ -34,10 +34,9 @@ from typing import Any
 import numpy as np
 from estimates.figures import body_figures, camera_motion, object_figures
 from estimates.source import write_source
-from PIL import Image
+from estimates.training import Training, trained
 
 CLIPS = ("lift-and-swing", "carry", "throw-and-catch", "figure-eight", "jolted-push")
-REGIONS = ("human_object", "object", "full")
 
 
 @dataclass(frozen=True)
@@ -129,65 +128,10 @@ def _measure(job: Job, folder: Path) -> dict[str, Any]:
     if job.train:
         if job.camera == "given":  # otherwise the held-out cameras are of another world
             shutil.copytree(truth_folder / "held_out", out / "held_out", dirs_exist_ok=True)
-        row["estimated"] = trained(out, folder / f"{name}.run", job)
-        row["every_pose_given"] = trained(truth_folder, folder / f"{name}.given-run", job)
+        how = Training(job.train, job.train_width, job.device, job.seed, job.pictures)
+        row["estimated"] = trained(out, folder / f"{name}.run", how)
+        row["every_pose_given"] = trained(truth_folder, folder / f"{name}.given-run", how)
     return row
-
-
-# ---- training
-
-
-def trained(clip: Path, run: Path, job: Job) -> dict[str, Any]:
-    """PSNR by region of test frames and held-out cameras after `job.train` steps, with the body
-    poses of test frames as the clip has them ("given"), and interpolated from training frames."""
-    from hoigs.evaluation.evaluate import evaluate
-    from hoigs.training.session import Session
-
-    session = Session.open(
-        clip, "hoigs", out=run, overwrite=True, device=job.device,
-        overrides=[
-            f"train.steps={job.train}", f"train.width={job.train_width}",
-            "train.preview_every=0", f"train.seed={job.seed}",
-        ],
-    )  # fmt: skip
-    start = time.perf_counter()
-    session.train()
-    seconds = time.perf_counter() - start
-    found: dict[str, Any] = {"train_s": round(seconds, 1)}
-    if job.pictures:
-        draw_views(session, job.pictures / f"{run.name.removesuffix('.run')}.png")
-    for poses in ("given", "interpolated"):
-        scores = evaluate(session.trainer.model, session.clip, timing_frames=0, test_pose=poses)
-        found[f"{poses} poses"] = {
-            view.name: {r: _value(scores.score(r, "psnr", view.name)) for r in REGIONS}
-            for view in scores.views
-        }
-    return found
-
-
-def draw_views(session: Any, file: Path) -> None:
-    """Three test frames and three held-out views: the image above, the drawn one below."""
-    import torch
-
-    clip, model = session.clip, session.trainer.model.eval()
-    chosen = [(clip, p) for p in clip.split["test"]]
-    if clip.held_out is not None:
-        chosen += [(clip.held_out, p) for p in clip.held_out.split["test"]]
-    columns = []
-    for views in (chosen[: len(clip.split["test"])], chosen[len(clip.split["test"]) :]):
-        for source, position in views[:: max(1, len(views) // 3)][:3]:
-            frame = source[position]
-            with torch.no_grad():
-                drawn = model.render(
-                    frame.moment.to(model.device), frame.camera.to(model.device)
-                ).color.clamp(0, 1)
-            columns.append(torch.cat((frame.rgb.cpu(), drawn.cpu())))
-    file.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray((255 * torch.cat(columns, 1)).byte().numpy()).save(file)
-
-
-def _value(score: Any) -> float | str:
-    return round(float(score), 2) if isinstance(score, float) else f"not computed: {score}"
 
 
 # ---- the command

@@ -40,9 +40,8 @@ def main() -> int:
         print(rows[-1], flush=True)
     if options.json:
         options.json.write_text(json.dumps({"clip": CLIP, "rows": rows}, indent=1) + "\n")
-    print(
-        "| from | noise | the file itself, about the pelvis mm | about the pelvis mm | joints mm | wrists mm |"
-    )
+    head = "from", "noise", "the file, about pelvis", "about pelvis", "joints", "wrists"
+    print(f"| {' | '.join(head)} |")
     print("|---|---|---|---|---|---|")
     for row in rows:
         values = [row[key] for key in ("from", "noise")]

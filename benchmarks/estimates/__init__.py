@@ -1,1 +1,1 @@
-"""Parts of estimated.py: the source that `hoigs prepare` reads, and figures of what it makes."""
+"""Parts of estimated.py and end_to_end.py: sources, figures of what is made, short trainings."""

@@ -11,7 +11,7 @@ from jaxtyping import Bool
 
 from hoigs.annotation.video import ScrubbedVideo
 from hoigs.core.errors import HoigsError
-from hoigs.core.interfaces.estimator import EntityRequest, VideoRequest
+from hoigs.core.interfaces.estimator import EntityRequest, FramePrompt, VideoRequest
 from hoigs.plugins.estimators.common.environments import MEDIAPIPE
 from hoigs.plugins.estimators.mediapipe import MediapipeEstimator
 
@@ -24,7 +24,7 @@ class FoundPeople:
 
     def __init__(self, video: ScrubbedVideo) -> None:
         self.video = video
-        self._found: dict[int, Bool[np.ndarray, "H W"]] = {}
+        self._found: dict[int, tuple[FramePrompt | None, Bool[np.ndarray, "H W"]]] = {}
         self._lock = threading.Lock()
 
     @property
@@ -33,28 +33,34 @@ class FoundPeople:
 
     def known(self, frame: int) -> Bool[np.ndarray, "H W"] | None:
         """The mask, if the frame was looked at."""
-        return self._found.get(frame)
+        found = self._found.get(frame)
+        return None if found is None else found[1]
 
-    def find(self, frame: int) -> Bool[np.ndarray, "H W"]:
-        """The mask, empty where nobody is found.
+    def find(self, frame: int, prompt: FramePrompt | None = None) -> Bool[np.ndarray, "H W"]:
+        """The mask of the person at the prompt, without one of whom MediaPipe takes; empty where
+        that is nobody.
 
         Raises:
-            HoigsError: MediaPipe is not installed, or failed.
+            HoigsError: MediaPipe is not installed, finds nobody at the prompt, or failed.
         """
         with self._lock:
-            if frame not in self._found:
+            found = self._found.get(frame)
+            if found is None or prompt not in (None, found[0]):
+                found = prompt, self._estimated(frame, prompt)
                 while len(self._found) >= KEPT:
                     self._found.pop(next(iter(self._found)))
-                self._found[frame] = self._estimated(frame)
-            return self._found[frame]
+                self._found[frame] = found
+            return found[1]
 
-    def _estimated(self, frame: int) -> Bool[np.ndarray, "H W"]:
+    def _estimated(self, frame: int, prompt: FramePrompt | None) -> Bool[np.ndarray, "H W"]:
         video = self.video
+        points, box = ((), None) if prompt is None else (prompt.points, prompt.box)
+        person = EntityRequest(NAME, "human", points=points, box=box)
         pixels = video.rgb(frame)
         with tempfile.TemporaryDirectory(prefix="hoigs-annotate-") as work:
             request = VideoRequest(
                 frames=1, width=video.width, height=video.height, read=lambda _: pixels,
-                folder=Path(work), work=Path(work), entities=(EntityRequest(NAME, "human"),),
+                folder=Path(work), work=Path(work), entities=(person,),
             )  # fmt: skip
             masks = MediapipeEstimator().estimate(request).masks
             if masks is None:

@@ -106,6 +106,7 @@ class Session:
         texts = to_texts(self.entities)
         words = ["hoigs", "prepare", str(self.path)]
         words += [w for text in texts.object for w in ("--object", text)]
+        words += [w for text in texts.person for w in ("--person", text)]
         return {"file": prompt_file(self.path).name, "command": shlex.join(words)}
 
     def clicked(self, content: Any) -> tuple[bytes, str] | None:
@@ -117,9 +118,8 @@ class Session:
         wanted = ClickRequest.model_validate(content)
         prompts = [p for p in wanted.entity.prompts() if p.frame < self.video.count]
         if wanted.entity.kind == "person" and self.people.available:
-            if all(p.frame != wanted.frame for p in prompts):
-                return None
-            return _png(self.people.find(wanted.frame)), ""
+            here = next((p for p in prompts if p.frame == wanted.frame), None)
+            return None if here is None else (_png(self.people.find(wanted.frame, here)), "")
         found = self.clicks.mask(prompts, wanted.frame)
         return None if found is None else (_png(found.soft > 0.5), found.note)
 

@@ -31,6 +31,14 @@ def prepare(
             'x0,y0,x1,y1, words "football" (with --estimators hub), or none. Repeatable.',
         ),
     ] = None,
+    person: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--person",
+            help="Which person to fit where several are seen: a point on them, 320,210 or "
+            "320,210@FRAME, or a box, as with --object. Repeatable.",
+        ),
+    ] = None,
     estimators: Annotated[
         str | None,
         typer.Option(
@@ -140,7 +148,7 @@ def prepare(
             seconds = prepare_until(
                 stage, source, out, options=options, progress=show.fraction,
                 redo=redo or (), allow_commands=allow_commands, object=object_at or (),
-                yes=yes, consent=_consent(), announce=_announce,
+                person=person or (), yes=yes, consent=_consent(), announce=_announce,
             )  # fmt: skip
         rows = [(name, f"{value:.1f} s") for name, value in seconds.items()]
         print_table(f"stages kept in {work_folder(out)}", ("stage", "made in"), rows)
@@ -149,7 +157,7 @@ def prepare(
         report = run(
             source, out, options=options, progress=show.fraction,
             redo=redo or (), allow_commands=allow_commands, object=object_at or (),
-            yes=yes, consent=_consent(), announce=_announce,
+            person=person or (), yes=yes, consent=_consent(), announce=_announce,
         )  # fmt: skip
     print_table(f"prepared {out}", ("what", "value", "note"), report.rows())
     for warning in report.warnings:

@@ -173,6 +173,13 @@ class EstimateReader:
         masks = self.estimate("masks", lambda _done: None).masks
         return Estimates(masks, self.estimate("landmarks", lambda _done: None).landmarks)
 
+    def notes_on_person(self) -> tuple[str, ...]:
+        """What the estimator of masks finds doubtful in those of the person."""
+        if "masks" not in self.estimators:
+            return ()
+        masks = self.estimate("masks", lambda _done: None).masks
+        return () if masks is None else masks.notes
+
     @cached_property
     def _total(self) -> int:
         """Frames of the whole video, which are counted only where the survey stopped early."""

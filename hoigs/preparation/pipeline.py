@@ -215,6 +215,7 @@ class Pipeline:
         except NobodyFoundError:
             self.worth_keeping = False
             raise
+        self.warnings += self.reader.notes_on_person()
 
     def _prompts(self, *names: str) -> dict[str, Any]:
         """The prompts of the person and of `names`, as JSON."""

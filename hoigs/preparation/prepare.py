@@ -61,6 +61,7 @@ def prepare(
     keep_black: bool | None = None,
     overwrite: bool | None = None,
     object: str | Sequence[str] = (),
+    person: str | Sequence[str] = (),
     overrides: Sequence[str] = (),
     options: PrepareOptions | Path | str | None = None,
     allow_commands: bool = False,
@@ -89,6 +90,7 @@ def prepare(
         object: where the object is, in place of its prompt in `options`: "640,402@0", or several
             such (`prompts.parse_prompts`); "none": there is none. Without it, the clicks that
             `annotate` stored beside the video hold.
+        person: which person to fit where several are seen, likewise: "320,210@0".
         overrides: any field likewise: "estimators.masks.use=estimator:masks-files".
         options: ready-made, or a YAML or TOML file.
         body: the model to fit, whose key is `options.body`; by default it is made from that key.
@@ -114,7 +116,7 @@ def prepare(
         "calibration": None if calibration is None else str(calibration),
         "keep_black": keep_black, "overwrite": overwrite,
     }  # fmt: skip
-    options = with_prompts(load_options(options, overrides, flags), object, estimators)
+    options = with_prompts(load_options(options, overrides, flags), object, estimators, person)
     may_replace = options.overwrite or bool(redo)
     _, report = _run(
         source, out, body, options, progress, redo, estimators, None, may_replace, allow_commands,
@@ -130,6 +132,7 @@ def prepare_until(
     out: str | Path,
     *,
     object: str | Sequence[str] = (),
+    person: str | Sequence[str] = (),
     options: PrepareOptions | Path | str | None = None,
     allow_commands: bool = False,
     redo: Sequence[str] = (),
@@ -151,7 +154,7 @@ def prepare_until(
     check_stage(stage)
     if stage == list(PLAN)[-1]:
         raise HoigsError(f"{stage} is the last stage: run prepare as a whole")
-    options = with_prompts(load_options(options), object, estimators)
+    options = with_prompts(load_options(options), object, estimators, person)
     pipeline, _ = _run(
         source, out, body, options, progress, redo, estimators, stage, True, allow_commands,
         agree if yes else consent, announce,

@@ -87,9 +87,13 @@ def _boxed(at: PromptAt, numbers: list[float], text: str, what: str) -> PromptAt
 
 
 def with_prompts(
-    options: PrepareOptions, texts: str | Sequence[str], preset: object = None
+    options: PrepareOptions,
+    texts: str | Sequence[str],
+    preset: object = None,
+    person: str | Sequence[str] = (),
 ) -> PrepareOptions:
-    """Options with the objects' prompts from texts, and a preset if `preset` is the name of one.
+    """Options with the objects' and the person's prompts from texts, and a preset if `preset` is
+    the name of one.
 
     The name before a text's "=" is that of its object; texts of one name are places on one object.
 
@@ -107,6 +111,15 @@ def with_prompts(
         update["find_object"] = False
     elif texts:
         update |= named_objects(named, options)
+    if person := [person] if isinstance(person, str) else list(person):
+        split = [split_name(text) for text in person]
+        names = sorted({name for name, _ in split if name})
+        if len(names) > 1:
+            raise SpecError(f"--person: {' and '.join(names)} are given; one person is fitted")
+        human = names[0] if names else options.human
+        prompt = parse_prompts([place for _, place in split], "--person")
+        prompts = {**update.get("prompts", options.prompts), human: prompt}
+        update |= {"human": human, "prompts": prompts}
     return PrepareOptions.model_validate({**options.model_dump(), **update}) if update else options
 
 

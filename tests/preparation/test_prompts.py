@@ -86,3 +86,13 @@ def test_prompts_count_frames_of_the_video_wherever_it_is_started() -> None:
         check_prompts(with_prompts(PrepareOptions(), "3,4@2"), late)
     with pytest.raises(SpecError, match="frame 4 has two boxes"):
         placed_prompts(with_prompts(PrepareOptions(), ["0,0,3,4", "0,0,5,6@4"]), late)
+
+
+def test_a_person_is_chosen_as_an_object_is() -> None:
+    options = with_prompts(PrepareOptions(), "640,402", person=["320,210@3", "-500,200@3"])
+    (at,) = options.prompts["human"].places()
+    assert at.frame == 3 and at.points == [(320, 210, True), (500, 200, False)]
+    assert options.prompts["object"].points == [(640, 402, True)]
+    assert with_prompts(PrepareOptions(), (), person="anna=320,210").human == "anna"
+    with pytest.raises(SpecError, match="anna and ben are given"):
+        with_prompts(PrepareOptions(), (), person=["anna=3,2", "ben=5,2"])

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from PIL import Image
 from pydantic import Field
 
@@ -34,8 +34,9 @@ from hoigs.plugins.estimators.common.environments import HEAVY, MEDIAPIPE
 from hoigs.plugins.estimators.common.subprocess import run_tool, settings_key
 
 SCRIPT = Path(__file__).with_name("mediapipe_script.py")
-GUIDED = Path(__file__).with_name("mediapipe_guided.py")  # which it imports
+IMPORTED = [SCRIPT.with_name(f"mediapipe_{name}.py") for name in ("guided", "chosen")]
 INSTALL = "run `hoigs estimators install mediapipe` and leave `python` out"
+OTHERS, HIPS = 0.1, [23, 24]  # share of the frames that is worth a word; of the 33 landmarks
 LONGEST = 1280  # pixels: larger frames are made smaller, which the models do in any case
 
 
@@ -120,25 +121,33 @@ class MediapipeEstimator(Estimator):
             )
         first = min(video.numbers, default=0)
         count = max(video.numbers, default=-1) + 1 - first
+        order, chosen = _order(range(first, first + count), video)
         settings = {"pose": self._settings(), "frames": count, "masks": self.config.masks}
         settings |= {"first": first} if first else {}
+        settings |= {"person": chosen} if chosen else {}
         # what other versions of the scripts found is not taken
-        settings["scripts"] = [zlib.crc32(path.read_bytes()) for path in (SCRIPT, GUIDED)]
+        settings["scripts"] = [zlib.crc32(path.read_bytes()) for path in (SCRIPT, *IMPORTED)]
         out = video.work / f"mediapipe-{settings_key(settings)}.npz"
         if not out.is_file():
-            self._run(self._python(video), out, range(first, first + count), video, progress)
+            self._run(self._python(video), out, order, chosen, video, progress)
         with np.load(out, allow_pickle=False) as file:
             found = {name: file[name] for name in file.files}
+        if chosen:  # frames came from the prompt's forwards, then backwards
+            inverse = np.argsort(order)
+            found |= {k: v[inverse] for k, v in found.items() if k != "size"}
         given = range(first, first + count)
         image, world = (self._spread(found[k], given, video) for k in ("image_xyzv", "world_xyzv"))
         progress(1.0, "landmarks")
         text = f"MediaPipe Pose, complexity {self._complexity()}"
+        text += ", of the person clicked on" if chosen else ""
         landmarks = {people[0]: Landmarks(image, world, text)}
         if not self.config.masks:
             return Estimates(landmarks=landmarks)
         person = _frames_of(found["person"], found["size"], first, video)
         text = "MediaPipe's segmentation of selfies and of poses; it takes in what is held"
-        return Estimates(EntityMasks({people[0]: person}, None, text), landmarks)
+        text += "; of the person clicked on" if chosen else ""
+        notes = _others(found["several"], image)
+        return Estimates(EntityMasks({people[0]: person}, None, text, notes=notes), landmarks)
 
     def _python(self, video: VideoRequest) -> Path:
         if self.config.python is None:
@@ -150,23 +159,31 @@ class MediapipeEstimator(Estimator):
         return python
 
     def _run(
-        self, python: Path, out: Path, given: range, video: VideoRequest, progress: Progress
-    ) -> None:
+        self, python: Path, out: Path, order: Sequence[int], chosen: dict[str, Any] | None,
+        video: VideoRequest, progress: Progress,
+    ) -> None:  # fmt: skip
         out.parent.mkdir(parents=True, exist_ok=True)
         half = out.with_suffix(".part")
         settings = {
-            "width": video.width, "height": video.height, "count": len(given), "longest": LONGEST,
-            "masks": self.config.masks, "pose": self._settings(), "out": str(half.absolute()),
+            "width": video.width, "height": video.height, "count": len(order), "longest": LONGEST,
+            "masks": self.config.masks, "person": chosen, "pose": self._settings(),
+            "out": str(half.absolute()),
         }  # fmt: skip
         # -I: the script's own folder, where modules of hoigs lie, is not searched for imports
         argv = [str(python.absolute()), "-I", str(SCRIPT), json.dumps(settings)]
         log = out.with_suffix(".log")
         try:
             run_tool(
-                argv, what="estimator:mediapipe", log=log, images=_frames(video, given, progress)
+                argv, what="estimator:mediapipe", log=log, images=_frames(video, order, progress)
             )
         except HoigsError as error:
-            lacking = log.is_file() and "has no mediapipe" in log.read_text(errors="replace")
+            said = log.read_text(errors="replace") if log.is_file() else ""
+            if chosen and "no person is found there" in said:
+                raise HoigsError(
+                    f"--person: MediaPipe finds no person at the click in frame {order[0]}; click "
+                    "on the middle of their chest, in a frame that shows them well, or give a box"
+                ) from error
+            lacking = "has no mediapipe" in said
             raise HoigsError(f"{error}\n{INSTALL}" if lacking else str(error)) from error
         half.replace(out)
 
@@ -182,10 +199,48 @@ class MediapipeEstimator(Estimator):
         return spread
 
 
-def _frames(video: VideoRequest, given: range, progress: Progress) -> Iterator[np.ndarray]:
+def _others(several: Bool[np.ndarray, " N"], image: Float[np.ndarray, "F 33 4"]) -> tuple[str, ...]:
+    """What there is to say if others are seen beside the person who was followed."""
+    count = int(several.sum())
+    if count < OTHERS * len(several):
+        return ()
+    i = int(np.flatnonzero(np.isfinite(image[:, HIPS, 0]).all(1))[0])
+    x, y = image[i, HIPS, :2].mean(0)
+    return (
+        f"{count} of {len(several)} frames show several people; the one at {x:.0f},{y:.0f} in "
+        f"frame {i} was taken (--person X,Y@FRAME chooses another)",
+    )
+
+
+def _order(given: range, video: VideoRequest) -> tuple[list[int], dict[str, Any] | None]:
+    """The frames as they are shown, and where among them the person's prompts are: from the first
+    prompt's frame forwards, then backwards; without a prompt forwards, and None.
+
+    Raises:
+        HoigsError: a prompt is in a frame that is not used.
+    """
+    person = next((e for e in video.entities if e.kind == "human"), None)
+    if person is None or not person.prompts:
+        return list(given), None
+    for prompt in person.prompts:
+        if prompt.frame not in given:
+            raise HoigsError(
+                f"--person: the click in frame {prompt.frame} is not in a frame that is used; "
+                f"these are {given.start} to {given.stop - 1}"
+            )
+    first = min(p.frame for p in person.prompts)
+    order = [*range(first, given.stop), *reversed(range(given.start, first))]
+    prompts = [
+        [order.index(p.frame), [[q.x, q.y, q.inside] for q in p.points], p.box]
+        for p in person.prompts
+    ]
+    return order, {"prompts": prompts, "back": given.stop - first}
+
+
+def _frames(video: VideoRequest, order: Sequence[int], progress: Progress) -> Iterator[np.ndarray]:
     """The given frames, reporting progress."""
-    for i in given:
-        progress((i - given.start) / len(given), "landmarks")
+    for done, i in enumerate(order):
+        progress(done / len(order), "landmarks")
         yield video.frame(i)
 
 

@@ -92,20 +92,13 @@ class GuidedPose:
     def look(self, image, wide, square):
         """Score (0 if they are nobody's), landmarks, places in space, mask, square; or None."""
         height, width = image.shape[:2]
-        x, y, side = square
-        rect = self.rect(x_center=x / width, y_center=y / height, width=side / width,
-                         height=side / height, rotation=0.0)  # fmt: skip
-        found = self.graph.process({"image": image, "square": rect})
-        if found.landmarks is None or found.mask is None:
+        found = seen_in(self.graph, self.rect, image, square)
+        if found is None:
             return None
-        points, space = rows_of(found.landmarks), rows_of(found.world)
-        points[:, :3] *= [width, height, width]
-        inside = (points[:, :2] >= 0).all(1) & (points[:, :2] < [width, height]).all(1)
-        points[:, 3] *= inside  # what lies outside is supposed, not seen
+        points, space, mask = found
         broad = np.ptp(points[SHOULDERS, 0])
         near = broad >= max(NARROW * max(width, height), SAME * self.broad)
         person = near and upright(points) and self.credible(points, wide)
-        mask = np.array(found.mask)
         points[HEAD, 3] = 0.0  # one that can be seen is found by the detector
         x, y = points[LEGS, :2].astype(int).clip(0, [width - 1, height - 1]).T
         points[LEGS, 3] *= mask[y, x]  # not on the person: on a table before them
@@ -135,6 +128,22 @@ def landmark_graph(complexity):
     config = text_format.Parse(GRAPH, calculator_pb2.CalculatorGraphConfig())
     sides = {"model_complexity": complexity, "enable_segmentation": True}
     return SolutionBase(graph_config=config, side_inputs=sides), rect_pb2.NormalizedRect
+
+
+def seen_in(graph, rect, image, square):
+    """Landmarks in the image, places in space and mask of the person in a square; None if none."""
+    height, width = image.shape[:2]
+    x, y, side = square
+    roi = rect(x_center=x / width, y_center=y / height, width=side / width,
+               height=side / height, rotation=0.0)  # fmt: skip
+    found = graph.process({"image": image, "square": roi})
+    if found.landmarks is None or found.mask is None:
+        return None
+    points, space = rows_of(found.landmarks), rows_of(found.world)
+    points[:, :3] *= [width, height, width]
+    inside = (points[:, :2] >= 0).all(1) & (points[:, :2] < [width, height]).all(1)
+    points[:, 3] *= inside  # what lies outside is supposed, not seen
+    return points, space, np.array(found.mask)
 
 
 def upright(points) -> bool:

@@ -2,7 +2,7 @@
 
 Reads RGB frames from standard input and writes one .npz file: image_xyzv and world_xyzv
 [N, 33, 4], NaN where no person is found; and, if masks are wanted, `person`, the bits of boolean
-masks [N, H, ceil(W / 8)], and their `size`.
+masks [N, H, ceil(W / 8)], their `size`, and `several` [N], whether other people are seen.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ MARGIN = 1.25  # of the person's box, the second look at the person's mask
 CREDIBLE = 0.5  # share of the seen landmarks that have to lie on the person's mask
 TALL = 0.3  # height of the landmarks in heights of the mask, below which they are of something else
 SEEN = 0.5  # visibility
+OTHER, ELSEWHERE = 0.25, 0.2  # of the largest part's area; of a part, that is the person's own
+AROUND, EDGE = 0.01, 0.2  # in longer sides and of 1: about a person's own mask
 SOFT = 1 / 640  # of the longer side: standard deviation by which the person's mask is smoothed
 
 
@@ -33,7 +35,7 @@ def main() -> None:
     width, height, count = settings["width"], settings["height"], settings["count"]
     factor = min(1.0, settings["longest"] / max(width, height))
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    finder = Finder(cv2, mediapipe.solutions, settings)
+    finder = Finder(cv2, mediapipe.solutions, settings, size[0] / width)
     for i in range(count):
         pixels = sys.stdin.buffer.read(height * width * 3)
         if len(pixels) != height * width * 3:
@@ -41,7 +43,10 @@ def main() -> None:
         image = np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
         if factor < 1:
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        finder.add(np.ascontiguousarray(image))
+        try:
+            finder.add(i, np.ascontiguousarray(image))
+        except LookupError as error:
+            sys.exit(str(error))
     with Path(settings["out"]).open("wb") as out:
         np.savez_compressed(out, size=np.array(size), **finder.arrays(width / size[0]))
 
@@ -49,7 +54,7 @@ def main() -> None:
 class Finder:
     """Landmarks and masks, frame by frame."""
 
-    def __init__(self, cv2, solutions, settings) -> None:
+    def __init__(self, cv2, solutions, settings, factor) -> None:
         self.cv2, self.masks = cv2, settings["masks"]
         pose = {**settings["pose"], "enable_segmentation": self.masks, "smooth_segmentation": False}
         self.whole, self.padded = solutions.pose.Pose(**pose), solutions.pose.Pose(**pose)
@@ -63,16 +68,44 @@ class Finder:
         self.following = False  # a person whom `guided` found and the detector does not
         self.rows: dict[str, list] = {"image_xyzv": [], "world_xyzv": []}
         self.person: list[np.ndarray] = []
+        self.several: list[bool] = []  # whether others are seen beside the person followed
+        self.chosen: Any = None
+        if settings["person"] is not None:
+            from mediapipe_chosen import ChosenPose
+            from mediapipe_guided import landmark_graph
 
-    def add(self, image) -> None:
+            prompts = {
+                number: (
+                    [(factor * x, factor * y, on) for x, y, on in points],
+                    None if box is None else [factor * c for c in box],
+                )
+                for number, points, box in settings["person"]["prompts"]
+            }
+            back = settings["person"]["back"]
+            self.chosen = ChosenPose(*landmark_graph(self.complexity), prompts, back)
+
+    def add(self, number, image) -> None:
         wide = None if self.selfie is None else self.selfie.process(image).segmentation_mask
-        image_xyzv, world_xyzv, own = self.landmarks(image, wide)
+        if self.chosen is None:
+            image_xyzv, world_xyzv, own = self.landmarks(image, wide)
+        else:
+            nothing = np.full((33, 4), np.nan)
+            found = self.chosen.process(number, image) or (nothing, nothing, None)
+            image_xyzv, world_xyzv, own = found
         self.rows["image_xyzv"].append(image_xyzv)
         self.rows["world_xyzv"].append(world_xyzv)
         if wide is None:
             return
+        if self.chosen is not None:
+            self.keep(image, np.zeros_like(wide) if own is None else self.of_one(image, wide, own))
+            return
         if self.following and own is not None:
+            self.several.append(False)
             self.keep(image, own)  # segmentation of selfies takes tables in where there is no head
+            return
+        self.several.append(own is not None and self.another(wide, own))
+        if self.several[-1]:
+            self.keep(image, self.of_one(image, wide, own))
             return
         near = self.near(image, wide > 0.5)
         mean = wide if near is None else (wide + near) / 2
@@ -83,6 +116,22 @@ class Finder:
         # cells of the models are several pixels wide: without this, edges are stairs
         person = self.cv2.GaussianBlur(person, (0, 0), max(1.0, SOFT * max(image.shape)))
         self.person.append(np.packbits(person > 0.5, axis=1))
+
+    def another(self, wide, own) -> bool:
+        """Whether the mask of people has a large part that is not of the person followed."""
+        count, parts, stats, _ = self.cv2.connectedComponentsWithStats(np.uint8(wide > 0.5))
+        areas = stats[:, self.cv2.CC_STAT_AREA]
+        large = [i for i in range(1, count) if areas[i] >= OTHER * areas[1:].max()]
+        return any((own[parts == i] > 0.5).mean() < ELSEWHERE for i in large)
+
+    def of_one(self, image, wide, own):
+        """The mask of one of several people: of the segmentations of all, what lies at their own
+        one, which knows them apart and is coarse."""
+        around = self.cv2.GaussianBlur(own, (0, 0), max(1.0, AROUND * max(image.shape)))
+        mine = np.where(around > EDGE, wide, 0)
+        near = self.near(image, mine > 0.5)
+        mean = mine if near is None else (mine + np.where(around > EDGE, near, 0)) / 2
+        return (2 * mean + own) / 3
 
     def landmarks(self, image, wide):
         """In the image and in space, and the mask of their person; looked for a second time with a
@@ -136,6 +185,7 @@ class Finder:
         rows["image_xyzv"][..., :3] *= scale
         if self.masks:
             rows["person"] = np.array(self.person)
+            rows["several"] = np.array(self.several or [False] * len(self.person))
         return rows
 
 

@@ -205,6 +205,11 @@ class SolutionBase:
 FAKE_CV2 = """
 import numpy
 BORDER_REPLICATE = "edge"
+CC_STAT_AREA = 0
+def connectedComponentsWithStats(mask):
+    from scipy.ndimage import label
+    parts, count = label(mask)
+    return count + 1, parts, numpy.bincount(parts.ravel(), minlength=count + 1)[:, None], None
 def GaussianBlur(image, size, sigma):
     return image
 def copyMakeBorder(image, above, below, left, right, kind):

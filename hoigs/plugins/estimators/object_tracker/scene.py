@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +14,8 @@ from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
 
 SAMPLES = 48  # frames of which the median is taken
 NEIGHBOURS = (-24, -16, -10, -6, 6, 10, 16, 24)  # frames that a moving camera's are compared with
+SHIFT = 2  # pixels, the largest of the shifts that parallax is allowed
+SHIFTS = ((0, 0), (0, 2), (0, -2), (2, 0), (-2, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 
 
 class Scene(Protocol):
@@ -78,16 +80,22 @@ class MovingScene:
 
     footage: Footage
     steps: Float[np.ndarray, "F 3 3"]
+    _kept: dict[int, np.ndarray] = field(default_factory=dict)  # path and masks need each twice
 
     def difference(self, i: int) -> Float[np.ndarray, "h w"]:
-        here = self.footage.colors(i)
+        if i not in self._kept:
+            self._kept[i] = self._difference(i).astype(np.float16)
+        return self._kept[i].astype(np.float32)
+
+    def _difference(self, i: int) -> Float[np.ndarray, "h w"]:
+        here = np.ascontiguousarray(np.moveaxis(self.footage.colors(i), -1, 0))
         found = []
         for offset in NEIGHBOURS:
             j = i + offset
             if 0 <= j < len(self.footage):
                 found.append(self._against(here, i, j))
         if not found:
-            return np.full(here.shape[:2], np.nan, np.float32)
+            return np.full(here.shape[1:], np.nan, np.float32)
         stack = np.sort(np.stack(found), axis=0)  # NaN goes last
         count = np.isfinite(stack).sum(0)
         at = np.maximum(count - 1, 0) // 2
@@ -107,21 +115,18 @@ class MovingScene:
         ui, vi = np.rint(u).astype(int), np.rint(v).astype(int)
         inside = (ui >= 0) & (ui < columns) & (vi >= 0) & (vi < rows)
         ui, vi = ui.clip(0, columns - 1), vi.clip(0, rows - 1)
-        there = to_features(self.footage.lab[j])
-        best = np.full(here.shape[:2], np.inf, np.float32)
-        for dy, dx in (
-            (0, 0),
-            (0, 2),
-            (0, -2),
-            (2, 0),
-            (-2, 0),
-            (1, 1),
-            (-1, -1),
-            (1, -1),
-            (-1, 1),
-        ):
-            warped = there[(vi + dy).clip(0, rows - 1), (ui + dx).clip(0, columns - 1)]
-            best = np.minimum(best, np.sqrt(((warped - here) ** 2).sum(-1)))
+        there = to_features(self.footage.lab[j])[vi, ui]
+        # one lookup, then shifts of what was looked up: an image's neighbours stay neighbours
+        near = np.pad(np.moveaxis(there, -1, 0), ((0, 0), (SHIFT, SHIFT), (SHIFT, SHIFT)), "edge")
+        best = np.full((rows, columns), np.inf, np.float32)
+        for dy, dx in SHIFTS:
+            away = np.zeros((rows, columns), np.float32)
+            y, x = SHIFT + dy, SHIFT + dx
+            for channel, color in zip(near, here, strict=True):
+                apart = channel[y : y + rows, x : x + columns] - color
+                away += np.square(apart, out=apart)
+            np.minimum(best, away, out=best)
+        best = np.sqrt(best)
         hidden = ndimage.binary_dilation(
             self.footage.person[j] | self.footage.blank[j], iterations=3
         )

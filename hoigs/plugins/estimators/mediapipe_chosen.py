@@ -1,0 +1,112 @@
+"""Read by `mediapipe_script.py`: landmarks of the one of several people whom the user clicked on.
+
+MediaPipe's detector takes whom it likes. Its model of landmarks is therefore shown the square
+about the person clicked on, found in that frame and followed from there, forwards and backwards.
+It imports nothing of hoigs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from mediapipe_guided import KEPT, score, seen_in
+
+SIZES = (0.4, 0.6, 0.9, 1.3, 1.8)  # sides of the squares, in longer sides of the image
+SHIFTS = (-0.3, 0.0, 0.3)  # of the click from their middles, in sides: up, on and down the person
+ON = 0.5  # of the person's own mask, at a click
+SEEN = 0.5  # visibility
+MARGIN = 1.25  # of the landmarks' box, the next square
+STEADY = 0.7  # share of its last side that a square keeps
+JUMP, GROWTH = 0.35, 1.6  # in sides, from frame to frame: what moves or grows more is someone else
+
+
+class ChosenPose:
+    """MediaPipe's model of landmarks in the square about one person.
+
+    Args:
+        graph, rect: of `landmark_graph`.
+        prompts: by number of a frame, as they come: points (x, y, on the person or not) and a box
+            (x0, y0, x1, y1) or None, pixels of the images here.
+        back: number of the first frame of those that go backwards from the first prompt's.
+    """
+
+    def __init__(self, graph, rect, prompts, back) -> None:
+        self.graph, self.rect, self.prompts, self.back = graph, rect, prompts, back
+        self.square = (0.0, 0.0, 0.0)  # x, y of the middle and side, pixels: until it is found
+        self.first: tuple[float, float, float] | None = None
+
+    def process(self, number, image):
+        """Landmarks in the image and in space, and the person's mask; None where they are lost.
+
+        Raises:
+            LookupError: nobody is found where the first prompt says.
+        """
+        if number == self.back and self.first is not None:
+            self.square = self.first
+        if number in self.prompts:
+            found = self.search(image, *self.prompts[number])
+            if found is None and self.first is None:
+                raise LookupError("no person is found there")
+            if found is not None:
+                self.square, found = found
+                self.first = self.first or self.square
+                return found
+        found = self.look(image, self.square)
+        if found is None:
+            return None  # the square waits where it was
+        square = square_of(found[0])
+        (x, y, side), (x1, y1, side1) = self.square, square
+        far = np.hypot(x1 - x, y1 - y) > JUMP * side
+        if far or not 1 / GROWTH < side1 / side < GROWTH:
+            return None
+        self.square = (x1, y1, STEADY * side + (1 - STEADY) * side1)
+        return found
+
+    def search(self, image, points, box):
+        """The next square, and what is seen in the one with the best person on the prompt."""
+        inside = [(x, y) for x, y, on in points if on]
+        outside = [(x, y) for x, y, on in points if not on]
+        if box is not None:
+            x0, y0, x1, y1 = box
+            squares = [((x0 + x1) / 2, (y0 + y1) / 2, MARGIN * max(x1 - x0, y1 - y0))]
+        else:
+            x, y = np.mean(inside, axis=0)
+            sides = [s * max(image.shape[:2]) for s in SIZES]
+            squares = [(x, y - shift * side, side) for side in sides for shift in SHIFTS]
+        best = None
+        for square in squares:
+            found = self.look(image, square)
+            if found is None or not self.agrees(found[2], inside, outside):
+                continue
+            # the same once more, in the square that it will be followed in
+            closer = self.look(image, square_of(found[0]))
+            if closer is None or not self.agrees(closer[2], inside, outside):
+                continue
+            value = closer[0][:, 3].mean()  # more of the person
+            if best is None or value > best[0]:
+                best = value, square_of(closer[0]), closer
+        return None if best is None else best[1:]
+
+    def agrees(self, mask, inside, outside) -> bool:
+        """Whether a mask has the points that it should have, and not the others."""
+
+        def at(points):
+            columns, rows = np.array(points).reshape(-1, 2).astype(int).T
+            height, width = mask.shape[:2]
+            return mask[rows.clip(0, height - 1), columns.clip(0, width - 1)] > ON
+
+        return bool(at(inside).all() and not at(outside).any())
+
+    def look(self, image, square):
+        """What is seen in a square; None if it is nobody."""
+        found = seen_in(self.graph, self.rect, image, square)
+        if found is None or score(found[0][:, 3]) < KEPT or (found[0][:, 3] > SEEN).sum() < 4:
+            return None
+        return found
+
+
+def square_of(points):
+    """The square about the landmarks that are seen."""
+    seen = points[points[:, 3] > SEEN, :2]
+    low, high = seen.min(0), seen.max(0)
+    x, y = (low + high) / 2
+    return float(x), float(y), float(MARGIN * max(*(high - low), 8))
