@@ -104,7 +104,7 @@ class EstimatorPlan:
         if not isinstance(landmarks, BodyFileEstimator):
             note = f"{name}: {program}'s joint rotations start the body fit"
             return replace(self, notes=(*self.notes, note))
-        choice = Choice("landmarks", f"{program}'s body", f"{name} lies beside the video", 0.0)
+        choice = Choice("landmarks", f"{program}'s body", f"from {name}", 0.0)
         return replace(self, choices={**self.choices, "landmarks": choice})
 
     def rows(self) -> list[tuple[str, str, str, str]]:

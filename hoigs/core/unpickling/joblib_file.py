@@ -33,7 +33,7 @@ class _Wrapper:
 _PythonUnpickler: Any = pickle._Unpickler  # the C version cannot be extended
 
 
-class _Unpickler(_PythonUnpickler):
+class _Unpickler(_PythonUnpickler):  # type: ignore[misc]  # which is Any
     dispatch: ClassVar = dict(_PythonUnpickler.dispatch)
 
     def __init__(self, file: io.BytesIO) -> None:

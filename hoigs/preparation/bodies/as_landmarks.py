@@ -51,7 +51,7 @@ class BodyFileEstimator(Estimator):
         depth = (places - middle)[..., 2:] * (K[:, :1, :1] / middle[..., 2:])
         image = np.full((video.frames, 33, 4), np.nan, np.float32)
         world = image.copy()
-        rows = np.ix_(found.frames, marks)
+        rows = np.ix_(found.frames, np.array(marks))
         image[rows] = np.concatenate((pixels, depth, visible), -1)
         world[rows] = np.concatenate((places - middle, visible), -1)
         (name,) = video.named("human") or ("human",)

@@ -152,7 +152,7 @@ def read_bodies(path: Path) -> FileBody:
     """The body in a file.
 
     Raises:
-        SourceError: it cannot be read without running code, or is of no known program.
+        SourceError: it cannot be read as plain numbers, or is of no known program.
     """
     body = _recognised(path)
     if body is None:
@@ -165,11 +165,11 @@ def _recognised(path: Path) -> FileBody | None:
     """The body in a file, or None if its content is not that of a known program."""
     if path.suffix == ".pt":
         try:
-            content = torch.load(path, map_location="cpu", weights_only=True)
+            content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
         except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
             reason = str(error).strip().splitlines() or [type(error).__name__]
             raise SourceError(
-                f"{path} cannot be read without running code in it: {reason[0]}"
+                f"{path} cannot be read as tensors alone, without running code: {reason[0]}"
             ) from error
         return _gvhmr(content, path) if _has(content, "smpl_params_incam") else None
     try:
