@@ -21,6 +21,7 @@ from jaxtyping import Float, Int
 from hoigs.core.errors import ClipError
 from hoigs.core.unpickling.joblib_file import load_joblib
 from hoigs.core.values.lens import Lens
+from hoigs.preparation.body.kinematics import nearest_turn
 from hoigs.preparation.video.source import LANDMARKS, SourceError
 
 SUFFIXES = (".pt", ".pkl")
@@ -98,14 +99,8 @@ class FileBody:
 
     def rotations(self, numbers: Sequence[int]) -> Float[torch.Tensor, "F 21 3"]:
         """Axis-angle of joints 1..21 in these frames; those that it lacks are interpolated."""
-        # whole turns are added, so that neighbouring frames are neighbours as numbers, too
-        turns = self.turns[:, 1:].copy()
-        for i in range(1, len(turns)):
-            angle = np.linalg.norm(turns[i], axis=-1, keepdims=True).clip(1e-9)
-            rounds = 2 * math.pi * turns[i] / angle
-            choices = np.stack([turns[i] + k * rounds for k in (0, -1, 1)])
-            best = np.linalg.norm(choices - turns[i - 1], axis=-1).argmin(0)
-            turns[i] = np.take_along_axis(choices, best[None, :, None], 0)[0]
+        joints = torch.from_numpy(self.turns[:, 1:]).unbind(1)
+        turns = torch.stack([nearest_turn(joint) for joint in joints], 1).numpy()
         columns = turns.reshape(len(turns), -1).T
         filled = np.stack([np.interp(numbers, self.frames, column) for column in columns], -1)
         return torch.from_numpy(filled).float().unflatten(-1, (21, 3))
