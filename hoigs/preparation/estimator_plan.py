@@ -99,10 +99,10 @@ class EstimatorPlan:
         return {place: c.spec for place, c in self.choices.items() if c.spec is not None}
 
     def with_body(self, body: FileBody, landmarks: object) -> EstimatorPlan:
-        """Says what another program's body is used for; `landmarks`: their estimator, if chosen."""
+        """Says whether another program's body is used; `landmarks`: their estimator, if chosen."""
         name, program = body.path.name, body.program
         if not isinstance(landmarks, BodyFileEstimator):
-            note = f"{name}: {program}'s joint rotations start the body fit"
+            note = f"{name}, {program}'s body, is not used: there are landmarks"
             return replace(self, notes=(*self.notes, note))
         choice = Choice("landmarks", f"{program}'s body", f"from {name}", 0.0)
         return replace(self, choices={**self.choices, "landmarks": choice})

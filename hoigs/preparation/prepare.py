@@ -197,6 +197,8 @@ def _run(
     plan = replace(plan_estimators(found, options, set(chosen)), notes=stored)
     if bodies is not None:
         plan = plan.with_body(bodies, chosen.get("landmarks"))
+        if not isinstance(chosen.get("landmarks"), BodyFileEstimator):
+            bodies = None  # tried: its rotations make a fit to landmarks no better
     specs = plan.specs()
     for kind, spec in found.beside.items():
         specs[kind] = spec

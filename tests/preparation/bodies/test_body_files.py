@@ -18,7 +18,7 @@ from hoigs.preparation.bodies.as_landmarks import BodyFileEstimator
 from hoigs.preparation.bodies.body_file import SMPLX_PELVIS, body_beside, read_bodies
 from hoigs.preparation.body.joint_limits import beyond
 from hoigs.preparation.body.pose_prior import PosePrior
-from hoigs.preparation.prepare import PrepareOptions, prepare
+from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until
 from hoigs.preparation.video.source import SourceError
 
 FOCAL = 88.0
@@ -117,6 +117,17 @@ def test_prepare_from_a_body_file_alone(tmp_path: Path, tiny_video: Path) -> Non
     assert "GVHMR's, in hmr4d_results.pt" in report.provenance["cameras"]
     body = np.load(tmp_path / "clip" / "bodies" / "human.npz")
     np.testing.assert_allclose(body["body"][:, 17, 1], -1.0, atol=0.1)
+
+
+def test_landmarks_beside_it_come_first(tmp_path: Path, tiny_video: Path) -> None:
+    source = make_source(tmp_path / "source", tiny_video)
+    torch.save(gvhmr(), source / "hmr4d_results.pt")
+    plans: list[Any] = []
+    prepare_until(
+        "frames", source, tmp_path / "clip", body=AnnyBody(), announce=plans.append, object="none"
+    )
+    assert plans[0].choices["landmarks"].use == "estimator:landmarks-files"
+    assert "hmr4d_results.pt, GVHMR's body, is not used" in plans[0].notes[-1]
 
 
 def test_a_file_of_a_longer_video_is_refused(tmp_path: Path) -> None:
