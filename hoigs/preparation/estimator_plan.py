@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hoigs.core.errors import PluginError, SpecError
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import ComponentSpec
+from hoigs.preparation.bodies.as_landmarks import BodyFileEstimator
+from hoigs.preparation.bodies.body_file import FileBody
 from hoigs.preparation.options import Place, PrepareOptions
 from hoigs.preparation.video.header import video_header
 from hoigs.preparation.video.source import Source, numbered_frames
@@ -95,6 +97,15 @@ class EstimatorPlan:
     def specs(self) -> dict[Place, ComponentSpec]:
         """Estimators of the preset."""
         return {place: c.spec for place, c in self.choices.items() if c.spec is not None}
+
+    def with_body(self, body: FileBody, landmarks: object) -> EstimatorPlan:
+        """Says whether another program's body is used; `landmarks`: their estimator, if chosen."""
+        name, program = body.path.name, body.program
+        if not isinstance(landmarks, BodyFileEstimator):
+            note = f"{name}, {program}'s body, is not used: there are landmarks"
+            return replace(self, notes=(*self.notes, note))
+        choice = Choice("landmarks", f"{program}'s body", f"from {name}", 0.0)
+        return replace(self, choices={**self.choices, "landmarks": choice})
 
     def rows(self) -> list[tuple[str, str, str, str]]:
         """What, from where, why, and how long it takes, for a table."""

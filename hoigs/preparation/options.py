@@ -121,6 +121,11 @@ class PrepareOptions(ComponentConfig):
         'settings, before files and preset; "object": masks of the object, where "masks" gives the '
         "person's alone",
     )
+    bodies: str | None = Field(
+        default=None,
+        description="file of bodies that GVHMR or WHAM has fitted to the video, relative to its "
+        "folder; None: the one that lies beside it, if any",
+    )
     find_object: bool = Field(
         default=True, description="look for an object; False: the clip has the person alone"
     )

@@ -70,18 +70,21 @@ def fit_person(
     source: str = "MediaPipe",
     masks: MaskStack | None = None,
     times: Float[Tensor, " F"] | None = None,
+    turns: Float[Tensor, "F 21 3"] | None = None,
 ) -> FittedBody:
     """Fits the body to landmarks, and masks if there are any, in at most `steps`; finds the scale
     of a world that has none.
 
     Args:
         times: of the frames, seconds.
+        turns: axis-angle of the body's joints 1..21, about.
     """
     options = FitOptions(scale=not track.metric, steps=steps)
     known = None if track.metric else track.points
     fit = fit_body(
         body, landmarks, track.cameras,
-        options=options, points=known, masks=masks, times=times, progress=progress,
+        options=options, points=known, masks=masks, times=times, turns=turns,
+        progress=progress,
     )  # fmt: skip
     frames = list(posed(body, fit.poses))
     residual = float(fit.residual_px.nanmedian())

@@ -15,6 +15,7 @@ import hoigs
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.clip import BodyTrack
+from hoigs.preparation.bodies.body_file import FileBody
 from hoigs.preparation.body.silhouette import silhouette
 from hoigs.preparation.cameras.calibration import calibration_file
 from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras, known_lens
@@ -71,10 +72,11 @@ class Pipeline:
         estimators: Estimators,
         stages: Stages,
         work: WorkFolder,
+        bodies: FileBody | None = None,
     ) -> None:
         self.source, self.out, self.body = source, out, body
         self.options, self.stages, self.work = options, stages, work
-        self.estimators = estimators
+        self.estimators, self.bodies = estimators, bodies
         self.warnings: list[str] = []
         self.provenance: dict[str, str] = {}
         self.worth_keeping = False
@@ -261,6 +263,7 @@ class Pipeline:
         calibration = self.options.calibration
         lens = None if calibration is None else calibration_file(calibration)[0]
         known = [p for p in (self.source.colmap, self.source.cameras, lens) if p is not None]
+        known += [] if self.bodies is None else [self.bodies.path]
         files = [[str(path), fingerprint([path])] for path in known]
         folder = self.work.unfinished("cameras", self._key("cameras", files))
         chosen = self._stage(
@@ -275,7 +278,7 @@ class Pipeline:
     def _choose_cameras(self, folder: Path) -> ChosenCameras:
         chosen = choose_cameras(
             self.video, self.raw.landmarks, self.raw.masks, self.source.colmap, self.options,
-            folder, self.stages.advance, self.source.cameras,
+            folder, self.stages.advance, self.source.cameras, self.bodies,
         )  # fmt: skip
         self.provenance["cameras"] = chosen.track.provenance
         self.warnings.extend(chosen.warnings)
@@ -306,13 +309,19 @@ class Pipeline:
             person = fit_person(
                 found.landmarks, self.track, self.body, self.options.fit_steps,
                 self.stages.advance, self.raw.landmarks.source, found.masks.persons(found.ball),
-                times,
+                times, None if self.bodies is None else self.bodies.rotations(video.indices),
             )  # fmt: skip
             self.provenance["body"] = person.provenance
+            if self.bodies is not None:
+                self.provenance["body"] += f"; {self.bodies.used(video.indices)}"
             self.warnings.extend(person.warnings)
             return person
 
-        model = [type(self.body).__qualname__, self.body.num_betas, len(self.body.parents)]
+        model: list[Any] = [
+            type(self.body).__qualname__, self.body.num_betas, len(self.body.parents)
+        ]  # fmt: skip
+        if self.bodies is not None:
+            model.append(fingerprint([self.bodies.path]))
         self.person = self._stage("body", make, model)
         scale = self.person.scene_scale
         self.cameras = [camera.scaled(scale) for camera in self.track.cameras]

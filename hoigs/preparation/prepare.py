@@ -17,6 +17,8 @@ from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.registry.registry import default_registry
+from hoigs.preparation.bodies.as_landmarks import BodyFileEstimator
+from hoigs.preparation.bodies.body_file import body_beside
 from hoigs.preparation.clip_writing import write_clip_folder
 from hoigs.preparation.estimates import Estimators
 from hoigs.preparation.estimator_plan import EstimatorPlan, plan_estimators
@@ -184,11 +186,19 @@ def _run(
         refuse_commands(named)  # `estimators` are the caller's own code
     own = {} if isinstance(estimators, str) else (estimators or {})
     chosen = {**named, **own}
+    bodies = body_beside(source, options.bodies)
+    if bodies is not None and bodies.gives_landmarks(chosen, options.bodies is not None):
+        body = body or _body(options.body)
+        chosen["landmarks"] = BodyFileEstimator(bodies.path, body)
     found = find_source(
         source, human=options.human, object_name=options.object, given=set(chosen),
         own_cameras=options.camera in ("static", "sfm"), complete=options.preset == "files",
     )  # fmt: skip
     plan = replace(plan_estimators(found, options, set(chosen)), notes=stored)
+    if bodies is not None:
+        plan = plan.with_body(bodies, chosen.get("landmarks"))
+        if not isinstance(chosen.get("landmarks"), BodyFileEstimator):
+            bodies = None  # tried: its rotations make a fit to landmarks no better
     specs = plan.specs()
     for kind, spec in found.beside.items():
         specs[kind] = spec
@@ -203,7 +213,7 @@ def _run(
         cleanup.remove()
         for name in with_dependents(redo):
             work.forget(name)
-        pipeline = Pipeline(found, out, body, options, chosen, stages, work)
+        pipeline = Pipeline(found, out, body, options, chosen, stages, work, bodies)
         try:
             pipeline.run(until)
             report = None if until else write_clip_folder(pipeline, cleanup)

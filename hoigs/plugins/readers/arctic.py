@@ -17,6 +17,7 @@ from hoigs.core.errors import ClipError, did_you_mean
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.model.smpl_params import pose_from_smplx
+from hoigs.core.unpickling.pickles import load_pickled_npy
 from hoigs.core.values.clip import BodyTrack, Clip, ObjectTrack, uniform_test_split
 from hoigs.core.values.lens import Lens
 from hoigs.core.values.tokens import EntityKind
@@ -25,7 +26,6 @@ from hoigs.plugins.readers.common.frame_order import image_files, video_moments
 from hoigs.plugins.readers.common.json_file import load_json, parse_json_map
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
 from hoigs.plugins.readers.common.listing import Need, require_files
-from hoigs.plugins.readers.common.pickles import load_pickled_npy
 from hoigs.plugins.readers.common.poses import checked_rotation, rigid
 from hoigs.plugins.readers.common.start_points import points_along_rays
 from hoigs.plugins.readers.common.template_mesh import load_mesh

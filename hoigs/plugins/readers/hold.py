@@ -14,6 +14,7 @@ from PIL import Image
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.unpickling.pickles import load_pickled_npy
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip, ObjectTrack, uniform_test_split
 from hoigs.core.values.tokens import EntityKind
@@ -21,7 +22,6 @@ from hoigs.plugins.readers.common.config import VideoPointsConfig
 from hoigs.plugins.readers.common.frame_order import image_files, video_moments
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
 from hoigs.plugins.readers.common.listing import Need, require_files
-from hoigs.plugins.readers.common.pickles import load_pickled_npy
 from hoigs.plugins.readers.common.poses import rigid
 from hoigs.plugins.readers.common.start_points import points_along_rays
 

@@ -19,6 +19,7 @@ from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.core.model.smpl_params import betas_of_joints, pose_from_smpl
 from hoigs.core.npz import load_array
+from hoigs.core.unpickling.pickles import load_pickle
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, uniform_test_split
 from hoigs.core.values.lens import Lens
 from hoigs.core.values.tokens import EntityKind
@@ -27,7 +28,6 @@ from hoigs.plugins.readers.common.frame_order import image_files, video_moments
 from hoigs.plugins.readers.common.json_file import load_json
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
 from hoigs.plugins.readers.common.listing import Need, require_files
-from hoigs.plugins.readers.common.pickles import load_pickle
 from hoigs.plugins.readers.common.poses import body_model, checked_rotation, rigid
 from hoigs.plugins.readers.common.start_points import points_along_rays
 

@@ -16,11 +16,12 @@ from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.core.model.smpl_params import pose_from_smpl
+from hoigs.core.unpickling.joblib_file import load_joblib
+from hoigs.core.unpickling.pickles import load_pickled_npy
 from hoigs.core.values.clip import BodyTrack, Clip
 from hoigs.plugins.readers.common.colmap_model import SparseModel, View, read_sparse, sparse_needs
 from hoigs.plugins.readers.common.config import VideoReaderConfig
 from hoigs.plugins.readers.common.frame_order import image_files, video_moments
-from hoigs.plugins.readers.common.joblib_file import load_joblib
 from hoigs.plugins.readers.common.lazy_frames import (
     DepthFiles,
     LazyFrames,
@@ -29,7 +30,6 @@ from hoigs.plugins.readers.common.lazy_frames import (
     lens_for,
 )
 from hoigs.plugins.readers.common.listing import Need, require_files
-from hoigs.plugins.readers.common.pickles import load_pickled_npy
 from hoigs.plugins.readers.common.poses import body_model
 
 LAYOUT = "a NeuMan scene"

@@ -38,6 +38,7 @@ def fit_body(
     points: Float[Tensor, "S 3"] | None = None,
     masks: Iterable[Bool[np.ndarray, "H W"]] | None = None,
     times: Float[Tensor, " F"] | None = None,
+    turns: Float[Tensor, "F 21 3"] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> BodyFit:
     """Pose, shape and place of a body in every frame, in metres.
@@ -56,6 +57,8 @@ def fit_body(
         points: of the scene, in the cameras' own unit; only used to find the scale.
         masks: one a frame, of the person or of all that moves.
         times: of the frames, seconds; by default 30 frames a second.
+        turns: axis-angle of joints 1..21 as another program has found them: the fit starts there,
+            and `PosePrior` holds it near.
         progress: called with 0..1.
 
     Raises:
@@ -71,7 +74,7 @@ def fit_body(
             "body fit needs at least 2: is the person in view?"
         )
     times = torch.arange(len(seen)) / 30.0 if times is None else times
-    problem = FitProblem(body, landmarks, cameras, times, options)
+    problem = FitProblem(body, landmarks, cameras, times, options, turns)
     if options.scale and points is not None:
         problem.ground = points
     if masks is not None and options.masks and not seen.all():

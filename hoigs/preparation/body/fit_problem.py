@@ -34,6 +34,7 @@ class FitProblem:
 
     Args:
         times: of the frames, seconds.
+        turns: axis-angle of joints 1..21 where they are known, about.
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class FitProblem:
         cameras: Sequence[Camera],
         times: Float[Tensor, " F"],
         options: FitOptions,
+        turns: Float[Tensor, "F 21 3"] | None = None,
     ) -> None:
         self.body, self.options = body, options
         self.points: LandmarkPoints = points_of(body)
@@ -67,7 +69,7 @@ class FitProblem:
         steps = (times[1:] - times[:-1]).double().clamp_min(1e-4)
         apart = torch.nn.functional.pad(steps, (1, 1), value=float(steps.median()))
         self.spacing = 0.5 * (apart[1:] + apart[:-1])  # seconds that each frame stands for
-        self.prior = PosePrior()
+        self.prior = PosePrior(turns)
         torso = [self.points.index(mark) for mark in TORSO]
         self.motion = MotionPrior(self.kinematics, torso, len(rows), times, options.smooth)
         pairs = int(self.points.pairs.max()) + 1
@@ -79,9 +81,10 @@ class FitProblem:
             torch.full((len(rows),), options.spread * self.width, dtype=torch.float64),
             torch.full((len(rows), 3), options.space, dtype=torch.float64),
         )
-        self.begin = Unknowns.start(
-            first_guess(body, landmarks, cameras, options.scale), body.num_betas, pairs
-        )
+        start = first_guess(body, landmarks, cameras, options.scale)
+        if turns is not None:
+            start = replace(start, body=turns)
+        self.begin = Unknowns.start(start, body.num_betas, pairs)
 
     def posed(self, unknowns: Unknowns, derivatives: bool = True) -> Posed:
         """The points that stand for landmarks.

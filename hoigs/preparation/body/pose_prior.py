@@ -16,18 +16,25 @@ SPREADS = {
     10: 0.1, 11: 0.1, 20: 0.35, 21: 0.35,
 }  # fmt: skip
 FREE = 1.2
+FOUND = 0.3  # radians that a pose by another program is off, of every joint
 LIMIT = 0.1  # radians beyond a joint's limit that are as rare as one standard deviation
 LASTS = 0.3  # seconds: frames nearer than this are no evidence of their own of how a body rests
 
 
 class PosePrior:
-    """Departures of the 21 body joints from rest and beyond their limits."""
+    """Departures of the 21 body joints from rest and beyond their limits.
 
-    def __init__(self) -> None:
-        self.rest = relaxed().double().flatten()
+    Args:
+        turns: axis-angle of the joints as another program has found them, in place of rest.
+    """
+
+    def __init__(self, turns: Float[Tensor, "F 21 3"] | None = None) -> None:
+        self.rest = (relaxed() if turns is None else turns).double().flatten(-2)
         spread = torch.full((21, 3), FREE, dtype=torch.float64)
         for joint, angle in SPREADS.items():
             spread[joint - 1] = angle
+        if turns is not None:
+            spread[:] = FOUND
         self.precision = spread.flatten().pow(-2)
 
     def add(

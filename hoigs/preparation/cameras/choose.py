@@ -10,6 +10,7 @@ import numpy as np
 
 from hoigs.core.npz import holds
 from hoigs.core.values.lens import Lens
+from hoigs.preparation.bodies.body_file import FileBody
 from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
 from hoigs.preparation.cameras.camera_track import (
     CameraTrack,
@@ -46,12 +47,14 @@ def choose_cameras(
     folder: Path,
     progress: Callable[[float], None],
     given: Path | None = None,
+    bodies: FileBody | None = None,
 ) -> ChosenCameras:
     """Cameras as `options.camera` requests them.
 
     Args:
         landmarks, masks: of the raw frames. model: a COLMAP model that is there already, or None.
         given: cameras.npz or MegaSaM's npz, or None.
+        bodies: whose lens a still camera has, unless another is given.
         folder: to work in; it may be removed when the result has been kept.
 
     Raises:
@@ -72,6 +75,8 @@ def choose_cameras(
     if options.camera in {"auto", "static"}:
         motion = background_motion(video, masks)
         if options.camera == "static" or motion.static:
+            if lens is None and options.focal is None and bodies is not None:
+                lens = bodies.lens(video.native_width, video.native_height)
             return _static(video, landmarks, options, lens, motion)
         if motion.turned is not None:
             raise SourceError(

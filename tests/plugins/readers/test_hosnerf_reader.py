@@ -17,9 +17,9 @@ from layouts.changed import picked, without_fingers
 from same import same_cameras, same_poses
 
 from hoigs.core.errors import ClipError
+from hoigs.core.unpickling.pickles import load_pickle
 from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.smplh import SmplBody
-from hoigs.plugins.readers.common.pickles import load_pickle
 from hoigs.plugins.readers.hosnerf import HosnerfReader, published_split
 
 

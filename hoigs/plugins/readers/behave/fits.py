@@ -14,8 +14,8 @@ from torch import Tensor
 
 from hoigs.core.errors import ClipError
 from hoigs.core.npz import load_arrays
+from hoigs.core.unpickling.pickles import load_pickle
 from hoigs.plugins.readers.common.listing import Need
-from hoigs.plugins.readers.common.pickles import load_pickle
 
 SITE = "https://virtualhumans.mpi-inf.mpg.de/behave"
 MAKER = (

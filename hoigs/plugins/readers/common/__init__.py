@@ -6,5 +6,5 @@
 - `frame_order`: natural order of file names, and the times of frames.
 - `poses`, `transforms`, `colmap_model`: cameras and body poses from the conventions of others.
 - `point_file`, `start_points`, `template_mesh`: first points of scenes and objects.
-- `json_file`, `pickles`, `joblib_file`: data files; pickles are read without running their code.
+- `json_file`: data files.
 """

@@ -1,4 +1,4 @@
-"""Pickled dictionaries of data sets, read without running any code in them.
+"""Pickled dictionaries of data sets and programs, read without running any code in them.
 
 Python's own loader calls any function that a pickle names. Data sets hold dictionaries of numbers
 and arrays, so here only the functions that make those are allowed.
@@ -23,10 +23,10 @@ ALLOWED = {
     "numpy._core.multiarray": _NUMPY,
     "numpy.core.numeric": ("_frombuffer",),
     "numpy._core.numeric": ("_frombuffer",),
-    "collections": ("OrderedDict",),
+    "collections": ("OrderedDict", "defaultdict"),  # WHAM: a defaultdict of dict
     "_codecs": ("encode",),  # how protocol 2 spells bytes
     "torch._utils": ("_rebuild_tensor_v2",),  # HOLD saves some arrays as tensors
-    "builtins": ("set", "frozenset", "complex", "bytearray", "slice", "range"),
+    "builtins": ("dict", "set", "frozenset", "complex", "bytearray", "slice", "range"),
 }
 ALLOWED["__builtin__"] = ALLOWED["builtins"]  # Python 2
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from hoigs.core.errors import ClipError
 from hoigs.core.npz import MOST_RATIO, SMALL_BYTES
-from hoigs.plugins.readers.common.pickles import ALLOWED
+from hoigs.core.unpickling.pickles import ALLOWED
 
 WRAPPER = ("joblib.numpy_pickle", "NumpyArrayWrapper")
 
@@ -33,7 +33,7 @@ class _Wrapper:
 _PythonUnpickler: Any = pickle._Unpickler  # the C version cannot be extended
 
 
-class _Unpickler(_PythonUnpickler):
+class _Unpickler(_PythonUnpickler):  # type: ignore[misc]  # which is Any
     dispatch: ClassVar = dict(_PythonUnpickler.dispatch)
 
     def __init__(self, file: io.BytesIO) -> None:

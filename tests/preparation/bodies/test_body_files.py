@@ -1,0 +1,152 @@
+"""Bodies of GVHMR and WHAM: recognised, read without running code, and used by the body fit."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny import FRAMES, HEIGHT, WIDTH, make_source
+
+from hoigs.plugins.bodies.anny import AnnyBody
+from hoigs.preparation.bodies.as_landmarks import BodyFileEstimator
+from hoigs.preparation.bodies.body_file import SMPLX_PELVIS, body_beside, read_bodies
+from hoigs.preparation.body.joint_limits import beyond
+from hoigs.preparation.body.pose_prior import PosePrior
+from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until
+from hoigs.preparation.video.source import SourceError
+
+FOCAL = 88.0
+
+
+def gvhmr(frames: int = FRAMES) -> dict[str, Any]:
+    """Someone upright, 2.8 m away, with the left elbow bent."""
+    pose = torch.zeros(frames, 63)
+    pose[:, 17 * 3 + 1] = -1.0
+    turn = torch.tensor([np.pi, 0.0, 0.0], dtype=torch.float32).expand(frames, 3)
+    place = torch.tensor((0.05, 0.0, 2.8)) - torch.tensor(SMPLX_PELVIS)
+    params = {
+        "global_orient": turn, "body_pose": pose, "betas": torch.zeros(frames, 10),
+        "transl": place.expand(frames, 3),
+    }  # fmt: skip
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    return {
+        "smpl_params_incam": params, "smpl_params_global": params,
+        "K_fullimg": K.expand(frames, 3, 3),
+    }  # fmt: skip
+
+
+def wham(frames: list[int]) -> defaultdict[Any, Any]:
+    people: defaultdict[Any, Any] = defaultdict(dict)
+    for name, rows in ((0, frames[:1]), (3, frames)):
+        pose = np.zeros((len(rows), 72), np.float32)
+        pose[:, 0] = np.pi
+        pose[:, 55] = np.arange(len(rows))  # an elbow that turns on
+        people[name]["pose"] = pose
+        people[name]["trans"] = np.full((1, len(rows), 3), 2.0)
+        people[name]["frame_ids"] = np.array(rows)
+    return people
+
+
+class Evil:
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        return os.mkdir, ("ran",)
+
+
+def test_wham_lacks_frames_and_has_two_people(tmp_path: Path) -> None:
+    (tmp_path / "any name.pkl").write_bytes(pickle.dumps(wham([1, 3, 4])))
+    found = body_beside(tmp_path, None)
+    assert found is not None and found.program == "WHAM" and found.people == 2
+    assert found.frames.tolist() == [1, 3, 4]
+    np.testing.assert_allclose(found.K(640, 480)[0, :2, 2], (320, 240))
+    np.testing.assert_allclose(found.K(640, 480)[0, 0, 0], 800)
+    turns = found.rotations(range(6))
+    np.testing.assert_allclose(turns[:, 17, 1], [0, 0, 0.5, 1, 2, 2])
+    text = found.used(range(6))
+    assert "interpolated in 3 of 6 frames" in text and "of its 2 people" in text
+
+
+@pytest.mark.parametrize("name", ["hmr4d_results.pt", "wham_output.pkl"])
+def test_code_in_a_file_is_not_run(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    content = {"smpl_params_incam": Evil(), "pose": Evil()}
+    if name.endswith(".pt"):
+        torch.save(content, name)
+    else:
+        Path(name).write_bytes(pickle.dumps(content))
+    with pytest.raises(SourceError, match=r"cannot be read"):
+        body_beside(tmp_path, None)
+    assert not (tmp_path / "ran").exists()
+    (tmp_path / name).rename(tmp_path / f"other-{name}")  # of nobody's concern
+    assert body_beside(tmp_path, None) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"K_fullimg": torch.eye(3).expand(FRAMES - 1, 3, 3)}, "its arrays have"),
+        ({"K_fullimg": None}, "K_fullimg.*expected"),
+        ({"smpl_params_incam": {"global_orient": torch.zeros(2, 3)}}, "has no body_pose"),
+        ({"smpl_params_incam": 3}, "has no global_orient"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    torch.save(gvhmr() | change, tmp_path / "x.pt")
+    with pytest.raises(SourceError, match=message):
+        read_bodies(tmp_path / "x.pt")
+
+
+def test_prepare_from_a_body_file_alone(tmp_path: Path, tiny_video: Path) -> None:
+    source = make_source(tmp_path / "source", tiny_video)
+    (source / "pose_mediapipe.npz").unlink()
+    torch.save(gvhmr(), source / "hmr4d_results.pt")
+    plans: list[Any] = []
+    report = prepare(
+        source, tmp_path / "clip", body=AnnyBody(), announce=plans.append,
+        options=PrepareOptions(fit_steps=6, overlay_width=0, max_frames=4, find_object=False),
+    )  # fmt: skip
+    assert plans[0].choices["landmarks"].use == "GVHMR's body"
+    assert "fitted to GVHMR landmarks of 4 of 4 frames" in report.provenance["body"]
+    assert "GVHMR's, in hmr4d_results.pt" in report.provenance["cameras"]
+    body = np.load(tmp_path / "clip" / "bodies" / "human.npz")
+    np.testing.assert_allclose(body["body"][:, 17, 1], -1.0, atol=0.1)
+
+
+def test_landmarks_beside_it_come_first(tmp_path: Path, tiny_video: Path) -> None:
+    source = make_source(tmp_path / "source", tiny_video)
+    torch.save(gvhmr(), source / "hmr4d_results.pt")
+    plans: list[Any] = []
+    prepare_until(
+        "frames", source, tmp_path / "clip", body=AnnyBody(), announce=plans.append, object="none"
+    )
+    assert plans[0].choices["landmarks"].use == "estimator:landmarks-files"
+    assert "hmr4d_results.pt, GVHMR's body, is not used" in plans[0].notes[-1]
+
+
+def test_a_file_of_a_longer_video_is_refused(tmp_path: Path) -> None:
+    from hoigs.core.interfaces.estimator import VideoRequest
+
+    torch.save(gvhmr(), tmp_path / "x.pt")
+    video = VideoRequest(
+        FRAMES - 1, WIDTH, HEIGHT, lambda i: np.zeros((HEIGHT, WIDTH, 3), np.uint8), tmp_path,
+        tmp_path,
+    )  # fmt: skip
+    with pytest.raises(SourceError, match=f"has frame {FRAMES - 1}, the video {FRAMES - 1} frames"):
+        BodyFileEstimator(tmp_path / "x.pt", AnnyBody()).estimate(video)
+
+
+def test_a_found_pose_takes_the_place_of_rest() -> None:
+    turns = 0.2 * torch.ones(2, 21, 3)
+    at_rest, found = (
+        float(prior.add(turns.double().flatten(1), torch.ones(2).double(), None))
+        for prior in (PosePrior(), PosePrior(turns))
+    )
+    limits = float((beyond(turns.double()) / 0.1).square().sum())
+    assert found == pytest.approx(limits) and at_rest > limits + 1
