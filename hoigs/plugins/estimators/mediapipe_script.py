@@ -126,12 +126,12 @@ class Finder:
 
     def of_one(self, image, wide, own):
         """The mask of one of several people: of the segmentations of all, what lies at their own
-        one, which knows them apart and is coarse."""
-        around = self.cv2.GaussianBlur(own, (0, 0), max(1.0, AROUND * max(image.shape)))
-        mine = np.where(around > EDGE, wide, 0)
-        near = self.near(image, mine > 0.5)
-        mean = mine if near is None else (mine + np.where(around > EDGE, near, 0)) / 2
-        return (2 * mean + own) / 3
+        one, which knows them apart and is coarse. Each may miss a part of them, or, in the whole
+        image, one without a head altogether: a pixel needs one of both."""
+        around = self.cv2.GaussianBlur(own, (0, 0), max(1.0, AROUND * max(image.shape))) > EDGE
+        near = self.near(image, own > 0.5)
+        people = wide if near is None else np.maximum(wide, near)
+        return (2 * np.where(around, people, 0) + own) / 3
 
     def landmarks(self, image, wide):
         """In the image and in space, and the mask of their person; looked for a second time with a

@@ -66,6 +66,17 @@ def test_a_click_on_nobody_is_refused(chosen: ModuleType) -> None:
         pose.process(0, image(0))
 
 
+def test_the_mask_needs_no_segmentation_of_the_whole_image(chosen: ModuleType) -> None:
+    script = importlib.import_module("mediapipe_script")
+    finder = object.__new__(script.Finder)
+    finder.cv2 = Box(GaussianBlur=lambda image, *_: image)
+    finder.close = Box(process=lambda cut: Box(segmentation_mask=np.ones(cut.shape[:2])))
+    own, other = np.zeros((2, HEIGHT, WIDTH))
+    own[50:160, 40:80], other[50:160, 180:220] = 1, 1
+    mask = finder.of_one(image(0), other, own)
+    np.testing.assert_array_equal(mask > 0.5, own > 0.5)
+
+
 def video(*entities: EntityRequest) -> VideoRequest:
     folder = Path("nowhere")
     return VideoRequest(5, WIDTH, HEIGHT, image, folder, folder, entities=entities)
