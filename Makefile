@@ -11,7 +11,7 @@ demo: $(INSTALLED)
 
 # one worker a core; a file stays with one worker, whose fixtures its tests share
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile
+	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

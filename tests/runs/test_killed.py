@@ -16,7 +16,7 @@ from hoigs.core.clip_folder.write import write_clip
 from hoigs.runs.run_folder import RunFolder
 from hoigs.training.session import Session
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 SETTINGS = ["train.steps=12", "train.checkpoint_every=4", "train.log_every=1",
             "model.scene.points=500"]  # fmt: skip
 
@@ -90,6 +90,6 @@ def test_killed_while_it_writes_it_ends_as_the_unbroken_run(
     duration = time.perf_counter() - started
     run = tmp_path / "run"
     command += ["--out", str(run)]
-    record = hammer(command, run, whole, kills=2, duration=0.8 * duration, seed=3)
+    record = hammer(command, run, whole, kills=1, duration=0.8 * duration, seed=3)
     assert record.faults == []
-    assert record.kills == 2 and record.finished >= 1
+    assert record.kills == 1 and record.finished >= 1

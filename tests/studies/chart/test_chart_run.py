@@ -21,7 +21,7 @@ from hoigs.studies.jobs.variants import parse_variants
 
 CLIP = "builtin:carry?frames=8&width=32&samples=1&edge_samples=1&held_out_views=0&test_frames=2"
 SPECS = "static,few=static+model.scene.points=60"
-WORDS = ("chart", CLIP, "--specs", SPECS, "--rasterizers", "warp", "--budgets", "6", "--seeds", "2",
+WORDS = ("chart", CLIP, "--specs", SPECS, "--rasterizers", "warp", "--budgets", "6", "--seeds", "1",
          "--threads", "1", "--device", "cpu", "--set", "model.scene.points=200",
          "--set", "train.checkpoint_every=2")  # fmt: skip
 
@@ -69,12 +69,11 @@ def test_a_killed_chart_goes_on_and_a_cell_is_reproduced(tmp_path: Path) -> None
     second = _start(out)
     told, _ = second.communicate()
     assert second.returncode == 0, told
-    assert told.count("done before") >= 1 and told.count("wrote") >= 4 + 4
+    assert told.count("done before") >= 1 and told.count("wrote") >= 4 + 2
 
     data = json.loads((out / "chart.json").read_text())
     cells = data["cells"]
-    assert [(c["spec"], c["seed"]) for c in cells] == [("static", 0), ("static", 1),
-                                                       ("few", 0), ("few", 1)]  # fmt: skip
+    assert [(c["spec"], c["seed"]) for c in cells] == [("static", 0), ("few", 0)]
     for cell in cells:
         own = json.loads((out / cell["run"] / "evaluation.json").read_text())
         (score,) = [s for s in own["scores"] if (s["view"], s["region"], s["metric"]) ==
@@ -87,7 +86,7 @@ def test_a_killed_chart_goes_on_and_a_cell_is_reproduced(tmp_path: Path) -> None
     sizes = {c["spec"]: c["values"]["parameters"] for c in cells}
     assert sizes["few"] < sizes["static"]
     rows = list(csv.DictReader(io.StringIO((out / "chart.csv").read_text())))
-    assert len(rows) == 4 * 9 and all(row["protocol"] for row in rows)
+    assert len(rows) == 2 * 9 and all(row["protocol"] for row in rows)
     figures = sorted(p.suffix for p in out.glob("chart-carry*"))
     assert figures == [".png", ".png", ".svg", ".svg"]
 

@@ -37,7 +37,7 @@ def short(case: Case) -> Case:
 
 def study(out: Path, cases: str, specs: str = "static", **more: object) -> StressStudy:
     chosen, rows = [short(case) for case in choose_cases(cases)], parse_variants(specs)
-    small = {"seeds": 2, "steps": 4, "points": 100, "base": BASE}
+    small = {"seeds": 1, "steps": 4, "points": 100, "base": BASE}
     return StressStudy(chosen, rows, out, **small, **more)  # type: ignore[arg-type]
 
 
@@ -59,7 +59,7 @@ def test_a_study_is_run_once_and_goes_on(tmp_path: Path) -> None:
 
     words.clear()
     (verdict,) = run_stress(study(tmp_path, "F49"), workers=2, report=report)
-    assert verdict.status in ("pass", "nature") and len(verdict.seeds) == 2
+    assert verdict.status in ("pass", "nature") and len(verdict.seeds) == 1
     assert verdict.machines and "2 frames of split 'test'" in verdict.protocol[0]
     values = [level.value for level in verdict.seeds[0].levels]
     assert values == [0, 0.9][: len(values)]
