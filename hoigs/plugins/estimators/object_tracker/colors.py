@@ -40,17 +40,10 @@ class ColorModel:
     inside: np.ndarray
     outside: np.ndarray
 
-    def odds(
-        self,
-        bins: Int[np.ndarray, "..."],
-        near: np.ndarray | None = None,
-        here: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Log-odds of each pixel. near, here: histograms, in this frame, of the surroundings and of
-        what is probably the object, which light changes as it turns."""
+    def odds(self, bins: Int[np.ndarray, "..."], near: np.ndarray | None = None) -> np.ndarray:
+        """Log-odds of each pixel. near: a histogram of the surroundings in this frame."""
         outside = self.outside if near is None else 0.5 * (self.outside + near)
-        inside = self.inside if here is None else 0.5 * (self.inside + here)
-        return odds_of(inside, outside)[bins]
+        return odds_of(self.inside, outside)[bins]
 
     def likeness(self, other: np.ndarray) -> float:
         """Bhattacharyya coefficient of a region's histogram and the object's."""

@@ -16,8 +16,6 @@ from hoigs.plugins.estimators.object_tracker.scene import Scene
 CANDIDATES = 8
 ABSENT = 1.1  # cost of a frame in which the object is not seen
 TURN = 0.8  # and of its going or coming back
-ALONE = 0.4  # and of one in which it is far from the person
-APART = 4  # pixels, the grid on which that distance is measured
 
 
 @dataclass(frozen=True)
@@ -56,8 +54,7 @@ def found_path(
             frames.append((np.array([center_of(known[i])]), np.array([-4.0])))
         else:
             odds = object_odds(footage, scene, colors, i)
-            places, cost = _candidates(odds, bins_of(footage.colors(i)), colors, size)
-            frames.append((places, cost + _apart(footage, i, places)))
+            frames.append(_candidates(odds, bins_of(footage.colors(i)), colors, size))
         progress((i + 1) / len(footage))
     return _cheapest(frames, size, sorted(known))
 
@@ -94,17 +91,6 @@ def _candidates(
         for (a, b), place in zip(zip(x, y), places)
     ]
     return places.reshape(-1, 2), np.asarray(cost, float)
-
-
-def _apart(footage: Footage, i: int, places: np.ndarray) -> np.ndarray:
-    """Cost of places far from the person, who handles the object: what looks like it there is more
-    often the scene."""
-    person = footage.person[i]
-    if not person.any():
-        return np.zeros(len(places))
-    x, y = places.astype(int).T
-    gap = ndimage.distance_transform_edt(~person[::APART, ::APART])[y // APART, x // APART] * APART
-    return ALONE * (1 - 1 / (1 + (gap / (0.12 * footage.diagonal)) ** 2))
 
 
 def _likeness(bins: np.ndarray, colors: ColorModel, place: np.ndarray, size: float) -> float:

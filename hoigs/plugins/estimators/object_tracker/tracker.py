@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
-from hoigs.plugins.estimators.object_tracker.affine import matched
 from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram
 from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
 from hoigs.plugins.estimators.object_tracker.path import Path, center_of, found_path
@@ -20,8 +19,6 @@ from hoigs.plugins.estimators.object_tracker.transfer import shift_of, transferr
 from hoigs.plugins.estimators.object_tracker.walker import walked
 from hoigs.plugins.estimators.object_tracker.windows import Window
 
-OURS = 0.85  # label from other frames above which a pixel's colour is taken for the object's
-SAME = 0.25  # difference of colours, 0 to 1, up to which a thing is followed without the path
 SURE = 0.35  # confidence below which the object counts as not seen
 
 
@@ -146,12 +143,11 @@ class _Walk:
     def step(self, i: int) -> tuple[float, np.ndarray]:
         """Confidence and soft mask (uint8) of frame `i`, next to the one before."""
         nothing = np.zeros(self.footage.shape, np.uint8)
-        away = None if self.scene is None else self.scene.difference(i)
-        window = self._followed(i, away)
-        if window is None and not self.path.seen[i]:
+        if not self.path.seen[i]:
             self.unseen += 1
             return 0.0, nothing
-        window = window or self._aligned(i, away)
+        away = None if self.scene is None else self.scene.difference(i)
+        window = self._aligned(i, away)
         soft, prior = self._segmented(i, window, away)
         mask = self._kept(soft > 0.5, prior, window.step)
         soft = np.where(ndimage.binary_dilation(mask, iterations=2), soft, 0)
@@ -166,60 +162,41 @@ class _Walk:
     def _colors(self, i: int, window: Window) -> np.ndarray:
         return to_features(window.cut(self.footage.lab[i]))
 
-    def _followed(self, i: int, away: np.ndarray | None) -> Window | None:
-        """Where the last sighting moved to, if it looks the same there, whatever the path says,
-        which knows colours alone and loses a thing before a person or a wall of its colours."""
-        if self.unseen:
-            return None
-        place, _ = self._fitted(i, away, self.center + self.velocity)
-        window = self.last.window.at(*place)
-        fit = matched(self._colors(i, window), self.last.colors, self.last.soft)
-        return window if fit[2] < SAME else None
-
     def _aligned(self, i: int, away: np.ndarray | None) -> Window:
         """The last sighting's window moved to where it fits best near the path."""
+        last, step = self.last, self.last.window.step
         reach = self.path.centers[i] + self.off
         guesses = [reach] if self.unseen else [reach, self.center + self.velocity]
-        half = self.last.window.n * self.last.window.step / 2
-        found = [self._fitted(i, away, guess) for guess in guesses]
-        # a place far from the path is unlikely
-        costs = [e + 0.5 * (np.hypot(*(place - reach)) / half) ** 2 for place, e in found]
-        return self.last.window.at(*found[int(np.argmin(costs))][0])
-
-    def _fitted(
-        self, i: int, away: np.ndarray | None, guess: np.ndarray
-    ) -> tuple[np.ndarray, float]:
-        """The place near a guess at which the last sighting fits best, and the error there."""
-        last, step = self.last, self.last.window.step
         slack = max(4, int(0.22 * last.window.n))
         n = last.window.n + 2 * slack
-        x, y = guess
-        wide = Window(round(x - n * step / 2), round(y - n * step / 2), n, step)
-        colors = self._colors(i, wide)
-        odds = self._odds(i, wide, colors, away)
-        odds = np.where(wide.inside(self.footage.shape), odds, -3)
-        dx, dy, error = shift_of(colors, last.colors, last.soft, odds, slack)
-        return np.array(wide.center) + np.array((dx, dy)) * step, error
+        best = None
+        for x, y in guesses:
+            wide = Window(round(x - n * step / 2), round(y - n * step / 2), n, step)
+            colors = self._colors(i, wide)
+            odds = self._odds(i, wide, colors, away)
+            odds = np.where(wide.inside(self.footage.shape), odds, -3)
+            dx, dy, error = shift_of(colors, last.colors, last.soft, odds, slack)
+            place = np.array(wide.center) + np.array((dx, dy)) * step
+            # a place far from the path is unlikely
+            error += 0.5 * (np.hypot(*(place - reach)) / (last.window.n * step / 2)) ** 2
+            if best is None or error < best[0]:
+                best = (error, place)
+        assert best is not None
+        return last.window.at(*best[1])
 
     def _segmented(
         self, i: int, window: Window, away: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Soft mask, and what other frames alone say of it."""
         colors = self._colors(i, window)
-        *moved, apart = matched(colors, self.last.colors, self.last.soft)
-        known = [(moved[0], moved[1])]
+        known = [(self.last.colors, self.last.soft)]
         if self.first is not self.last and self.first.window.n == window.n:
             known.append((self.first.colors, self.first.soft))
         prior, similar = transferred(colors, known)
         valid = window.inside(self.footage.shape)
         near = histogram(bins_of(colors), (prior < 0.3) * valid * 1.0)
         shape = np.log((prior + 0.03) / (1.03 - prior)) * (0.4 + 0.6 * similar)
-        here: np.ndarray | None = None
-        sure, person = prior > OURS, window.cut(self.footage.person[i]) > 0.5
-        # before the person alone: in flight, a blurred thing's surroundings would be learnt
-        if apart < SAME and sure.any() and person[sure].mean() > 0.5:
-            here = histogram(bins_of(colors), np.where(sure, prior, 0) * valid)
-        odds = shape + self._odds(i, window, colors, away, near, here, prior)
+        odds = shape + self._odds(i, window, colors, away, near, prior)
         odds = np.where(valid, odds, -9)
         return walked(odds, colors), prior
 
@@ -230,15 +207,13 @@ class _Walk:
         colors: np.ndarray,
         away: np.ndarray | None,
         near: np.ndarray | None = None,
-        here: np.ndarray | None = None,
         prior: np.ndarray | None = None,
     ) -> np.ndarray:
         """Log-odds of a window's pixels by colour, person's mask and scene.
 
-        near, here: colours around the object and of it in this frame. prior: where other frames
-        put it.
+        near: colours around the object in this frame. prior: where other frames put it.
         """
-        odds = 0.6 * self.colors.odds(bins_of(colors), near, here)
+        odds = 0.6 * self.colors.odds(bins_of(colors), near)
         person = window.cut(self.footage.person[i])
         # a person's mask that takes in most of what is known to be the object says little
         taken = 0.5 if prior is None else float((prior * person).sum() / max(prior.sum(), 1e-6))

@@ -19,7 +19,6 @@ from hoigs.core.interfaces.estimator import (
     VideoRequest,
     checked,
 )
-from hoigs.plugins.estimators.object_tracker.affine import matched
 from hoigs.plugins.estimators.object_tracker.estimator import ObjectTrackerEstimator
 from hoigs.plugins.estimators.object_tracker.footage import lab_of
 
@@ -155,26 +154,3 @@ def test_lab_of_known_colors() -> None:
     lab = lab_of(np.uint8([[[255, 0, 0], [255, 255, 255]]])).astype(float)
     assert np.allclose(lab[0, 0] / [2.55, 1, 1] - [0, 128, 128], (53.2, 80.1, 67.2), atol=0.6)
     assert np.allclose(lab[0, 1] / [2.55, 1, 1] - [0, 128, 128], (100, 0, 0), atol=0.6)
-
-
-def test_a_turned_and_half_covered_thing_is_registered() -> None:
-    rng = np.random.default_rng(0)
-    colors = 120 * ndimage.gaussian_filter(rng.normal(size=(90, 90, 3)), (2, 2, 0))
-    y, x = np.mgrid[:90, :90]
-    soft = ((abs(y - 45) < 24) & (abs(x - 45) < 20)).astype(np.float32)
-    turn = 1.05 * np.array([[np.cos(0.17), -np.sin(0.17)], [np.sin(0.17), np.cos(0.17)]])
-    back = np.linalg.inv(turn)
-    offset = 45 - back @ np.array([47.0, 42.0])
-    moved = [ndimage.affine_transform(c, back, offset, order=1) for c in colors.transpose(2, 0, 1)]
-    image = np.stack(moved, -1)
-    image[50:70, 30:45] = 40  # a hand
-    true = ndimage.affine_transform(soft, back, offset, order=1) > 0.5
-    _, found, _ = matched(image, colors, soft)
-
-    def iou(a: np.ndarray, b: np.ndarray) -> float:
-        return (a & b).sum() / (a | b).sum()
-
-    assert iou(found > 0.5, true) > 0.95
-    assert iou(soft > 0.5, true) < 0.9
-    template, same, _ = matched(rng.normal(size=(90, 90, 3)) * 30, colors, soft)
-    assert template is colors and same is soft  # nothing like it is there
