@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tiny import FRAMES, HEIGHT, WIDTH, landmarks, masks
-from tiny_mediapipe import FAKE
+from tiny_mediapipe import FAKE, FAKE_CV2
 
 from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.environments.managed import MARKER, EnvironmentAbsentError
@@ -48,9 +48,7 @@ def environment(alone: Path, tmp_path: Path) -> None:
     package.mkdir(parents=True)
     np.savez(known, **landmarks())
     (package / "__init__.py").write_text(FAKE.replace("KNOWN", str(known)))
-    (package.parent / "cv2.py").write_text(
-        "BORDER_REPLICATE = 1\ncopyMakeBorder = GaussianBlur = lambda i, *a: i\n"
-    )
+    (package.parent / "cv2.py").write_text(FAKE_CV2)
     start = f"import sys, runpy; sys.path.insert(0, {str(package.parent)!r}); "
     start += "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
     python = MEDIAPIPE.folder / "bin" / "python"

@@ -34,3 +34,18 @@ class Pose:
                    pose_world_landmarks=Box(landmark=points[1]))
 solutions = Box(pose=Box(Pose=Pose), selfie_segmentation=Box(SelfieSegmentation=Selfie))
 """
+
+# what the script takes of OpenCV
+FAKE_CV2 = """
+import numpy
+BORDER_REPLICATE = "edge"
+CC_STAT_AREA = 0
+def connectedComponentsWithStats(mask):
+    from scipy.ndimage import label
+    parts, count = label(mask)
+    return count + 1, parts, numpy.bincount(parts.ravel(), minlength=count + 1)[:, None], None
+def GaussianBlur(image, size, sigma):
+    return image
+def copyMakeBorder(image, above, below, left, right, kind):
+    return numpy.pad(image, ((above, below), (left, right), (0, 0)), kind)
+"""

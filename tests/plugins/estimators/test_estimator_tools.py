@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from estimator_cases import FRAMES, HEIGHT, WIDTH, mask, request
 from pydantic import ValidationError
+from tiny_mediapipe import FAKE_CV2
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.context import BuildContext
@@ -202,19 +203,6 @@ class SolutionBase:
         return Box(landmarks=None, world=None, mask=None)
 """,
 }
-FAKE_CV2 = """
-import numpy
-BORDER_REPLICATE = "edge"
-CC_STAT_AREA = 0
-def connectedComponentsWithStats(mask):
-    from scipy.ndimage import label
-    parts, count = label(mask)
-    return count + 1, parts, numpy.bincount(parts.ravel(), minlength=count + 1)[:, None], None
-def GaussianBlur(image, size, sigma):
-    return image
-def copyMakeBorder(image, above, below, left, right, kind):
-    return numpy.pad(image, ((above, below), (left, right), (0, 0)), kind)
-"""
 
 
 @pytest.fixture
