@@ -113,6 +113,8 @@ def with_prompts(
         update |= named_objects(named, options)
     if person := [person] if isinstance(person, str) else list(person):
         split = [split_name(text) for text in person]
+        if any(place.strip() == NONE for _, place in split):
+            raise SpecError("--person none: a clip needs a person; leave --person out")
         names = sorted({name for name, _ in split if name})
         if len(names) > 1:
             raise SpecError(f"--person: {' and '.join(names)} are given; one person is fitted")

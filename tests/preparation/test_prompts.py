@@ -94,5 +94,7 @@ def test_a_person_is_chosen_as_an_object_is() -> None:
     assert at.frame == 3 and at.points == [(320, 210, True), (500, 200, False)]
     assert options.prompts["object"].points == [(640, 402, True)]
     assert with_prompts(PrepareOptions(), (), person="anna=320,210").human == "anna"
+    with pytest.raises(SpecError, match="needs a person"):
+        with_prompts(PrepareOptions(), (), person="none")
     with pytest.raises(SpecError, match="anna and ben are given"):
         with_prompts(PrepareOptions(), (), person=["anna=3,2", "ben=5,2"])

@@ -8,6 +8,7 @@ user names; it reads frames from standard input and writes one file.
 from __future__ import annotations
 
 import json
+import re
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -178,10 +179,11 @@ class MediapipeEstimator(Estimator):
             )
         except HoigsError as error:
             said = log.read_text(errors="replace") if log.is_file() else ""
-            if chosen and "no person is found there" in said:
+            if chosen and (nobody := re.search(r"no person is found there: (\d+)", said)):
                 raise HoigsError(
-                    f"--person: MediaPipe finds no person at the click in frame {order[0]}; click "
-                    "on the middle of their chest, in a frame that shows them well, or give a box"
+                    f"--person: MediaPipe finds no person at the click in frame "
+                    f"{order[int(nobody[1])]}; click on the middle of their body (belly or hips), "
+                    "in a frame that shows them well, or give a box"
                 ) from error
             lacking = "has no mediapipe" in said
             raise HoigsError(f"{error}\n{INSTALL}" if lacking else str(error)) from error

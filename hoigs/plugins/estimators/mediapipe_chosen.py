@@ -38,18 +38,17 @@ class ChosenPose:
         """Landmarks in the image and in space, and the person's mask; None where they are lost.
 
         Raises:
-            LookupError: nobody is found where the first prompt says.
+            LookupError: nobody is found where a prompt says; its one argument ends with `number`.
         """
         if number == self.back and self.first is not None:
             self.square = self.first
         if number in self.prompts:
             found = self.search(image, *self.prompts[number])
-            if found is None and self.first is None:
-                raise LookupError("no person is found there")
-            if found is not None:
-                self.square, found = found
-                self.first = self.first or self.square
-                return found
+            if found is None:
+                raise LookupError(f"no person is found there: {number}")
+            self.square, found = found
+            self.first = self.first or self.square
+            return found
         found = self.look(image, self.square)
         if found is None:
             return None  # the square waits where it was

@@ -62,8 +62,13 @@ def test_the_one_clicked_on_is_followed(chosen: ModuleType, start: int) -> None:
 
 def test_a_click_on_nobody_is_refused(chosen: ModuleType) -> None:
     pose = chosen.ChosenPose(Graph(), Box, {0: ([(150, 90, True)], None)}, back=1)
-    with pytest.raises(LookupError):
+    with pytest.raises(LookupError, match="there: 0"):
         pose.process(0, image(0))
+    on, beside = ([(LEFT + 40, 90, True)], None), ([(150, 90, True)], None)
+    pose = chosen.ChosenPose(Graph(), Box, {0: on, 1: beside}, back=2)
+    pose.process(0, image(40))
+    with pytest.raises(LookupError, match="there: 1"):  # a later one is not dropped, either
+        pose.process(1, image(0))
 
 
 def test_the_mask_needs_no_segmentation_of_the_whole_image(chosen: ModuleType) -> None:
