@@ -17,7 +17,7 @@ import numpy as np
 
 from hoigs.core.errors import ClipError
 from hoigs.core.npz import MOST_RATIO, SMALL_BYTES
-from hoigs.core.unpickling.pickles import ALLOWED
+from hoigs.core.unpickling.pickles import refuse_unknown
 
 WRAPPER = ("joblib.numpy_pickle", "NumpyArrayWrapper")
 
@@ -43,11 +43,7 @@ class _Unpickler(_PythonUnpickler):  # type: ignore[misc]  # which is Any
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == WRAPPER:
             return _Wrapper
-        if name not in ALLOWED.get(module, ()):
-            raise pickle.UnpicklingError(
-                f"it contains {module}.{name}; only numbers, arrays, lists and dictionaries "
-                "are allowed, so save only these"
-            )
+        refuse_unknown(module, name)
         return super().find_class(module, name)
 
     def load_build(self) -> None:

@@ -31,15 +31,20 @@ ALLOWED = {
 ALLOWED["__builtin__"] = ALLOWED["builtins"]  # Python 2
 
 
+def refuse_unknown(module: str, name: str) -> None:
+    """UnpicklingError for what a pickle names, unless it is in `ALLOWED`."""
+    if name not in ALLOWED.get(module, ()):
+        raise pickle.UnpicklingError(
+            f"it contains {module}.{name}; only numbers, arrays, lists and dictionaries "
+            "are allowed, so save only these"
+        )
+
+
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("torch.storage", "_load_from_bytes"):
             return _storage
-        if name not in ALLOWED.get(module, ()):
-            raise pickle.UnpicklingError(
-                f"it contains {module}.{name}; only numbers, arrays, lists and dictionaries "
-                "are allowed, so save only these"
-            )
+        refuse_unknown(module, name)
         return super().find_class(module, name)
 
 

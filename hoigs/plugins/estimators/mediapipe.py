@@ -37,7 +37,8 @@ from hoigs.plugins.estimators.common.subprocess import run_tool, settings_key
 SCRIPT = Path(__file__).with_name("mediapipe_script.py")
 IMPORTED = [SCRIPT.with_name(f"mediapipe_{name}.py") for name in ("guided", "chosen")]
 INSTALL = "run `hoigs estimators install mediapipe` and leave `python` out"
-OTHERS, HIPS = 0.1, [23, 24]  # share of the frames that is worth a word; of the 33 landmarks
+OTHERS, FOLLOWED = 0.1, 0.8  # shares of the frames, above and below which there is something to say
+HIPS = [23, 24]  # of the 33 landmarks
 LONGEST = 1280  # pixels: larger frames are made smaller, which the models do in any case
 
 
@@ -147,7 +148,7 @@ class MediapipeEstimator(Estimator):
         person = _frames_of(found["person"], found["size"], first, video)
         text = "MediaPipe's segmentation of selfies and of poses; it takes in what is held"
         text += "; of the person clicked on" if chosen else ""
-        notes = _others(found["several"], image)
+        notes = _lost(order, image) if chosen else _others(found["several"], image)
         return Estimates(EntityMasks({people[0]: person}, None, text, notes=notes), landmarks)
 
     def _python(self, video: VideoRequest) -> Path:
@@ -211,6 +212,17 @@ def _others(several: Bool[np.ndarray, " N"], image: Float[np.ndarray, "F 33 4"])
     return (
         f"{count} of {len(several)} frames show several people; the one at {x:.0f},{y:.0f} in "
         f"frame {i} was taken (--person X,Y@FRAME chooses another)",
+    )
+
+
+def _lost(order: Sequence[int], image: Float[np.ndarray, "F 33 4"]) -> tuple[str, ...]:
+    """What there is to say if the person clicked on was lost in many of the frames in `order`."""
+    seen = np.isfinite(image[order, 0, 0])
+    if seen.mean() >= FOLLOWED:
+        return ()
+    return (
+        f"the person clicked on was followed in {int(seen.sum())} of {len(order)} frames; click on "
+        f"them in another frame, too, such as {order[int(seen.argmin())]}",
     )
 
 

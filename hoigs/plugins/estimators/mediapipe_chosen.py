@@ -15,7 +15,8 @@ SHIFTS = (-0.3, 0.0, 0.3)  # of the click from their middles, in sides: up, on a
 ON = 0.5  # of the person's own mask, at a click
 SEEN = 0.5  # visibility
 MARGIN = 1.25  # of the landmarks' box, the next square
-STEADY = 0.7  # share of its last side that a square keeps
+STEADY, SHRINKS = 0.7, 0.95  # shares of its last side that a square keeps as it grows, or shrinks
+WIDER = (1.0, 1.4)  # sides in which someone who is lost is looked for
 JUMP, GROWTH = 0.35, 1.6  # in sides, from frame to frame: what moves or grows more is someone else
 
 
@@ -49,16 +50,19 @@ class ChosenPose:
             self.square, found = found
             self.first = self.first or self.square
             return found
-        found = self.look(image, self.square)
-        if found is None:
-            return None  # the square waits where it was
-        square = square_of(found[0])
-        (x, y, side), (x1, y1, side1) = self.square, square
-        far = np.hypot(x1 - x, y1 - y) > JUMP * side
-        if far or not 1 / GROWTH < side1 / side < GROWTH:
-            return None
-        self.square = (x1, y1, STEADY * side + (1 - STEADY) * side1)
-        return found
+        x, y, side = self.square
+        for wider in WIDER:
+            found = self.look(image, (x, y, wider * side))
+            if found is None:
+                continue
+            x1, y1, side1 = square_of(found[0])
+            if np.hypot(x1 - x, y1 - y) > JUMP * side or not 1 / GROWTH < side1 / side < GROWTH:
+                continue
+            # quickly smaller, it would leave a limb out, see less, and be smaller again
+            kept = STEADY if side1 > side else SHRINKS
+            self.square = (x1, y1, kept * side + (1 - kept) * side1)
+            return found
+        return None  # the square waits where it was
 
     def search(self, image, points, box):
         """The next square, and what is seen in the one with the best person on the prompt."""

@@ -153,6 +153,10 @@ def ballistic(
     A hand lets go, or catches, at any moment between two frames, and until then it moves the object
     as it likes: the parabola passes the known places only nearly. Linear in its ends p0 and p1 and
     the acceleration a: p(t) = line from p0 to p1 + a (t - t0) (t - t1) / 2.
+
+    Args:
+        places: world, metres; only those before and after the flight are read.
+        rows: of the flight's crops. up: against gravity, unit, world.
     """
     ends = [rows[0] - 1, rows[-1] + 1]
     times = crops.frames[rows] / fps

@@ -96,7 +96,7 @@ def hand_motion(
     palm_depths = _depths_of(palms, near, depths, cameras)
     if known.any():
         depths = fill_gaps(palm_depths, known)
-    return HandMotion(held, rests, rotations, depths, palms, near, pieces, _up(places))
+    return HandMotion(held, rests, rotations, depths, palms, near, pieces, upward(places))
 
 
 def along_bones(joints: Float[Tensor, "F J 3"], parents: Sequence[int]) -> Float[Tensor, "F B 3"]:
@@ -110,7 +110,7 @@ def along_bones(joints: Float[Tensor, "F J 3"], parents: Sequence[int]) -> Float
     return bones.flatten(1, 2)
 
 
-def _up(places: Float[np.ndarray, "F J 3"]) -> Float[np.ndarray, " 3"]:
+def upward(places: Float[np.ndarray, "F J 3"]) -> Float[np.ndarray, " 3"]:
     """From the middle of the feet to the centre of mass, which balance keeps above it."""
     mass = np.einsum("j,fjc->fc", np.array(list(MASS.values())), places[:, list(MASS)])
     body = mass - places[:, list(FEET)].mean(1)

@@ -95,3 +95,11 @@ def test_frames_come_from_the_click_forwards_then_backwards() -> None:
     assert mediapipe._order(range(5), video()) == ([0, 1, 2, 3, 4], None)
     with pytest.raises(HoigsError, match="frame 7"):
         mediapipe._order(range(5), video(replace(person, frame=7)))
+
+
+def test_a_person_who_is_lost_is_worth_a_word() -> None:
+    image = np.zeros((5, 33, 4), np.float32)
+    assert mediapipe._lost([2, 3, 4, 1, 0], image) == ()
+    image[[4, 1]] = np.nan
+    (note,) = mediapipe._lost([2, 3, 4, 1, 0], image)
+    assert "3 of 5 frames" in note and note.endswith("such as 4")

@@ -18,7 +18,7 @@ from hoigs.preparation.objects import make_object as making
 from hoigs.preparation.objects.alignment import Aligned, Poses
 from hoigs.preparation.objects.crops import make_crops
 from hoigs.preparation.objects.flights import ballistic, flights_by_texture
-from hoigs.preparation.objects.hands import hand_motion
+from hoigs.preparation.objects.hands import hand_motion, upward
 from hoigs.preparation.objects.make_object import make_object
 from hoigs.preparation.objects.surface import hull
 from hoigs.preparation.objects.tracked import (
@@ -196,6 +196,16 @@ def test_a_spin_in_flight_is_found_by_texture() -> None:
     found = flights_by_texture(crops, surface, first, guess, np.array([0.0, -1, 0]), FPS)
     assert float(angles(found.rotations[flight], rotations[flight]).max()) < 25
     assert float(angles(guess.rotations[flight], rotations[flight]).max()) > 120
+
+
+def test_up_is_where_balance_keeps_the_body() -> None:
+    """And not where a bent head is."""
+    joints = np.zeros((4, 52, 3))
+    joints[:, [7, 8]] = (0, 0, -0.06)
+    joints[:, [10, 11]] = (0, 0, 0.06)
+    joints[:, [0, 9, 16, 17], 1] = (0.9, 1.2, 1.4, 1.4)
+    joints[:, 15] = (0, 1.5, 0.4)
+    np.testing.assert_allclose(upward(joints), (0, 1, 0), atol=1e-9)
 
 
 def test_a_throw_need_not_leave_the_hand_at_a_frame() -> None:
