@@ -57,8 +57,8 @@ def prepare(
         str | None,
         typer.Option(
             "--camera",
-            help="auto, static, moving (COLMAP's model beside the video, or structure from motion) "
-            "or sfm (structure from motion in any case).",
+            help="auto, static, turning (on its spot), moving (COLMAP's model beside the video, or "
+            "structure from motion) or sfm (structure from motion in any case).",
         ),
     ] = None,
     max_frames: Annotated[

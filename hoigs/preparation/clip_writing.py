@@ -110,7 +110,7 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         width=made.video.width,
         height=made.video.height,
         fps=made.video.fps,
-        camera="static" if made.track.static else "moving",
+        camera=made.track.kind,
         parallax_degrees=parallax(made.cameras, middle),
         coverage={n: m.coverage().round(5).tolist() for n, m in coverage.items()},
         body_residual_px=person.residual_px,

@@ -82,9 +82,10 @@ class PrepareOptions(ComponentConfig):
         default="jpg", description="format of stored frames"
     )
     quality: int = Field(default=95, ge=1, le=100, description="quality of jpg frames")
-    camera: Literal["auto", "static", "moving", "sfm"] = Field(
+    camera: Literal["auto", "static", "turning", "moving", "sfm"] = Field(
         default="auto",
-        description='"static": it never moves; "moving": the COLMAP model beside the video, or '
+        description='"static": it never moves; "turning": it turns on its spot, as on a tripod; '
+        '"moving": the COLMAP model beside the video, or '
         'structure from motion without one; "sfm": structure from motion in any case; "auto": the '
         "COLMAP model, or else whether the background moves decides",
     )

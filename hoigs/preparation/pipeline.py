@@ -460,15 +460,15 @@ class Pipeline:
             )  # fmt: skip
         else:
             scene = static_scene(
-                self.images, self.masks, self.cameras[0],
+                self.images, self.masks, self.cameras,
                 ground=self.person.ground, distance=self.person.distance(self.cameras),
                 backdrop=self.options.backdrop, count=self.options.scene_points,
                 metres=None if self.depth is None else self._metres_of,
             )  # fmt: skip
             if self.depth is None:
                 self.warnings.append(
-                    "the camera stands still: the scene's depth is supposed, only what moves has a "
-                    "measured place"
+                    "the camera stays in one place: the scene's depth is supposed, only what moves "
+                    "has a measured place"
                 )
         self.provenance["scene"] = scene.provenance
         return scene

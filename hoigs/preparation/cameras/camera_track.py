@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from hoigs.core.values.undistortion import Undistortion
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import SourceError, frame_number
 
+CameraKind = Literal["static", "turning", "moving"]
 ASSUMED_FOCAL = 0.8  # of the longer side: 64 degrees, a phone's main camera
 
 
@@ -34,7 +35,8 @@ class CameraTrack:
         model: folder of the COLMAP model, or None for a static camera.
         positions: places, among the frames given in, of those that have a camera.
         figures: for the report: "registered" and "images", "reprojection_px", "points",
-            "distortion_px", and of a static camera "displacement_px" and those of its focal length.
+            "distortion_px", of a static camera "displacement_px" and those of its focal length,
+            and of one that turns "turn_degrees".
     """
 
     cameras: list[Camera]
@@ -56,7 +58,15 @@ class CameraTrack:
 
     @property
     def static(self) -> bool:
+        """Whether it stays in one place, where it may turn."""
         return not len(self.points)  # only a camera that moves has measured any
+
+    @property
+    def kind(self) -> CameraKind:
+        """For the report."""
+        if not self.static:
+            return "moving"
+        return "turning" if "turn_degrees" in self.figures else "static"
 
 
 def pinhole(video: Frames, focal: float) -> Lens:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hoigs.core.diagnostics import ranges
 from hoigs.core.npz import holds
 from hoigs.core.values.lens import Lens
 from hoigs.preparation.bodies.body_file import FileBody
@@ -23,6 +24,7 @@ from hoigs.preparation.cameras.megasam import megasam_cameras
 from hoigs.preparation.cameras.motion import BackgroundMotion, background_motion
 from hoigs.preparation.cameras.sfm import structure_from_motion
 from hoigs.preparation.cameras.static_focal import static_focal
+from hoigs.preparation.cameras.turning_cameras import turning_cameras
 from hoigs.preparation.given import GivenMasks, RawLandmarks
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames
@@ -61,30 +63,27 @@ def choose_cameras(
         SourceError: the model does not fit, or structure from motion fails.
     """
     lens = known_lens(options, video)
-    beside = None if options.camera in {"static", "sfm"} else given or model
+    own = options.camera in {"static", "turning", "sfm"}
+    beside = None if own else given or model
     if lens is not None and beside is not None:
         raise SourceError(
             f"{beside.name} beside the video has a lens already: leave {lens[1]} out, or use "
-            "--camera sfm or static to make the cameras anew"
+            "--camera sfm, static or turning to make the cameras anew"
         )
-    if options.camera not in {"static", "sfm"} and given is not None:
+    if not own and given is not None:
         read = megasam_cameras if holds(given, MEGASAM) else given_cameras
         return ChosenCameras(read(video, given))
-    if options.camera not in {"static", "sfm"} and model is not None:
+    if not own and model is not None:
         return ChosenCameras(colmap_cameras(video, model))
-    if options.camera in {"auto", "static"}:
-        motion = background_motion(video, masks)
-        if options.camera == "static" or motion.static:
-            if lens is None and options.focal is None and bodies is not None:
-                lens = bodies.lens(video.native_width, video.native_height)
-            return _static(video, landmarks, options, lens, motion)
-        if motion.turned is not None:
-            raise SourceError(
-                f"{_turns(motion)}: without a change of place structure from motion finds no "
-                "depth, and hoigs does not solve such cameras. Choose a part in which it stands "
-                "still (--start, --end), use --camera static if it hardly turns, or --camera "
-                "moving if it does walk"
-            )
+    if options.camera in {"auto", "static", "turning"}:
+        still_lens = lens
+        if lens is None and options.focal is None and bodies is not None:
+            still_lens = bodies.lens(video.native_width, video.native_height)
+        motion = None if options.camera == "turning" else background_motion(video, masks)
+        if motion is not None and (options.camera == "static" or motion.static):
+            return _static(video, landmarks, options, still_lens, motion)
+        if motion is None or motion.turned is not None:
+            return _turning(video, landmarks, masks, options, still_lens, progress)
     return _from_motion(video, masks, options, lens, folder, progress)
 
 
@@ -133,6 +132,25 @@ def _static(
         figures |= found.figures
         warnings += found.warnings
     track = replace(track, provenance=track.provenance + how, figures={**track.figures, **figures})
+    return ChosenCameras(track, warnings=warnings)
+
+
+def _turning(
+    video: Frames,
+    landmarks: RawLandmarks,
+    masks: GivenMasks,
+    options: PrepareOptions,
+    lens: tuple[Lens, str] | None,
+    progress: Callable[[float], None],
+) -> ChosenCameras:
+    focal = static_focal(video, landmarks, options.focal)
+    track, turns = turning_cameras(video, masks, lens, focal, progress)
+    warnings = [] if lens is not None or turns.spread else [*focal.warnings]
+    if turns.lost:
+        warnings.append(
+            f"the camera turns, and the background of {len(turns.lost)} frames "
+            f"({ranges(turns.lost)}) was not found again: their cameras lie between the others'"
+        )
     return ChosenCameras(track, warnings=warnings)
 
 

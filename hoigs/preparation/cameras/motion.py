@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -21,6 +22,8 @@ WIDTH = 640  # at which they are
 FEATURES, ENOUGH = 1500, 25  # of an image; matches that make a pair count
 STILL = 1.0  # pixels at WIDTH: codecs and rolling light move features by a few tenths
 MARGIN = 0.01  # of the width: masks are grown by it
+
+Features = tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 128"]]
 
 
 @dataclass(frozen=True)
@@ -63,18 +66,11 @@ class BackgroundMotion:
 
 def background_motion(video: Frames, masks: GivenMasks) -> BackgroundMotion:
     """Compares frames spread over the video with the first one."""
-    import pycolmap
-
-    options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1)
-    options.sift.max_num_features = FEATURES
-    with quiet_colmap():
-        sift = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
     chosen = sorted(set(np.linspace(0, len(video) - 1, FRAMES + 1).round().astype(int).tolist()))
-    pairs = zip(chosen, video.subset(chosen), strict=True)
-    found = [_features(sift, image, masks.moving(i)) for i, image in pairs]
+    found = list(background_features(video, masks, chosen))
     displacement, matches = [], []
     for other in found[1:]:
-        one, two = _paired(found[0], other)
+        one, two = paired(found[0], other)
         matches.append(len(one))
         moved = np.linalg.norm(one - two, axis=-1)
         displacement.append(float(np.median(moved)) if len(one) >= ENOUGH else np.nan)
@@ -82,7 +78,7 @@ def background_motion(video: Frames, masks: GivenMasks) -> BackgroundMotion:
     if motion.static:
         return motion
     size = (WIDTH, round(video.height * WIDTH / video.width))
-    return replace(motion, turned=_turned([_paired(a, b) for a, b in pairwise(found)], size))
+    return replace(motion, turned=_turned([paired(a, b) for a, b in pairwise(found)], size))
 
 
 def _turned(pairs: list[Pair], size: tuple[int, int]) -> float | None:
@@ -93,15 +89,28 @@ def _turned(pairs: list[Pair], size: tuple[int, int]) -> float | None:
     return degrees if share >= SHARE else None
 
 
-def _paired(one: tuple[np.ndarray, np.ndarray], two: tuple[np.ndarray, np.ndarray]) -> Pair:
+def background_features(
+    video: Frames, masks: GivenMasks, chosen: Sequence[int]
+) -> Iterator[Features]:
+    """SIFT's of the chosen frames, outside the masks: positions, pixels at WIDTH, and unit
+    descriptors."""
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1)
+    options.sift.max_num_features = FEATURES
+    with quiet_colmap():
+        sift = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    for i, image in zip(chosen, video.subset(chosen), strict=True):
+        yield _features(sift, image, masks.moving(i))
+
+
+def paired(one: Features, two: Features) -> Pair:
     """Positions of the features that are found in both images."""
     rows = _matches(one[1], two[1])
     return one[0][rows[:, 0]], two[0][rows[:, 1]]
 
 
-def _features(
-    sift, image: UInt8[np.ndarray, "H W 3"], moving: Bool[np.ndarray, "H W"]
-) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 128"]]:
+def _features(sift, image: UInt8[np.ndarray, "H W 3"], moving: Bool[np.ndarray, "H W"]) -> Features:
     """Positions, pixels at WIDTH, and unit descriptors of features outside the mask."""
     scale = WIDTH / image.shape[1]
     size = (min(WIDTH, image.shape[1]), max(1, round(image.shape[0] * min(1.0, scale))))

@@ -17,12 +17,14 @@ class StaticFocal:
 
     Attributes:
         how: a phrase that tells where it comes from. figures: of the search, for the report.
+        known: it is given, or the file's metadata have it.
     """
 
     pixels: float
     how: str
     figures: dict[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    known: bool = False
 
 
 def static_focal(video: Frames, landmarks: RawLandmarks, given: float | None) -> StaticFocal:
@@ -30,10 +32,10 @@ def static_focal(video: Frames, landmarks: RawLandmarks, given: float | None) ->
     0.8 of the longer side.
     """
     if given is not None:
-        return StaticFocal(given, "given")
+        return StaticFocal(given, "given", known=True)
     found = focal_of_metadata(video.path, video.native_width, video.native_height)
     if found is not None:
-        return StaticFocal(found[0], f"from {found[1]}")
+        return StaticFocal(found[0], f"from {found[1]}", known=True)
     longer = max(video.native_width, video.native_height)
     curve = focal_curve(
         landmarks.image[..., [0, 1, 3]], landmarks.world[..., :3], (video.width, video.height)

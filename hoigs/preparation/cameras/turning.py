@@ -32,15 +32,17 @@ def turn_share(pairs: Sequence[Pair], size: tuple[int, int]) -> tuple[float, flo
     """
     best = (0.0, 0.0)
     for focal in FOCALS * max(size):
-        found = [_turn(pair, float(focal), size) for pair in pairs]
+        found = [best_turn(pair, float(focal), size) for pair in pairs]
         share = min(share for share, _ in found)
         if share > best[0]:
-            best = share, max(angle for _, angle in found)
+            best = share, max(degrees(R) for _, R in found)
     return best
 
 
-def _turn(pair: Pair, focal: float, size: tuple[int, int]) -> tuple[float, float]:
-    """The share of features that the best rotation explains, and its angle, degrees."""
+def best_turn(
+    pair: Pair, focal: float, size: tuple[int, int]
+) -> tuple[float, Float[np.ndarray, "3 3"]]:
+    """The share of features that the best rotation explains, and that rotation."""
     one, two = (_rays(xy, focal, size) for xy in pair)
     weights = np.ones(len(one))
     for _ in range(STEPS):
@@ -50,8 +52,12 @@ def _turn(pair: Pair, focal: float, size: tuple[int, int]) -> tuple[float, float
         seen = moved[:, :2] / moved[:, 2:] * focal + np.array(size) / 2
         off = np.linalg.norm(seen - pair[1], axis=-1)
         weights = 1 / (1 + (off / NEAR) ** 2)
-    angle = float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))
-    return float((off < NEAR).mean()), angle
+    return float((off < NEAR).mean()), R
+
+
+def degrees(R: Float[np.ndarray, "3 3"]) -> float:
+    """The angle of a rotation."""
+    return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))
 
 
 def _rays(

@@ -40,12 +40,14 @@ def _judged(
 
 
 def _cameras(report: Measures) -> Iterator[MeasureDiagnostic]:
-    if report.camera == "static":
+    if report.camera != "moving":
         moved = report.displacement_px
         yield _judged(
             "camera",
-            "static",
-            "taken to stand still"
+            report.camera,
+            "taken to turn on its spot"
+            if report.camera == "turning"
+            else "taken to stand still"
             + (f": the background moves by {moved:.2f} px at 640" if moved is not None else ""),
             "fair",
             "the background has one view and no measured depth: it looks right from near the "

@@ -12,8 +12,8 @@ class Measures:
 
     Attributes:
         name, frames, width, height, fps: of the clip. video: the source's file name.
-        camera: "static" or "moving". parallax_degrees: largest angle between two views of the
-            scene's middle; under about 5 the geometry is weakly known.
+        camera: "static", "turning" or "moving". parallax_degrees: largest angle between two views
+            of the scene's middle; under about 5 the geometry is weakly known.
         coverage: by entity, part of the image that the mask covers in each frame, 0..1.
         body_residual_px: median distance of fitted to given landmarks, in frame pixels.
         body: whatever else the body fit reports.

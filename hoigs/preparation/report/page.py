@@ -13,6 +13,11 @@ from hoigs.preparation.report.measures import Measures
 WIDTH, HEIGHT = 300, 90  # of a plot, in its own units
 Series = Mapping[str, Sequence[float | None]]
 
+CAMERAS = {
+    "static": "a camera that stands still", "turning": "a camera that turns on its spot",
+    "moving": "a moving camera",
+}  # fmt: skip
+
 
 def report_page(
     report: Measures,
@@ -25,7 +30,7 @@ def report_page(
     """The page; `rows` are what, value and note of each measure, `overlay` links overlay.mp4 and
     `object_picture` object.jpg."""
     page = (resources.files(__package__) / "page.html").read_text(encoding="utf-8")
-    camera = "a camera that stands still" if report.camera == "static" else "a moving camera"
+    camera = CAMERAS[report.camera]
     return Template(page).substitute(
         title=escape(report.name),
         lead=escape(

@@ -84,18 +84,22 @@ def plate_points(
     ground: float,
     backdrop: float,
     count: int,
+    within: Bool[np.ndarray, "H W"] | None = None,
     measured: Float[np.ndarray, "H W"] | None = None,
 ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
     """Points on floor and wall, denser where the plate has detail, with its colours.
 
     Args:
         camera: of the plate's size. count: of points, about.
+        within: pixels of the plate that some frame shows, and that get points; None: all.
         measured: depth of the plate, metres, 0 where floor and wall are supposed; None: everywhere.
 
     Returns:
         points in the world, metres, and RGB in [0, 1].
     """
     cells = quadtree(plate.image, count)
+    if within is not None:
+        cells = [(y, x, h, w) for y, x, h, w in cells if within[y + h // 2, x + w // 2]]
     means = [plate.image[y : y + h, x : x + w].mean((0, 1)) for y, x, h, w in cells]
     colors = torch.tensor(np.array(means), dtype=torch.float32) / 255
     middles = [(x + w / 2, y + h / 2) for y, x, h, w in cells]

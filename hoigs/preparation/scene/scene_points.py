@@ -14,15 +14,13 @@ from hoigs.core.values.camera import Camera
 from hoigs.preparation.entity_masks import EntityMasks
 from hoigs.preparation.masks.separate import Images
 from hoigs.preparation.scene.background_points import (
-    MASK_MARGIN,
     PLATE_FRAMES,
-    REFERENCE_WIDTH,
     background_plate,
     plate_points,
 )
 from hoigs.preparation.scene.dense_points import densify, keyframes
 from hoigs.preparation.scene.depth import median_depth
-from hoigs.preparation.video.resizing import shrink, shrink_mask
+from hoigs.preparation.scene.plate_view import PlateView
 from hoigs.preparation.video.source import SourceError
 
 
@@ -78,7 +76,7 @@ def camera_scene(
 def static_scene(
     images: Images,
     masks: EntityMasks,
-    camera: Camera,
+    cameras: Sequence[Camera],
     *,
     ground: float,
     distance: float,
@@ -90,31 +88,31 @@ def static_scene(
 
     Args:
         images: gives the frames anew. masks: of the frames.
+        cameras: of the frames, all in the world's origin; they may look into other directions.
         ground: height of the camera over the floor, metres. distance: of the person, metres.
         backdrop: distance of the wall in distances of the person.
         count: of points, about.
         metres: measured depth of a frame, 0 where unknown; None: it is supposed everywhere.
     """
-    width = min(camera.width, REFERENCE_WIDTH)
-    small = camera.resized(width, max(1, round(camera.height * width / camera.width)))
-    last = len(masks.human) - 1
-    chosen = set(np.linspace(0, last, PLATE_FRAMES).round().astype(int).tolist())
-
-    def frames():
-        for i, image in enumerate(images()):
-            if i in chosen:
-                size = (small.width, small.height)
-                yield shrink(image, *size), shrink_mask(masks.moving(i), *size)
-
-    margin = max(1, round(MASK_MARGIN * width / REFERENCE_WIDTH))
-    plate = background_plate(frames(), margin)
+    chosen = set(np.linspace(0, len(cameras) - 1, PLATE_FRAMES).round().astype(int).tolist())
+    view = PlateView.of(cameras)
+    shown = (
+        view.carried(image, masks.moving(i), cameras[i])
+        for i, image in enumerate(images())
+        if i in chosen
+    )
+    plate = background_plate(shown, view.margin)
     measured = None
     if metres is not None:
-        maps = ((metres(i), masks.moving(i)) for i in sorted(chosen))
-        measured = median_depth(maps, (small.width, small.height))
+        depths = (
+            view.carried_depth(metres(i), masks.moving(i), cameras[i]) for i in sorted(chosen)
+        )
+        measured = median_depth(depths, (view.camera.width, view.camera.height))
+    within = view.within([cameras[i] for i in sorted(chosen)])
     points, colors = plate_points(
-        plate, small, ground=ground, backdrop=backdrop * distance, count=count, measured=measured
-    )
+        plate, view.camera, ground=ground, backdrop=backdrop * distance, count=count,
+        within=within, measured=measured,
+    )  # fmt: skip
     floor = (
         f"a level floor {ground:.2f} m below a level camera and a wall at "
         f"{backdrop * distance:.1f} m"
@@ -123,8 +121,8 @@ def static_scene(
         text = f"supposed: {floor}, coloured by the median of unmasked pixels; its depth is not "
         text += "measured, and "
     else:
-        share = 100 * float((measured > 0).mean())
+        share = 100 * float((measured[within] > 0).mean())
         text = f"the median of the depth maps over unmasked pixels, {share:.0f} % of the image "
         text += f"(else {floor}); "
-    text += f"{100 * (1 - plate.seen.mean()):.1f} % of it is never seen"
+    text += f"{100 * (1 - plate.seen[within].mean()):.1f} % of it is never seen"
     return ScenePoints(points, colors, text)

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 import pytest
+import torch
 from PIL import Image
 from scipy import ndimage
 
@@ -94,31 +95,63 @@ def test_a_camera_that_moves_and_one_that_shows_nothing(tmp_path: Path) -> None:
     assert any("too few to tell" in warning for warning in chosen.warnings)
 
 
-def test_a_camera_that_turns_on_its_spot(tmp_path: Path) -> None:
-    folder = tmp_path / "turns"
+def turning_video(folder: Path, yaw: list[float]) -> tuple[Frames, GivenMasks]:
+    """A camera that looks at the wall from one place, turned by these degrees."""
     folder.mkdir()
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     rays = np.stack(((x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)), -1)
-    for i in range(3):
-        c, s = np.cos(np.radians(6 * i)), np.sin(np.radians(6 * i))
+    for i, degrees in enumerate(yaw):
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         wall = rays @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
         at = wall[..., 1::-1] / wall[..., 2:] * 440 + 450
         grey = ndimage.map_coordinates(WALLS[0][1], at.transpose(2, 0, 1), order=1, mode="mirror")
         Image.fromarray(np.stack([grey.astype(np.uint8)] * 3, -1)).save(folder / f"{i}.png")
-    video = open_frames(folder)
-    nothing = GivenMasks(together=MaskStack([np.zeros((HEIGHT, WIDTH), bool)] * 3))
+    nothing = MaskStack([np.zeros((HEIGHT, WIDTH), bool)] * len(yaw))
+    return open_frames(folder), GivenMasks(together=nothing)
 
-    def choose(camera: str):
-        options = PrepareOptions(focal=FOCAL, camera=camera)
-        return choose_cameras(video, nobody(3), nothing, None, options, tmp_path, lambda _: None)
 
-    with pytest.raises(
-        SourceError, match=r"turns on its spot \(by 6\.\d degrees .* --camera static"
-    ):
-        choose("auto")
-    chosen = choose("static")
-    assert chosen.track.figures["displacement_px"] > 50
+def test_a_camera_that_turns_on_its_spot(tmp_path: Path) -> None:
+    yaw = [0.0, 6.0, 12.0, 9.0]
+    video, nothing = turning_video(tmp_path / "turns", yaw)
+
+    def choose(**options):
+        return choose_cameras(
+            video, nobody(4), nothing, None, PrepareOptions(**options), tmp_path, lambda _: None
+        )
+
+    chosen = choose()
+    track = chosen.track
+    assert track.kind == "turning" and track.static and not chosen.warnings
+    assert float(track.cameras[0].K[0, 0]) == pytest.approx(FOCAL, rel=0.02)  # found by itself
+    poses = torch.stack([c.world_to_camera for c in track.cameras]).double()
+    assert (poses[:, :3, 3] == 0).all()
+    turned = poses[:, :3, :3] @ poses[0, :3, :3].mT
+    found = torch.rad2deg(torch.atan2(turned[:, 0, 2], turned[:, 2, 2])).abs()
+    assert found.numpy() == pytest.approx(np.array(yaw), abs=0.1)
+    given = choose(camera="turning", focal=1.2 * FOCAL)
+    assert float(given.track.cameras[0].K[0, 0]) == pytest.approx(1.2 * FOCAL, rel=1e-5)
+    chosen = choose(camera="static", focal=FOCAL)
+    assert chosen.track.figures["displacement_px"] > 50 and chosen.track.kind == "static"
     assert any("turns on its spot" in w and "declared static" in w for w in chosen.warnings)
+
+
+def test_a_turning_camera_of_which_some_frames_show_no_background(tmp_path: Path) -> None:
+    video, _ = turning_video(tmp_path / "turns", [0.0, 5.0, 10.0, 14.0])
+    hidden = [np.full((HEIGHT, WIDTH), i == 1) for i in range(4)]
+
+    def choose():
+        masks = GivenMasks(together=MaskStack(hidden))
+        options = PrepareOptions(camera="turning", focal=FOCAL)
+        return choose_cameras(video, nobody(4), masks, None, options, tmp_path, lambda _: None)
+
+    chosen = choose()
+    assert any("background of 1 frames (1) was not found" in w for w in chosen.warnings)
+    poses = torch.stack([c.world_to_camera[:3, :3] for c in chosen.track.cameras]).double()
+    turned = poses[1] @ poses[0].mT  # half way to frame 2
+    assert float(torch.rad2deg(torch.acos(turned[0, 0]))) == pytest.approx(5.0, abs=0.2)
+    hidden[2][:] = True
+    with pytest.raises(SourceError, match=r"background of 4 of 4 frames"):
+        choose()
 
 
 def test_the_way_of_a_moving_camera(tmp_path: Path) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -14,6 +17,8 @@ from hoigs.preparation.scene.background_points import (
     quadtree,
     supposed_depth,
 )
+from hoigs.preparation.scene.plate_view import PlateView
+from hoigs.preparation.video.source import SourceError
 
 
 def camera() -> Camera:
@@ -60,3 +65,35 @@ def test_quadtree_tiles_the_image_and_goes_where_the_detail_is() -> None:
     busy = sum(y < 20 and x < 20 for y, x, _, _ in cells)
     assert busy > 0.85 * len(cells), "a flat area needs few cells"
     assert all(min(h, w) == 1 for _, _, h, w in quadtree(image, 10**6)), "no more than pixels"
+
+
+def turned(degrees: float) -> Camera:
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    pose = torch.eye(4)
+    pose[:3, :3] = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+    return replace(camera(), world_to_camera=pose)
+
+
+def test_the_plate_of_a_camera_that_turns_shows_what_any_frame_shows() -> None:
+    """Frames that show the azimuth of their pixels in red are one picture of it."""
+    cameras = [turned(d) for d in (-12.0, 0.0, 12.0)]
+    view = PlateView.of(cameras)
+    shown = []
+    for c in cameras:
+        rays = c.unproject(c.pixel_grid(), torch.ones(HEIGHT, WIDTH))
+        azimuth = torch.rad2deg(torch.atan2(rays[..., 0], rays[..., 2]))
+        image = torch.stack([(azimuth + 60) * 2] * 3, -1).round().byte().numpy()
+        shown.append(view.carried(image, np.zeros((HEIGHT, WIDTH), bool), c))
+    plate, within = background_plate(shown, 0), view.within(cameras)
+    assert view.camera.width > WIDTH and 0.7 < within.mean() < 1
+    assert plate.seen[within].mean() > 0.98 and not plate.seen[~within].all()
+    grid = view.camera.pixel_grid()
+    rays = view.camera.unproject(grid, torch.ones(grid.shape[:2]))
+    azimuth = torch.rad2deg(torch.atan2(rays[..., 0], rays[..., 2])).numpy()
+    inner = plate.seen & within
+    assert np.abs(plate.image[..., 0] / 2 - 60 - azimuth)[inner].max() < 1.5
+    points, _ = plate_points(plate, view.camera, ground=1.5, backdrop=7.0, count=600, within=within)
+    seen = torch.stack([c.shows(*c.project(points)) for c in cameras])
+    assert seen.any(0).float().mean() > 0.98
+    with pytest.raises(SourceError, match="degrees off the middle"):
+        PlateView.of([turned(-60.0), turned(60.0)])

@@ -1,0 +1,262 @@
+"""Cameras of a video whose camera turns on its spot: rotations, and the focal length if they
+determine it.
+
+Every pair of frames that show the same background gives a rotation (`turning`); all rotations and
+the focal length are then solved together, as in panoramas (Brown and Lowe 2007), by Gauss-Newton.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hoigs.core.diagnostics import ranges
+from hoigs.core.values.lens import Lens
+from hoigs.preparation.cameras.camera_track import CameraTrack, pinhole, static_cameras
+from hoigs.preparation.cameras.motion import (
+    ENOUGH,
+    WIDTH,
+    Features,
+    background_features,
+    paired,
+)
+from hoigs.preparation.cameras.static_focal import StaticFocal
+from hoigs.preparation.cameras.turning import NEAR, best_turn, degrees
+from hoigs.preparation.given import GivenMasks
+from hoigs.preparation.video.frames import Frames
+from hoigs.preparation.video.source import SourceError
+
+STEPS = (1, 2, 4, 8, 16, 32)  # frames between those that are compared
+MATCHES = 80  # of a pair; more change nothing
+ROUNDS = 12  # of Gauss-Newton
+SURE = 0.05  # of the focal length: a larger standard deviation, and it is not determined
+PLAUSIBLE = (0.4, 2.5)  # longer sides
+MOST_LOST = 0.3  # of the frames may be without matches
+
+
+@dataclass(frozen=True)
+class Match:
+    """The same features in frames `one` and `two`, pixels."""
+
+    one: int
+    two: int
+    first: Float[np.ndarray, "N 2"]
+    second: Float[np.ndarray, "N 2"]
+
+
+@dataclass(frozen=True)
+class Turns:
+    """Rotations from the world to each frame's camera, the focal length and how sure it is.
+
+    Attributes:
+        focal: pixels. spread: its standard deviation, as a part of it; 0 if it was given.
+        off: pixels between features and where the rotations put them, median.
+        lost: frames without matches; their rotations are interpolated.
+    """
+
+    rotations: Float[np.ndarray, "F 3 3"]
+    focal: float
+    spread: float
+    off: float
+    lost: tuple[int, ...] = ()
+
+
+def turning_cameras(
+    video: Frames,
+    masks: GivenMasks,
+    lens: tuple[Lens, str] | None,
+    focal: StaticFocal,
+    progress: Callable[[float], None],
+) -> tuple[CameraTrack, Turns]:
+    """One place, and a rotation for each frame; the world is the frame's that looks into the
+    middle, y down, z forward.
+
+    Args:
+        lens: at the video's own size, and where it comes from; None: a pinhole's, whose focal
+            length is found, or that of `focal` where the turns do not determine it.
+
+    Returns:
+        the cameras, and what was found: with a `spread`, the turns determined the focal length.
+
+    Raises:
+        SourceError: most frames' background is not found again in their neighbours.
+    """
+    size = (WIDTH, round(video.height * WIDTH / video.width))
+    start = lens[0] if lens else pinhole(video, focal.pixels)
+    K = start.resized(*size).K.numpy()
+    straight = start.undistortion(size).pixels
+    found = []
+    for i, (xy, descriptors) in enumerate(background_features(video, masks, range(len(video)))):
+        found.append((straight(xy) if len(xy) else xy, descriptors))
+        progress(0.8 * (i + 1) / len(video))
+    matches = _matches(found)
+    known = lens is not None or focal.known
+    turns = solved(matches, len(video), K, fixed=True)
+    if not known:
+        free = solved(matches, len(video), K, fixed=False)
+        if free.spread < SURE and PLAUSIBLE[0] < free.focal / max(size) < PLAUSIBLE[1]:
+            turns = free
+    progress(1.0)
+    how = lens[1] if lens else focal.how
+    return _track(video, start, how, turns, turns.focal / K[0, 0]), turns
+
+
+def _track(video: Frames, lens: Lens, how: str, turns: Turns, zoom: float) -> CameraTrack:
+    if turns.spread:
+        lens = pinhole(video, zoom * float(lens.K[0, 0]))
+        how = f"by the camera's turns, to {100 * turns.spread:.1f} %"
+    still = static_cameras(video, lens, how)
+    poses = torch.eye(4).repeat(len(video), 1, 1)
+    poses[:, :3, :3] = torch.from_numpy(turns.rotations).float()
+    angles = [degrees(R) for R in turns.rotations]
+    provenance = still.provenance.replace("static camera", "camera that turns", 1)
+    return replace(
+        still,
+        cameras=[
+            replace(camera, world_to_camera=pose)
+            for camera, pose in zip(still.cameras, poses, strict=True)
+        ],
+        provenance=f"{provenance}, up to {max(angles):.1f} degrees from the middle; features "
+        f"outside the masks lie {turns.off:.2f} px (median, at a width of {WIDTH}) off",
+        figures=still.figures | {"turn_degrees": round(max(angles), 2)},
+    )
+
+
+def _matches(found: Sequence[Features]) -> list[Match]:
+    """Of frames a few steps apart, features spread over what there is."""
+    matches = []
+    for step in STEPS:
+        for i in range(len(found) - step):
+            one, two = paired(found[i], found[i + step])
+            if len(one) >= ENOUGH:
+                chosen = np.linspace(0, len(one) - 1, min(MATCHES, len(one))).astype(int)
+                matches.append(Match(i, i + step, one[chosen], two[chosen]))
+    return matches
+
+
+def solved(
+    matches: Sequence[Match], count: int, K: Float[np.ndarray, "3 3"], *, fixed: bool
+) -> Turns:
+    """The rotations, and unless it is `fixed` the focal length, that explain all matches best.
+
+    Raises:
+        SourceError: no chain of matches leads to most frames.
+    """
+    (rotations, lost), focal, center = _chained(matches, count, K), float(K[0, 0]), K[:2, 2]
+    size = 3 * count + 1
+    normal, off = np.eye(size), np.zeros(1)
+    for _ in range(ROUNDS):
+        normal, gradient, off = _equations(matches, rotations, focal, center)
+        if fixed:
+            normal[-1], normal[:, -1], gradient[-1] = 0, 0, 0
+            normal[-1, -1] = 1
+        largest = normal.diagonal().max()
+        normal += 1e-9 * largest * np.eye(size)  # of frames without matches, too
+        normal[:3, :3] += largest * np.eye(3)  # one frame stays
+        change = np.linalg.solve(normal, gradient)
+        rotations = _exp(change[:-1].reshape(-1, 3)) @ rotations
+        focal *= float(np.exp(np.clip(change[-1], -0.2, 0.2)))
+        if np.abs(change).max() < 1e-6:
+            break
+    spread = 0.0
+    if not fixed:  # of residuals within reach of the weights
+        noise = float((off[off < 3 * NEAR] ** 2).mean() / 2)
+        spread = float(np.sqrt(noise * np.linalg.inv(normal)[-1, -1]))
+    rotations = _interpolated(rotations, lost)
+    mean = _nearest_rotation(rotations.sum(0))
+    middle = int(np.argmax(np.einsum("fij,ij->f", rotations, mean)))
+    return Turns(rotations @ rotations[middle].T, focal, spread, float(np.median(off)), lost)
+
+
+def _equations(
+    matches: Sequence[Match], rotations: np.ndarray, focal: float, center: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normal equations for small turns of each camera and the logarithm of the focal length, and
+    the distances in pixels. A match's prediction is the first feature's ray, turned."""
+    size = 3 * len(rotations) + 1
+    normal, gradient, distances = np.zeros((size, size)), np.zeros(size), []
+    for m in matches:
+        A = rotations[m.two] @ rotations[m.one].T
+        ray = np.concatenate(((m.first - center) / focal, np.ones((len(m.first), 1))), -1)
+        d = ray @ A.T
+        flat = d[:, :2] / d[:, 2:]
+        off = m.second - (focal * flat + center)
+        # derivatives of the prediction by the turned ray, then by turns and focal length
+        slope = np.zeros((len(d), 2, 3))
+        slope[:, 0, 0] = slope[:, 1, 1] = 1
+        slope[:, :, 2] = -flat
+        slope *= (focal / d[:, 2])[:, None, None]
+        turned = -slope @ _cross(d)
+        shrunk = -ray * (1, 1, 0)
+        by_focal = focal * flat + np.einsum("nij,nj->ni", slope, shrunk @ A.T)
+        J = np.concatenate((turned, -turned @ A, by_focal[..., None]), -1)
+        length = np.linalg.norm(off, axis=-1)
+        weight = 1 / (1 + (length / NEAR) ** 2) ** 2
+        rows = np.r_[3 * m.two : 3 * m.two + 3, 3 * m.one : 3 * m.one + 3, size - 1]
+        normal[np.ix_(rows, rows)] += np.einsum("nai,naj,n->ij", J, J, weight)
+        gradient[rows] += np.einsum("nai,na,n->i", J, off, weight)
+        distances.append(length)
+    return normal, gradient, np.concatenate(distances)
+
+
+def _chained(
+    matches: Sequence[Match], count: int, K: np.ndarray
+) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Rotations from one frame on, each by the nearest frame that is reached already, and the
+    frames that no chain reaches."""
+    size = (2 * K[0, 2], 2 * K[1, 2])
+    rotations = np.tile(np.eye(3), (count, 1, 1))
+    waiting = sorted(matches, key=lambda m: m.two - m.one)
+    reached = {waiting[0].one} if waiting else set()
+    while True:
+        m = next((m for m in waiting if (m.one in reached) != (m.two in reached)), None)
+        if m is None:
+            break
+        _, A = best_turn((m.first, m.second), float(K[0, 0]), size)
+        if m.one in reached:
+            rotations[m.two] = A @ rotations[m.one]
+        else:
+            rotations[m.one] = A.T @ rotations[m.two]
+        reached |= {m.one, m.two}
+    lost = tuple(sorted(set(range(count)) - reached))
+    if len(lost) > MOST_LOST * count:
+        raise SourceError(
+            f"the camera turns, and the background of {len(lost)} of {count} frames "
+            f"({ranges(lost)}) is not found again in their neighbours: it may lack texture, be "
+            "blurred or be hidden by the masks; choose a part without them (--start, --end)"
+        )
+    return rotations, lost
+
+
+def _interpolated(rotations: np.ndarray, lost: Sequence[int]) -> np.ndarray:
+    """With the rotations of lost frames between those of their neighbours."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    if not lost:
+        return rotations
+    kept = np.setdiff1d(np.arange(len(rotations)), lost)
+    frames = np.clip(np.arange(len(rotations)), kept[0], kept[-1])
+    between: np.ndarray = Slerp(kept, Rotation.from_matrix(rotations[kept]))(frames).as_matrix()
+    return between
+
+
+def _cross(v: np.ndarray) -> np.ndarray:
+    """Matrices of the cross products with vectors [N, 3]."""
+    x, y, z = v.T
+    o = np.zeros_like(x)
+    return np.stack((o, -z, y, z, o, -x, -y, x, o), -1).reshape(-1, 3, 3)
+
+
+def _exp(turns: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(turns).as_matrix()
+
+
+def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    u, _, v = np.linalg.svd(matrix)
+    return u @ np.diag((1, 1, np.sign(np.linalg.det(u @ v)))) @ v
