@@ -33,7 +33,7 @@ from hoigs.plugins.estimators.object_tracker.proposal import WRISTS, proposed
 from hoigs.plugins.estimators.object_tracker.scene import Scene, moving_scene, static_scene
 from hoigs.plugins.estimators.object_tracker.tracker import Track, color_model, tracked
 
-VERSION = 4  # of what is kept in `work`; raised when masks change
+VERSION = 5  # of what is kept in `work`; raised when masks change
 WEAK = 0.6  # confidence below which a frame is named in a note
 
 

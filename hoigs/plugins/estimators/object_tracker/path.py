@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +11,13 @@ from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram
 from hoigs.plugins.estimators.object_tracker.footage import Footage
-from hoigs.plugins.estimators.object_tracker.scene import Scene
+from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, median_of
 
 CANDIDATES = 8
 ABSENT = 1.1  # cost of a frame in which the object is not seen
 TURN = 0.8  # and of its going or coming back
+JUMP = 8.0  # and of lying, all at once, elsewhere, as if it had been there before
+CHANGED = 4  # units of noise by which a pixel differs from the scene
 
 
 @dataclass(frozen=True)
@@ -44,19 +46,41 @@ def found_path(
     scene: Scene | None,
     colors: ColorModel,
     known: Mapping[int, Bool[np.ndarray, "h w"]],
-    progress: Callable[[float], None],
+    frames: Sequence[int] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Path:
-    """The path through the masks at `known` frames that follows the object's colours."""
+    """The path through the masks at `known` frames that follows the object's colours.
+
+    Args:
+        frames: neighbours, in order of going through them; None: all. The path has as many rows.
+    """
+    order = list(range(len(footage)) if frames is None else frames)
     size = float(np.sqrt(np.mean([m.sum() for m in known.values()]) / np.pi))
-    frames = []
-    for i in range(len(footage)):
+    found = []
+    for row, i in enumerate(order):
         if i in known:
-            frames.append((np.array([center_of(known[i])]), np.array([-4.0])))
+            places = np.array([center_of(known[i])])
+            found.append((places, np.array([-4.0]), np.zeros(1, bool)))
         else:
             odds = object_odds(footage, scene, colors, i)
-            frames.append(_candidates(odds, bins_of(footage.colors(i)), colors, size))
-        progress((i + 1) / len(footage))
-    return _cheapest(frames, size, sorted(known))
+            places, cost = _candidates(odds, bins_of(footage.colors(i)), colors, size)
+            found.append((places, cost, _still(scene, i, places, size)))
+        progress((row + 1) / len(order))
+    return _cheapest(found, size, [row for row, i in enumerate(order) if i in known])
+
+
+def _still(
+    scene: Scene | None, i: int, places: Float[np.ndarray, "C 2"], size: float
+) -> Bool[np.ndarray, "C"]:
+    """Which places look like the scene of a moving camera's nearby frames. Before a still camera
+    the scene is known better, and its odds say enough."""
+    still = np.zeros(len(places), bool)
+    if isinstance(scene, MovingScene):
+        away, r = scene.difference(i), max(1, int(0.6 * size))
+        for row, (x, y) in enumerate(places.astype(int)):
+            part = away[max(y - r, 0) : y + r + 1, max(x - r, 0) : x + r + 1]
+            still[row] = not median_of(part) > CHANGED
+    return still
 
 
 def center_of(mask: Bool[np.ndarray, "h w"]) -> tuple[float, float]:
@@ -106,7 +130,7 @@ def _cheapest(frames: list, size: float, known: list[int]) -> Path:
     spots: list[list] = []
     costs: list[list] = []
     back: list[list] = []
-    for i, (places, unary) in enumerate(frames):
+    for i, (places, unary, still) in enumerate(frames):
         here = [(p, 0) for p in places]
         if i == 0:
             total = [*unary, ABSENT]
@@ -115,8 +139,8 @@ def _cheapest(frames: list, size: float, known: list[int]) -> Path:
         else:
             total, parent, state = [], [], []
             before, before_cost = spots[-1], costs[-1]
-            for place, cost in zip(places, unary):
-                moves = [c + _move(s, place, size) for s, c in zip(before, before_cost)]
+            for place, cost, lies in zip(places, unary, still):
+                moves = [c + _move(s, place, size, lies) for s, c in zip(before, before_cost)]
                 k = int(np.argmin(moves))
                 total.append(moves[k] + cost)
                 parent.append(k)
@@ -147,12 +171,13 @@ def _cheapest(frames: list, size: float, known: list[int]) -> Path:
     return Path(centers, seen)
 
 
-def _move(before: tuple, place: np.ndarray, size: float) -> float:
+def _move(before: tuple, place: np.ndarray, size: float, still: bool) -> float:
     """Cost of a step: grows with its length in radii of the object, up to a jump's."""
     spot, age = before
     if spot is None:
         return TURN
     far = float(np.hypot(*(place - spot))) / size
+    jump = JUMP if still and far > 1.5 else 0.0
     if age:
-        return TURN + min(0.25 * far / (1 + age), 3.0)
-    return min(0.25 * far, 1.0) if far < 4 else min(1.0 + 0.5 * (far - 4), 5.0)
+        return TURN + jump + min(0.25 * far / (1 + age), 3.0)
+    return jump + (min(0.25 * far, 1.0) if far < 4 else min(1.0 + 0.5 * (far - 4), 5.0))

@@ -17,6 +17,8 @@ from hoigs.plugins.estimators.object_tracker.windows import Window
 
 RADII = (0.025, 0.04, 0.06, 0.09, 0.13, 0.19)  # of the object, in diagonals of the image
 ROUNDS = 4
+USUAL, LARGEST = 0.25, 0.55  # of the person's mask: what a held thing may, and cannot, cover of it
+INSIDE = (0.6, 1.5, 3.0)  # log-odds of the inside of a box, tried in turn
 
 
 @dataclass(frozen=True)
@@ -39,24 +41,27 @@ def prompted_mask(
 ) -> PromptedMask:
     """The best of masks grown from the prompt at several sizes."""
     inside, outside, box = _scaled(prompt, footage)
+    center = inside.mean(0) if box is None else (box[:2] + box[2:]) / 2
+    if not len(inside):
+        inside = center[None]
     seed = _disc(footage.shape, inside, max(1.5, 0.005 * footage.diagonal))
     away = scene.difference(i)
-    on_person = bool(footage.person[i][seed].mean() > 0.5) if seed.any() else False
+    shown = seed if box is None else _filled(footage.shape, box)
+    on_person = bool(footage.person[i][shown].mean() > 0.5) if shown.any() else False
     at_rest = not median_of(away[seed]) > 4
-    fixed = _evidence(footage.person[i], away, on_person, at_rest)
+    fixed = _evidence(footage.person[i], away, on_person, at_rest, box is not None)
     fixed[_disc(footage.shape, outside, max(1.5, 0.008 * footage.diagonal))] = -9
     fixed[footage.blank[i]] = -9
     fixed[seed] = 6
-    if box is not None:
-        spread = [max(box[2] - box[0], box[3] - box[1]) / 2]
-        center = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
-        if not len(inside):
-            inside = np.array([center])
-    else:
-        center = tuple(inside.mean(0))
+    if box is None:
         reach = float(np.hypot(*(inside - center).T).max())
-        spread = [reach + r * footage.diagonal for r in RADII]
-    grown = [_grown(footage, i, fixed, center, s, inside, box, known) for s in spread]
+        spreads = [reach + r * footage.diagonal for r in RADII]
+        grown = [_grown(footage, i, fixed, center, s, inside, known) for s in spreads]
+    else:
+        half = float(max(box[2:] - box[:2])) / 2
+        grown = [
+            _grown(footage, i, fixed, center, half, inside, known, box, odds) for odds in INSIDE
+        ]
     tried = [g for g in grown if g is not None]
     if not tried:
         return PromptedMask(i, np.zeros(footage.shape, np.float32), 0.0, on_person)
@@ -67,6 +72,8 @@ def prompted_mask(
         for k, (score, _) in enumerate(tried)
     ]
     scores = [score * n for score, n in zip(scores, new)]
+    if box is not None:  # which is drawn so that the object reaches its sides
+        scores = [score * _reaching(m, box) ** 2 for score, m in zip(scores, masks)]
     best = int(np.argmax(scores))
     return PromptedMask(i, tried[best][1], scores[best], on_person)
 
@@ -94,12 +101,22 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / union) if union else 1.0
 
 
+def _reaching(mask: Bool[np.ndarray, "h w"], box: np.ndarray) -> float:
+    """Overlap of a box and the one around a mask."""
+    y, x = np.nonzero(mask)
+    low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()]) + 1
+    both = np.prod(np.maximum(np.minimum(high, box[2:]) - np.maximum(low, box[:2]), 0))
+    return float(both / (np.prod(high - low) + np.prod(box[2:] - box[:2]) - both))
+
+
 def _plausible(footage: Footage, i: int, mask: np.ndarray, on_person: bool) -> float:
     """Less for huge masks, and those that spill onto the person though the prompt is not on one."""
     fits = min(1.0, (0.1 * mask.size / max(mask.sum(), 1)) ** 0.5)
+    both = (mask & footage.person[i]).sum()
     if on_person:  # the person's mask took the object in: a mask of the person is no object's
-        return fits * float(1 - (mask & footage.person[i]).sum() / footage.person[i].sum()) ** 2
-    return fits * float(1 - (mask & footage.person[i]).sum() / max(mask.sum(), 1)) ** 2
+        taken = both / footage.person[i].sum()
+        return fits * float(np.clip((LARGEST - taken) / (LARGEST - USUAL), 0, 1))
+    return fits * float(1 - both / max(mask.sum(), 1))
 
 
 def _scaled(prompt: FramePrompt, footage: Footage):
@@ -118,12 +135,21 @@ def _disc(shape: tuple[int, int], points: np.ndarray, radius: float) -> Bool[np.
     return found
 
 
-def _evidence(person: np.ndarray, away: np.ndarray, on_person: bool, at_rest: bool) -> np.ndarray:
+def _filled(shape: tuple[int, int], box: np.ndarray) -> Bool[np.ndarray, "h w"]:
+    y, x = np.mgrid[: shape[0], : shape[1]] + 0.5
+    return (x > box[0]) & (x < box[2]) & (y > box[1]) & (y < box[3])
+
+
+def _evidence(
+    person: np.ndarray, away: np.ndarray, on_person: bool, at_rest: bool, boxed: bool
+) -> np.ndarray:
     """Log-odds from the person's mask and from the scene.
+
+    The person's mask often takes in the rim of what they hold, and a box says how much.
 
     A thing that rests where it is clicked is part of the scene, which then says nothing of it.
     """
-    odds = np.where(person, -0.3 if on_person else -2.5, 0.0)
+    odds = np.where(person, -0.3 if on_person else -0.8 if boxed else -1.6, 0.0)
     if not at_rest:
         changed = np.nan_to_num(2.0 * np.tanh((away - 5) / 3), nan=0.0)
         # on the person everything has changed, which says nothing of an object there
@@ -132,9 +158,20 @@ def _evidence(person: np.ndarray, away: np.ndarray, on_person: bool, at_rest: bo
 
 
 def _grown(
-    footage: Footage, i: int, fixed: np.ndarray, center, spread: float, seeds, box, known
+    footage: Footage,
+    i: int,
+    fixed: np.ndarray,
+    center: np.ndarray,
+    spread: float,
+    seeds: np.ndarray,
+    known: ColorModel | None,
+    box: np.ndarray | None = None,
+    inside: float = 0.0,
 ) -> tuple[float, np.ndarray] | None:
-    """Score and soft mask at one size: colours and mask in turns, as in GrabCut (Rother 2004)."""
+    """Score and soft mask at one size: colours and mask in turns, as in GrabCut (Rother 2004).
+
+    inside: log-odds of the pixels of `box`.
+    """
     window = Window.around(center[0], center[1], 1.6 * spread + 4)
     colors = window.cut(footage.colors(i))
     valid = window.inside(footage.shape)
@@ -149,7 +186,7 @@ def _grown(
     else:
         x0, y0 = window.cells(box[0], box[1])
         x1, y1 = window.cells(box[2], box[3])
-        space = np.where((x > x0) & (x < x1) & (y > y0) & (y < y1), 0.6, -8.0)
+        space = np.where((x > x0) & (x < x1) & (y > y0) & (y < y1), inside, -8.0)
     soft = 1 / (1 + np.exp(-(space + fixed_here)))
     if box is None:
         soft = soft * (space > 0.4)

@@ -14,11 +14,12 @@ from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, 
 from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
 from hoigs.plugins.estimators.object_tracker.path import Path, center_of, found_path
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
-from hoigs.plugins.estimators.object_tracker.scene import Scene, median_of
+from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, median_of
 from hoigs.plugins.estimators.object_tracker.transfer import shift_of, transferred
 from hoigs.plugins.estimators.object_tracker.walker import walked
 from hoigs.plugins.estimators.object_tracker.windows import Window
 
+AGAIN, AHEAD = 6, 14  # frames after which the path is found anew, and how far
 SURE = 0.35  # confidence below which the object counts as not seen
 
 
@@ -49,9 +50,12 @@ def tracked(
     known = {p.frame: p.soft > 0.5 for p in prompts}
     colors = color_model(footage, {p.frame: p.soft for p in prompts})
     rests = at_rest(scene, known)
-    used = None if rests else scene
-    path = found_path(footage, used, colors, known, lambda x: progress(0.3 * x))
-    unchanged = 1.2 if stands_out(footage, used, path, known) else 0.1
+    moving = isinstance(scene, MovingScene)
+    # what rests is a part of a still camera's scene; a moving one's is that of nearby frames
+    used = scene if moving or not rests else None
+    path = found_path(footage, used, colors, known, progress=lambda x: progress(0.3 * x))
+    stands = not rests and stands_out(footage, used, path, known)
+    unchanged = 1.2 if stands else 0.1
     soft = np.zeros(footage.lab.shape[:3], np.uint8)
     confidence = np.zeros(len(footage))
     for p in prompts:
@@ -60,7 +64,7 @@ def tracked(
     done = 0
     for start, frames in walks:
         first = next(p for p in prompts if p.frame == start)
-        walk = _Walk(footage, used, colors, path, first, unchanged)
+        walk = _Walk(footage, used, colors, path, first, unchanged, moving)
         for i in frames:
             confidence[i], soft[i] = walk.step(i)
             done += 1
@@ -124,6 +128,7 @@ class _Walk:
         path: Path,
         start: PromptedMask,
         unchanged: float,
+        moving: bool,
     ) -> None:
         self.footage, self.scene, self.colors, self.path = footage, scene, colors, path
         self.unchanged = unchanged  # log-odds by which a pixel that shows the scene is not ours
@@ -134,8 +139,9 @@ class _Walk:
         self.off = self.center - path.centers[start.frame]  # of windows from the path
         self.velocity = np.zeros(2)
         self.unseen = 0
-        mask = start.soft > 0.5
-        self.area = float(mask.sum())
+        self.moving = moving  # the camera, so that the path is found anew on the way
+        self.seen, self.steps = (start.frame, start.soft > 0.5), 0
+        self.area = float(self.seen[1].sum())
 
     def _sighting(self, i: int, window: Window, soft: np.ndarray) -> Sighting:
         return Sighting(window, self._colors(i, window), soft)
@@ -143,6 +149,9 @@ class _Walk:
     def step(self, i: int) -> tuple[float, np.ndarray]:
         """Confidence and soft mask (uint8) of frame `i`, next to the one before."""
         nothing = np.zeros(self.footage.shape, np.uint8)
+        if self.moving and not self.unseen and self.steps % AGAIN == 0:
+            self._look_ahead(i)
+        self.steps += 1
         if not self.path.seen[i]:
             self.unseen += 1
             return 0.0, nothing
@@ -158,6 +167,17 @@ class _Walk:
         pasted = window.paste(soft, self.footage.shape)
         self._remember(i, pasted, window, confidence)
         return confidence, pasted
+
+    def _look_ahead(self, i: int) -> None:
+        """Finds the path of the next frames anew, by what the object looks like by now."""
+        last, mask = self.seen
+        step = 1 if i > last else -1
+        ahead = range(last, last + step * (AHEAD + 1), step)
+        frames = [k for k in ahead if 0 <= k < len(self.footage)]
+        found = found_path(self.footage, self.scene, self.colors, {last: mask}, frames)
+        centers, seen = self.path.centers.copy(), self.path.seen.copy()
+        centers[frames], seen[frames] = found.centers, found.seen
+        self.path = Path(centers, seen)
 
     def _colors(self, i: int, window: Window) -> np.ndarray:
         return to_features(window.cut(self.footage.lab[i]))
@@ -255,6 +275,7 @@ class _Walk:
 
     def _remember(self, i: int, pasted: np.ndarray, window: Window, confidence: float) -> None:
         mask = pasted > 127
+        self.seen = (i, mask)
         fresh = _window_of(mask) if mask.any() else window
         # the size changes slowly, so that windows of neighbouring frames can be compared
         if not 0.8 < fresh.n * fresh.step / (window.n * window.step) < 1.25:
@@ -267,9 +288,10 @@ class _Walk:
         self.off = 0.7 * self.off + 0.3 * (center - self.path.centers[i])
         self.last = self._sighting(i, window, window.cut(pasted.astype(np.float32) / 255))
         self.area = 0.9 * self.area + 0.1 * float(mask.sum())
-        if confidence > 0.75:  # it turns, and other sides of it have other colours
+        # it turns, and other sides of it have other colours
+        if confidence > (0.6 if self.moving else 0.75):
             seen = histogram(bins_of(self.last.colors), np.where(self.last.soft > 0.5, 1.0, 0.0))
-            self.colors = self.colors.blended(seen, 0.04)
+            self.colors = self.colors.blended(seen, 0.12 if self.moving else 0.04)
 
 
 def _supported(mask: np.ndarray, prior: np.ndarray) -> np.ndarray:

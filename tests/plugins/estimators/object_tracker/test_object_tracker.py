@@ -21,6 +21,7 @@ from hoigs.core.interfaces.estimator import (
 )
 from hoigs.plugins.estimators.object_tracker.estimator import ObjectTrackerEstimator
 from hoigs.plugins.estimators.object_tracker.footage import lab_of
+from hoigs.plugins.estimators.object_tracker.path import _cheapest
 
 H, W, RADIUS, COUNT = 72, 108, 8, 14
 
@@ -114,6 +115,45 @@ def test_a_still_video_without_a_prompt_has_no_object(tmp_path: Path) -> None:
     found = masks_of(request(tmp_path, ([frames[0]] * COUNT, [people[0]] * COUNT, discs)))
     assert not any(found.entities["object"][i].any() for i in range(COUNT))
     assert "nothing was found that moves" in found.notes[0]
+
+
+@pytest.mark.parametrize("prompt", ["click", "box"])
+def test_a_held_thing_that_the_person_s_mask_takes_in(tmp_path: Path, prompt: str) -> None:
+    """A segmenter calls what a person holds a part of them; a box there was an error, and a click
+    gave a piece of the thing."""
+    frames, people, _ = world()
+    y, x = np.mgrid[:H, :W] + 0.5
+    board = (np.abs(x - 50) < 10) & (np.abs(y - 44) < 7)
+    halves = np.where((x < 50)[..., None], (230, 230, 220), (220, 90, 40))
+    for image, person in zip(frames, people, strict=True):
+        image[board] = halves[board]
+        person |= board
+    box = (39.0, 36.0, 61.0, 52.0) if prompt == "box" else None
+    points = (PromptPoint(52, 44),) if prompt == "click" else ()
+    scene = frames, people, [board] * COUNT
+    found = masks_of(request(tmp_path, scene, (FramePrompt(0, points, box),)))
+    assert overlaps(found, scene[2])[0] > 0.9 and overlaps(found, scene[2]).mean() > 0.85
+
+
+def test_an_object_does_not_jump_to_a_thing_of_its_colours_that_was_always_there() -> None:
+    """A moving thing that looks odd for some frames, and a still one elsewhere that looks right."""
+    here, there = np.array([20.0, 20.0]), np.array([80.0, 20.0])
+
+    def frames(still: bool) -> list:
+        odd = [0.9 if 3 <= i < 8 else -0.5 for i in range(12)]
+        first = (here[None], np.array([-4.0]), np.zeros(1, bool))
+        later = [
+            (
+                np.stack((here + np.array((i, 0)), there)),
+                np.array([cost, -0.2]),
+                np.array([False, still]),
+            )
+            for i, cost in enumerate(odd)
+        ]
+        return [first, *later]
+
+    assert _cheapest(frames(still=False), 10.0, [0]).centers[6, 0] == 80
+    assert (_cheapest(frames(still=True), 10.0, [0]).centers[:, 0] < 40).all()
 
 
 def test_a_click_on_the_person_is_noted(tmp_path: Path) -> None:
