@@ -22,6 +22,7 @@ import pickle
 import random
 import resource
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -431,6 +432,37 @@ def run(
     return outcomes
 
 
+def shared_out(arguments: argparse.Namespace, limit_s: float) -> tuple[dict[str, Any], float]:
+    """The same by several processes, each with its own part of the seeds: their outcomes joined,
+    and the largest peak of memory."""
+    jobs, each = arguments.jobs, math.ceil(arguments.count / arguments.jobs)
+    only = ["--only", *arguments.only] if arguments.only else []
+    small_clip_folder()
+    with tempfile.TemporaryDirectory() as folder:
+        files = [Path(folder) / f"{k}.json" for k in range(jobs)]
+        minutes = [] if limit_s == math.inf else ["--minutes", str(limit_s / 60)]
+        running = [
+            subprocess.Popen(
+                [sys.executable, __file__, "--count", str(each), "--seed",
+                 str(arguments.seed + k * each), "--json", str(file), *minutes, *only]
+            )
+            for k, file in enumerate(files)
+        ]  # fmt: skip
+        for process in running:
+            process.wait()
+        records = [json.loads(file.read_text()) for file in files]
+    joined: dict[str, Any] = {}
+    for name in records[0]["targets"]:
+        parts = [record["targets"][name] for record in records]
+        joined[name] = {
+            **{key: sum(part[key] for part in parts) for key in ("cases", "read", "refused")},
+            "errors": dict(sum((Counter(part["errors"]) for part in parts), Counter())),
+            "slowest_s": max(part["slowest_s"] for part in parts),
+            "wrong": [case for part in parts for case in part["wrong"]],
+        }
+    return joined, max(record["peak_gib"] for record in records)
+
+
 def small_clip_folder() -> Path:
     """The built-in clip at its smallest, generated once and cached."""
     from hoigs.plugins.bodies.anny import AnnyBody
@@ -445,26 +477,32 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", help="names of targets")
     parser.add_argument("--minutes", type=float, help="stop after this time, all targets alike")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that share the cases")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     limit = math.inf if arguments.minutes is None else 60 * arguments.minutes
     torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as folder:
-        targets = make_targets(Path(folder), small_clip_folder())
-        chosen = [t for t in targets if not arguments.only or t.name in arguments.only]
-        began = time.perf_counter()
-        each = max(1, arguments.count // len(chosen))
-        outcomes = run(chosen, each, arguments.seed, limit / len(chosen))
+    began = time.perf_counter()
+    if arguments.jobs > 1:
+        found, peak = shared_out(arguments, limit)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            targets = make_targets(Path(folder), small_clip_folder())
+            chosen = [t for t in targets if not arguments.only or t.name in arguments.only]
+            each = max(1, math.ceil(arguments.count / len(chosen)))
+            outcomes = run(chosen, each, arguments.seed, limit / len(chosen))
+        found = {name: vars(outcome) for name, outcome in outcomes.items()}
+        peak = round(_peak() / 2**30, 2)
     if arguments.json:
         record = {
             "command": " ".join(["python benchmarks/fuzz.py", *sys.argv[1:]]),
-            "cases": sum(outcome.cases for outcome in outcomes.values()),
+            "cases": sum(outcome["cases"] for outcome in found.values()),
             "seconds": round(time.perf_counter() - began),
-            "peak_gib": round(_peak() / 2**30, 2),
-            "targets": {name: vars(outcome) for name, outcome in outcomes.items()},
+            "peak_gib": peak,
+            "targets": found,
         }
         arguments.json.write_text(json.dumps(record, indent=1) + "\n")
-    if any(outcome.wrong for outcome in outcomes.values()):
+    if any(outcome["wrong"] for outcome in found.values()):
         sys.exit(1)
 
 
