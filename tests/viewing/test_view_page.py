@@ -65,6 +65,7 @@ def test_packing_is_as_exact_as_it_says() -> None:
     import gzip
 
     still = cloud()
+    still = still.replace(sh=2 * still.sh)  # some colours are brighter than white
     frames = [still.replace(means=still.means * (1 + 0.05 * i)) for i in range(5)]
     track = track_of("a", frames, EYES)
     (head,), data = packed([track])
@@ -76,6 +77,10 @@ def test_packing_is_as_exact_as_it_says() -> None:
     span = np.array(head["high"]) - np.array(head["low"])
     means = np.array(head["low"])[:, None] + steps / 65535 * span[:, None]
     assert np.abs(means.transpose(0, 2, 1) - track.means.numpy()).max() <= span.max() / 65535
+    rgba = np.cumsum(codes[-4 * keys * count :].reshape(keys, 4, count).astype(int), 0) % 256
+    colors = (rgba[:, :3] / 255 * head["bright"]).transpose(0, 2, 1)
+    assert head["bright"] > 1.2 and rgba[:, 3].min() > 0
+    assert np.quantile(np.abs(colors - track.rgba[..., :3].numpy()), 0.99) <= head["bright"] / 255
 
 
 def test_every_frame_is_reached_from_the_keys() -> None:

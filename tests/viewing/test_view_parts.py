@@ -132,6 +132,9 @@ def test_every_mode_draws_another_picture(drawing: RunDrawing) -> None:
         assert picture.shape == (camera.height, camera.width, 3) and picture.std() > 1
         for other in pictures[:i]:
             assert np.abs(picture.astype(int) - other).mean() > 1
+    wide = fitted(camera, (2 * camera.width, camera.height))
+    error = drawing.draw(3.0, wide, Look("error to the video", everything)).image
+    assert error[:, : camera.width // 2].max() == 0 < error.max()  # the video does not reach there
     colour = pictures[MODES.index("colour")]
     plain = drawing.loaded.model.render(drawing.clip.moments[3], camera).color
     assert np.abs(colour / 255 - plain.detach().clamp(0, 1).numpy()).max() < 0.01

@@ -23,7 +23,8 @@ class Eye:
 
     Attributes:
         resolution: sizes of this canvas. drawn: what was last drawn (any key).
-        full: whether that was in full size. changed: when something last changed, seconds.
+        full: whether that was a still picture, in full size and quality.
+        changed: when something last changed, seconds.
         rates: times of the last drawings.
     """
 
