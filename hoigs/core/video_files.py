@@ -25,6 +25,7 @@ ENCODERS: dict[str, tuple[str, str, str, dict[str, str]]] = {
     ),
     ".mov": ("prores_ks", "yuv444p10le", "yuva444p10le", {"profile": "4444", "vendor": "apl0"}),
 }  # fmt: skip
+BT709, SRGB = 1, 13  # primaries and transfer function, as ITU-T H.273 numbers them
 
 
 def write_video(
@@ -79,6 +80,7 @@ def _encode(
     path: Path, kind: str, frames: Iterator[np.ndarray], first: np.ndarray, fps: float
 ) -> None:
     import av
+    from av.video.reformatter import ColorRange, Colorspace
 
     name, rgb, rgba, options = ENCODERS[kind]
     alpha = first.shape[2] == 4
@@ -90,9 +92,17 @@ def _encode(
         stream.height, stream.width = first.shape[:2]
         if kind != ".mp4":  # these encoders' bytes depend on the number of threads
             stream.codec_context.thread_count = 1
+        # players guess what is not declared, and differ by up to 25 of 255
+        context = stream.codec_context
+        context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
+        context.color_primaries, context.color_trc = BT709, SRGB
         for frame in frames:
             image = av.VideoFrame.from_ndarray(frame, format="rgba" if alpha else "rgb24")
-            container.mux(stream.encode(image))
+            coded = image.reformat(
+                format=stream.pix_fmt, src_color_range=ColorRange.JPEG,
+                dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG,
+            )  # fmt: skip
+            container.mux(stream.encode(coded))
         container.mux(stream.encode())
 
 

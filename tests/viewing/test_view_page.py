@@ -120,6 +120,15 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return 10 * math.log10(255**2 / float(((a - b) ** 2).mean()))
 
 
+def drawn_after(page: Any, count: int) -> None:
+    """Wait for another picture; the policy of the page forbids wait_for_function."""
+    for _ in range(300):
+        if page.evaluate("n => window.drawn > n", count):
+            return
+        page.wait_for_timeout(200)
+    raise AssertionError("no picture within 60 s")
+
+
 def test_the_page_plays_offline_and_draws_what_we_draw(
     loaded: LoadedRun, tmp_path: Path, window: Any
 ) -> None:
@@ -127,7 +136,7 @@ def test_the_page_plays_offline_and_draws_what_we_draw(
     opened = window(offline=True)
     page = opened.page
     page.goto(path.as_uri())
-    page.wait_for_function("window.drawn > 0", timeout=60_000)
+    drawn_after(page, 0)
     page.add_style_tag(content="#top, #bar, #about { display: none !important; }")
     drawing = RunDrawing(loaded)
     everything = frozenset(drawing.names)
@@ -139,7 +148,7 @@ def test_the_page_plays_offline_and_draws_what_we_draw(
             "f => { const t = document.getElementById('time'); t.value = f;"
             " t.oninput({target: t}); }", frame,
         )  # fmt: skip
-        page.wait_for_function("n => window.drawn > n", arg=before)
+        drawn_after(page, before)
         seen[frame] = opened.pixels()
         from hoigs.core.values.between import camera_between
         from hoigs.viewing.viewer.fitting import fitted
