@@ -80,7 +80,6 @@ def _encode(
     path: Path, kind: str, frames: Iterator[np.ndarray], first: np.ndarray, fps: float
 ) -> None:
     import av
-    from av.video.reformatter import ColorRange, Colorspace
 
     name, rgb, rgba, options = ENCODERS[kind]
     alpha = first.shape[2] == 4
@@ -92,18 +91,32 @@ def _encode(
         stream.height, stream.width = first.shape[:2]
         if kind != ".mp4":  # these encoders' bytes depend on the number of threads
             stream.codec_context.thread_count = 1
-        # players guess what is not declared, and differ by up to 25 of 255
-        context = stream.codec_context
-        context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
-        context.color_primaries, context.color_trc = BT709, SRGB
+        declare_colors(stream)
         for frame in frames:
-            image = av.VideoFrame.from_ndarray(frame, format="rgba" if alpha else "rgb24")
-            coded = image.reformat(
-                format=stream.pix_fmt, src_color_range=ColorRange.JPEG,
-                dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG,
-            )  # fmt: skip
-            container.mux(stream.encode(coded))
+            container.mux(stream.encode(coded(frame, stream)))
         container.mux(stream.encode())
+
+
+def declare_colors(stream: Any) -> None:
+    """Write into a video which colours `coded` gives: players guess what is not declared, and are
+    wrong by up to 25 of 255."""
+    from av.video.reformatter import ColorRange, Colorspace
+
+    context = stream.codec_context
+    context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
+    context.color_primaries, context.color_trc = BT709, SRGB
+
+
+def coded(image: UInt8[np.ndarray, "H W C"], stream: Any) -> Any:
+    """An RGB or RGBA picture as PyAV's frame for a stream, by the matrix of BT.709."""
+    import av
+    from av.video.reformatter import ColorRange, Colorspace
+
+    frame = av.VideoFrame.from_ndarray(image, format="rgba" if image.shape[2] == 4 else "rgb24")
+    return frame.reformat(
+        format=stream.pix_fmt, src_color_range=ColorRange.JPEG,
+        dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG,
+    )  # fmt: skip
 
 
 def _write_gif(
