@@ -7,7 +7,12 @@ the picture and showing it in the browser are not in these numbers: on one machi
 over a network they are the limit.
 """
 
+# ruff: noqa: E402
 from __future__ import annotations
+
+from hoigs.core.machine.cpus import share_processors
+
+share_processors()  # as the command does, before torch is imported
 
 import argparse
 import time

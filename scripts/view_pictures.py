@@ -1,6 +1,6 @@
 """The screenshots of docs/howto/view.md, made by a headless Chromium.
 
-    python scripts/view_pictures.py RUN [run clip file]      # for example runs/demo
+    python scripts/view_pictures.py RUN [run modes clip file two=RUN2]      # for example runs/demo
 
 Needs the extras of dev (playwright) and Chromium in PATH. Writes docs/assets/view-*.webp.
 """
@@ -20,6 +20,7 @@ from playwright.sync_api import Page, sync_playwright
 
 import hoigs
 from hoigs.runs.run_folder import RunFolder
+from hoigs.viewing.viewer.drawing import MODES
 
 ASSETS = Path(__file__).resolve().parents[1] / "docs" / "assets"
 SLOW_MS = 240_000  # software rendering on a busy machine
@@ -32,8 +33,11 @@ SOFTWARE = (
 )
 
 
-def save(page: Page, name: str) -> None:
-    shot = Image.open(BytesIO(page.screenshot(timeout=SLOW_MS))).convert("RGB")
+def shot_of(page: Page) -> Image.Image:
+    return Image.open(BytesIO(page.screenshot(timeout=SLOW_MS))).convert("RGB")
+
+
+def save(shot: Image.Image, name: str) -> None:
     shot = shot.resize((900, round(900 * shot.height / shot.width)), Image.Resampling.LANCZOS)
     shot.save(ASSETS / f"view-{name}.webp", quality=80)
     print(f"view-{name}.webp: {(ASSETS / f'view-{name}.webp').stat().st_size // 1000} kB")
@@ -50,7 +54,10 @@ class Served:
         self.address = next(line.split()[1] for line in self.lines if line.startswith("open"))
 
     def _work(self, *what: Path) -> None:
-        hoigs.view(*what, port=0, report=self.lines.append, started=self._started)
+        try:
+            hoigs.view(*what, port=0, report=self.lines.append, started=self._started)
+        finally:
+            self.ready.set()  # also where it failed: then there is no address
 
     def _started(self, viewer: Any) -> None:
         self.viewer = viewer
@@ -93,17 +100,48 @@ def of_run(browser: Any, run: Path) -> None:
     with viewer.controls.lock:
         viewer.settings.layout, viewer.settings.share = "wipe", 0.32
     served.settle(page)
-    save(page, "wipe")
+    save(shot_of(page), "wipe")
     with viewer.controls.lock:
         viewer.settings.layout = "one"
     drag(page, 36, 20)
     served.settle(page)
-    save(page, "run")
+    save(shot_of(page), "run")
     with viewer.controls.lock:
         viewer.settings.entities.discard("human")
         viewer.settings.overlays.update(("body mesh", "object track"))
     served.settle(page)
-    save(page, "overlays")
+    save(shot_of(page), "overlays")
+    served.close()
+
+
+def of_modes(browser: Any, run: Path) -> None:
+    """All modes but colour in one picture, without the panel."""
+    served = Served(run)
+    page = served.open(browser)
+    served.viewer.clock.seek(0.5 * served.viewer.clock.last, 0.0)
+    cells = []
+    for mode in MODES[1:]:
+        with served.viewer.controls.lock:
+            served.viewer.settings.mode = mode
+        served.settle(page)
+        width, height = next(iter(served.viewer._eyes.values())).canvas
+        left = (width - height) // 2  # the frame is square
+        cells.append(shot_of(page).crop((left, 0, left + height, height)).resize((360, 360)))
+    sheet = Image.new("RGB", (360 * len(cells), 360))
+    for i, cell in enumerate(cells):
+        sheet.paste(cell, (360 * i, 0))
+    save(sheet, "modes")
+    served.close()
+
+
+def of_two(browser: Any, run: Path, second: Path) -> None:
+    served = Served(run, second)
+    page = served.open(browser)
+    served.viewer.clock.seek(0.5 * served.viewer.clock.last, 0.0)
+    served.settle(page)
+    drag(page, 30, 10)
+    served.settle(page)
+    save(shot_of(page), "two")
     served.close()
 
 
@@ -114,7 +152,7 @@ def of_clip(browser: Any, clip: Path) -> None:
     with served.viewer.controls.lock:
         served.viewer.settings.overlays.update(("skeleton", "object track"))
     served.settle(page)
-    save(page, "clip")
+    save(shot_of(page), "clip")
     served.close()
 
 
@@ -124,13 +162,14 @@ def of_file(browser: Any, run: Path) -> None:
         print(made)
         page = browser.new_context(viewport=SIZE, offline=True).new_page()
         page.goto(made.path.as_uri())
-        page.wait_for_function("window.drawn > 0", timeout=SLOW_MS)
+        while not page.evaluate("window.drawn > 0"):  # its policy forbids wait_for_function
+            page.wait_for_timeout(200)
         page.evaluate("(() => { const t = document.getElementById('time'); t.value = t.max / 2;"
                       " t.oninput({target: t}); })()")  # fmt: skip
         page.wait_for_timeout(2000)
         drag(page, 60, 10)
         page.wait_for_timeout(3000)
-        save(page, "html")
+        save(shot_of(page), "html")
 
 
 def main() -> None:
@@ -138,9 +177,12 @@ def main() -> None:
     clip = (run / RunFolder(run).read_provenance()["clip"]["path"]).resolve()
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=[*SOFTWARE])
-        made = {"file": of_file, "clip": of_clip, "run": of_run}
+        made = {"file": of_file, "clip": of_clip, "run": of_run, "modes": of_modes}
         for part in sys.argv[2:] or made:
-            made[part](browser, clip if part == "clip" else run)
+            if part.startswith("two="):
+                of_two(browser, run, Path(part.removeprefix("two=")))
+            else:
+                made[part](browser, clip if part == "clip" else run)
         browser.close()
 
 

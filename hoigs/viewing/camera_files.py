@@ -55,10 +55,7 @@ def read_camera_path(
     Raises:
         HoigsError: the file is absent or not understood.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise HoigsError(f"{path}: expected a JSON file of cameras: {error}") from error
+    content = _read(path)
     if isinstance(content, dict) and "camera_path" in content:
         return _nerfstudio(path, content, clip, frames)
     try:
@@ -87,6 +84,29 @@ def read_camera_path(
     return views
 
 
+def rate_of(path: Path) -> float | None:
+    """Pictures a second that a file of nerfstudio gives by its `seconds`; None if there are none.
+
+    Raises:
+        HoigsError: the file is absent or not understood.
+    """
+    content = _read(path)
+    if not isinstance(content, dict) or "camera_path" not in content:
+        return None
+    try:
+        count, seconds = len(content["camera_path"]), float(content.get("seconds") or 0)
+    except (TypeError, ValueError) as error:
+        raise HoigsError(f"{path}: its camera_path or seconds: {error}") from error
+    return count / seconds if count and 0 < seconds < math.inf else None
+
+
+def _read(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise HoigsError(f"{path}: expected a JSON file of cameras: {error}") from error
+
+
 def _keyed(path: Path, key: Key, clip: Clip) -> Camera:
     first = clip.cameras[0]
     up = clip.up()
@@ -105,6 +125,11 @@ def _nerfstudio(
     path: Path, content: dict[str, Any], clip: Clip, frames: Sequence[float]
 ) -> list[tuple[Moment, Camera]]:
     """Every camera of the file; the clip plays once over them, or as `render_time` has it."""
+    kind = content.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise HoigsError(f"{path}: camera_type {kind!r}: expected 'perspective'")
+    if content.get("crop") is not None:
+        raise HoigsError(f"{path}: its crop cannot be drawn; remove it, and choose by --entities")
     last = clip.num_frames - 1
     try:
         width, height = int(content["render_width"]), int(content["render_height"])

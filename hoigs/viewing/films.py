@@ -22,6 +22,7 @@ from hoigs.core.values.clip import Clip
 from hoigs.core.values.moment import Moment
 from hoigs.core.video_files import SUFFIXES, WITH_ALPHA, write_video
 from hoigs.runs.loaded_run import LoadedRun
+from hoigs.viewing.camera_files import rate_of
 from hoigs.viewing.frames import dithered, fitted, read_background, source_frame
 from hoigs.viewing.paths import OLDER, View, film_path, frames_shown
 from hoigs.viewing.playback import Mode, Playback
@@ -101,7 +102,8 @@ def render(
             default.
         width, height: pixels; by default those of training. One alone keeps the aspect, both
             cut what does not fit.
-        start, end: first and last frame number. fps: pictures a second, by default the clip's.
+        start, end: first and last frame number. fps: pictures a second, by default those
+            of nerfstudio's file, or the clip's.
         slow: how many times slower than the clip it plays; moments between frames are computed.
         at: frame number at which bullet-time stands still; by default where the objects move
             fastest.
@@ -126,6 +128,8 @@ def render(
                 f"entity {entity!r}: this run has {names}{did_you_mean(entity, names)}"
             )
     numbers, rate = frame_numbers(loaded.clip, start, end, fps, slow)
+    if name.endswith(".json") and fps is None:
+        rate = rate_of(Path(name)) or rate
     film = [
         (moment, fitted(camera, width, height))
         for moment, camera in film_path(loaded.model, loaded.clip, name, numbers, rate, at)

@@ -83,7 +83,7 @@ class ClientScene:
             GROWN * gaussians.log_scales.exp()
         ).unsqueeze(-2)
         covariances = (rotated @ rotated.mT).clamp(-LARGEST, LARGEST)
-        rgba = rgba_of(gaussians, eyes)
+        rgba = rgba_of(gaussians, eyes).clamp(0, 1)  # viser has 8 bits
         arrays = [
             np.ascontiguousarray(a.float().numpy())
             for a in (GROWN * gaussians.means, covariances, rgba[:, :3], rgba[:, 3:])

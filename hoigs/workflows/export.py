@@ -47,7 +47,7 @@ def export(
         format: name of an exporter, "ply" or "exporter:ply" (`hoigs plugins` lists them).
         out: the new file or folder; by default RUN/exports/FORMAT. A name that ends as the
             format's files do (x.ply) is a file, beside which x.ply.json is written; any other is
-            a folder with export.json in it.
+            a folder with export.json in it. x.zip holds the folder.
         entities: names of those to export; all by default.
         start, end: first and last frame number, also fractions; the whole clip by default. A
             format of one moment takes `start`.
@@ -130,7 +130,7 @@ def write_to(
 ) -> Exported:
     """Export to a folder, or where `target` ends as the format's files do, to that file.
 
-    A zip holds the folder.
+    A zip holds the folder, with its sheet.
 
     Raises:
         HoigsError: `target` ends as files of other formats do, or it is one file, and the export
@@ -147,9 +147,9 @@ def write_to(
         done = exporter.export(request, folder, progress)
         if target.suffix.lower() == ZIP:
             write_zip(folder, folder / ZIP)
-            (folder / ZIP).rename(target)
-            return replace(done, folder=target.parent, files={target.name: target.stat().st_size})
-        files = [name for name in done.files if name != SHEET]
+            files = [ZIP]
+        else:
+            files = [name for name in done.files if name != SHEET]
         if len(files) != 1:
             raise HoigsError(
                 f"{target}: the export has {len(files)} files; name a folder, "

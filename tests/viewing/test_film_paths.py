@@ -16,6 +16,7 @@ import hoigs as h
 from hoigs.core.errors import HoigsError
 from hoigs.core.values.between import frame_numbers, frame_of
 from hoigs.runs.loaded_run import LoadedRun
+from hoigs.viewing.camera_files import rate_of
 from hoigs.viewing.frames import dithered, fitted
 from hoigs.viewing.paths import best_moment, film_path
 
@@ -86,7 +87,10 @@ def test_keyed_cameras_of_ours_and_of_nerfstudio(run, tmp_path):
     film = views(run, str(tmp_path / "ns.json"))
     assert len(film) == 2
     assert torch.allclose(film[0][1].world_to_camera, camera.world_to_camera, atol=1e-4)
-    for text in ("{", "{}", '{"keys": []}', '{"camera_path": [{}]}'):
+    (tmp_path / "ns.json").write_text(json.dumps(path | {"camera_path": [entry] * 3, "seconds": 6}))
+    assert rate_of(tmp_path / "ns.json") == 0.5 and rate_of(tmp_path / "own.json") is None
+    bad = ("{", "{}", '{"keys": []}', '{"camera_path": [{}]}', '{"camera_path": [], "crop": {}}')
+    for text in (*bad, '{"camera_path": [], "camera_type": "equirectangular"}'):
         (tmp_path / "bad.json").write_text(text)
         with pytest.raises(HoigsError, match=r"bad\.json"):
             views(run, str(tmp_path / "bad.json"))

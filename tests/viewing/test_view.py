@@ -242,9 +242,9 @@ def test_the_browser_draws_with_client(tiny_run: Path, window: Any) -> None:
         until(lambda: "drawn by the browser" in viewer.controls.status.content, page, "Gaussians")
         until(lambda: bool(viewer._eyes), page, "the browser")
         eye = next(iter(viewer._eyes.values()))
-        ours = viewer.picture(eye.canvas, viewer.settings, 0.0, eye.view).image
 
         def alike() -> bool:  # below the browser's notice, left of the panel
+            ours = viewer.picture(eye.canvas, viewer.settings, 0.0, eye.view).image
             theirs, own = (p[170:, :280].mean(-1).ravel() for p in (opened.pixels(), ours))
             return bool(np.corrcoef(theirs, own)[0, 1] > 0.8)
 

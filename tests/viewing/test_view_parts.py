@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.viewer.clip_drawing import ClipDrawing
 from hoigs.viewing.viewer.clock import Clock
 from hoigs.viewing.viewer.drawing import FAR, MODES, Look, RunDrawing
+from hoigs.viewing.viewer.eyes import Eye
 from hoigs.viewing.viewer.fitting import fitted, inner_rectangle
 from hoigs.viewing.viewer.panes import joined
 from hoigs.viewing.viewer.resolution import Resolution
@@ -132,6 +135,9 @@ def test_every_mode_draws_another_picture(drawing: RunDrawing) -> None:
         assert picture.shape == (camera.height, camera.width, 3) and picture.std() > 1
         for other in pictures[:i]:
             assert np.abs(picture.astype(int) - other).mean() > 1
+    wide = fitted(camera, (2 * camera.width, camera.height))
+    error = drawing.draw(3.0, wide, Look("error to the video", everything)).image
+    assert error[:, : camera.width // 2].max() == 0 < error.max()  # the video does not reach there
     colour = pictures[MODES.index("colour")]
     plain = drawing.loaded.model.render(drawing.clip.moments[3], camera).color
     assert np.abs(colour / 255 - plain.detach().clamp(0, 1).numpy()).max() < 0.01
@@ -166,3 +172,23 @@ def test_a_clip_shows_its_frames_masks_and_depth(drawing: RunDrawing) -> None:
         assert inside.any() and not (inside & ~clip.store.mask(name, 2).numpy()).any()
     if clip.depth_kind != "none":
         assert shown.draw(2.0, camera, Look("depth")).image.std() > 1
+
+
+def test_a_late_answer_of_the_browser_is_no_drag() -> None:
+    """As Chromium sent them: its own start, the camera that was set, its start with that target."""
+    camera = SimpleNamespace(
+        position=np.array((2.7, 3.5, 2.6)), look_at=np.zeros(3), wxyz=np.array((1.0, 0, 0, 0)),
+        up_direction=np.array((0.0, 1, 0)), fov=1.0, image_width=64, image_height=48,
+    )  # fmt: skip
+    drags: list[Eye] = []
+    eye = Eye(SimpleNamespace(camera=camera, atomic=nullcontext), 640, drags.append)
+    start = camera.position
+    goal = View(np.array((-0.8, 1.2, 3.5)), np.array((0, 0.8, 0.0)), np.eye(3), start, 1.0)
+    eye.look(goal)
+    eye.moved()
+    camera.position = start
+    eye.moved()
+    assert not drags
+    camera.position = goal.position + 0.3
+    eye.moved()
+    assert drags == [eye]

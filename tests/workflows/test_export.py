@@ -56,6 +56,8 @@ def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
     for out in (tmp_path / "x.ply", tmp_path / "folder"):
         with pytest.raises(HoigsError, match="No space left on device"):
             h.export(tiny_run(), format="ply", out=out)
+    with pytest.raises(HoigsError, match=r"x\.html cannot be written: No space left on device"):
+        h.view(tiny_run(), html=tmp_path / "x.html", device="cpu")
     assert not list(tmp_path.iterdir())
 
 

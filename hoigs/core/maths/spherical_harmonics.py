@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -57,6 +59,20 @@ def sh_basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor
             -C3[0] * x * (xx - 3 * yy),
         ]
     return torch.stack(bands, dim=-1)
+
+
+def mean_colors(
+    sh: Float[Tensor, "N K 3"],
+    means: Float[Tensor, "N 3"],
+    camera_centers: Sequence[Float[Tensor, " 3"]],
+) -> Float[Tensor, "N 3"]:
+    """Colours for where none may depend on the direction: the mean of what cameras see, >= 0.
+
+    Band 0 alone is the mean over all directions, most of which no camera looks along; after
+    training from one video the two differ a lot.
+    """
+    seen = [sh_to_colors(sh, means, center.to(means)) for center in camera_centers]
+    return torch.stack(seen).mean(0)
 
 
 def sh_to_colors(

@@ -13,11 +13,15 @@ import torch
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.maths.spherical_harmonics import mean_colors
 from hoigs.core.model.exporter import Exporter, ExportRequest
 from hoigs.core.progress import Progress
 from hoigs.core.values.between import camera_between, frame_of
-from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.clip import Clip
+from hoigs.core.values.gaussians import SH_C0, Gaussians
 from hoigs.plugins.exporters.common.ply_file import parse_ply, ply_bytes
+
+EYES = 8  # cameras of the video, of which a colour is the mean
 
 
 class GaussForgeConfig(ComponentConfig):
@@ -39,7 +43,7 @@ class GaussForgeExporter(Exporter):
         """See `Exporter.write`."""
         progress(0.0, "gaussians")
         ours = request.scene(request.moments[0], request.entities).joined()
-        data, read = self.packed(ours)
+        data, read = self.packed(self.prepared(ours, request.clip))
         progress(0.5, "comparing")
         (folder / f"scene{self.suffixes[0]}").write_bytes(data)
         if len(read) != len(ours):
@@ -48,10 +52,18 @@ class GaussForgeExporter(Exporter):
             lost = {}
         lost["precision"] = picture_loss(request, ours, read)
         if read.sh_degree < ours.sh_degree:
-            lost["view-dependent colour"] = f"SH of degree {read.sh_degree} of {ours.sh_degree}"
+            lost["view-dependent colour"] = (
+                f"SH of degree {read.sh_degree} of {ours.sh_degree}: each colour is the mean of "
+                "what the cameras of the video see, cut at white"
+            )
         if len(request.moments) > 1:
             lost["motion"] = "the file holds one moment, the first; ply-sequence holds all"
         return lost
+
+    def prepared(self, gaussians: Gaussians, clip: Clip) -> Gaussians:
+        """What is packed; overridden where the format cannot hold all of it."""
+        del clip
+        return gaussians
 
     def packed(self, gaussians: Gaussians) -> tuple[bytes, Gaussians]:
         """The file, and the Gaussians that GaussForge reads back from it."""
@@ -71,6 +83,14 @@ class SplatExporter(GaussForgeExporter):
 
     suffixes = (".splat",)
     file_format = "splat"
+
+    def prepared(self, gaussians: Gaussians, clip: Clip) -> Gaussians:
+        """Colours that do not depend on the direction: band 0 alone is far from what was seen."""
+        if gaussians.sh_degree == 0:
+            return gaussians
+        eyes = [camera.center for camera in clip.cameras[:: max(1, len(clip) // EYES)]]
+        colors = mean_colors(gaussians.sh, gaussians.means, eyes)
+        return gaussians.replace(sh=((colors - 0.5) / SH_C0)[:, None])
 
 
 class SogExporter(GaussForgeExporter):

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from hoigs.core.video_files import coded, declare_colors
+
 
 class VideoWriter:
     """H.264, yuv420p; an odd last row or column is dropped, as the format demands.
@@ -32,8 +34,6 @@ class VideoWriter:
         return self
 
     def add(self, image: UInt8[np.ndarray, "H W 3"]) -> None:
-        import av
-
         height, width = (n - n % 2 for n in image.shape[:2])
         if self._stream is None:
             rate = Fraction(self.fps).limit_denominator(1000)
@@ -41,9 +41,8 @@ class VideoWriter:
             self._stream.width, self._stream.height = width, height
             self._stream.pix_fmt = "yuv420p"
             self._stream.options = {"crf": str(self.crf), "preset": "veryfast"}
-        frame = av.VideoFrame.from_ndarray(
-            np.ascontiguousarray(image[:height, :width]), format="rgb24"
-        )
+            declare_colors(self._stream)
+        frame = coded(np.ascontiguousarray(image[:height, :width]), self._stream)
         self._container.mux(self._stream.encode(frame))
 
     def __exit__(

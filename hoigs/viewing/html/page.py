@@ -15,6 +15,7 @@ import torch
 
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.progress import Progress, no_progress
+from hoigs.core.whole_files import write_whole
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.html.packing import packed
 from hoigs.viewing.html.tracks import Track, track_of
@@ -65,7 +66,7 @@ def write_page(
         entities: names; all by default.
 
     Raises:
-        HoigsError: an entity is unknown, or the size cannot be reached.
+        HoigsError: an entity is unknown, the size cannot be reached, or the disk is full.
     """
     path, report = Path(path), progress or no_progress
     if path.suffix.lower() not in (".html", ".htm"):
@@ -74,13 +75,11 @@ def write_page(
     budget = None if max_mb is None else int(max_mb * 1e6)
     kept, stride, text = _fitting(loaded, tracks, budget, report)
     total = sum(len(t) for t in tracks)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.part")
     try:
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, text)
+    except OSError as error:
+        raise HoigsError(f"{path} cannot be written: {error.strerror or error}") from error
     left = _left_out(loaded, tracks, kept, stride)
     count = sum(len(t) for t in kept)
     return Page(path, path.stat().st_size / 1e6, count, total, stride, left)

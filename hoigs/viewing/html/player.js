@@ -88,7 +88,7 @@ function place(track, frame) {
       const x = signed(track.quats[(a * 4 + c) * n + i]), y = sign * signed(track.quats[(b * 4 + c) * n + i]);
       q[c] = x + (y - x) * r;
       const u = track.rgba[(a * 4 + c) * n + i], v = track.rgba[(b * 4 + c) * n + i];
-      out[o + (c < 3 ? 12 + c : 3)] = (u + (v - u) * r) / 255;
+      out[o + (c < 3 ? 12 + c : 3)] = ((u + (v - u) * r) / 255) * (c < 3 ? track.bright : 1);
     }
     if (pose) {
       const p = rotate(pose.q, out[o], out[o + 1], out[o + 2]);

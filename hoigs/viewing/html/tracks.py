@@ -17,7 +17,7 @@ from hoigs.core.maths.rotations import (
     normalize_quats,
     quats_to_matrices,
 )
-from hoigs.core.maths.spherical_harmonics import sh_to_colors
+from hoigs.core.maths.spherical_harmonics import mean_colors
 from hoigs.core.values.gaussians import Gaussians
 
 STILL_M = 5e-4  # an entity whose Gaussians all stay within this is stored once
@@ -33,7 +33,7 @@ class Track:
 
     Attributes:
         means: metres. quats: wxyz, unit, of the nearer sign from key to key. log_scales: of metres.
-        rgba: colour and opacity in [0, 1].
+        rgba: colour, which may be brighter than 1 where a Gaussian is transparent, and opacity.
         poses: of a rigid one, quaternion and translation in every key.
     """
 
@@ -114,9 +114,8 @@ def track_of(
 
 
 def rgba_of(gaussians: Gaussians, eyes: Sequence[Float[Tensor, " 3"]]) -> Float[Tensor, "N 4"]:
-    """Colour, the mean of what these camera centres see, and opacity, in [0, 1]."""
-    seen = [sh_to_colors(gaussians.sh, gaussians.means, eye) for eye in eyes]
-    color = torch.stack(seen).mean(0).clamp(0, 1)
+    """Colour, the mean of what these camera centres see, and opacity."""
+    color = mean_colors(gaussians.sh, gaussians.means, eyes)
     return torch.cat((color, gaussians.opacities[:, None]), -1)
 
 

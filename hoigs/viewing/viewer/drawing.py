@@ -26,7 +26,7 @@ from hoigs.evaluation.report.draw import (
 )
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.playback import Playback
-from hoigs.viewing.viewer.fitting import source_frame
+from hoigs.viewing.viewer.fitting import covered, source_frame
 
 Mode = Literal["colour", "depth", "alpha", "entity", "velocity", "error to the video"]
 MODES: tuple[str, ...] = get_args(Mode)
@@ -177,7 +177,9 @@ class RunDrawing:
             return depth_picture(output, self._span)
         if look.mode == "error to the video":
             source = torch.from_numpy(source_frame(self.clip, frame, camera)).float() / 255.0
-            return error_picture(output.color, source)
+            wrong = error_picture(output.color, source)
+            wrong[~covered(self.clip, camera)] = 0  # around the frame there is no error
+            return wrong
         return picture(output.color)
 
     def _deformed(self, moment: Moment, interaction: bool) -> Gaussians:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,8 @@ class Eye:
 
     Attributes:
         resolution: sizes of this canvas. drawn: what was last drawn (any key).
-        full: whether that was in full size. changed: when something last changed, seconds.
+        full: whether that was a still picture, in full size and quality.
+        changed: when something last changed, seconds.
         rates: times of the last drawings.
     """
 
@@ -34,6 +35,7 @@ class Eye:
         self.full, self.changed = False, 0.0
         self.rates: deque[float] = deque(maxlen=20)
         self._set: deque[np.ndarray] = deque(maxlen=400)  # positions of cameras
+        self._own: list[np.ndarray] = []  # positions of the browser's own start
         self._answered = False  # whether the browser has taken a camera that was set
 
     @property
@@ -48,6 +50,8 @@ class Eye:
 
     def look(self, view: View) -> None:
         """Set the browser's camera."""
+        if not self._set:
+            self._own.append(self.view.position)
         self._set.append(view.position)
         with self.client.atomic():
             view.apply(self.client.camera)
@@ -58,13 +62,19 @@ class Eye:
         A busy browser answers seconds later, and with the position of one camera and the target
         of another, as it takes them one after the other; whatever the mouse does to the camera
         moves its position. What comes before the browser has taken the first one that was set is
-        its own start.
+        its own start, which may also come once more, with the target that was set.
         """
         seen = self.view
         scale = 0.01 * max(float(np.linalg.norm(seen.target - seen.position)), 1e-3)
-        if any(np.linalg.norm(seen.position - position) < scale for position in self._set):
+
+        def at(places: Iterable[np.ndarray]) -> bool:
+            return any(np.linalg.norm(seen.position - place) < scale for place in places)
+
+        if at(self._set):
             self._answered = True
-        elif self._answered:
+        elif not self._answered:
+            self._own.append(seen.position)
+        elif not at(self._own):
             self._dragged(self)
 
     def rate(self) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
@@ -18,6 +18,16 @@ def source_frame(clip: Clip, frame: float, camera: Camera) -> UInt8[np.ndarray, 
     """The video's nearest frame in the middle of a picture of the camera's size."""
     image = clip.store.image(nearest_position(clip, frame)).numpy()
     return placed(image, (camera.width, camera.height))
+
+
+def covered(clip: Clip, camera: Camera) -> Bool[np.ndarray, "H W"]:
+    """Where `source_frame` has the video, and not the black around it."""
+    first = clip.cameras[0]
+    canvas = camera.width, camera.height
+    left, top, width, height = inner_rectangle((first.width, first.height), canvas)
+    inside = np.zeros((camera.height, camera.width), bool)
+    inside[top : top + height, left : left + width] = True
+    return inside
 
 
 def placed(

@@ -42,6 +42,7 @@ def open_server(host: str, port: int, label: str) -> Any:
         dark_mode=True, show_share_button=False, show_logo=False, control_width="medium",
         brand_color=(242, 158, 66),
     )  # fmt: skip
+    server.gui.main_panel.dock_right()  # beside the picture, not over it
     return server
 
 

@@ -197,7 +197,7 @@ class Viewer:
         if changed:
             eye.resolution.took(took)
             eye.rates.append(time.monotonic())
-        eye.drawn, eye.full = key, size == eye.resolution.size(eye.canvas, moving=False)
+        eye.drawn, eye.full = key, not changed
         self._tell(eye, size, changed, took, now)
         return True
 

@@ -14,7 +14,7 @@ gaussforge = pytest.importorskip("gaussforge", reason="not installed: hoigs[expo
 
 
 @pytest.mark.parametrize(
-    ("name", "least"), [("spz", 35), ("sog", 30), ("compressed-ply", 30), ("splat", 10)]
+    ("name", "least"), [("spz", 35), ("sog", 30), ("compressed-ply", 30), ("splat", 20)]
 )
 def test_what_is_read_back_draws_the_picture(name, least, request_of, psnr_to_ours, tmp_path):
     request = request_of()
