@@ -2,6 +2,8 @@
 
 python benchmarks/fuzz.py --json benchmarks/results/fuzz.json
 python benchmarks/busy_machine.py --json benchmarks/results/busy-machine.json
+python benchmarks/long_run.py --json benchmarks/results/long-run.json
+python benchmarks/sanitize.py --json benchmarks/results/sanitize.json
 python scripts/robustness.py
 """
 
@@ -47,9 +49,40 @@ def busy(record: dict[str, Any]) -> str:
     return f"{table(columns, rows)}\n\nOn {record['cpus']} processors."
 
 
+def long_run(record: dict[str, Any]) -> str:
+    """Readings between a quarter and a third of the steps, and at the end."""
+    keys = {
+        "memory, MiB": "memory_mib", "file handles": "handles", "a step, ms": "step_ms",
+        "Gaussians": "gaussians",
+    }  # fmt: skip
+    rows = [[what, *(f"{v:g}" for v in record[key])] for what, key in keys.items()]
+    made = table(("", "at a quarter to a third", "at the end"), rows)
+    return (
+        f"{made}\n\nSteps: {record['steps']}, on {record['device']}; {record['checkpoints']} "
+        "checkpoints on disk."
+    )
+
+
+def sanitize(record: dict[str, Any]) -> str:
+    """What each tool found."""
+    rows = [[tool, t["summary"].lower(), t["seconds"]] for tool, t in record["tools"].items()]
+    drawn = len(next(iter(record["tools"].values()))["drawn"])
+    made = table(("tool", "found", "seconds"), rows)
+    return f"{made}\n\n{drawn} renders and scores with gradients under each, on {record['device']}."
+
+
+TABLES = (
+    ("fuzz", "fuzz.json", fuzz),
+    ("busy", "busy-machine.json", busy),
+    ("long", "long-run.json", long_run),
+    ("long-cuda", "long-run-h100.json", long_run),
+    ("sanitize", "sanitize.json", sanitize),
+)
+
+
 def main() -> None:
     text = PAGE.read_text(encoding="utf-8")
-    for mark, file, make in (("fuzz", "fuzz.json", fuzz), ("busy", "busy-machine.json", busy)):
+    for mark, file, make in TABLES:
         if (RESULTS / file).is_file():
             made = make(json.loads((RESULTS / file).read_text(encoding="utf-8")))
             pattern = rf"<!-- {mark} -->.*<!-- /{mark} -->"
