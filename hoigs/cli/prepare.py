@@ -95,6 +95,13 @@ def prepare(
             "several.",
         ),
     ] = None,
+    person_height: Annotated[
+        float | None,
+        typer.Option(
+            "--person-height",
+            help="Of the person standing, metres: the unit of the world comes from it.",
+        ),
+    ] = None,
     keep_black: Annotated[
         bool | None,
         typer.Option(
@@ -139,7 +146,7 @@ def prepare(
     flags = {
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
         "start": start, "end": end, "focal": focal, "intrinsics": intrinsics,
-        "calibration": calibration, "keep_black": keep_black,
+        "calibration": calibration, "person_height": person_height, "keep_black": keep_black,
         "overwrite": overwrite, "preset": estimators,
     }  # fmt: skip
     options = load_options(file, settings or (), flags)

@@ -107,6 +107,14 @@ class PrepareOptions(ComponentConfig):
         "TOML of Pose2Sim; FILE#NAME where it holds several",
     )
     body: str = Field(default="body:anny", description="key of the body model, for the clip")
+    person_height: float | None = Field(
+        default=None,
+        gt=0.4,
+        lt=2.6,
+        description="of the person standing, metres; None: the body model's mean. A camera that "
+        "stays in one place shows no size, and structure from motion none either: the unit of the "
+        "world comes from it",
+    )
     fit_steps: int = Field(
         default=FitOptions.steps, ge=1, description="steps of the body fit, at most"
     )

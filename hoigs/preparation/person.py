@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -71,6 +71,7 @@ def fit_person(
     masks: MaskStack | None = None,
     times: Float[Tensor, " F"] | None = None,
     turns: Float[Tensor, "F 21 3"] | None = None,
+    height: float | None = None,
 ) -> FittedBody:
     """Fits the body to landmarks, and masks if there are any, in at most `steps`; finds the scale
     of a world that has none.
@@ -78,8 +79,11 @@ def fit_person(
     Args:
         times: of the frames, seconds.
         turns: axis-angle of the body's joints 1..21, about.
+        height: of the person who stands upright, metres; None: the body model's mean.
     """
     options = FitOptions(scale=not track.metric, steps=steps)
+    if height is not None:
+        options = replace(options, mean_size=height / stature(body))
     known = None if track.metric else track.points
     fit = fit_body(
         body, landmarks, track.cameras,
@@ -105,6 +109,12 @@ def fit_person(
         report=fit.report,
         warnings=[*_warnings(residual, found, solid, track.cameras), *_unseen(landmarks)],
     )
+
+
+def stature(body: BodyModel) -> float:
+    """Height of the mean body as it stands, metres."""
+    vertices, _ = next(iter(posed(body, BodyPose.zeros(1, betas=body.num_betas))))
+    return float(vertices[:, 1].max() - vertices[:, 1].min())
 
 
 def _warnings(residual: float, found: int, solid: int, cameras: Sequence[Camera]) -> list[str]:

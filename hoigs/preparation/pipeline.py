@@ -310,6 +310,7 @@ class Pipeline:
                 found.landmarks, self.track, self.body, self.options.fit_steps,
                 self.stages.advance, self.raw.landmarks.source, found.masks.persons(found.ball),
                 times, None if self.bodies is None else self.bodies.rotations(video.indices),
+                self.options.person_height,
             )  # fmt: skip
             self.provenance["body"] = person.provenance
             if self.bodies is not None:

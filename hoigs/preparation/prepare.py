@@ -58,6 +58,7 @@ def prepare(
     focal: float | None = None,
     intrinsics: str | Sequence[float] | None = None,
     calibration: str | Path | None = None,
+    person_height: float | None = None,
     keep_black: bool | None = None,
     overwrite: bool | None = None,
     object: str | Sequence[str] = (),
@@ -85,8 +86,8 @@ def prepare(
         out: the clip folder to make, with report.json, report.md and overlay.mp4 in it; it
             appears when it is whole.
         width, camera, max_frames, every, fps, start, end, focal, intrinsics, calibration,
-            keep_black, overwrite: fields of `PrepareOptions`, laid over `options`; None leaves a
-            field as it is.
+            person_height, keep_black, overwrite: fields of `PrepareOptions`, laid over `options`;
+            None leaves a field as it is.
         object: where the object is, in place of its prompt in `options`: "640,402@0", or several
             such (`prompts.parse_prompts`); "none": there is none. Without it, the clicks that
             `annotate` stored beside the video hold.
@@ -114,7 +115,7 @@ def prepare(
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
         "start": start, "end": end, "focal": focal, "intrinsics": intrinsics,
         "calibration": None if calibration is None else str(calibration),
-        "keep_black": keep_black, "overwrite": overwrite,
+        "person_height": person_height, "keep_black": keep_black, "overwrite": overwrite,
     }  # fmt: skip
     options = with_prompts(load_options(options, overrides, flags), object, estimators, person)
     may_replace = options.overwrite or bool(redo)

@@ -257,13 +257,15 @@ class FitProblem:
         Offsets count in parts of the body's size. In metres, those that landmarks have by
         definition would be cheaper on a smaller body closer by.
         """
-        betas, unit = unknowns.pose.betas, self.offset_spread.new_tensor([unknowns.unit])
+        mean = self.options.mean_size
+        betas = unknowns.pose.betas
+        unit = self.offset_spread.new_tensor([unknowns.unit - (1 / mean - 1)])
         size, by_betas = self.kinematics.size(betas)
         spread = self.offset_spread.repeat_interleave(3) * size
         shape = torch.full_like(betas, self.options.shape)
         spreads = torch.cat((shape, spread, torch.full_like(unit, self.options.unit)))
         values = torch.cat((betas, unknowns.offsets.flatten(), unit)) / spreads
-        larger = (size - 1) / self.options.size
+        larger = (size - mean) / self.options.size
         if equations is not None:
             derivatives = torch.diag(spreads.reciprocal())
             offsets = slice(len(betas), -1)

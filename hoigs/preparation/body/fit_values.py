@@ -27,10 +27,12 @@ class FitOptions:
         smooth: acceleration of points of the body in the world, m/s^2, that is ordinary; larger
             ones cost less than their square (a throw is no error).
         shape: standard deviation of the shape coefficients, in those of the body model.
-        size: standard deviation of the body's size about the model's mean, in parts of it. Adults
-            differ by 4 %, but 3D landmarks by a network do not measure size, and one still camera
-            shows none: the mean is the best guess, which only plain evidence may move (cameras in
-            metres that move, see the body from several sides).
+        size: standard deviation of the body's size about `mean_size`, in parts of the model's mean.
+            Adults differ by 4 %, but 3D landmarks by a network do not measure size, and one still
+            camera shows none: the mean is the best guess, which only plain evidence may move
+            (cameras in metres that move, see the body from several sides).
+        mean_size: of the body, in parts of the model's mean; other than 1 where the person's height
+            is known. 3D landmarks, of a person of average height, are taken in that unit.
         offset: standard deviation of the distance from a landmark to the body's own point that
             stands for it, metres on a body of the mean size.
         masks: number of landmarks that a mask weighs as much as. mask_spread: residual at which a
@@ -45,6 +47,7 @@ class FitOptions:
     smooth: float = 6.0
     shape: float = 0.3
     size: float = 0.005
+    mean_size: float = 1.0
     offset: float = 0.003
     masks: float = 10.0
     mask_spread: float = 0.03

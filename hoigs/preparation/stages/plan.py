@@ -32,7 +32,7 @@ PLAN = {
     "object_masks": Stage(30, ("evidence",), ("object", "further_objects"), slow=True),
     "cameras": Stage(3, ("frames", "evidence"), ("camera", "focal", "intrinsics", "calibration")),
     "inputs": Stage(6, ("evidence", "cameras"), ("find_object",)),
-    "body": Stage(40, ("inputs",), ("body", "fit_steps"), slow=True),
+    "body": Stage(40, ("inputs",), ("body", "fit_steps", "person_height"), slow=True),
     "masks": Stage(10, ("inputs", "body", "object_masks"), ("keep_black",), slow=True),
     "object": Stage(40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True),
     "depth": Stage(4, ("masks",), ("prompts",), slow=True),

@@ -24,6 +24,7 @@ from hoigs.preparation.body.joint_limits import beyond
 from hoigs.preparation.body.landmarks import LandmarkTrack, points_of
 from hoigs.preparation.body.limb_start import limb_pose
 from hoigs.preparation.body.normal_equations import NormalEquations
+from hoigs.preparation.person import stature
 from hoigs.preparation.report.mesh_overlay import overlay_frame
 
 FRAMES, WIDTH, HEIGHT, FOCAL = 9, 640, 480, 600.0
@@ -100,6 +101,16 @@ def test_a_known_pose_is_found() -> None:
     assert fit.report["frames_with_landmarks"] == FRAMES
     assert fit.scene_scale == 1.0
     assert fit.poses.hand_pose_convention == "flat"
+
+
+def test_a_known_height_scales_the_body_and_its_distance() -> None:
+    cameras, landmarks = [camera()] * FRAMES, seen_by([camera()] * FRAMES, truth())
+    fit = fit_body(body(), landmarks, cameras, options=replace(QUICK, mean_size=0.92))
+    usual = static_fit()
+    assert fit.residual_px.max() < 3.0
+    nearer = fit.poses.transl[:, 2] / usual.poses.transl[:, 2]
+    assert nearer.mean() == pytest.approx(0.92, abs=0.015)
+    assert 1.5 < stature(body()) < 1.9
 
 
 def test_frames_without_landmarks_lie_between_their_neighbours() -> None:
