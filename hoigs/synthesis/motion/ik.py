@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 Array = np.ndarray
 
@@ -101,7 +101,7 @@ def twist_about(rotation: Float[Array, "F 3 3"], axis: Float[Array, "3"]) -> Flo
     return 2 * np.arctan2(along, w)
 
 
-def about(axis: Float[Array, "3"], angle: Float[Array, " F"]) -> Float[Array, "F 3 3"]:
+def about(axis: Num[Array, "3"], angle: Float[Array, " F"]) -> Float[Array, "F 3 3"]:
     """Rotations about one axis (Rodrigues), radians."""
     x, y, z = unit(np.asarray(axis, float))
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
