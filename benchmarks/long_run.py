@@ -5,8 +5,9 @@
 
 The trainer is `hoigs train`'s own with spec `hoigs`: density control and every rule of the spec to
 the end, checkpoints of which the last ones are kept, and a preview drawn from the model now and
-then, as a viewer does. The first twentieth is left out (kernels are compiled, caches fill); the
-next tenth is compared with the last one. Flat is: memory within 5 % and 64 MiB, handles equal,
+then, as a viewer does. The first quarter is left out (kernels are compiled, Gaussians are added, and
+at a fifth the interaction begins, by the spec's `train.warmup`); the next tenth is compared with the
+last one. Flat is: memory within 5 % and 64 MiB, handles equal,
 steps within 25 %, and no more checkpoints than `train.keep_checkpoints`. Exit code 1 if anything is
 not flat.
 """
@@ -93,9 +94,9 @@ def resident() -> int:
 
 
 def judged(rows: list[dict[str, float]], steps: int) -> dict[str, Any]:
-    """The second tenth or so of the rows against the last, and what is flat."""
-    rows = rows[len(rows) // 20 :]
+    """The tenth of the rows after the first quarter against the last tenth, and what is flat."""
     part = max(2, len(rows) // 10)
+    rows = rows[len(rows) // 4 :]
     first, last = rows[:part], rows[-part:]
 
     def rate(some: list[dict[str, float]]) -> float:
