@@ -5,11 +5,10 @@
 
 The trainer is `hoigs train`'s own with spec `hoigs`: density control and every rule of the spec to
 the end, checkpoints of which the last ones are kept, and a preview drawn from the model now and
-then, as a viewer does. The first quarter is left out (kernels are compiled, Gaussians are added, and
-at a fifth the interaction begins, by the spec's `train.warmup`); the next tenth is compared with the
-last one. Flat is: memory within 5 % and 64 MiB, handles equal,
-steps within 25 %, and no more checkpoints than `train.keep_checkpoints`. Exit code 1 if anything is
-not flat.
+then, as a viewer does. The first quarter is left out (kernels are compiled, Gaussians are added,
+and at a fifth the interaction begins, by the spec's `train.warmup`); the next tenth is compared
+with the last one. Flat is: memory within 5 % and 64 MiB, handles equal, steps within 25 %, and no
+more checkpoints than `train.keep_checkpoints`. Exit code 1 if anything is not flat.
 """
 
 from __future__ import annotations
