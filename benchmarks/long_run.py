@@ -1,7 +1,7 @@
 """Memory, handles, time a step and checkpoints over a very long training of a tiny model.
 
     python benchmarks/long_run.py --steps 100000 --json benchmarks/results/long-run.json
-    python benchmarks/long_run.py --steps 200 --width 16        # what the tests run
+    python benchmarks/long_run.py --steps 60 --width 16         # what the tests run
 
 The trainer is `hoigs train`'s own with spec `hoigs`: density control and every rule of the spec to
 the end, checkpoints of which the last ones are kept, and a preview drawn from the model now and

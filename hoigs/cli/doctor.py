@@ -12,7 +12,7 @@ from hoigs.cli.common import print_table
 def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Check the installation: versions, devices, rasterizers, LPIPS weights."""
+    """Check the installation: versions, devices, rasterizers, video codecs, LPIPS weights."""
     from hoigs.workflows.doctor import doctor as inspect
 
     rows = inspect()

@@ -93,7 +93,7 @@ def surface_error(
 
 def rigid_motion(
     start: Float[Array, "N 3"], end: Float[Array, "N 3"]
-) -> tuple[Float[Array, "3 3"], Float[Array, 3]]:
+) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
     """R, t of least squares with end = R start + t."""
     R = kabsch(torch.as_tensor(start), torch.as_tensor(end)).numpy()
     return R, end.mean(0) - R @ start.mean(0)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 
@@ -18,6 +19,8 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.metrics.lpips import find_weights
 from hoigs.runs.run_folder import versions
+
+DECODERS = ("h264", "hevc", "vp9", "av1", "mjpeg")
 
 
 class Inspected(NamedTuple):
@@ -38,11 +41,18 @@ class Inspected(NamedTuple):
 
 
 def doctor() -> list[Inspected]:
-    """Check the installation: versions, devices, rasterizers, LPIPS weights."""
+    """Check the installation: versions, devices, rasterizers, video codecs, LPIPS weights."""
+    from hoigs.core.registry.environments import known_environments
     from hoigs.core.registry.registry import default_registry
 
     rows = [Inspected(name, version) for name, version in versions().items()]
     rows += [*_devices(), *rasterizer_rows(default_registry())]
+    rows += [training_row(d) for d in ("cpu", "cuda") if d == "cpu" or torch.cuda.is_available()]
+    rows += codec_rows()
+    for environment in known_environments().values():
+        state = environment.description().get("versions") or "not installed"
+        lacks = "; ".join(f"lacks {name}: {why}" for name, why in environment.lacking().items())
+        rows.append(Inspected(f"environment {environment.name}", str(state), lacks))
     weights = find_weights()
     return [*rows, Inspected("LPIPS weights", weights.location or "none", weights.reason)]
 
@@ -61,6 +71,56 @@ def _devices() -> list[Inspected]:
         rows.append(Inspected("cuda", "ok", torch.cuda.get_device_name(0)))
     else:
         rows.append(Inspected("cuda", "none", "everything runs on the CPU"))
+    return rows
+
+
+def training_row(device: str) -> Inspected:
+    """Drawing 1000 Gaussians with rasterizer:warp, gradients and an optimiser's step, timed."""
+    from hoigs.rasterizers.warp import WarpRasterizer
+
+    def step() -> None:
+        loss = rasterizer.render(gaussians, camera).color.square().mean()
+        loss.backward()
+        optimiser.step()
+        float(loss)  # waits for the device
+
+    try:
+        points = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) + 1
+        gaussians = Gaussians.from_points(points, points / 2, scales=0.05, opacity=0.5)
+        gaussians = gaussians.to(device).map(lambda x: x.detach().clone().requires_grad_())
+        K = torch.tensor([[64.0, 0, 0], [0, 64.0, 0], [0, 0, 1]])
+        camera = Camera(K, torch.eye(4), 64, 64).to(device)
+        rasterizer = WarpRasterizer()
+        optimiser = torch.optim.Adam([gaussians.means, gaussians.sh])
+        before = gaussians.means.detach().clone()
+        step()  # compiles kernels, or loads them
+        began = time.perf_counter()
+        step()
+        spent = 1000 * (time.perf_counter() - began)
+    except Exception as error:  # reported as the device's state
+        return Inspected(f"training step on {device}", _failed(error))
+    if torch.equal(before, gaussians.means):
+        return Inspected(f"training step on {device}", "wrong: no Gaussian moved")
+    return Inspected(f"training step on {device}", "ok", f"{spent:.1f} ms for 1000 Gaussians")
+
+
+def codec_rows() -> list[Inspected]:
+    """The encoders that films need, and the decoders of usual videos, in this build of PyAV."""
+    import av
+
+    from hoigs.core.video_files import ENCODERS
+
+    rows = []
+    wanted: list[tuple[str, Literal["r", "w"], str]]
+    wanted = [(encoder[0], "w", ending) for ending, encoder in ENCODERS.items()]
+    wanted += [(name, "r", "reading") for name in DECODERS]
+    for name, mode, use in wanted:
+        try:
+            av.Codec(name, mode)
+        except Exception:  # PyAV's own classes of errors differ by version
+            rows.append(Inspected(f"codec {name}", "none", f"{use} does not work"))
+        else:
+            rows.append(Inspected(f"codec {name}", "ok", use))
     return rows
 
 

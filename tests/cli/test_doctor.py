@@ -7,7 +7,7 @@ import torch
 
 from hoigs.core.registry.manager import PluginManager
 from hoigs.core.registry.registry import Registry, default_registry
-from hoigs.workflows.doctor import rasterizer_rows
+from hoigs.workflows.doctor import codec_rows, rasterizer_rows, training_row
 
 PLUGIN = """
 from hoigs import Component, hookimpl
@@ -114,6 +114,12 @@ def test_a_backend_whose_extra_is_absent_says_how_to_get_it(hoigs, registry, no_
     assert "pip install 'backends.py[quick]'" in note
     outcome = hoigs("doctor")
     assert outcome.code == 0 and "[quick]" in outcome.out
+
+
+def test_a_training_step_and_the_codecs_of_films():
+    row = training_row("cpu")
+    assert row.ok and row.found == "ok" and "ms for 1000 Gaussians" in row.note
+    assert {row.what: row.found for row in codec_rows()}["codec libx264"] == "ok"
 
 
 @pytest.mark.gpu

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 Array = np.ndarray
 
@@ -52,8 +52,8 @@ def two_bone(
     start: Float[Array, "F 3"],
     target: Float[Array, "F 3"],
     pole: Float[Array, "F 3"],
-    rest_bones: tuple[Float[Array, 3], Float[Array, 3]],
-    rest_hinge: Float[Array, 3],
+    rest_bones: tuple[Float[Array, "3"], Float[Array, "3"]],
+    rest_hinge: Float[Array, "3"],
     reach: float = 0.9985,
 ) -> tuple[Float[Array, "F 3 3"], Float[Array, "F 3 3"], Float[Array, " F"]]:
     """World rotations of two bones that take the tip to `target`, in closed form.
@@ -86,7 +86,7 @@ def two_bone(
     return rotations[0], rotations[1], np.abs(distance - used)
 
 
-def twist_about(rotation: Float[Array, "F 3 3"], axis: Float[Array, 3]) -> Float[Array, " F"]:
+def twist_about(rotation: Float[Array, "F 3 3"], axis: Float[Array, "3"]) -> Float[Array, " F"]:
     """Angle of the twist part (swing-twist decomposition) of rotations about an axis, radians."""
     w = 0.5 * np.sqrt(np.maximum(1 + np.trace(rotation, axis1=1, axis2=2), 1e-9))
     skew = np.stack(
@@ -101,7 +101,7 @@ def twist_about(rotation: Float[Array, "F 3 3"], axis: Float[Array, 3]) -> Float
     return 2 * np.arctan2(along, w)
 
 
-def about(axis: Float[Array, 3], angle: Float[Array, " F"]) -> Float[Array, "F 3 3"]:
+def about(axis: Num[Array, "3"], angle: Float[Array, " F"]) -> Float[Array, "F 3 3"]:
     """Rotations about one axis (Rodrigues), radians."""
     x, y, z = unit(np.asarray(axis, float))
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -40,7 +40,7 @@ class Palm:
     """The contact of a hand in the zero pose: offset from the wrist, and the frame
     [fingers, palm normal, cross product] as columns."""
 
-    offset: Float[Array, 3]
+    offset: Float[Array, "3"]
     frame: Float[Array, "3 3"]
 
 

@@ -89,7 +89,7 @@ class RayCaster:
         samples: int = 4,
         edge_samples: int = 16,
     ):
-        wp.load_module(kernels, device="cpu")  # compile before threads use it
+        wp.load_module(kernels, device="cpu", block_dim=1)  # as launched, before threads use it
         self.shell = shell
         self.texels: wp.array = wp.array(atlas.texels, dtype=wp.vec3, device="cpu")
         self.levels: wp.array = wp.array(atlas.levels, dtype=wp.vec3i, device="cpu")
