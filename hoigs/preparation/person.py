@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from hoigs.core.diagnostics import ranges
 from hoigs.core.interfaces.body import PELVIS, BodyModel
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
@@ -81,6 +82,8 @@ def fit_person(
         turns: axis-angle of the body's joints 1..21, about.
         height: of the person who stands upright, metres; None: the body model's mean.
     """
+    strays = landmarks.strays()
+    landmarks = landmarks.without(strays)
     options = FitOptions(scale=not track.metric, steps=steps)
     if height is not None:
         options = replace(options, mean_size=height / stature(body))
@@ -107,7 +110,11 @@ def fit_person(
             f"{residual:.1f} px off (median of frames); hands are not fitted"
         ),
         report=fit.report,
-        warnings=[*_warnings(residual, found, solid, track.cameras), *_unseen(landmarks)],
+        warnings=[
+            *_warnings(residual, found, solid, track.cameras),
+            *_unseen(landmarks),
+            *_strays(strays),
+        ],
     )
 
 
@@ -115,6 +122,16 @@ def stature(body: BodyModel) -> float:
     """Height of the mean body as it stands, metres."""
     vertices, _ = next(iter(posed(body, BodyPose.zeros(1, betas=body.num_betas))))
     return float(vertices[:, 1].max() - vertices[:, 1].min())
+
+
+def _strays(strays: Bool[Tensor, " F"]) -> list[str]:
+    frames = strays.nonzero()[:, 0].tolist()
+    if not frames:
+        return []
+    return [
+        f"landmarks of {len(frames)} frames ({ranges(frames)}) stand alone between frames without "
+        "any, and were left out"
+    ]
 
 
 def _warnings(residual: float, found: int, solid: int, cameras: Sequence[Camera]) -> list[str]:

@@ -19,6 +19,7 @@ TORSO = (11, 12, 23, 24)
 FEET = (29, 30, 31, 32)
 USED = tuple(sorted((*JOINTS, *KNUCKLES, 0, 7, 8, *FEET)))  # landmarks that `points_of` places
 SOLID = (11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)  # in space: torso and limbs start on them
+ALONE = 3  # frames: shorter runs of landmarks between gaps of as many are not believed
 ENOUGH = 8  # landmarks of USED in the image, with which a frame counts
 
 
@@ -53,6 +54,25 @@ class LandmarkTrack:
     def found(self) -> Bool[Tensor, " F"]:
         """Frames in which enough landmarks of the body were found in the image."""
         return self.known[:, list(USED)].sum(1) >= ENOUGH
+
+    def strays(self) -> Bool[Tensor, " F"]:
+        """Frames of `found` that stand alone, or by two, between longer gaps: what a detector takes
+        for a person for a moment only is more often a shadow or a thing."""
+        found = self.found
+        edges = torch.diff(found.int(), prepend=torch.zeros(1), append=torch.zeros(1))
+        starts, ends = (edges == 1).nonzero()[:, 0], (edges == -1).nonzero()[:, 0]
+        before = starts - torch.cat((starts.new_tensor([0]), ends[:-1]))
+        after = torch.cat((starts[1:], starts.new_tensor([len(found)]))) - ends
+        stray = torch.zeros_like(found)
+        for row in ((ends - starts < ALONE) & (before >= ALONE) & (after >= ALONE)).nonzero():
+            stray[starts[row] : ends[row]] = True
+        return stray if stray.sum() < 0.2 * found.sum() else torch.zeros_like(found)
+
+    def without(self, frames: Bool[Tensor, " F"]) -> LandmarkTrack:
+        """The same with these frames not found."""
+        image, world = self.image.clone(), self.world.clone()
+        image[frames], world[frames] = torch.nan, torch.nan
+        return LandmarkTrack(image, world)
 
     @property
     def solid(self) -> Bool[Tensor, " F"]:

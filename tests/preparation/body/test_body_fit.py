@@ -113,6 +113,23 @@ def test_a_known_height_scales_the_body_and_its_distance() -> None:
     assert 1.5 < stature(body()) < 1.9
 
 
+@pytest.mark.parametrize(
+    ("seen", "stray"),
+    [
+        ("#######....#...######....##", "...........#..............."),  # its end may go on
+        ("#####..#..#####", "..............."),  # gaps of two frames
+        ("#....#####....#", "..............."),  # too many of them: that is how they are seen
+    ],
+)
+def test_landmarks_that_stand_alone_are_not_believed(seen: str, stray: str) -> None:
+    image = torch.zeros(len(seen), 33, 3)
+    image[[frame == "." for frame in seen]] = torch.nan
+    landmarks = LandmarkTrack(image, image.clone())
+    found = landmarks.strays()
+    assert "".join("#" if frame else "." for frame in found) == stray
+    assert (landmarks.without(found).found == (landmarks.found & ~found)).all()
+
+
 def test_frames_without_landmarks_lie_between_their_neighbours() -> None:
     cameras = [camera()] * FRAMES
     landmarks = seen_by(cameras, truth())
