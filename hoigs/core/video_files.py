@@ -25,6 +25,7 @@ ENCODERS: dict[str, tuple[str, str, str, dict[str, str]]] = {
     ),
     ".mov": ("prores_ks", "yuv444p10le", "yuva444p10le", {"profile": "4444", "vendor": "apl0"}),
 }  # fmt: skip
+BLOCK = 32  # pixels
 BT709, SRGB = 1, 13  # primaries and transfer function, as ITU-T H.273 numbers them
 
 
@@ -108,15 +109,31 @@ def declare_colors(stream: Any) -> None:
 
 
 def coded(image: UInt8[np.ndarray, "H W C"], stream: Any) -> Any:
-    """An RGB or RGBA picture as PyAV's frame for a stream, by the matrix of BT.709."""
+    """An RGB or RGBA picture as PyAV's frame for a stream, by the matrix of BT.709.
+
+    The conversion and encoders read on to the end of a block of pixels, where a row's memory holds
+    whatever was there: rows are continued by their last pixel, so that equal pictures give equal
+    files.
+    """
     import av
     from av.video.reformatter import ColorRange, Colorspace
 
-    frame = av.VideoFrame.from_ndarray(image, format="rgba" if image.shape[2] == 4 else "rgb24")
-    return frame.reformat(
+    height, width = image.shape[:2]
+    wide = np.pad(image, ((0, 0), (0, -width % BLOCK), (0, 0)), "edge")
+    frame = av.VideoFrame.from_ndarray(wide, format="rgba" if image.shape[2] == 4 else "rgb24")
+    frame = frame.reformat(
         format=stream.pix_fmt, src_color_range=ColorRange.JPEG,
         dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG,
     )  # fmt: skip
+    made = av.VideoFrame(width, height, stream.pix_fmt)
+    made.colorspace, made.color_range = Colorspace.ITU709, ColorRange.MPEG
+    kind = np.uint16 if made.format.components[0].bits > 8 else np.uint8
+    for source, plane in zip(frame.planes, made.planes, strict=True):
+        given = np.frombuffer(source, kind).reshape(source.height, -1)[:, : source.width]
+        room = plane.line_size // np.dtype(kind).itemsize
+        rows = np.pad(given[:, :room], ((0, 0), (0, max(0, room - source.width))), "edge")
+        plane.update(rows)
+    return made
 
 
 def _write_gif(

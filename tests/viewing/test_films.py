@@ -25,6 +25,18 @@ def test_frames_come_back(tmp_path: Path) -> None:
         assert np.abs(image.mean((0, 1)) - colors[i]).max() < 4
 
 
+@pytest.mark.parametrize("suffix", [".mov", ".webm"])
+def test_equal_pictures_give_equal_files(tmp_path: Path, suffix: str) -> None:
+    """A width of no whole number of blocks, whose rows once ended with what the memory held."""
+    random = np.random.default_rng(0)
+    frames = [random.integers(0, 255, (30, 42, 4)).astype(np.uint8) for _ in range(2)]
+    files = set()
+    for i in range(8):
+        random.integers(0, 255, 4000 * i).astype(np.uint8)  # memory that is used again
+        files.add(write_video(tmp_path / f"{i}{suffix}", frames, fps=10).read_bytes())
+    assert len(files) == 1
+
+
 def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
     def breaks():
         yield np.zeros((16, 16, 3), np.uint8)
