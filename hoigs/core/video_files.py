@@ -127,10 +127,11 @@ def coded(image: UInt8[np.ndarray, "H W C"], stream: Any) -> Any:
     )  # fmt: skip
     made = av.VideoFrame(width, height, stream.pix_fmt)
     made.colorspace, made.color_range = Colorspace.ITU709, ColorRange.MPEG
-    kind = np.uint16 if made.format.components[0].bits > 8 else np.uint8
-    for source, plane in zip(frame.planes, made.planes, strict=True):
+    kind = np.dtype(np.uint16 if made.format.components[0].bits > 8 else np.uint8)
+    planes: Any = zip(frame.planes, made.planes, strict=True)
+    for source, plane in planes:
         given = np.frombuffer(source, kind).reshape(source.height, -1)[:, : source.width]
-        room = plane.line_size // np.dtype(kind).itemsize
+        room = plane.line_size // kind.itemsize
         rows = np.pad(given[:, :room], ((0, 0), (0, max(0, room - source.width))), "edge")
         plane.update(rows)
     return made
