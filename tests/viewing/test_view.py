@@ -62,6 +62,11 @@ def test_the_viewer_in_a_browser(tiny_run: Path, window: Any) -> None:
             page.wait_for_timeout(700)
             return opened.pixels()[:, :280]  # left of the panel
 
+        def another(before: np.ndarray) -> np.ndarray:
+            """Once it has come: the old one may have been a still picture, too."""
+            until(lambda: np.abs(picture() - before).max() > 30, page, "another picture")
+            return picture()
+
         until(still, page, "the first picture")
         page.wait_for_timeout(3000)  # the notice of software rendering fades in
         first = picture()
@@ -75,20 +80,21 @@ def test_the_viewer_in_a_browser(tiny_run: Path, window: Any) -> None:
         page.get_by_role("button", name="Pause").click()
         until(lambda: not viewer.clock.playing, page, "the pause")
         viewer.clock.seek(6.0, 0.0)
-        later = picture()
-        assert np.abs(later - second).max() > 30
+        later = another(second)
         page.get_by_label("human", exact=True).click()
         until(lambda: "human" not in viewer.settings.entities, page, "no human")
-        alone = picture()
-        assert np.abs(alone - later).max() > 30
+        alone = another(later)
         assert viewer.settings.video
-        page.mouse.move(150, 300)
-        page.mouse.down()
-        page.mouse.move(190, 310, steps=5)
-        page.mouse.up()
-        until(lambda: not viewer.settings.video, page, "the end of the video's camera")
-        turned = picture()
-        assert np.abs(turned - alone).max() > 30
+
+        def dragged() -> bool:  # again where a busy browser took the video's camera once more
+            page.mouse.move(150, 300)
+            page.mouse.down()
+            page.mouse.move(190, 310, steps=5)
+            page.mouse.up()
+            until(lambda: not viewer.settings.video, page, "the end of the video's camera")
+            return bool(np.abs(picture() - alone).max() > 30)
+
+        until(dragged, page, "a picture from elsewhere")
         page.get_by_label("body mesh").click()
         until(lambda: "body mesh" in viewer.settings.overlays, page, "the body mesh")
         viewer.settings.video = viewer.settings.see_through = True  # where the person is seen
