@@ -5,10 +5,11 @@
 
 The trainer is `hoigs train`'s own with spec `hoigs`: density control and every rule of the spec to
 the end, checkpoints of which the last ones are kept, and a preview drawn from the model now and
-then, as a viewer does. From a fifth of the steps on the spec couples the entities and adapts the
-keyframes, which costs time; so the steps between a quarter and a third are compared with the last
-tenth of those made. Flat is: memory within 5 % and 64 MiB, handles equal, steps within 25 %, and no
-more checkpoints than `train.keep_checkpoints`. Exit code 1 if anything is not flat.
+then, as a viewer does. From a fifth of the steps on the spec's interaction is at work
+(`train.warmup.interaction`), which costs time; so the steps between a quarter and a third are
+compared with the last tenth of those made. Flat is: memory within 5 % and 64 MiB, handles equal,
+steps within 25 %, and no more checkpoints than `train.keep_checkpoints`. Exit code 1 if anything is
+not flat.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     python benchmarks/sanitize.py --json benchmarks/results/sanitize.json
     python benchmarks/sanitize.py --work          # what runs under the tool, without the tool
 
-Renders with and without feature channels, absolute gradients, room for the intersections and a
-captured graph, all with gradients, then SSIM with its gradient, under memcheck (memory out of
+Renders with and without feature channels, absolute gradients and room for the intersections, all
+with gradients, then SSIM with its gradient, under memcheck (memory out of
 bounds), racecheck (shared memory written and read without a barrier) and synccheck (barriers that
 some threads of a block miss). torch takes its memory without its cache, which would hide what lies
 beyond an array. Exit code 1 if a tool finds anything, or cannot be run.
@@ -77,7 +77,7 @@ def device_name() -> str:
 
 
 def work() -> int:
-    """Every CUDA kernel of the library, once at least."""
+    """Renders and SSIM on CUDA, with their gradients."""
     import torch
 
     from hoigs.core.interfaces.rasterizer import RenderRequest

@@ -71,12 +71,15 @@ class Served:
         page.wait_for_timeout(1500)
 
     def open(self, browser: Any) -> Page:
+        """A page with the moment in the middle, still."""
         page: Page = browser.new_page(viewport=SIZE)
         page.goto(self.address)
         while not self.viewer._eyes:
             page.wait_for_timeout(200)
         page.wait_for_timeout(5000)
         page.add_style_tag(content=".mantine-Notifications-root { display: none; }")
+        self.viewer.clock.seek(0.5 * self.viewer.clock.last, 0.0)
+        self.settle(page)
         return page
 
     def close(self) -> None:
@@ -95,8 +98,6 @@ def of_run(browser: Any, run: Path) -> None:
     served = Served(run)
     page = served.open(browser)
     viewer = served.viewer
-    viewer.clock.seek(0.5 * viewer.clock.last, 0.0)
-    served.settle(page)
     with viewer.controls.lock:
         viewer.settings.layout, viewer.settings.share = "wipe", 0.32
     served.settle(page)
@@ -118,7 +119,6 @@ def of_modes(browser: Any, run: Path) -> None:
     """All modes but colour in one picture, without the panel."""
     served = Served(run)
     page = served.open(browser)
-    served.viewer.clock.seek(0.5 * served.viewer.clock.last, 0.0)
     cells = []
     for mode in MODES[1:]:
         with served.viewer.controls.lock:
@@ -137,8 +137,6 @@ def of_modes(browser: Any, run: Path) -> None:
 def of_two(browser: Any, run: Path, second: Path) -> None:
     served = Served(run, second)
     page = served.open(browser)
-    served.viewer.clock.seek(0.5 * served.viewer.clock.last, 0.0)
-    served.settle(page)
     drag(page, 30, 10)
     served.settle(page)
     save(shot_of(page), "two")
@@ -148,7 +146,6 @@ def of_two(browser: Any, run: Path, second: Path) -> None:
 def of_clip(browser: Any, clip: Path) -> None:
     served = Served(clip)
     page = served.open(browser)
-    served.viewer.clock.seek(0.5 * served.viewer.clock.last, 0.0)
     with served.viewer.controls.lock:
         served.viewer.settings.overlays.update(("skeleton", "object track"))
     served.settle(page)

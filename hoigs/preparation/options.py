@@ -92,7 +92,8 @@ class PrepareOptions(ComponentConfig):
     focal: float | None = Field(
         default=None,
         gt=0,
-        description="focal length in pixels of the *video's* own size, for a static camera; None: "
+        description="focal length in pixels of the *video's* own size, for a camera that "
+        "stays in one place; None: "
         "what the file's metadata give, or the landmarks if they determine it, or else 0.8 x the "
         "longer side (64 degrees); it scales all depths",
     )
@@ -179,6 +180,11 @@ class PrepareOptions(ComponentConfig):
     overlay_width: int = Field(
         default=640, ge=0, description="width of overlay.mp4, pixels; 0 writes none"
     )
+
+    @property
+    def own_cameras(self) -> bool:
+        """Whether cameras are found anew, whatever lies beside the video."""
+        return self.camera in ("static", "turning", "sfm")
 
     @property
     def objects(self) -> tuple[str, ...]:

@@ -193,7 +193,7 @@ def _run(
         chosen["landmarks"] = BodyFileEstimator(bodies.path, body)
     found = find_source(
         source, human=options.human, object_name=options.object, given=set(chosen),
-        own_cameras=options.camera in ("static", "turning", "sfm"),
+        own_cameras=options.own_cameras,
         complete=options.preset == "files",
     )  # fmt: skip
     plan = replace(plan_estimators(found, options, set(chosen)), notes=stored)

@@ -19,7 +19,8 @@ TORSO = (11, 12, 23, 24)
 FEET = (29, 30, 31, 32)
 USED = tuple(sorted((*JOINTS, *KNUCKLES, 0, 7, 8, *FEET)))  # landmarks that `points_of` places
 SOLID = (11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)  # in space: torso and limbs start on them
-ALONE = 3  # frames: shorter runs of landmarks between gaps of as many are not believed
+ALONE = 3  # frames: shorter runs of landmarks between gaps of as many are not believed,
+FEW = 0.2  # unless they are more than this share of those with landmarks
 ENOUGH = 8  # landmarks of USED in the image, with which a frame counts
 
 
@@ -66,7 +67,7 @@ class LandmarkTrack:
         stray = torch.zeros_like(found)
         for row in ((ends - starts < ALONE) & (before >= ALONE) & (after >= ALONE)).nonzero():
             stray[starts[row] : ends[row]] = True
-        return stray if stray.sum() < 0.2 * found.sum() else torch.zeros_like(found)
+        return stray if stray.sum() < FEW * found.sum() else torch.zeros_like(found)
 
     def without(self, frames: Bool[Tensor, " F"]) -> LandmarkTrack:
         """The same with these frames not found."""

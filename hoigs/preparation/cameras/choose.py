@@ -63,17 +63,16 @@ def choose_cameras(
         SourceError: the model does not fit, or structure from motion fails.
     """
     lens = known_lens(options, video)
-    own = options.camera in {"static", "turning", "sfm"}
-    beside = None if own else given or model
+    beside = None if options.own_cameras else given or model
     if lens is not None and beside is not None:
         raise SourceError(
             f"{beside.name} beside the video has a lens already: leave {lens[1]} out, or use "
             "--camera sfm, static or turning to make the cameras anew"
         )
-    if not own and given is not None:
+    if not options.own_cameras and given is not None:
         read = megasam_cameras if holds(given, MEGASAM) else given_cameras
         return ChosenCameras(read(video, given))
-    if not own and model is not None:
+    if not options.own_cameras and model is not None:
         return ChosenCameras(colmap_cameras(video, model))
     if options.camera in {"auto", "static", "turning"}:
         still_lens = lens

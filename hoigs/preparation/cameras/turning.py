@@ -46,13 +46,19 @@ def best_turn(
     one, two = (_rays(xy, focal, size) for xy in pair)
     weights = np.ones(len(one))
     for _ in range(STEPS):
-        u, _, v = np.linalg.svd((two * weights[:, None]).T @ one)
-        R = u @ np.diag((1, 1, np.sign(np.linalg.det(u @ v)))) @ v
+        R = nearest_rotation((two * weights[:, None]).T @ one)
         moved = one @ R.T
         seen = moved[:, :2] / moved[:, 2:] * focal + np.array(size) / 2
         off = np.linalg.norm(seen - pair[1], axis=-1)
         weights = 1 / (1 + (off / NEAR) ** 2)
     return float((off < NEAR).mean()), R
+
+
+def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation with the least sum of squared differences (Kabsch 1976)."""
+    u, _, v = np.linalg.svd(matrix)
+    turn: np.ndarray = u @ np.diag((1, 1, np.sign(np.linalg.det(u @ v)))) @ v
+    return turn
 
 
 def degrees(R: Float[np.ndarray, "3 3"]) -> float:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation, Slerp
 
 from hoigs.core.diagnostics import ranges
 from hoigs.core.values.lens import Lens
@@ -25,7 +26,7 @@ from hoigs.preparation.cameras.motion import (
     paired,
 )
 from hoigs.preparation.cameras.static_focal import StaticFocal
-from hoigs.preparation.cameras.turning import NEAR, best_turn, degrees
+from hoigs.preparation.cameras.turning import NEAR, best_turn, degrees, nearest_rotation
 from hoigs.preparation.given import GivenMasks
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import SourceError
@@ -95,9 +96,10 @@ def turning_cameras(
         progress(0.8 * (i + 1) / len(video))
     matches = _matches(found)
     known = lens is not None or focal.known
-    turns = solved(matches, len(video), K, fixed=True)
+    start_from = _chained(matches, len(video), K)
+    turns = solved(matches, *start_from, K, fixed=True)
     if not known:
-        free = solved(matches, len(video), K, fixed=False)
+        free = solved(matches, *start_from, K, fixed=False)
         if free.spread < SURE and PLAUSIBLE[0] < free.focal / max(size) < PLAUSIBLE[1]:
             turns = free
     progress(1.0)
@@ -139,15 +141,20 @@ def _matches(found: Sequence[Features]) -> list[Match]:
 
 
 def solved(
-    matches: Sequence[Match], count: int, K: Float[np.ndarray, "3 3"], *, fixed: bool
+    matches: Sequence[Match],
+    rotations: Float[np.ndarray, "F 3 3"],
+    lost: tuple[int, ...],
+    K: Float[np.ndarray, "3 3"],
+    *,
+    fixed: bool,
 ) -> Turns:
     """The rotations, and unless it is `fixed` the focal length, that explain all matches best.
 
-    Raises:
-        SourceError: no chain of matches leads to most frames.
+    Args:
+        rotations: to start from. lost: frames without matches. K: of the images that were matched.
     """
-    (rotations, lost), focal, center = _chained(matches, count, K), float(K[0, 0]), K[:2, 2]
-    size = 3 * count + 1
+    focal, center = float(K[0, 0]), K[:2, 2]
+    size = 3 * len(rotations) + 1
     normal, off = np.eye(size), np.zeros(1)
     for _ in range(ROUNDS):
         normal, gradient, off = _equations(matches, rotations, focal, center)
@@ -158,7 +165,7 @@ def solved(
         normal += 1e-9 * largest * np.eye(size)  # of frames without matches, too
         normal[:3, :3] += largest * np.eye(3)  # one frame stays
         change = np.linalg.solve(normal, gradient)
-        rotations = _exp(change[:-1].reshape(-1, 3)) @ rotations
+        rotations = Rotation.from_rotvec(change[:-1].reshape(-1, 3)).as_matrix() @ rotations
         focal *= float(np.exp(np.clip(change[-1], -0.2, 0.2)))
         if np.abs(change).max() < 1e-6:
             break
@@ -167,7 +174,7 @@ def solved(
         noise = float((off[off < 3 * NEAR] ** 2).mean() / 2)
         spread = float(np.sqrt(noise * np.linalg.inv(normal)[-1, -1]))
     rotations = _interpolated(rotations, lost)
-    mean = _nearest_rotation(rotations.sum(0))
+    mean = nearest_rotation(rotations.sum(0))
     middle = int(np.argmax(np.einsum("fij,ij->f", rotations, mean)))
     return Turns(rotations @ rotations[middle].T, focal, spread, float(np.median(off)), lost)
 
@@ -207,7 +214,12 @@ def _chained(
     matches: Sequence[Match], count: int, K: np.ndarray
 ) -> tuple[np.ndarray, tuple[int, ...]]:
     """Rotations from one frame on, each by the nearest frame that is reached already, and the
-    frames that no chain reaches."""
+    frames that no chain reaches.
+
+    Raises:
+        SourceError: these are most of them.
+    """
+    # `best_turn` has the axis in the middle of images of this size, where K has it
     size = (2 * K[0, 2], 2 * K[1, 2])
     rotations = np.tile(np.eye(3), (count, 1, 1))
     waiting = sorted(matches, key=lambda m: m.two - m.one)
@@ -234,8 +246,6 @@ def _chained(
 
 def _interpolated(rotations: np.ndarray, lost: Sequence[int]) -> np.ndarray:
     """With the rotations of lost frames between those of their neighbours."""
-    from scipy.spatial.transform import Rotation, Slerp
-
     if not lost:
         return rotations
     kept = np.setdiff1d(np.arange(len(rotations)), lost)
@@ -249,14 +259,3 @@ def _cross(v: np.ndarray) -> np.ndarray:
     x, y, z = v.T
     o = np.zeros_like(x)
     return np.stack((o, -z, y, z, o, -x, -y, x, o), -1).reshape(-1, 3, 3)
-
-
-def _exp(turns: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_rotvec(turns).as_matrix()
-
-
-def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    u, _, v = np.linalg.svd(matrix)
-    return u @ np.diag((1, 1, np.sign(np.linalg.det(u @ v)))) @ v
