@@ -16,7 +16,7 @@ import torch
 
 from hoigs.core.clip_folder.write import ClipWriter
 from hoigs.core.interfaces.body import BodyModel
-from hoigs.core.values.clip import BodyTrack, ObjectTrack, uniform_test_split
+from hoigs.core.values.clip import POSES_EXACT, BodyTrack, ObjectTrack, uniform_test_split
 from hoigs.synthesis.clips import name_of
 from hoigs.synthesis.config import SceneConfig
 from hoigs.synthesis.degradation.damage import damage, with_frames_dropped
@@ -172,6 +172,7 @@ def write_scene(
                 "generator": f"hoigs.synthesis {generator_version()}",
                 "config": config.model_dump(mode="json"),
                 "truth": "truth.npz",
+                POSES_EXACT: not config.noise.moves_poses(),
             }
         )
     save_truth(scene, folder / "truth.npz")

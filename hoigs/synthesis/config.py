@@ -163,6 +163,10 @@ class NoiseConfig(ComponentConfig):
     camera_metres: float = Field(default=0.0, ge=0, description="std of each camera's position")
     points_metres: float = Field(default=0.004, ge=0, description="std of the initial points")
 
+    def moves_poses(self) -> bool:
+        """Whether the clip's body poses or shapes differ from the truth."""
+        return self.pose_degrees > 0 or self.pose_metres > 0 or self.betas > 0
+
 
 class SceneConfig(ComponentConfig):
     """A synthetic clip: one person, one object, one room, one moving camera, known truth."""

@@ -38,6 +38,7 @@ def test_the_folder_is_a_whole_clip(clip_folder: Path, clip: Clip) -> None:
     assert clip.bodies["human"].model == "body:anny"
     assert clip.objects["object"].provenance == "synthetic truth"
     assert clip.provenance["config"]["object"]["motion"] == "held"
+    assert clip.provenance["poses_exact"] is True
 
 
 def test_frames_read_back(clip: Clip) -> None:

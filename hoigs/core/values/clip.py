@@ -24,6 +24,7 @@ EVEN = 1e-5  # of the clip: times this near to even ones are even
 # keys of Clip.provenance
 CAMERAS_REFINED = "cameras_refined_in_training"
 POSES_ESTIMATED = "poses_estimated"  # body poses were estimated from the frames, test ones too
+POSES_EXACT = "poses_exact"  # body poses and shapes are the truth: nothing is left to refine
 
 
 class FrameStore(ABC):

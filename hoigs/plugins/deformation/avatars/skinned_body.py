@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import torch
 from jaxtyping import Float
@@ -24,7 +24,7 @@ from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.deformation import DeformationModel
 from hoigs.core.maths.frame_times import FrameTimes, frame_at
 from hoigs.core.maths.skinning import ancestor_table, transform_points
-from hoigs.core.values.clip import Clip
+from hoigs.core.values.clip import POSES_EXACT, Clip
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.plugins.deformation.avatars.pose_refinement import PoseRefinement
@@ -51,8 +51,10 @@ class PosedBody(NamedTuple):
 class SkinnedBodyConfig(ComponentConfig):
     """Settings of all avatars."""
 
-    refine_poses: bool = True
-    """Learn per-frame corrections of pose and translation, and one of shape."""
+    refine_poses: bool | Literal["auto"] = True
+    """Learn per-frame corrections of pose and translation, and one of shape. "auto" learns them
+    unless the clip declares its poses to be exact, as a built-in clip without noise does:
+    corrections of exact poses hide errors of the shape in the views that were filmed."""
 
 
 class SkinnedBody(DeformationModel):
@@ -149,6 +151,9 @@ class SkinnedBody(DeformationModel):
                 f"{cls.__name__} needs a body model, and the context has none: it deforms entities "
                 "of kind human"
             )
+        if config.refine_poses == "auto":
+            exact = context.clip is not None and context.clip.provenance.get(POSES_EXACT) is True
+            config = config.model_copy(update={"refine_poses": not exact})
         return cls(config, body=context.body, **context_settings(context))
 
     @property

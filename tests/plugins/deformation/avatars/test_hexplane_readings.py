@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch.nn.functional import grid_sample
@@ -12,7 +14,7 @@ from hoigs.core.maths.feature_planes import PairedPlanes, ProductPlanes
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.clip import BodyTrack, Clip, FrameStore
+from hoigs.core.values.clip import POSES_EXACT, BodyTrack, Clip, FrameStore
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.plugins.deformation.avatars.body_planes import body_planes
@@ -287,3 +289,11 @@ def test_what_moves_alpha(toy_body, about, seen):  # F17
     assert (of_image.abs() > 1.0) if seen else (of_image.abs() < 1e-2)
     if about == "camera":  # d (alpha z) / d log alpha = alpha z
         torch.testing.assert_close(of_depth, depth.sum().detach())
+
+
+@pytest.mark.parametrize(("provenance", "refined"), [({}, True), ({POSES_EXACT: False}, True),
+                                                     ({POSES_EXACT: True}, False)])  # fmt: skip
+def test_exact_poses_are_not_refined_by_auto(toy_body, provenance, refined):
+    clip = replace(clip_of(toy_body, 1.0), provenance=provenance)
+    assert (built(toy_body, clip, refine_poses="auto").refinement is not None) == refined
+    assert built(toy_body, clip, refine_poses=True).refinement is not None
