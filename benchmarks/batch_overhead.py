@@ -14,7 +14,7 @@ from pathlib import Path
 
 from hoigs.studies.batch.drive import drive
 from hoigs.studies.batch.manifest import read_manifest
-from hoigs.studies.jobs.executor import Needs
+from hoigs.studies.execution.executor import Needs
 from hoigs.studies.jobs.machine import cpu_model
 
 
@@ -35,9 +35,9 @@ class Simulated:
 
     slots = 2
 
-    def start(self, command: Sequence[str], log: Path, needs: Needs) -> Done:
-        del log, needs
-        words = list(command)
+    def start(self, command: Sequence[str], log: Path, needs: Needs, lease: str) -> Done:
+        del log, needs, lease
+        words = list(command[1:])
         if words[0] == "eval":
             (Path(words[1]) / "evaluation.json").write_text("{}")
         else:

@@ -28,6 +28,19 @@ ThreadsOption = Annotated[
     int | None,
     typer.Option("--threads", min=1, help="Threads of each training; default cores / jobs."),
 ]
+ExecutorOption = Annotated[
+    str,
+    typer.Option(
+        "--executor",
+        help="Where they run: local, ray (pip install 'hoigs[ray]'), or MODULE:CLASS of your own.",
+    ),
+]
+AddressOption = Annotated[
+    str | None,
+    typer.Option(
+        "--address", help="Ray cluster to join: auto, HOST:PORT. Default: Ray on this machine only."
+    ),
+]
 MinutesOption = Annotated[
     float | None,
     typer.Option(

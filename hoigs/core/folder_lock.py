@@ -60,6 +60,11 @@ class FolderLock:
         """Of the present hold; "" while it is not held."""
         return self._token
 
+    @property
+    def lease(self) -> str:
+        """The present hold as text, for processes that work for the holder: PATH:TOKEN."""
+        return f"{self.path}:{self._token}" if self._token else ""
+
     def acquire(self) -> FolderLock:
         """Take the lock.
 

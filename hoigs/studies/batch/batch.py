@@ -15,7 +15,7 @@ from hoigs.studies.batch.manifest import Row, read_manifest
 from hoigs.studies.batch.stages import folder_of, stages_of
 from hoigs.studies.batch.states import State
 from hoigs.studies.batch.summary import write_summary
-from hoigs.studies.jobs.executor import Executor, LocalExecutor
+from hoigs.studies.execution.executor import Executor, make_executor
 
 BATCH = "batch.json"
 
@@ -46,7 +46,8 @@ def batch(
     limit: int | None = None,
     only_failed: bool = False,
     dry_run: bool = False,
-    executor: Executor | None = None,
+    executor: Executor | str = "local",
+    address: str | None = None,
     report: Report = lambda work, word: None,
     tick: Callable[[Sequence[Work]], None] = lambda running: None,
 ) -> Batch:
@@ -59,7 +60,8 @@ def batch(
         jobs: rows at a time. threads: of each; default cores / jobs. retries: of a failed stage.
         limit: only the first rows. only_failed: only rows whose last attempt failed.
         dry_run: run and write nothing.
-        executor: where the stages run; default this machine, its GPUs in turn.
+        executor: where the stages run: "local", this machine and its GPUs in turn; "ray", all of a
+            Ray cluster; "MODULE:CLASS"; or an Executor. address: of the cluster to join.
         report, tick: as for `hoigs.studies.batch.drive.drive`.
 
     Raises:
@@ -76,8 +78,9 @@ def batch(
         raise HoigsError(f"{out}: is a file; --out names a folder")
     (out / "rows").mkdir(parents=True, exist_ok=True)
     write_whole(out / BATCH, json.dumps([row.model_dump(mode="json") for row in rows], indent=1))
-    where = executor or LocalExecutor(jobs, threads)
-    failed = drive(chosen, out, where, retries=retries, report=report, tick=tick)
+    if isinstance(executor, str):
+        executor = make_executor(executor, jobs, threads, address)
+    failed = drive(chosen, out, executor, retries=retries, report=report, tick=tick)
     return Batch(tuple(chosen), failed, tuple(write_summary(rows, out)), plan)
 
 
@@ -87,7 +90,8 @@ def work(
     jobs: int = 1,
     threads: int | None = None,
     retries: int = 1,
-    executor: Executor | None = None,
+    executor: Executor | str = "local",
+    address: str | None = None,
     report: Report = lambda work, word: None,
     tick: Callable[[Sequence[Work]], None] = lambda running: None,
 ) -> Batch:
@@ -105,8 +109,9 @@ def work(
         ) from None
     except ValueError as error:
         raise HoigsError(f"{out / BATCH}: damaged; `hoigs batch` writes it again") from error
-    where = executor or LocalExecutor(jobs, threads)
-    failed = drive(rows, out, where, retries=retries, report=report, tick=tick)
+    if isinstance(executor, str):
+        executor = make_executor(executor, jobs, threads, address)
+    failed = drive(rows, out, executor, retries=retries, report=report, tick=tick)
     return Batch(tuple(rows), failed, tuple(write_summary(rows, out)), {})
 
 

@@ -20,12 +20,12 @@ from hoigs.core.folder_lock import FolderLock
 from hoigs.studies.batch.manifest import Row
 from hoigs.studies.batch.stages import Stage, folder_of, stages_of
 from hoigs.studies.batch.states import State
-from hoigs.studies.jobs.executor import Executor, Needs, Process
-from hoigs.studies.jobs.pool import why_failed
+from hoigs.studies.execution.executor import Executor, Needs, Process, why_failed
 
 POLL_S = 0.01
 TAKEN_POLL_S = 2.0  # how often a row that another driver has is looked at again
 RETRY_S = 1.0
+LEASE_POLL_S = 1.0
 WRONG_INPUT = 2  # exit code that another attempt does not change
 
 Report = Callable[["Work", str], None]
@@ -57,6 +57,7 @@ class Work:
     lock: FolderLock | None = None
     process: Process | None = None
     not_before: float = 0.0
+    look_at: float = 0.0  # when to look at the lock again
 
     @property
     def todo(self) -> Sequence[Stage]:
@@ -187,10 +188,14 @@ class _Driver:
         if work.process is None:
             self._start(work)
             return True
+        assert work.lock is not None
         code = work.process.poll()
         if code is None:
+            if time.monotonic() >= work.look_at:
+                work.look_at = time.monotonic() + LEASE_POLL_S
+                if work.lock.is_lost():
+                    work.lock.require_held()
             return True
-        assert work.lock is not None
         work.lock.require_held()  # or another driver's record would be overwritten
         stage, work.process = work.todo[0], None
         if code == 0 and stage.result.exists():
@@ -224,11 +229,16 @@ class _Driver:
         todo = work.todo
         stage = todo[0]
         command = work.state.command(stage)
-        needs = Needs(gpu=work.row.device != "cpu", memory_gb=work.row.memory_gb)
+        gpus = 0.0 if work.row.device == "cpu" else work.row.gpus
+        needs = Needs(gpus=gpus, memory_gb=work.row.memory_gb)
         work.stage = stage.name
+        if left := FolderLock(stage.locks, "").holder():  # by a driver that was lost
+            self.report(work, f"waits: {stage.locks.name} is being written by {left}")
+            work.not_before = time.monotonic() + TAKEN_POLL_S
+            return
         if stage.clear and stage.result.exists():
             shutil.rmtree(stage.result)
-        work.process = self.executor.start(command, work.log, needs)
+        work.process = self.executor.start(("hoigs", *command), work.log, needs, work.lock.lease)
         if work.process is not None:
             work.since, work.device = time.monotonic(), work.process.device
             work.state.begin(todo)

@@ -43,6 +43,9 @@ class Row(BaseModel):
     )
     export: tuple[str, ...] = Field(default=("ply",), description="formats to export")
     device: str = Field(default="auto", description="cpu, cuda or auto")
+    gpus: float | None = Field(
+        default=None, ge=0, le=1, description="share of a GPU; default by --jobs and the GPUs"
+    )
     memory_gb: float = Field(default=0.0, ge=0, description="memory to set aside while it runs, GB")
 
     @field_validator(*LISTS, mode="before")

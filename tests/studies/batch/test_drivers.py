@@ -9,17 +9,21 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+
+import hoigs
+from hoigs.studies.execution.local import LocalExecutor
 
 # in place of `hoigs`: notes its start and end, and makes what the stage would make
 STAGE = """
 import os, sys, time
 from pathlib import Path
-from hoigs.studies.jobs.command import end_with
-end_with(int(sys.argv[1]))
-words = sys.argv[2:]
+from hoigs.studies.execution.command import end_with
+end_with(int(sys.argv[1]), sys.argv[2])
+words = sys.argv[4:]
 def note(text):
     with open(os.environ["NOTES"], "a") as file:
         file.write(f"{text} {words[0]} {target.parent.name} {os.getpid()}\\n")
@@ -41,7 +45,7 @@ note("end")
 DRIVER = """
 import sys
 import hoigs
-from hoigs.studies.jobs.executor import LocalExecutor
+from hoigs.studies.execution.local import LocalExecutor
 where = LocalExecutor(2, program=(sys.executable, sys.argv[1]))
 done = hoigs.batch(sys.argv[2], sys.argv[3], executor=where)
 sys.exit(len(done.failed))
@@ -123,6 +127,38 @@ def test_after_a_kill_every_row_is_done_once(tmp_path, victim):
     assert set(batches.states().values()) == {"done"}
     assert not [p for p in batches.out.rglob("*") if p.suffix in (".part", ".lock")]
     assert all_gone([int(pid) for *_, pid in batches.noted()])
+
+
+def test_two_drivers_in_threads_of_one_process(tmp_path, monkeypatch):
+    batches = Batches(tmp_path, ["a", "b", "c"])
+    monkeypatch.setenv("NOTES", str(batches.notes))
+    monkeypatch.setenv("SECONDS", "0.1")
+
+    def drive(_: int) -> hoigs.batch:
+        where = LocalExecutor(2, program=(sys.executable, str(tmp_path / "stage.py")))
+        return hoigs.batch(tmp_path / "rows.yaml", batches.out, executor=where)
+
+    with ThreadPoolExecutor(2) as pool:
+        assert [done.failed for done in pool.map(drive, range(2))] == [{}, {}]
+    assert set(batches.ends().values()) == {1} and len(batches.ends()) == 9
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
+def test_a_driver_whose_lease_is_taken_stops_its_stage_at_once(tmp_path):
+    batches = Batches(tmp_path, ["a"])
+    driver = batches.start(seconds=60)
+    try:
+        stage = batches.wait_for("start", "train")
+        lock = batches.out / "rows" / ".a.lock"
+        record = json.loads(lock.read_text()) | {"token": "its", "pid": os.getpid()}
+        lock.with_suffix(".new").write_text(json.dumps(record | {"began": None}))
+        lock.with_suffix(".new").replace(lock)
+        assert all_gone([stage]) and driver.poll() is None
+        assert not batches.ends(), "it was killed while it worked"
+    finally:
+        driver.terminate()
+        driver.wait(20)
+    assert json.loads(lock.read_text())["token"] == "its"
 
 
 def test_what_goes_wrong_with_a_row_is_on_its_record(tmp_path):
