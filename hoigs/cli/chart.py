@@ -19,11 +19,11 @@ from hoigs.cli.common import (
     SetOption,
     ThreadsOption,
     print_table,
+    study_device,
 )
 from hoigs.cli.evaluate import LpipsOption
 from hoigs.core.machine.cpus import available_cpus
 from hoigs.core.names import printable
-from hoigs.runs.choices import pick_device
 
 if TYPE_CHECKING:
     from hoigs.studies.execution.executor import Executor
@@ -112,7 +112,7 @@ def chart(
             budgets=_steps(budgets),
             seeds=seeds,
             settings=tuple(settings or ()),
-            device=pick_device(device),
+            device=study_device(device, executor),
             lpips_weights=lpips_weights.resolve() if lpips_weights else None,
             plugins=tuple(p.resolve() for p in plugin or ()),
         )

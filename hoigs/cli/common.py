@@ -70,6 +70,13 @@ PluginOption = Annotated[
 ]
 
 
+def study_device(device: str, executor: str) -> str:
+    """`pick_device`; a GPU for jobs on other machines need not be in this one."""
+    from hoigs.runs.choices import pick_device
+
+    return pick_device(device) if executor == "local" or device == "auto" else device
+
+
 def print_table(
     title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], notes: Sequence[str] = ()
 ) -> None:

@@ -18,10 +18,10 @@ from hoigs.cli.common import (
     SeedsOption,
     SetOption,
     ThreadsOption,
+    study_device,
 )
 from hoigs.core.machine.cpus import available_cpus
 from hoigs.core.names import printable
-from hoigs.runs.choices import pick_device
 
 
 def stress(
@@ -81,7 +81,7 @@ def stress(
         base=BASE.replace("width=96", f"width={width}"),
         whole=whole,
         settings=tuple(settings or ()),
-        device=pick_device(device),
+        device=study_device(device, executor),
         plugins=tuple(p.resolve() for p in plugin or ()),
     )
     each = threads or max(1, available_cpus() // jobs)

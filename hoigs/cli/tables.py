@@ -18,10 +18,10 @@ from hoigs.cli.common import (
     SeedsOption,
     SetOption,
     ThreadsOption,
+    study_device,
 )
 from hoigs.cli.evaluate import LpipsOption
 from hoigs.core.names import printable
-from hoigs.runs.choices import pick_device
 
 
 def tables(
@@ -75,7 +75,7 @@ def tables(
         seeds=seeds,
         steps=steps,
         settings=tuple(settings or ()),
-        device=pick_device(device),
+        device=study_device(device, executor),
         lpips_weights=lpips_weights.resolve() if lpips_weights else None,
         plugins=tuple(p.resolve() for p in plugin or ()),
     )

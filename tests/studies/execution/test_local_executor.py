@@ -102,15 +102,11 @@ def test_gpus_of_the_environment(monkeypatch):
         assert visible_gpus() == gpus
 
 
-def test_a_process_ends_when_its_lease_is_anothers(tmp_path):
+def test_a_process_ends_when_its_lease_is_anothers(tmp_path, monkeypatch):
     """Even while its driver is suspended: it looks for itself."""
-    where = LocalExecutor()
-    lock = FolderLock(tmp_path / "row", "hoigs batch").acquire()
-    module = tmp_path / "sleeper.py"
-    module.write_text("import time\nprint('here', flush=True)\ntime.sleep(60)\n")
-    where._program = (sys.executable, "-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r});"
-                      "import runpy; runpy.run_module('hoigs.studies.execution.command', "
-                      "run_name='__main__', alter_sys=True)")  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    Path("sleeper.py").write_text("import time\nprint('here', flush=True)\ntime.sleep(60)\n")
+    where, lock = LocalExecutor(), FolderLock(tmp_path / "row", "hoigs batch").acquire()
     process = where.start(("sleeper",), tmp_path / "log", Needs(), lock.lease)
     try:
         assert printed(tmp_path / "log") == "here"
