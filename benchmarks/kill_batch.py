@@ -234,37 +234,13 @@ def _differences(ours: Path, theirs: Path) -> list[str]:
                     if scores[0][key] != scores[1][key]]  # fmt: skip
 
 
-def table(result: dict[str, Any]) -> str:
-    """The result in Markdown."""
-    kinds = " | ".join(str(result["kills"][kind]) for kind in KINDS)
-    heads = " | ".join(f"kills of a {kind}" for kind in KINDS)
-    attempts = ", ".join(f"{result['attempts'][s]} of {s}" for s in STAGES)
-    return (
-        f"| rows | batches | {heads} | faults |\n|{'---|' * (len(KINDS) + 3)}\n"
-        f"| {result['rows']} | {result['batches']} | {kinds} | {len(result['faults'])} |\n\n"
-        f"Started stages, for {result['rows'] * result['batches']} rows: {attempts}.\n"
-    )
-
-
-def write_table(page: Path, result: dict[str, Any]) -> None:
-    """Replace what stands between <!-- kills --> and <!-- /kills --> in a page."""
-    head, _, rest = page.read_text().partition("<!-- kills -->\n")
-    _, _, tail = rest.partition("<!-- /kills -->")
-    page.write_text(f"{head}<!-- kills -->\n{table(result)}<!-- /kills -->{tail}")
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rows", type=int, default=24)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="JSON of the result")
-    parser.add_argument("--page", type=Path, help="page whose table is written; with --out alone "
-                        "from that file, nothing is run if it exists")  # fmt: skip
     given = parser.parse_args()
-    if given.page and given.out and given.out.exists():
-        write_table(given.page, json.loads(given.out.read_text()))
-        return 0
     os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "OMP_NUM_THREADS": "1"}
     folder = Path(tempfile.mkdtemp(prefix="kill-batch-"))
     campaign = Campaign(folder, given.rows, given.kills, given.seed)

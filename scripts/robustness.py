@@ -4,6 +4,7 @@ python benchmarks/fuzz.py --json benchmarks/results/fuzz.json
 python benchmarks/busy_machine.py --json benchmarks/results/busy-machine.json
 python benchmarks/long_run.py --json benchmarks/results/long-run.json
 python benchmarks/sanitize.py --json benchmarks/results/sanitize.json
+python benchmarks/kill_batch.py --out benchmarks/results/kill-batch.json
 python scripts/robustness.py
 """
 
@@ -71,7 +72,20 @@ def sanitize(record: dict[str, Any]) -> str:
     return f"{made}\n\n{drawn} renders and scores with gradients under each, on {record['device']}."
 
 
+def kill_batch(record: dict[str, Any]) -> str:
+    """Kills by what was killed, and how often a stage was started and ended."""
+    rows = [[kind, kills] for kind, kills in record["kills"].items()]
+    made = table(("SIGKILL of a", "times"), rows)
+    whole = record["rows"] * record["batches"]
+    started = ", ".join(f"{stage} {count}" for stage, count in record["attempts"].items())
+    return (
+        f"{made}\n\n{record['batches']} batches of {record['rows']} rows, {record['drivers']} "
+        f"drivers; started stages, for {whole} rows: {started}. Faults: {len(record['faults'])}."
+    )
+
+
 TABLES = (
+    ("kill-batch", "kill-batch.json", kill_batch),
     ("fuzz", "fuzz.json", fuzz),
     ("busy", "busy-machine.json", busy),
     ("long", "long-run.json", long_run),
