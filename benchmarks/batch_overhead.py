@@ -13,7 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hoigs.studies.batch.drive import drive
-from hoigs.studies.batch.manifest import read_manifest
+from hoigs.studies.batch.folder import BatchFolder
+from hoigs.studies.batch.manifest import each_row
 from hoigs.studies.execution.executor import Needs
 from hoigs.studies.jobs.machine import cpu_model
 
@@ -52,9 +53,9 @@ def measure(rows: int) -> dict[str, float]:
         (folder / "a.mp4").touch()
         lines = "".join(f"row{i},a.mp4\n" for i in range(rows))
         (folder / "rows.csv").write_text(f"name,video\n{lines}")
-        (folder / "rows").mkdir()
+        batch = BatchFolder.begin(folder / "out", each_row(folder / "rows.csv"))
         wall, cpu = time.perf_counter(), time.process_time()
-        failed = drive(read_manifest(folder / "rows.csv"), folder, Simulated())
+        failed = drive(batch.rows(), batch, Simulated())
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         assert not failed, failed
     return {

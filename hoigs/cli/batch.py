@@ -115,7 +115,7 @@ def _finish(done: Batch) -> None:
     for path in done.summary:
         typer.echo(f"wrote {path}")
     if done.failed:
-        typer.echo(f"{len(done.failed)} of {len(done.rows)} rows failed", err=True)
+        typer.echo(f"{len(done.failed)} of {done.rows} rows failed", err=True)
         raise typer.Exit(1)
 
 

@@ -11,14 +11,15 @@ import shutil
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.folder_lock import FolderLock
+from hoigs.studies.batch.folder import BatchFolder, TakenError
 from hoigs.studies.batch.manifest import Row
-from hoigs.studies.batch.stages import Stage, folder_of, stages_of
+from hoigs.studies.batch.stages import Stage, stages_of
 from hoigs.studies.batch.states import State
 from hoigs.studies.execution.executor import Executor, Needs, Process, why_failed
 
@@ -26,13 +27,10 @@ POLL_S = 0.01
 TAKEN_POLL_S = 2.0  # how often a row that another driver has is looked at again
 RETRY_S = 1.0
 LEASE_POLL_S = 1.0
+NEW_ROWS = 100  # that are looked at between two looks at the running ones
 WRONG_INPUT = 2  # exit code that another attempt does not change
 
 Report = Callable[["Work", str], None]
-
-
-class TakenError(HoigsError):
-    """Another driver works on this row."""
 
 
 @dataclass
@@ -69,8 +67,8 @@ class Work:
 
 
 def drive(
-    rows: Sequence[Row],
-    out: Path,
+    rows: Iterable[Row],
+    out: BatchFolder,
     executor: Executor,
     *,
     retries: int = 1,
@@ -84,22 +82,29 @@ def drive(
     call continues.
 
     Args:
+        rows: taken one by one, as there is room.
         retries: further attempts at a stage that failed.
         report: called with a row and "done before", "taken", "STAGE", "STAGE done", "retry: why",
             "done" or "failed: why".
         tick: called at every look at the running rows.
     """
     began = time.time()
-    waiting = deque(Work(row, folder_of(out, row), stages_of(row, out)) for row in rows)
+    new = (Work(row, out.of(row), stages_of(row, out.of(row))) for row in rows)
+    waiting: deque[Work] = deque()  # rows that other drivers have
+    more = True
     running: list[Work] = []
     failed: dict[str, str] = {}
     driver = _Driver(executor, retries, report, began, failed)
     try:
-        while waiting or running:
-            for _ in range(len(waiting)):
+        while more or waiting or running:
+            for i in range(len(waiting) + NEW_ROWS):
                 if len(running) >= executor.slots:
                     break
-                work = waiting.popleft()
+                known = i < len(waiting)
+                work = waiting.popleft() if known else next(new, None)
+                if work is None:
+                    more = False
+                    break
                 if time.monotonic() < work.not_before or (taken := driver.take(work)) is None:
                     waiting.append(work)
                 elif taken:

@@ -29,13 +29,8 @@ class Stage:
     clear: bool = False
 
 
-def folder_of(out: Path, row: Row) -> Path:
-    return out / "rows" / row.name
-
-
-def stages_of(row: Row, out: Path) -> list[Stage]:
-    """The stages of `row` in order, all of them below `folder_of(out, row)`."""
-    folder = folder_of(out, row)
+def stages_of(row: Row, folder: Path) -> list[Stage]:
+    """The stages of `row` in order, all of them below its folder."""
     run, clip = folder / "run", Path(row.clip)
     stages = []
     if row.video:
