@@ -5,6 +5,7 @@ python benchmarks/busy_machine.py --json benchmarks/results/busy-machine.json
 python benchmarks/long_run.py --json benchmarks/results/long-run.json
 python benchmarks/sanitize.py --json benchmarks/results/sanitize.json
 python benchmarks/kill_batch.py --out benchmarks/results/kill-batch.json
+python benchmarks/many_rows.py --out benchmarks/results/many-rows.json
 python scripts/robustness.py
 """
 
@@ -84,7 +85,23 @@ def kill_batch(record: dict[str, Any]) -> str:
     )
 
 
+def many_rows(record: dict[str, Any]) -> str:
+    """What the driver of a batch takes, by the number of rows."""
+    columns = ("rows", "manifest, s", "a row driven, ms", "a row done before, ms",
+               "all folders, s", "summary, s", "peak memory, MiB", "fullest folder")  # fmt: skip
+    rows = [
+        [f"{r['rows']:,}", r["manifest_s"], r["drive_ms_per_row"], r["done_before_ms_per_row"],
+         r["folders_s"], r["summary_s"], r["peak_mib"], f"{r['fullest_folder']:,}"]
+        for r in record["measured"]
+    ]  # fmt: skip
+    last = record["measured"][-1]
+    hours = last["rows"] * last["drive_ms_per_row"] / 3.6e6
+    driven = f"At most {last['driven']:,} rows were driven; all {last['rows']:,}"
+    return f"{table(columns, rows)}\n\n{driven} would take the driver {hours:.1f} h at this rate."
+
+
 TABLES = (
+    ("many-rows", "many-rows.json", many_rows),
     ("kill-batch", "kill-batch.json", kill_batch),
     ("fuzz", "fuzz.json", fuzz),
     ("busy", "busy-machine.json", busy),
