@@ -27,6 +27,9 @@ from hoigs.studies.execution.local import (
 )
 
 LOOPBACK = "127.0.0.1"
+# read as Ray is imported; by default Ray takes another address of the machine in place of loopback,
+# and then its servers listen on all of them
+NO_CLUSTER = ("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
 ANSWER_S = 10.0  # for the head of a cluster
 POLL_S = 0.05
 CANCEL_S = 15.0  # for the end of a process that was cancelled, which first gets SIGTERM
@@ -43,7 +46,8 @@ class RayExecutor:
         program: arguments of the Python of a machine, before those of a command.
 
     Raises:
-        HoigsError: Ray is not installed, or there is no cluster at `address`.
+        HoigsError: Ray is not installed, there is no cluster at `address`, or Ray would listen on
+            more than loopback.
     """
 
     def __init__(
@@ -54,6 +58,8 @@ class RayExecutor:
         program: Sequence[str] = PROGRAM[1:],
     ) -> None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        if address is None:
+            os.environ.setdefault(*NO_CLUSTER)
         try:
             import ray
         except ImportError as error:
@@ -93,13 +99,19 @@ def _join(ray: Any, address: str | None) -> None:
     """Join the cluster, or start Ray on this machine.
 
     Raises:
-        HoigsError: there is no cluster.
+        HoigsError: there is no cluster, or Ray would listen on more than loopback.
     """
     if address is None:
         ray.init(
             address="local", include_dashboard=False, log_to_driver=False,
             _node_ip_address=LOOPBACK,
         )  # fmt: skip
+        if (found := ray.util.get_node_ip_address()) != LOOPBACK:
+            ray.shutdown()
+            raise HoigsError(
+                f"Ray listens on {found}, not on {LOOPBACK} alone, since it was imported before "
+                f"{'='.join(NO_CLUSTER)} was set: set it, or start Ray yourself"
+            )
         return
     try:
         if address != "auto":  # Ray itself waits many minutes for a head that is not there

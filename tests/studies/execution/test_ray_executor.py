@@ -127,3 +127,24 @@ def test_no_cluster_at_an_address(ray):
     )
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
     assert "HoigsError: --address 127.0.0.1:1: no Ray cluster answers there" in done.stderr
+
+
+def test_by_default_nothing_listens_but_on_loopback(ray):
+    """In a process of its own, as Ray reads its settings when it is imported."""
+    text = (
+        "import socket\n"
+        "from hoigs.studies.execution.executor import make_executor\n"
+        "make_executor('ray')\n"
+        "import ray\n"
+        "host, _, port = ray.get_runtime_context().gcs_address.rpartition(':')\n"
+        "assert host == '127.0.0.1', host\n"
+        "probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)\n"
+        "try:\n"
+        "    probe.connect(('192.0.2.1', 9))  # sends nothing; fails without a network\n"
+        "    other = probe.getsockname()[0]\n"
+        "    socket.create_connection((other, int(port)), 2)\n"
+        "except OSError:\n"
+        "    print('refused')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
+    assert done.stdout == "refused\n", done.stdout + done.stderr
