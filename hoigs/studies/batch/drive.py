@@ -84,8 +84,8 @@ def drive(
     Args:
         rows: taken one by one, as there is room.
         retries: further attempts at a stage that failed.
-        report: called with a row and "done before", "taken", "STAGE", "STAGE done", "retry: why",
-            "done" or "failed: why".
+        report: called with a row and "done before", "taken by another driver", "STAGE", "STAGE
+            done", "waits: why", "retry: why", "done" or "failed: why".
         tick: called at every look at the running rows.
     """
     began = time.time()
@@ -202,6 +202,7 @@ class _Driver:
                     work.lock.require_held()
             return True
         work.lock.require_held()  # or another driver's record would be overwritten
+        work.device = work.process.device  # some executors know it only now
         stage, work.process = work.todo[0], None
         if code == 0 and stage.result.exists():
             seconds = time.monotonic() - work.since

@@ -74,11 +74,10 @@ class BatchFolder:
         """
         if path.exists() and not path.is_dir():
             raise HoigsError(f"{path}: is a file; --out names a folder")
-        known = cls.open(path) if (path / BATCH).exists() else None
         first = next(rows := iter(rows), None)  # a wrong one raises before a folder is made
         path.mkdir(parents=True, exist_ok=True)
         with in_turn(path / BATCH), written_whole(path / BATCH) as part:
-            count = 0
+            known, count = cls.open(path) if (path / BATCH).exists() else None, 0
             with part.open("w", encoding="utf-8") as file:
                 file.write(_head(False))
                 for row in chain([first] if first else [], rows):
