@@ -21,7 +21,7 @@ from hoigs.studies.batch.folder import BatchFolder, TakenError
 from hoigs.studies.batch.manifest import Row
 from hoigs.studies.batch.stages import Stage, stages_of
 from hoigs.studies.batch.states import State
-from hoigs.studies.execution.executor import Executor, Needs, Process, why_failed
+from hoigs.studies.execution.executor import Executor, Needs, Process, stop_all, why_failed
 
 POLL_S = 0.01
 TAKEN_POLL_S = 2.0  # how often a row that another driver has is looked at again
@@ -115,9 +115,8 @@ def drive(
             tick(running)
             time.sleep(POLL_S)
     finally:
+        stop_all(work.process for work in running)
         for work in running:
-            if work.process is not None:
-                work.process.stop()
             if work.lock is not None:
                 work.lock.release()
     return failed

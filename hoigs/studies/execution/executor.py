@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -92,6 +93,13 @@ def make_executor(
         raise HoigsError(f"--executor {name}: cannot be imported ({error})") from error
     made: Executor = kind(slots=slots, threads=threads, address=address)
     return made
+
+
+def stop_all(processes: Iterable[Process | None]) -> None:
+    """Stop processes, all at a time, as each may take seconds to end."""
+    running = [process for process in processes if process is not None]
+    with ThreadPoolExecutor(max(1, len(running))) as pool:
+        list(pool.map(lambda process: process.stop(), running))
 
 
 def why_failed(log: Path, code: int) -> str:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.folder_lock import FolderLock
-from hoigs.studies.execution.executor import Executor, Needs, Process, why_failed
+from hoigs.studies.execution.executor import Executor, Needs, Process, stop_all, why_failed
 from hoigs.studies.execution.local import LocalExecutor
 from hoigs.studies.jobs.job import Job, JobState
 
@@ -185,7 +185,7 @@ class _Jobs:
         return [job.run for job in rest]
 
     def end(self) -> None:
+        stop_all(running.process for running in self.running)
         for running in self.running:
-            running.process.stop()
             running.lock.release()
         self.running.clear()

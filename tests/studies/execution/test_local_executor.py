@@ -12,7 +12,7 @@ import pytest
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.folder_lock import FolderLock
-from hoigs.studies.execution.executor import Needs, Process, make_executor, why_failed
+from hoigs.studies.execution.executor import Needs, Process, make_executor, stop_all, why_failed
 from hoigs.studies.execution.local import LocalExecutor, visible_gpus
 
 PRINTS = """
@@ -60,8 +60,7 @@ def starts(tmp_path, two_gpus):
         return made[-1]
 
     yield make
-    for process in (p for one in made for p in one.processes if p is not None):
-        process.stop()
+    stop_all(process for one in made for process in one.processes)
 
 
 def test_processes_take_the_gpus_in_turn(starts):
