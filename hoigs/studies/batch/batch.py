@@ -72,9 +72,10 @@ def batch(
         chosen = islice(_chosen(rows, known, only_failed), limit)
         plan = {row.name: _plan(row, known.of(row)) for row in chosen}
         return Batch(len(plan), {}, (), plan)
+    where = _executor(executor, jobs, threads, address)
     folder = BatchFolder.begin(path, rows)
     chosen = islice(_chosen(folder.rows(), folder, only_failed), limit)
-    return _drive(folder, chosen, executor, jobs, threads, address, retries, report, tick)
+    return _drive(folder, chosen, where, retries, report, tick)
 
 
 def _chosen(rows: Iterable[Row], folder: BatchFolder, only_failed: bool) -> Iterator[Row]:
@@ -98,22 +99,24 @@ def work(
     paths. Arguments and errors as for `batch`.
     """
     folder = BatchFolder.open(Path(out).absolute())
-    return _drive(folder, folder.rows(), executor, jobs, threads, address, retries, report, tick)
+    where = _executor(executor, jobs, threads, address)
+    return _drive(folder, folder.rows(), where, retries, report, tick)
+
+
+def _executor(
+    given: Executor | str, jobs: int, threads: int | None, address: str | None
+) -> Executor:
+    return make_executor(given, jobs, threads, address) if isinstance(given, str) else given
 
 
 def _drive(
     folder: BatchFolder,
     rows: Iterable[Row],
-    executor: Executor | str,
-    jobs: int,
-    threads: int | None,
-    address: str | None,
+    executor: Executor,
     retries: int,
     report: Report,
     tick: Callable[[Sequence[Work]], None],
 ) -> Batch:
-    if isinstance(executor, str):
-        executor = make_executor(executor, jobs, threads, address)
     count = 0
 
     def counted() -> Iterator[Row]:

@@ -104,7 +104,7 @@ def _join(ray: Any, address: str | None) -> None:
     if address is None:
         ray.init(
             address="local", include_dashboard=False, log_to_driver=False,
-            _node_ip_address=LOOPBACK,
+            logging_level="WARNING", _node_ip_address=LOOPBACK,
         )  # fmt: skip
         if (found := ray.util.get_node_ip_address()) != LOOPBACK:
             ray.shutdown()
@@ -117,7 +117,7 @@ def _join(ray: Any, address: str | None) -> None:
         if address != "auto":  # Ray itself waits many minutes for a head that is not there
             host, _, port = address.rpartition(":")
             socket.create_connection((host, int(port)), ANSWER_S).close()
-        ray.init(address=address, log_to_driver=False)
+        ray.init(address=address, log_to_driver=False, logging_level="WARNING")
     except (OSError, ValueError, RuntimeError) as error:
         raise HoigsError(
             f"--address {address}: no Ray cluster answers there ({error}); on one of its machines "
