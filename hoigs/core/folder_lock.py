@@ -236,7 +236,8 @@ def _age(path: Path) -> float | None:
 def _is_stale(holder: dict[str, Any], age: float) -> bool:
     here = _this_process()
     pid = holder.get("pid")
-    if holder.get("host") != here["host"] or not isinstance(pid, int):
+    elsewhere = any(holder.get(key, here[key]) != here[key] for key in ("host", "pids"))
+    if "host" not in holder or elsewhere or not isinstance(pid, int):
         return age > STALE_S
     if pid == here["pid"]:  # this process itself, or one that had its number before
         return holder.get("token") not in _HELD
@@ -248,7 +249,13 @@ def _is_stale(holder: dict[str, Any], age: float) -> bool:
 
 
 def _this_process() -> dict[str, Any]:
-    return {"pid": os.getpid(), "host": socket.gethostname(), "began": _began(os.getpid())}
+    """Where processes have other numbers, as in another container, "pids" differs."""
+    try:
+        pids: str | None = str(Path("/proc/self/ns/pid").readlink())
+    except OSError:
+        pids = None
+    number = os.getpid()
+    return {"pid": number, "host": socket.gethostname(), "pids": pids, "began": _began(number)}
 
 
 def _alive(pid: int) -> bool:

@@ -49,7 +49,14 @@ def test_a_lock_is_gone_with_the_parents_that_it_made(tmp_path):
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["run"]
 
 
-@pytest.mark.parametrize("record", [{}, {"host": "elsewhere", "pid": 1}])
+@pytest.mark.parametrize(
+    "record",
+    [
+        {},
+        {"host": "elsewhere", "pid": 1},
+        {"pids": "pid:[1]", "pid": 2**22 + 1},  # of another container with this host's name
+    ],
+)
 def test_a_living_process_keeps_its_lock(tmp_path, record):
     path = lock_of(tmp_path / "run", **record)
     with pytest.raises(HoigsError, match=r"being written by another process \(training, pid"):
