@@ -22,7 +22,7 @@ from hoigs.studies.jobs.machine import cpu_model
 class Done:
     """A process that has ended."""
 
-    device = "cpu"
+    device, lost = "cpu", False
 
     def poll(self) -> int:
         return 0

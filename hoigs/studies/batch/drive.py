@@ -21,7 +21,14 @@ from hoigs.studies.batch.folder import BatchFolder, TakenError
 from hoigs.studies.batch.manifest import Row
 from hoigs.studies.batch.stages import Stage, stages_of
 from hoigs.studies.batch.states import State
-from hoigs.studies.execution.executor import Executor, Needs, Process, stop_all, why_failed
+from hoigs.studies.execution.executor import (
+    LOST_RETRIES,
+    Executor,
+    Needs,
+    Process,
+    stop_all,
+    why_failed,
+)
 
 POLL_S = 0.01
 TAKEN_POLL_S = 2.0  # how often a row that another driver has is looked at again
@@ -40,7 +47,8 @@ class Work:
     Attributes:
         stage: that runs, or ran last. since: when it was started, on the monotonic clock.
         taken_at: when this driver took the row.
-        retries: of the present stage, by this driver. device: where the stage runs.
+        retries: of the present stage, by this driver, and losses: those of them whose machine was
+            lost. device: where the stage runs.
     """
 
     row: Row
@@ -51,6 +59,7 @@ class Work:
     since: float = 0.0
     taken_at: float = 0.0
     retries: int = 0
+    losses: int = 0
     device: str = ""
     lock: FolderLock | None = None
     process: Process | None = None
@@ -201,13 +210,14 @@ class _Driver:
                     work.lock.require_held()
             return True
         work.lock.require_held()  # or another driver's record would be overwritten
+        lost = work.process.lost and work.losses < LOST_RETRIES
         work.device = work.process.device  # some executors know it only now
         stage, work.process = work.todo[0], None
         if code == 0 and stage.result.exists():
             seconds = time.monotonic() - work.since
             work.state.end(stage, seconds, work.device, socket.gethostname())
             work.state.write(work.folder)
-            work.retries = 0
+            work.retries = work.losses = 0
             self.report(work, f"{stage.name} done")
             if work.todo:
                 self._start(work)
@@ -215,8 +225,8 @@ class _Driver:
             self.report(work, "done")
             return self._leave(work)
         why = why_failed(work.log, code) if code else f"made no {stage.result.name}"
-        if code != WRONG_INPUT and work.retries < self.retries:
-            work.retries += 1
+        if lost or (code != WRONG_INPUT and work.retries - work.losses < self.retries):
+            work.retries, work.losses = work.retries + 1, work.losses + lost
             work.not_before = time.monotonic() + RETRY_S
             self.report(work, f"retry: {why}")
             return True

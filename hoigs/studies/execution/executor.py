@@ -17,6 +17,9 @@ EXECUTORS = {
 }
 
 
+LOST_RETRIES = 3  # of a process whose machine was lost, as by pre-emption
+
+
 @dataclass(frozen=True)
 class Needs:
     """What a process needs.
@@ -33,9 +36,14 @@ class Needs:
 
 
 class Process(Protocol):
-    """A started process."""
+    """A started process.
+
+    Attributes:
+        device: where it computes, as text. lost: whether its machine was lost while it ran.
+    """
 
     device: str
+    lost: bool
 
     def poll(self) -> int | None:
         """Its exit code, negative for a signal; None while it runs."""

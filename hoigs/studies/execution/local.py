@@ -95,6 +95,8 @@ class LocalExecutor:
 
 
 class _LocalProcess:
+    lost = False  # the machine is that of the driver
+
     def __init__(
         self, process: subprocess.Popen[bytes], memory_gb: float, gpu: str | None, share: float
     ) -> None:

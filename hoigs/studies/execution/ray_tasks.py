@@ -154,7 +154,7 @@ class _RayProcess:
     def __init__(self, ray: Any, reference: Any, log: Path) -> None:
         self._ray, self._reference, self._log = ray, reference, log
         self._code: int | None = None
-        self.device = "ray"
+        self.device, self.lost = "ray", False
 
     def poll(self) -> int | None:
         if self._code is None and self._ray.wait([self._reference], timeout=0)[0]:
@@ -167,7 +167,8 @@ class _RayProcess:
             self._code, self.device = self._ray.get(self._reference)
         except errors.TaskCancelledError:
             self._code = -signal.SIGTERM
-        except errors.RayError as error:  # the worker or its machine was lost
+        except errors.RayError as error:  # of its worker, its machine, or the disk
+            self.lost = not isinstance(error, errors.RayTaskError)
             self._log.parent.mkdir(parents=True, exist_ok=True)
             with self._log.open("a", encoding="utf-8") as file:
                 file.write(f"error: Ray lost the process: {' '.join(str(error).split())}\n")

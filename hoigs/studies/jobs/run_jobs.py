@@ -13,14 +13,20 @@ from dataclasses import dataclass, field
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.folder_lock import FolderLock
-from hoigs.studies.execution.executor import Executor, Needs, Process, stop_all, why_failed
+from hoigs.studies.execution.executor import (
+    LOST_RETRIES,
+    Executor,
+    Needs,
+    Process,
+    stop_all,
+    why_failed,
+)
 from hoigs.studies.execution.local import LocalExecutor
 from hoigs.studies.jobs.job import Job, JobState
 
 POLL_S = 0.05
 TAKEN_POLL_S = 2.0  # how often a job that another driver has is looked at again
 LEASE_POLL_S = 1.0
-RETRIES = 3  # of a job whose machine was lost
 
 OUT_OF_TIME = "the time limit came first; run the same command again"
 
@@ -128,7 +134,7 @@ class _Jobs:
                 return self._taken(job)
             job.log.unlink(missing_ok=True)
             command = (job.worker, job.dump(), str(self.executor.slots))
-            needs = Needs(gpus=0.0 if job.device == "cpu" else None, retries=RETRIES)
+            needs = Needs(gpus=0.0 if job.device == "cpu" else None, retries=LOST_RETRIES)
             process = self.executor.start(command, job.log, needs, lock.lease)
         except BaseException:
             lock.release()

@@ -174,3 +174,42 @@ def test_what_goes_wrong_with_a_row_is_on_its_record(tmp_path):
     assert [found[n]["state"] for n in ("big", "spoilt", "fine")] == ["failed", "failed", "done"]
     assert "damaged" in found["spoilt"]["why"] and "memory_gb" in found["big"]["why"]
     assert json.loads((batches.out / "rows/big/state.json").read_text())["failed"]["why"]
+
+
+class Ended:
+    """A process that has ended, or was lost with its machine."""
+
+    device = "elsewhere"
+
+    def __init__(self, code: int, lost: bool) -> None:
+        self.code, self.lost = code, lost
+
+    def poll(self) -> int:
+        return self.code
+
+    def stop(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("losses", "state"), [(3, "done"), (4, "failed")])
+def test_a_machine_that_is_lost_is_no_failure_of_a_stage(tmp_path, monkeypatch, losses, state):
+    monkeypatch.setattr("hoigs.studies.batch.drive.RETRY_S", 0.0)
+    batches = Batches(tmp_path, ["a"])
+
+    class Losing:
+        slots = 1
+
+        def start(self, command, log, needs, lease):
+            words = list(command[1:])
+            target = Path(words[words.index("--out") + 1] if "--out" in words else words[1])
+            self.started = getattr(self, "started", 0) + 1
+            if self.started <= losses:
+                log.write_text("error: Ray lost the process\n")
+                return Ended(1, lost=True)
+            target.mkdir(parents=True, exist_ok=True)
+            (target / "evaluation.json").write_text("{}")
+            return Ended(0, lost=False)
+
+    done = hoigs.batch(tmp_path / "rows.yaml", batches.out, executor=Losing(), retries=0)
+    assert batches.states() == {"a": state}
+    assert list(done.failed.values()) == (["Ray lost the process"] if state == "failed" else [])

@@ -82,7 +82,7 @@ def test_shares_of_gpus_and_exit_codes(start):
     assert sorted(gpus) in (["0", "0", "1"], ["0", "1", "1"])
     assert all(words[1:] == ["1", "module"] for words in halves), "4 CPUs for 4 slots"
     process, _ = start(seconds=0, code=3, gpus=0.25)
-    assert wait(process) == 3 and process.device.startswith("GPU ")
+    assert wait(process) == 3 and not process.lost and process.device.startswith("GPU ")
 
 
 def test_a_stopped_process_is_gone(start):
@@ -99,7 +99,7 @@ def test_a_process_whose_worker_is_killed_is_begun_again_if_it_may_be(start, tmp
     assert len(log.read_text().splitlines()) == 2, "two attempts"
     lost, log = start(gpus=0)
     os.kill(int(log.read_text().split()[1]), signal.SIGKILL)
-    assert wait(lost) == 1 and "Ray lost the process" in why_failed(log, 1)
+    assert wait(lost) == 1 and lost.lost and "Ray lost the process" in why_failed(log, 1)
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
