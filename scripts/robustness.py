@@ -6,6 +6,7 @@ python benchmarks/long_run.py --json benchmarks/results/long-run.json
 python benchmarks/sanitize.py --json benchmarks/results/sanitize.json
 python benchmarks/kill_batch.py --out benchmarks/results/kill-batch.json
 python benchmarks/many_rows.py --out benchmarks/results/many-rows.json
+python benchmarks/two_gpus.py --out benchmarks/results/two-gpus.json
 python scripts/robustness.py
 """
 
@@ -100,7 +101,20 @@ def many_rows(record: dict[str, Any]) -> str:
     return f"{table(columns, rows)}\n\n{driven} would take the driver {hours:.1f} h at this rate."
 
 
+def two_gpus(record: dict[str, Any]) -> str:
+    """Seconds of the same batch on one GPU and on two."""
+    busy = ", ".join(f"{p:g} %" for p in record["utilisation_percent"].values())
+    rows = [["one", record["one_gpu_s"]], ["two", record["two_gpus_s"]]]
+    placed = ", ".join(f"{n} on {d}" for d, n in sorted(record["rows_by_device"].items()))
+    return (
+        f"{table(('GPUs', 'seconds'), rows)}\n\n{record['rows']} rows of {record['steps']} steps on "
+        f"{' and '.join(record['gpus'])}: {record['times']:.2f} times the throughput; rows: {placed}. "
+        f"Mean utilisation while both worked: {busy}."
+    )
+
+
 TABLES = (
+    ("two-gpus", "two-gpus.json", two_gpus),
     ("many-rows", "many-rows.json", many_rows),
     ("kill-batch", "kill-batch.json", kill_batch),
     ("fuzz", "fuzz.json", fuzz),

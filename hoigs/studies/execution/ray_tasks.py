@@ -69,23 +69,32 @@ class RayExecutor:
         self.slots, self._program, self._ray = slots, tuple(program), ray
         if not ray.is_initialized():
             _join(ray, address)
-        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        cpus = [int(node.get("CPU", 0)) for node in nodes]
+        cpus = [int(machine.get("CPU", 0)) for machine in self._machines()]
         self._threads = threads or max(1, min(sum(cpus) // slots, max(cpus)))
-        self._gpus = int(sum(node.get("GPU", 0) for node in nodes))
+        self._gpus = int(sum(machine.get("GPU", 0) for machine in self._machines()))
         self._task = ray.remote(run_process)
 
     def start(
         self, command: Sequence[str], log: Path, needs: Needs, lease: str = ""
     ) -> Process | None:
-        """As `Executor.start`; Ray queues what has no room yet."""
+        """As `Executor.start`; Ray queues what has no room yet.
+
+        Raises:
+            HoigsError: no machine has room for it even while it is idle.
+        """
         given = needs.gpus is not None
         share = gpu_share(needs, self._gpus, self.slots) if self._gpus or given else 0.0
+        wanted = {"CPU": self._threads, "GPU": share, "memory": int(1e9 * needs.memory_gb)}
+        if not any(all(m.get(k, 0) >= v for k, v in wanted.items()) for m in self._machines()):
+            raise HoigsError(
+                f"no machine of the Ray cluster has {self._threads} CPUs, {share:g} GPUs and "
+                f"{needs.memory_gb:g} GB of memory; lower --threads, or gpus or memory_gb of a row"
+            )
         settings = {k: v for k, v in os.environ.items() if k.startswith("HOIGS_")}
         task = self._task.options(
-            num_cpus=self._threads,
+            num_cpus=wanted["CPU"],
             num_gpus=share,
-            memory=int(1e9 * needs.memory_gb),
+            memory=wanted["memory"],
             max_retries=needs.retries,
         )
         reference = task.remote(
@@ -93,6 +102,10 @@ class RayExecutor:
             str(Path.cwd()),
         )  # fmt: skip
         return _RayProcess(self._ray, reference, log)
+
+    def _machines(self) -> list[dict[str, float]]:
+        """What the machines that are alive have, by Ray's names."""
+        return [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
 
 
 def _join(ray: Any, address: str | None) -> None:

@@ -85,6 +85,15 @@ def test_shares_of_gpus_and_exit_codes(start):
     assert wait(process) == 3 and not process.lost and process.device.startswith("GPU ")
 
 
+def test_what_no_machine_has_room_for_is_refused(ray, tmp_path):
+    where = RayExecutor(4, threads=1)
+    for needs in (Needs(memory_gb=1e6), Needs(gpus=2.5)):
+        with pytest.raises(HoigsError, match=r"no machine of the Ray cluster|expected a share"):
+            where.start(("module",), tmp_path / "log", needs)
+    with pytest.raises(HoigsError, match="has 99 CPUs, 0 GPUs and 0 GB"):
+        RayExecutor(1, threads=99).start(("module",), tmp_path / "log", Needs(gpus=0))
+
+
 def test_a_stopped_process_is_gone(start):
     process, log = start(gpus=0)
     process.stop()
