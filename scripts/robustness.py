@@ -106,9 +106,10 @@ def two_gpus(record: dict[str, Any]) -> str:
     busy = ", ".join(f"{p:g} %" for p in record["utilisation_percent"].values())
     rows = [["one", record["one_gpu_s"]], ["two", record["two_gpus_s"]]]
     placed = ", ".join(f"{n} on {d}" for d, n in sorted(record["rows_by_device"].items()))
+    made, gpus = table(("GPUs", "seconds"), rows), " and ".join(record["gpus"])
     return (
-        f"{table(('GPUs', 'seconds'), rows)}\n\n{record['rows']} rows of {record['steps']} steps on "
-        f"{' and '.join(record['gpus'])}: {record['times']:.2f} times the throughput; rows: {placed}. "
+        f"{made}\n\n{record['rows']} rows of {record['steps']} steps on {gpus}: "
+        f"{record['times']:.2f} times the throughput; rows: {placed}. "
         f"Mean utilisation while both worked: {busy}."
     )
 
