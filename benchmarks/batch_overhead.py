@@ -13,15 +13,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hoigs.studies.batch.drive import drive
-from hoigs.studies.batch.manifest import read_manifest
-from hoigs.studies.jobs.executor import Needs
+from hoigs.studies.batch.folder import BatchFolder
+from hoigs.studies.batch.manifest import each_row
+from hoigs.studies.execution.executor import Needs
 from hoigs.studies.jobs.machine import cpu_model
 
 
 class Done:
     """A process that has ended."""
 
-    device = "cpu"
+    device, lost = "cpu", False
 
     def poll(self) -> int:
         return 0
@@ -35,9 +36,9 @@ class Simulated:
 
     slots = 2
 
-    def start(self, command: Sequence[str], log: Path, needs: Needs) -> Done:
-        del log, needs
-        words = list(command)
+    def start(self, command: Sequence[str], log: Path, needs: Needs, lease: str) -> Done:
+        del log, needs, lease
+        words = list(command[1:])
         if words[0] == "eval":
             (Path(words[1]) / "evaluation.json").write_text("{}")
         else:
@@ -52,9 +53,9 @@ def measure(rows: int) -> dict[str, float]:
         (folder / "a.mp4").touch()
         lines = "".join(f"row{i},a.mp4\n" for i in range(rows))
         (folder / "rows.csv").write_text(f"name,video\n{lines}")
-        (folder / "rows").mkdir()
+        batch = BatchFolder.begin(folder / "out", each_row(folder / "rows.csv"))
         wall, cpu = time.perf_counter(), time.process_time()
-        failed = drive(read_manifest(folder / "rows.csv"), folder, Simulated())
+        failed = drive(batch.rows(), batch, Simulated())
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         assert not failed, failed
     return {

@@ -4,6 +4,9 @@ python benchmarks/fuzz.py --json benchmarks/results/fuzz.json
 python benchmarks/busy_machine.py --json benchmarks/results/busy-machine.json
 python benchmarks/long_run.py --json benchmarks/results/long-run.json
 python benchmarks/sanitize.py --json benchmarks/results/sanitize.json
+python benchmarks/kill_batch.py --out benchmarks/results/kill-batch.json
+python benchmarks/many_rows.py --out benchmarks/results/many-rows.json
+python benchmarks/two_gpus.py --out benchmarks/results/two-gpus.json
 python scripts/robustness.py
 """
 
@@ -71,7 +74,50 @@ def sanitize(record: dict[str, Any]) -> str:
     return f"{made}\n\n{drawn} renders and scores with gradients under each, on {record['device']}."
 
 
+def kill_batch(record: dict[str, Any]) -> str:
+    """Kills by what was killed, and how often a stage was started and ended."""
+    rows = [[kind, kills] for kind, kills in record["kills"].items()]
+    made = table(("SIGKILL of a", "times"), rows)
+    whole = record["rows"] * record["batches"]
+    started = ", ".join(f"{stage} {count}" for stage, count in record["attempts"].items())
+    return (
+        f"{made}\n\n{record['batches']} batches of {record['rows']} rows, {record['drivers']} "
+        f"drivers; started stages, for {whole} rows: {started}. Faults: {len(record['faults'])}."
+    )
+
+
+def many_rows(record: dict[str, Any]) -> str:
+    """What the driver of a batch takes, by the number of rows."""
+    columns = ("rows", "manifest, s", "a row driven, ms", "a row done before, ms",
+               "all folders, s", "summary, s", "peak memory, MiB", "fullest folder")  # fmt: skip
+    rows = [
+        [f"{r['rows']:,}", r["manifest_s"], r["drive_ms_per_row"], r["done_before_ms_per_row"],
+         r["folders_s"], r["summary_s"], r["peak_mib"], f"{r['fullest_folder']:,}"]
+        for r in record["measured"]
+    ]  # fmt: skip
+    last = record["measured"][-1]
+    hours = last["rows"] * last["drive_ms_per_row"] / 3.6e6
+    driven = f"At most {last['driven']:,} rows were driven; all {last['rows']:,}"
+    return f"{table(columns, rows)}\n\n{driven} would take the driver {hours:.1f} h at this rate."
+
+
+def two_gpus(record: dict[str, Any]) -> str:
+    """Seconds of the same batch on one GPU and on two."""
+    busy = ", ".join(f"{p:g} %" for p in record["utilisation_percent"].values())
+    rows = [["one", record["one_gpu_s"]], ["two", record["two_gpus_s"]]]
+    placed = ", ".join(f"{n} on {d}" for d, n in sorted(record["rows_by_device"].items()))
+    made, gpus = table(("GPUs", "seconds"), rows), " and ".join(record["gpus"])
+    return (
+        f"{made}\n\n{record['rows']} rows of {record['steps']} steps on {gpus}: "
+        f"{record['times']:.2f} times the throughput; rows: {placed}. "
+        f"Mean utilisation while both worked: {busy}."
+    )
+
+
 TABLES = (
+    ("two-gpus", "two-gpus.json", two_gpus),
+    ("many-rows", "many-rows.json", many_rows),
+    ("kill-batch", "kill-batch.json", kill_batch),
     ("fuzz", "fuzz.json", fuzz),
     ("busy", "busy-machine.json", busy),
     ("long", "long-run.json", long_run),

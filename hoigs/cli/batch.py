@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hoigs.cli.common import JobsOption, ThreadsOption
+from hoigs.cli.common import AddressOption, ExecutorOption, JobsOption, ThreadsOption
 from hoigs.core.names import printable
 
 if TYPE_CHECKING:
@@ -48,6 +48,8 @@ def batch(
     ] = None,
     jobs: JobsOption = 1,
     threads: ThreadsOption = None,
+    executor: ExecutorOption = "local",
+    address: AddressOption = None,
     retries: RetriesOption = 1,
     limit: Annotated[
         int | None, typer.Option("--limit", min=1, help="Only this many rows, the first.")
@@ -79,8 +81,9 @@ def batch(
     defaults = {key: value for key, value in given.items() if value is not None}
     with _shown() as show:
         done = run(
-            manifest, out, defaults=defaults, jobs=jobs, threads=threads, retries=retries,
-            limit=limit, only_failed=only == "failed", dry_run=dry_run, **show,
+            manifest, out, defaults=defaults, jobs=jobs, threads=threads, executor=executor,
+            address=address, retries=retries, limit=limit, only_failed=only == "failed",
+            dry_run=dry_run, **show,
         )  # fmt: skip
     if dry_run:
         for name, commands in done.plan.items():
@@ -93,13 +96,18 @@ def work(
     out: Annotated[Path, typer.Argument(help="Folder that `hoigs batch` was given as --out.")],
     jobs: JobsOption = 1,
     threads: ThreadsOption = None,
+    executor: ExecutorOption = "local",
+    address: AddressOption = None,
     retries: RetriesOption = 1,
 ) -> None:
     """Help with a batch: work on its rows that nobody works on, until none is left."""
     from hoigs.studies.batch.batch import work as run
 
     with _shown() as show:
-        done = run(out, jobs=jobs, threads=threads, retries=retries, **show)
+        done = run(
+            out, jobs=jobs, threads=threads, executor=executor, address=address, retries=retries,
+            **show,
+        )  # fmt: skip
     _finish(done)
 
 
@@ -107,7 +115,7 @@ def _finish(done: Batch) -> None:
     for path in done.summary:
         typer.echo(f"wrote {path}")
     if done.failed:
-        typer.echo(f"{len(done.failed)} of {len(done.rows)} rows failed", err=True)
+        typer.echo(f"{len(done.failed)} of {done.rows} rows failed", err=True)
         raise typer.Exit(1)
 
 

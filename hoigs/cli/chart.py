@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import signal
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hoigs.cli.common import (
+    AddressOption,
     DeviceOption,
+    ExecutorOption,
     JobsOption,
     MinutesOption,
     PluginOption,
@@ -17,11 +19,14 @@ from hoigs.cli.common import (
     SetOption,
     ThreadsOption,
     print_table,
+    study_device,
 )
 from hoigs.cli.evaluate import LpipsOption
 from hoigs.core.machine.cpus import available_cpus
 from hoigs.core.names import printable
-from hoigs.runs.choices import pick_device
+
+if TYPE_CHECKING:
+    from hoigs.studies.execution.executor import Executor
 
 
 def chart(
@@ -47,6 +52,8 @@ def chart(
     ),
     jobs: JobsOption = 1,
     threads: ThreadsOption = None,
+    executor: ExecutorOption = "local",
+    address: AddressOption = None,
     minutes: MinutesOption = None,
     add: Annotated[
         list[Path] | None,
@@ -74,11 +81,14 @@ def chart(
     chart.csv, chart.json, and chart-CLIP.png and .svg with training curves beside them. With
     --rerun, the exit code is 1 if a PSNR differs by more than 0.05 dB on the same machine.
     """
+    from hoigs.studies.execution.executor import make_executor
+
     each = threads or max(1, available_cpus() // jobs)
+    where = make_executor(executor, jobs, each, address)
     before = signal.signal(signal.SIGTERM, _stop)  # so that SIGTERM ends the runs too
     try:
         if rerun is not None:
-            _rerun(out, rerun, each)
+            _rerun(out, rerun, where)
             return
         from hoigs.core.errors import HoigsError
         from hoigs.studies.chart.data import load_chart
@@ -102,7 +112,7 @@ def chart(
             budgets=_steps(budgets),
             seeds=seeds,
             settings=tuple(settings or ()),
-            device=pick_device(device),
+            device=study_device(device, executor),
             lpips_weights=lpips_weights.resolve() if lpips_weights else None,
             plugins=tuple(p.resolve() for p in plugin or ()),
         )
@@ -111,7 +121,7 @@ def chart(
             typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
 
         limit = None if minutes is None else 60 * minutes
-        cells = run_chart(study, workers=jobs, threads=each, limit_s=limit, report=report)
+        cells = run_chart(study, executor=where, limit_s=limit, report=report)
         about = _about(study.settings, study.device, jobs, each)
         if not clips:  # nothing was run
             about = {k if len(loaded) == 1 else f"{k} ({path})": v
@@ -153,13 +163,13 @@ def _about(settings: tuple[str, ...], device: str, jobs: int, threads: int) -> d
     }
 
 
-def _rerun(out: Path, cell: str, threads: int) -> None:
+def _rerun(out: Path, cell: str, executor: Executor) -> None:
     from hoigs.evaluation.protocol import NotComputed
     from hoigs.studies.chart.data import AXES
     from hoigs.studies.chart.rerun import TOLERANCE_DB
     from hoigs.studies.chart.rerun import rerun as run_again
 
-    found = run_again(out.resolve(), cell, threads)
+    found = run_again(out.resolve(), cell, executor)
     rows = []
     for name, axis in AXES.items():
         pair = (found.first[name], found.again[name])

@@ -28,6 +28,19 @@ ThreadsOption = Annotated[
     int | None,
     typer.Option("--threads", min=1, help="Threads of each training; default cores / jobs."),
 ]
+ExecutorOption = Annotated[
+    str,
+    typer.Option(
+        "--executor",
+        help="Where they run: local, ray (pip install 'hoigs[ray]'), or MODULE:CLASS of your own.",
+    ),
+]
+AddressOption = Annotated[
+    str | None,
+    typer.Option(
+        "--address", help="Ray cluster to join: auto, HOST:PORT. Default: Ray on this machine only."
+    ),
+]
 MinutesOption = Annotated[
     float | None,
     typer.Option(
@@ -55,6 +68,13 @@ PluginOption = Annotated[
         "--plugin", help="Also load this Python file as a plugin; its code runs. Repeatable."
     ),
 ]
+
+
+def study_device(device: str, executor: str) -> str:
+    """`pick_device`; a GPU for jobs on other machines need not be in this one."""
+    from hoigs.runs.choices import pick_device
+
+    return pick_device(device) if executor == "local" or device == "auto" else device
 
 
 def print_table(

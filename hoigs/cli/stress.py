@@ -9,17 +9,19 @@ from typing import Annotated
 import typer
 
 from hoigs.cli.common import (
+    AddressOption,
     DeviceOption,
+    ExecutorOption,
     JobsOption,
     MinutesOption,
     PluginOption,
     SeedsOption,
     SetOption,
     ThreadsOption,
+    study_device,
 )
 from hoigs.core.machine.cpus import available_cpus
 from hoigs.core.names import printable
-from hoigs.runs.choices import pick_device
 
 
 def stress(
@@ -47,6 +49,8 @@ def stress(
     ),
     jobs: JobsOption = 1,
     threads: ThreadsOption = None,
+    executor: ExecutorOption = "local",
+    address: AddressOption = None,
     minutes: MinutesOption = None,
     settings: SetOption = None,
     device: DeviceOption = "cpu",
@@ -58,6 +62,7 @@ def stress(
     harder until a spec breaks. Writes stress.md, .csv and .json, stress-matrix.png and .svg, and
     stress-curves.png and .svg. The exit code is 1 if a check of hoigs' own code fails.
     """
+    from hoigs.studies.execution.executor import make_executor
     from hoigs.studies.jobs.job import Job
     from hoigs.studies.jobs.variants import definition, parse_variants
     from hoigs.studies.stress.case import choose_cases
@@ -76,10 +81,11 @@ def stress(
         base=BASE.replace("width=96", f"width={width}"),
         whole=whole,
         settings=tuple(settings or ()),
-        device=pick_device(device),
+        device=study_device(device, executor),
         plugins=tuple(p.resolve() for p in plugin or ()),
     )
     each = threads or max(1, available_cpus() // jobs)
+    where = make_executor(executor, jobs, each, address)
 
     def report(job: Job, word: str) -> None:
         typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
@@ -87,9 +93,7 @@ def stress(
     before = signal.signal(signal.SIGTERM, _stop)  # so that SIGTERM ends the runs too
     try:
         limit = None if minutes is None else 60 * minutes
-        verdicts = run_stress(
-            study, workers=jobs, threads=each, limit_s=limit, report=report, log=typer.echo
-        )
+        verdicts = run_stress(study, executor=where, limit_s=limit, report=report, log=typer.echo)
     finally:
         signal.signal(signal.SIGTERM, before)
     definitions = {row.label: definition(row) for row in study.specs}

@@ -9,18 +9,19 @@ from typing import Annotated
 import typer
 
 from hoigs.cli.common import (
+    AddressOption,
     DeviceOption,
+    ExecutorOption,
     JobsOption,
     MinutesOption,
     PluginOption,
     SeedsOption,
     SetOption,
     ThreadsOption,
+    study_device,
 )
 from hoigs.cli.evaluate import LpipsOption
-from hoigs.core.machine.cpus import available_cpus
 from hoigs.core.names import printable
-from hoigs.runs.choices import pick_device
 
 
 def tables(
@@ -47,6 +48,8 @@ def tables(
     ),
     jobs: JobsOption = 1,
     threads: ThreadsOption = None,
+    executor: ExecutorOption = "local",
+    address: AddressOption = None,
     minutes: MinutesOption = None,
     settings: SetOption = None,
     device: DeviceOption = "auto",
@@ -59,6 +62,7 @@ def tables(
     object-prior, mask-depth-source. Writes tables.md, tables.csv and tables.json.
     """
     from hoigs.runs.run_folder import versions
+    from hoigs.studies.execution.executor import make_executor
     from hoigs.studies.jobs.job import Job
     from hoigs.studies.tables.run import Study, circumstances, protocols, run_study
     from hoigs.studies.tables.sets import choose_sets
@@ -71,11 +75,11 @@ def tables(
         seeds=seeds,
         steps=steps,
         settings=tuple(settings or ()),
-        device=pick_device(device),
+        device=study_device(device, executor),
         lpips_weights=lpips_weights.resolve() if lpips_weights else None,
         plugins=tuple(p.resolve() for p in plugin or ()),
     )
-    each = threads or max(1, available_cpus() // jobs)
+    where = make_executor(executor, jobs, threads, address)
     ended = 0
 
     def report(job: Job, word: str) -> None:
@@ -89,7 +93,7 @@ def tables(
     limit = None if minutes is None else 60 * minutes
     before = signal.signal(signal.SIGTERM, stop)
     try:
-        results = run_study(study, workers=jobs, threads=each, limit_s=limit, report=report)
+        results = run_study(study, executor=where, limit_s=limit, report=report)
     finally:
         signal.signal(signal.SIGTERM, before)
     about: dict[str, object] = {

@@ -1,9 +1,13 @@
-"""FolderLock: one process at a time writes a folder, on local and on network disks.
+"""FolderLock: one holder at a time writes a folder, on local and on network disks.
 
 The lock is a file beside the folder, since the folder itself may be replaced. It is created
 exclusively and removed by rename, which NFS does atomically where flock may do nothing. It names
 its process, and a thread renews its time: a lock whose process is dead on this machine, or that was
-not renewed for two minutes on another one, is taken over.
+not renewed for two minutes on another one, is taken over. Its token is new each time, so a holder
+that was suspended, and processes that work for it, see that it is another's by now (`is_token`).
+
+A disk offers no write that depends on a lock. Holders therefore look (`require_held`) right before
+they rename what they wrote into place; a suspension between these two steps is not covered.
 """
 
 from __future__ import annotations
@@ -26,50 +30,93 @@ HEARTBEAT_S = 15.0
 STALE_S = 120.0
 SUFFIX = ".lock"
 
+_HELD: set[str] = set()  # tokens of this process
+
 
 class FolderLock:
     """The right to write `folder`, from `acquire` to `release`, or as a context.
 
-    A process may take its own lock again: the newer one counts.
+    It excludes other threads of the same process too.
 
     Args:
         folder: it need not exist; missing parents are made, and removed again if they stay empty.
         work: of the holder, for the message of others: "training". error: class of these messages.
+        token: of a lock of this folder that the caller holds already. This one is then a part of
+            it: it is held while that one is, and its release leaves that one as it is.
     """
 
-    def __init__(self, folder: Path, work: str, error: type[HoigsError] = HoigsError) -> None:
+    def __init__(
+        self, folder: Path, work: str, error: type[HoigsError] = HoigsError, token: str = ""
+    ) -> None:
         self.folder = folder.absolute()
         self.path = self.folder.with_name(f".{self.folder.name}{SUFFIX}")
         self.work, self.error = work, error
-        self._token = ""
+        self._token, self._outer = "", token
         self._ended = threading.Event()
         self._made: list[Path] = []
+
+    @property
+    def token(self) -> str:
+        """Of the present hold; "" while it is not held."""
+        return self._token
+
+    @property
+    def lease(self) -> str:
+        """The present hold as text, for processes that work for the holder: PATH:TOKEN."""
+        return f"{self.path}:{self._token}" if self._token else ""
 
     def acquire(self) -> FolderLock:
         """Take the lock.
 
         Raises:
-            HoigsError: another process holds it.
+            HoigsError: another process or thread holds it.
         """
+        if self._outer:
+            self._token = self._outer
+            self.require_held()
+            return self
         self._make_parents()
         token = uuid.uuid4().hex
         record = {"work": self.work, "token": token, **_this_process()}
-        for _ in range(3):  # a stale lock may be taken over by another process first
-            if _create(self.path, json.dumps(record)):
-                break
-            self._take_over_stale()
-        else:
-            raise self.error(f"{self.folder}: other processes are about to write it; try again")
+        _HELD.add(token)  # before its file is there for another thread to see
+        try:
+            self._create(json.dumps(record))
+        except BaseException:
+            _HELD.discard(token)
+            raise
         self._token, self._ended = token, threading.Event()
         _Heartbeat(self.path, token, self._ended).start()
         weakref.finalize(self, _release, self.path, token, self._ended, list(self._made))
         return self
 
+    def _create(self, record: str) -> None:
+        for _ in range(3):  # a stale lock may be taken over by another process first
+            if _create(self.path, record):
+                return
+            self._take_over_stale()
+        raise self.error(f"{self.folder}: other processes are about to write it; try again")
+
     def release(self) -> None:
         """Give the lock back; nothing happens where this process does not hold it any more."""
-        if self._token:
+        if self._token and not self._outer:
             _release(self.path, self._token, self._ended, self._made)
         self._token = ""
+
+    def holder(self) -> str:
+        """Who holds it and is alive, as text; "" if it is free."""
+        record, age = _read(self.path), _age(self.path)
+        if age is None or _is_stale(record, age):
+            return ""
+        here = record.get("token") in _HELD
+        who = "this process itself" if here else "another process"
+        return (
+            f"{who} ({record.get('work', '?')}, pid {record.get('pid', '?')} on "
+            f"{record.get('host', '?')}, alive {age:.0f} s ago)"
+        )
+
+    def is_lost(self) -> bool:
+        """Whether the lock was this holder's and is another's or gone, by a disk that answers."""
+        return bool(self._token) and not is_token(self.path, self._token)
 
     def require_held(self) -> None:
         """Raise `error` if another process took the lock over, as after a long suspension."""
@@ -101,23 +148,18 @@ class FolderLock:
         Raises:
             HoigsError: it is not stale.
         """
-        holder = _read(self.path)
-        age = _age(self.path)
-        if age is None:
-            return  # released meanwhile
-        if not _is_stale(holder, age):
+        token = _read(self.path).get("token")  # first: a later one is another holder's
+        if who := self.holder():
             raise self.error(
-                f"{self.folder} is being written by another process ({holder.get('work', '?')}, "
-                f"pid {holder.get('pid', '?')} on {holder.get('host', '?')}, alive {age:.0f} s "
-                f"ago): wait for it, stop it, or name another folder; if it cannot be there any "
-                f"more, remove {self.path}"
+                f"{self.folder} is being written by {who}: wait for it, stop it, or name another "
+                f"folder; if it cannot be there any more, remove {self.path}"
             )
         moved = self.path.with_name(f"{self.path.name}.{uuid.uuid4().hex[:8]}.part")
         try:
             self.path.rename(moved)
         except FileNotFoundError:
             return
-        if _read(moved).get("token") != holder.get("token"):  # another one was quicker
+        if _read(moved).get("token") != token:  # another one was quicker
             with contextlib.suppress(OSError):
                 os.link(moved, self.path)  # unlike rename, never over a third one
         moved.unlink(missing_ok=True)
@@ -138,6 +180,17 @@ class _Heartbeat(threading.Thread):
                 os.utime(self._path)
 
 
+def is_token(path: Path, token: str) -> bool:
+    """Whether the lock file `path` has this token, or cannot be read now."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return False
+    except (OSError, ValueError, RecursionError):
+        return True
+    return isinstance(found, dict) and found.get("token") == token
+
+
 def _create(path: Path, text: str) -> bool:
     """Make a file with `text` unless there is one."""
     try:
@@ -151,6 +204,7 @@ def _create(path: Path, text: str) -> bool:
 
 def _release(path: Path, token: str, ended: threading.Event, made: list[Path]) -> None:
     ended.set()
+    _HELD.discard(token)
     with contextlib.suppress(OSError):
         if _read(path).get("token") == token:
             path.unlink()
@@ -182,10 +236,11 @@ def _age(path: Path) -> float | None:
 def _is_stale(holder: dict[str, Any], age: float) -> bool:
     here = _this_process()
     pid = holder.get("pid")
-    if holder.get("host") != here["host"] or not isinstance(pid, int):
+    elsewhere = any(holder.get(key, here[key]) != here[key] for key in ("host", "pids"))
+    if "host" not in holder or elsewhere or not isinstance(pid, int):
         return age > STALE_S
-    if pid == here["pid"]:
-        return True  # this process itself, or one that had its number before
+    if pid == here["pid"]:  # this process itself, or one that had its number before
+        return holder.get("token") not in _HELD
     if not _alive(pid):
         return True
     began = _began(pid)
@@ -194,7 +249,13 @@ def _is_stale(holder: dict[str, Any], age: float) -> bool:
 
 
 def _this_process() -> dict[str, Any]:
-    return {"pid": os.getpid(), "host": socket.gethostname(), "began": _began(os.getpid())}
+    """Where processes have other numbers, as in another container, "pids" differs."""
+    try:
+        pids: str | None = str(Path("/proc/self/ns/pid").readlink())
+    except OSError:
+        pids = None
+    number = os.getpid()
+    return {"pid": number, "host": socket.gethostname(), "pids": pids, "began": _began(number)}
 
 
 def _alive(pid: int) -> bool:

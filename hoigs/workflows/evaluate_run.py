@@ -9,12 +9,14 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.folder_lock import FolderLock
 from hoigs.core.progress import Progress
 from hoigs.core.spec.train_schema import EvaluationSpec
 from hoigs.evaluation.evaluate import evaluate
 from hoigs.evaluation.report import write_report
 from hoigs.evaluation.scores import Evaluation
 from hoigs.runs.loaded_run import LoadedRun
+from hoigs.runs.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -60,19 +62,35 @@ def evaluate_run(
         report: write report.html. progress: called with the share done, in [0, 1], and the work.
 
     Raises:
-        HoigsError: this is no run, its clip is not there, or the protocol is unknown.
+        HoigsError: this is no run, its clip is not there, the protocol is unknown, or another
+            process writes the run.
     """
     run = Path(run)
-    loaded = LoadedRun.open(run, clip=clip, rasterizer=rasterizer, device=device, plugins=plugins)
-    settings = _protocol(
-        loaded.spec.evaluation,
-        {"test_pose": test_pose, "test_camera": test_camera, "fit_steps": fit_steps},
-    )
+    RunFolder(run).require()
+    with FolderLock(run, "scoring") as lock:  # from reading the model until its scores are written
+        loaded = LoadedRun.open(
+            run, clip=clip, rasterizer=rasterizer, device=device, plugins=plugins
+        )
+        given = {"test_pose": test_pose, "test_camera": test_camera, "fit_steps": fit_steps}
+        return _score(loaded, given, lpips_weights, report, lock, progress)
+
+
+def _score(
+    loaded: LoadedRun,
+    given: Mapping[str, object],
+    lpips_weights: Path | str | None,
+    report: bool,
+    lock: FolderLock,
+    progress: Progress | None,
+) -> EvaluatedRun:
+    """The rest of `evaluate_run`, with the run folder locked; `given` changes the protocol."""
+    run, settings = lock.folder, _protocol(loaded.spec.evaluation, given)
     evaluation = evaluate(
         loaded.model, loaded.clip, lpips_weights=lpips_weights, held_out=settings.held_out,
         test_pose=settings.test_pose, test_camera=settings.test_camera,
         fit_steps=settings.fit_steps, progress=progress,
     )  # fmt: skip
+    lock.require_held()
     if settings != loaded.spec.evaluation:
         scores = run / f"evaluation-{settings.test_pose}-{settings.test_camera}.json"
         evaluation.save(scores)

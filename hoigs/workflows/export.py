@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import shutil
 import zipfile
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.folder_lock import FolderLock
 from hoigs.core.model.compose import compose_bodies
 from hoigs.core.model.exporter import SHEET, Exported, Exporter, ExportRequest
 from hoigs.core.progress import Progress, no_progress
@@ -84,7 +86,10 @@ def export(
         fps=rate,
     )
     try:
-        return write_to(exporter, request, target, progress or no_progress)
+        with FolderLock(target, "hoigs export"):
+            refuse_existing(target)  # another process may have written it meanwhile
+            _remove_unfinished(target)
+            return write_to(exporter, request, target, progress or no_progress)
     except OSError as error:
         raise HoigsError(f"{target} cannot be written: {error.strerror or error}") from error
 
@@ -123,6 +128,13 @@ def refuse_existing(target: Path) -> None:
     for path in (target, _sheet_of(target)):
         if path.exists() or path.is_symlink():
             raise HoigsError(f"{path} exists and is not replaced; name another --out")
+
+
+def _remove_unfinished(target: Path) -> None:
+    """Remove what killed exports to `target` left beside it; only the holder of its lock may."""
+    for kind in ("part", "folder"):
+        for path in target.parent.glob(f".{glob.escape(target.name)}.*.{kind}"):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def write_to(

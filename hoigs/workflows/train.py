@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError, Interrupted
-from hoigs.core.folder_lock import FolderLock
 from hoigs.core.progress import Progress
 from hoigs.core.spec.schema import Spec
 from hoigs.evaluation.report.sections import clock
@@ -148,8 +147,7 @@ def _trained(
     if not evaluate:
         return TrainedRun(path, session, None)
     try:
-        with FolderLock(path, "scoring"):
-            evaluated = evaluate_run(path, device=device, plugins=plugins, progress=progress)
+        evaluated = evaluate_run(path, device=device, plugins=plugins, progress=progress)
     except KeyboardInterrupt as stop:
         number = stop.code - 128 if isinstance(stop, Interrupted) else signal.SIGINT
         rest = f"stopped; {path} is trained, but not scored: hoigs eval {shlex.quote(str(path))}"

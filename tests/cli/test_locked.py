@@ -20,13 +20,35 @@ def test_a_run_that_is_being_trained(hoigs, tiny_clip, tmp_path):
     lock = tmp_path / ".run.lock"
     lock.write_text(json.dumps({"work": "training", "host": socket.gethostname(),
                                 "pid": os.getppid(), "token": "its"}))  # fmt: skip
-    for more in (["--overwrite"], ["--resume", "--set", "train.steps=9"]):
-        outcome = hoigs(*arguments, *more)
+    for words in (
+        [*arguments, "--overwrite"],
+        [*arguments, "--resume", "--set", "train.steps=9"],
+        ["eval", run, "--device", "cpu"],
+    ):
+        outcome = hoigs(*words)
         assert outcome.code == 2 and "being written by another process" in outcome.err
     assert {p: p.read_bytes() for p in run.rglob("*") if p.is_file()} == before
     lock.unlink()
     assert hoigs(*arguments, "--overwrite").code == 0
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
+
+
+def test_an_export_to_one_place_at_a_time(hoigs, tiny_clip, tmp_path):
+    """What a killed export left is removed; one that is alive is not disturbed."""
+    run, target = tmp_path / "run", tmp_path / "out"
+    assert hoigs("train", tiny_clip, "--spec", "static", "--out", run, *SMALL).code == 0
+    unfinished = tmp_path / ".out.1.part"
+    unfinished.mkdir()
+    lock = tmp_path / ".out.lock"
+    lock.write_text(json.dumps({"work": "hoigs export", "host": socket.gethostname(),
+                                "pid": os.getppid(), "token": "its"}))  # fmt: skip
+    export = ["export", run, "--format", "ply", "--out", target, "--device", "cpu"]
+    outcome = hoigs(*export)
+    assert outcome.code == 2 and "being written by another process" in outcome.err
+    assert unfinished.is_dir() and not target.exists()
+    lock.unlink()
+    assert hoigs(*export).code == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "run"]
 
 
 @pytest.mark.parametrize("more", [[], ["--stage", "frames"]])

@@ -25,6 +25,7 @@ FUNCTIONS = {
     "doctor": (hoigs.doctor,),
     "bug-report": (hoigs.bug_report,),
     "demo": (hoigs.demo,),
+    "work": (hoigs.work,),
 }
 # option -> argument, where the names differ
 RENAMED = {
@@ -49,7 +50,7 @@ WITHOUT = {
 }  # fmt: skip
 # arguments that only a Python caller can give: objects and callbacks
 PYTHON = {"on_start", "on_step", "on_found", "progress", "report", "body", "estimators",
-          "positions", "consent", "announce"}  # fmt: skip
+          "positions", "consent", "announce", "tick"}  # fmt: skip
 
 
 def options_of(command: str) -> dict[str, Any]:

@@ -7,13 +7,15 @@ import os
 import socket
 import subprocess
 import sys
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.folder_lock import STALE_S, FolderLock
+from hoigs.core.folder_lock import STALE_S, FolderLock, _began
 
 SCRIPT = """
 import sys, time
@@ -47,7 +49,14 @@ def test_a_lock_is_gone_with_the_parents_that_it_made(tmp_path):
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["run"]
 
 
-@pytest.mark.parametrize("record", [{}, {"host": "elsewhere", "pid": 1}])
+@pytest.mark.parametrize(
+    "record",
+    [
+        {},
+        {"host": "elsewhere", "pid": 1},
+        {"pids": "pid:[1]", "pid": 2**22 + 1},  # of another container with this host's name
+    ],
+)
 def test_a_living_process_keeps_its_lock(tmp_path, record):
     path = lock_of(tmp_path / "run", **record)
     with pytest.raises(HoigsError, match=r"being written by another process \(training, pid"):
@@ -75,10 +84,55 @@ def test_a_stale_lock_is_taken_over(tmp_path, age, record):
 def test_a_holder_whose_lock_was_taken_over_finds_out(tmp_path):
     lock = FolderLock(tmp_path / "run", "training").acquire()
     path = lock_of(tmp_path / "run")
+    assert lock.is_lost()
     with pytest.raises(HoigsError, match="another process took this folder over"):
         lock.require_held()
     lock.release()
     assert path.is_file()  # it is the other one's
+
+
+def test_threads_of_one_process_exclude_each_other(tmp_path):
+    """One of eight holds it; the others are refused, and then it is free."""
+    inside, most, refused = [], [], []
+    start = threading.Barrier(8)
+
+    def race(number: int) -> None:
+        start.wait()
+        try:
+            with FolderLock(tmp_path / "run", "training") as lock:
+                inside.append(number)
+                most.append(len(inside))
+                time.sleep(0.05)
+                lock.require_held()
+                inside.remove(number)
+        except HoigsError as error:
+            refused.append(str(error))
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(race, range(8)))
+    assert set(most) == {1} and refused and not list(tmp_path.iterdir())
+    assert any("by this process itself (training, pid" in text for text in refused)
+
+
+def test_work_inside_a_lock_names_its_token(tmp_path):
+    with FolderLock(tmp_path / "run", "training") as outer:
+        with pytest.raises(HoigsError, match="this process itself"):
+            FolderLock(tmp_path / "run", "scoring").acquire()
+        with FolderLock(tmp_path / "run", "scoring", token=outer.token) as inner:
+            assert inner.token == outer.token
+        outer.require_held()
+        assert not outer.is_lost()
+        with pytest.raises(HoigsError, match="another process took this folder over"):
+            FolderLock(tmp_path / "run", "scoring", token="another").acquire()
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_this_process_left_without_a_holder_is_taken_over(tmp_path):
+    """As after a fork, or where the number was another process's before."""
+    lock_of(tmp_path / "run", pid=os.getpid(), began=_began(os.getpid()))
+    with FolderLock(tmp_path / "run", "training") as lock:
+        lock.path.unlink()
+        assert lock.is_lost()
 
 
 def test_of_processes_at_the_same_time_one_gets_a_stale_lock(tmp_path):

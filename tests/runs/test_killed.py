@@ -45,6 +45,7 @@ def test_a_run_killed_before_its_first_checkpoint_starts_again(
         file.write('{"step": 2, "lo')
     (out / "checkpoints" / "step_000004.safetensors.part").write_bytes(b"half")
     (out / "checkpoints" / "step_000004.safetensors").write_bytes(b"its .json never came")
+    started.run.unlock()
     again = opened(folder, out, resume=True)
     assert again.trainer.step == 0
     again.train()

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from hoigs.core.errors import HoigsError
-from hoigs.core.whole_files import write_whole
 from hoigs.studies.batch.drive import Report, Work, drive
-from hoigs.studies.batch.manifest import Row, read_manifest
-from hoigs.studies.batch.stages import folder_of, stages_of
+from hoigs.studies.batch.folder import BATCH, BatchFolder
+from hoigs.studies.batch.manifest import Row, each_row
+from hoigs.studies.batch.stages import stages_of
 from hoigs.studies.batch.states import State
 from hoigs.studies.batch.summary import write_summary
-from hoigs.studies.jobs.executor import Executor, LocalExecutor
-
-BATCH = "batch.json"
+from hoigs.studies.execution.executor import Executor, make_executor
 
 
 @dataclass(frozen=True)
@@ -25,11 +22,12 @@ class Batch:
     """What a batch has made.
 
     Attributes:
-        rows: all rows that were chosen. failed: error of each row that failed, by name.
-        summary: its files; empty with `dry_run`. plan: commands that are to run, by row.
+        rows: how many were chosen. failed: error of each row that failed, by name.
+        summary: its files; empty with `dry_run`. plan: with it, the commands that are to run, by
+            row.
     """
 
-    rows: tuple[Row, ...]
+    rows: int
     failed: Mapping[str, str]
     summary: tuple[Path, ...]
     plan: Mapping[str, Sequence[str]]
@@ -46,7 +44,8 @@ def batch(
     limit: int | None = None,
     only_failed: bool = False,
     dry_run: bool = False,
-    executor: Executor | None = None,
+    executor: Executor | str = "local",
+    address: str | None = None,
     report: Report = lambda work, word: None,
     tick: Callable[[Sequence[Work]], None] = lambda running: None,
 ) -> Batch:
@@ -59,26 +58,28 @@ def batch(
         jobs: rows at a time. threads: of each; default cores / jobs. retries: of a failed stage.
         limit: only the first rows. only_failed: only rows whose last attempt failed.
         dry_run: run and write nothing.
-        executor: where the stages run; default this machine, its GPUs in turn.
+        executor: where the stages run: "local", this machine and its GPUs in turn; "ray", all of a
+            Ray cluster; "MODULE:CLASS"; or an Executor. address: of the cluster to join.
         report, tick: as for `hoigs.studies.batch.drive.drive`.
 
     Raises:
         HoigsError: the manifest or a folder cannot be used. A row that fails raises nothing.
     """
-    out = Path(out).absolute()
-    rows = read_manifest(Path(manifest), defaults)
-    chosen = [row for row in rows if not only_failed or State.known(folder_of(out, row)).failed]
-    chosen = chosen[:limit]
-    plan = {row.name: _plan(row, out) for row in chosen}
+    path = Path(out).absolute()
+    rows = each_row(Path(manifest), defaults)
     if dry_run:
-        return Batch(tuple(chosen), {}, (), plan)
-    if out.exists() and not out.is_dir():
-        raise HoigsError(f"{out}: is a file; --out names a folder")
-    (out / "rows").mkdir(parents=True, exist_ok=True)
-    write_whole(out / BATCH, json.dumps([row.model_dump(mode="json") for row in rows], indent=1))
-    where = executor or LocalExecutor(jobs, threads)
-    failed = drive(chosen, out, where, retries=retries, report=report, tick=tick)
-    return Batch(tuple(chosen), failed, tuple(write_summary(rows, out)), plan)
+        known = BatchFolder.open(path) if (path / BATCH).exists() else BatchFolder(path)
+        chosen = islice(_chosen(rows, known, only_failed), limit)
+        plan = {row.name: _plan(row, known.of(row)) for row in chosen}
+        return Batch(len(plan), {}, (), plan)
+    where = _executor(executor, jobs, threads, address)
+    folder = BatchFolder.begin(path, rows)
+    chosen = islice(_chosen(folder.rows(), folder, only_failed), limit)
+    return _drive(folder, chosen, where, retries, report, tick)
+
+
+def _chosen(rows: Iterable[Row], folder: BatchFolder, only_failed: bool) -> Iterator[Row]:
+    return (row for row in rows if not only_failed or State.known(folder.of(row)).failed)
 
 
 def work(
@@ -87,7 +88,8 @@ def work(
     jobs: int = 1,
     threads: int | None = None,
     retries: int = 1,
-    executor: Executor | None = None,
+    executor: Executor | str = "local",
+    address: str | None = None,
     report: Report = lambda work, word: None,
     tick: Callable[[Sequence[Work]], None] = lambda running: None,
 ) -> Batch:
@@ -96,20 +98,37 @@ def work(
     Any scheduler can start it, on any machine that has the folder and the inputs under the same
     paths. Arguments and errors as for `batch`.
     """
-    out = Path(out).absolute()
-    try:
-        rows = [Row.model_validate(row) for row in json.loads((out / BATCH).read_text())]
-    except FileNotFoundError:
-        raise HoigsError(
-            f"{out}: no batch; `hoigs batch MANIFEST --out {out}` begins one"
-        ) from None
-    except ValueError as error:
-        raise HoigsError(f"{out / BATCH}: damaged; `hoigs batch` writes it again") from error
-    where = executor or LocalExecutor(jobs, threads)
-    failed = drive(rows, out, where, retries=retries, report=report, tick=tick)
-    return Batch(tuple(rows), failed, tuple(write_summary(rows, out)), {})
+    folder = BatchFolder.open(Path(out).absolute())
+    where = _executor(executor, jobs, threads, address)
+    return _drive(folder, folder.rows(), where, retries, report, tick)
 
 
-def _plan(row: Row, out: Path) -> list[str]:
-    state = State.known(folder_of(out, row))
-    return [" ".join(("hoigs", *state.command(s))) for s in state.todo(stages_of(row, out))]
+def _executor(
+    given: Executor | str, jobs: int, threads: int | None, address: str | None
+) -> Executor:
+    return make_executor(given, jobs, threads, address) if isinstance(given, str) else given
+
+
+def _drive(
+    folder: BatchFolder,
+    rows: Iterable[Row],
+    executor: Executor,
+    retries: int,
+    report: Report,
+    tick: Callable[[Sequence[Work]], None],
+) -> Batch:
+    count = 0
+
+    def counted() -> Iterator[Row]:
+        nonlocal count
+        for row in rows:
+            count += 1
+            yield row
+
+    failed = drive(counted(), folder, executor, retries=retries, report=report, tick=tick)
+    return Batch(count, failed, tuple(write_summary(folder)), {})
+
+
+def _plan(row: Row, folder: Path) -> list[str]:
+    state = State.known(folder)
+    return [" ".join(("hoigs", *state.command(s))) for s in state.todo(stages_of(row, folder))]

@@ -11,28 +11,33 @@ import shutil
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.folder_lock import FolderLock
+from hoigs.studies.batch.folder import BatchFolder, TakenError
 from hoigs.studies.batch.manifest import Row
-from hoigs.studies.batch.stages import Stage, folder_of, stages_of
+from hoigs.studies.batch.stages import Stage, stages_of
 from hoigs.studies.batch.states import State
-from hoigs.studies.jobs.executor import Executor, Needs, Process
-from hoigs.studies.jobs.pool import why_failed
+from hoigs.studies.execution.executor import (
+    LOST_RETRIES,
+    Executor,
+    Needs,
+    Process,
+    stop_all,
+    why_failed,
+)
 
 POLL_S = 0.01
 TAKEN_POLL_S = 2.0  # how often a row that another driver has is looked at again
 RETRY_S = 1.0
+LEASE_POLL_S = 1.0
+NEW_ROWS = 100  # that are looked at between two looks at the running ones
 WRONG_INPUT = 2  # exit code that another attempt does not change
 
 Report = Callable[["Work", str], None]
-
-
-class TakenError(HoigsError):
-    """Another driver works on this row."""
 
 
 @dataclass
@@ -42,7 +47,8 @@ class Work:
     Attributes:
         stage: that runs, or ran last. since: when it was started, on the monotonic clock.
         taken_at: when this driver took the row.
-        retries: of the present stage, by this driver. device: where the stage runs.
+        retries: of the present stage, by this driver, and losses: those of them whose machine was
+            lost. device: where the stage runs.
     """
 
     row: Row
@@ -53,10 +59,12 @@ class Work:
     since: float = 0.0
     taken_at: float = 0.0
     retries: int = 0
+    losses: int = 0
     device: str = ""
     lock: FolderLock | None = None
     process: Process | None = None
     not_before: float = 0.0
+    look_at: float = 0.0  # when to look at the lock again
 
     @property
     def todo(self) -> Sequence[Stage]:
@@ -68,8 +76,8 @@ class Work:
 
 
 def drive(
-    rows: Sequence[Row],
-    out: Path,
+    rows: Iterable[Row],
+    out: BatchFolder,
     executor: Executor,
     *,
     retries: int = 1,
@@ -83,22 +91,29 @@ def drive(
     call continues.
 
     Args:
+        rows: taken one by one, as there is room.
         retries: further attempts at a stage that failed.
-        report: called with a row and "done before", "taken", "STAGE", "STAGE done", "retry: why",
-            "done" or "failed: why".
+        report: called with a row and "done before", "taken by another driver", "STAGE", "STAGE
+            done", "waits: why", "retry: why", "done" or "failed: why".
         tick: called at every look at the running rows.
     """
     began = time.time()
-    waiting = deque(Work(row, folder_of(out, row), stages_of(row, out)) for row in rows)
+    new = (Work(row, out.of(row), stages_of(row, out.of(row))) for row in rows)
+    waiting: deque[Work] = deque()  # rows that other drivers have
+    more = True
     running: list[Work] = []
     failed: dict[str, str] = {}
     driver = _Driver(executor, retries, report, began, failed)
     try:
-        while waiting or running:
-            for _ in range(len(waiting)):
+        while more or waiting or running:
+            for i in range(len(waiting) + NEW_ROWS):
                 if len(running) >= executor.slots:
                     break
-                work = waiting.popleft()
+                known = i < len(waiting)
+                work = waiting.popleft() if known else next(new, None)
+                if work is None:
+                    more = False
+                    break
                 if time.monotonic() < work.not_before or (taken := driver.take(work)) is None:
                     waiting.append(work)
                 elif taken:
@@ -109,9 +124,8 @@ def drive(
             tick(running)
             time.sleep(POLL_S)
     finally:
+        stop_all(work.process for work in running)
         for work in running:
-            if work.process is not None:
-                work.process.stop()
             if work.lock is not None:
                 work.lock.release()
     return failed
@@ -187,17 +201,23 @@ class _Driver:
         if work.process is None:
             self._start(work)
             return True
+        assert work.lock is not None
         code = work.process.poll()
         if code is None:
+            if time.monotonic() >= work.look_at:
+                work.look_at = time.monotonic() + LEASE_POLL_S
+                if work.lock.is_lost():
+                    work.lock.require_held()
             return True
-        assert work.lock is not None
         work.lock.require_held()  # or another driver's record would be overwritten
+        lost = work.process.lost and work.losses < LOST_RETRIES
+        work.device = work.process.device  # some executors know it only now
         stage, work.process = work.todo[0], None
         if code == 0 and stage.result.exists():
             seconds = time.monotonic() - work.since
             work.state.end(stage, seconds, work.device, socket.gethostname())
             work.state.write(work.folder)
-            work.retries = 0
+            work.retries = work.losses = 0
             self.report(work, f"{stage.name} done")
             if work.todo:
                 self._start(work)
@@ -205,8 +225,8 @@ class _Driver:
             self.report(work, "done")
             return self._leave(work)
         why = why_failed(work.log, code) if code else f"made no {stage.result.name}"
-        if code != WRONG_INPUT and work.retries < self.retries:
-            work.retries += 1
+        if lost or (code != WRONG_INPUT and work.retries - work.losses < self.retries):
+            work.retries, work.losses = work.retries + 1, work.losses + lost
             work.not_before = time.monotonic() + RETRY_S
             self.report(work, f"retry: {why}")
             return True
@@ -224,11 +244,16 @@ class _Driver:
         todo = work.todo
         stage = todo[0]
         command = work.state.command(stage)
-        needs = Needs(gpu=work.row.device != "cpu", memory_gb=work.row.memory_gb)
+        gpus = 0.0 if work.row.device == "cpu" else work.row.gpus
+        needs = Needs(gpus=gpus, memory_gb=work.row.memory_gb)
         work.stage = stage.name
+        if left := FolderLock(stage.locks, "").holder():  # by a driver that was lost
+            self.report(work, f"waits: {stage.locks.name} is being written by {left}")
+            work.not_before = time.monotonic() + TAKEN_POLL_S
+            return
         if stage.clear and stage.result.exists():
             shutil.rmtree(stage.result)
-        work.process = self.executor.start(command, work.log, needs)
+        work.process = self.executor.start(("hoigs", *command), work.log, needs, work.lock.lease)
         if work.process is not None:
             work.since, work.device = time.monotonic(), work.process.device
             work.state.begin(todo)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
@@ -43,6 +42,9 @@ class Row(BaseModel):
     )
     export: tuple[str, ...] = Field(default=("ply",), description="formats to export")
     device: str = Field(default="auto", description="cpu, cuda or auto")
+    gpus: float | None = Field(
+        default=None, ge=0, le=1, description="share of a GPU; default by --jobs and the GPUs"
+    )
     memory_gb: float = Field(default=0.0, ge=0, description="memory to set aside while it runs, GB")
 
     @field_validator(*LISTS, mode="before")
@@ -58,7 +60,14 @@ class Row(BaseModel):
 
 
 def read_manifest(path: Path, defaults: Mapping[str, Any] | None = None) -> list[Row]:
+    """The rows of a manifest; arguments and errors as `each_row`."""
+    return list(each_row(path, defaults))
+
+
+def each_row(path: Path, defaults: Mapping[str, Any] | None = None) -> Iterator[Row]:
     """The rows of a YAML file (`rows:`, and `defaults:` for all of them) or of a CSV file.
+
+    CSV is read line by line, YAML as a whole.
 
     Args:
         defaults: keys for rows that have none. Lists are not joined: a row's own replaces them.
@@ -66,35 +75,47 @@ def read_manifest(path: Path, defaults: Mapping[str, Any] | None = None) -> list
     Raises:
         ManifestError: the file cannot be read, or a row cannot be used.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ManifestError(f"{path}: cannot be read ({error}); name a YAML or CSV file") from error
+    names: set[int] = set()  # of hashes, which take less memory
+    for row, place in _rows_and_places(path, defaults):
+        key = hash(row.name.lower())  # some disks do not tell upper from lower case
+        if key in names and (first := _place_of(path, defaults, row.name, place)):
+            raise ManifestError(
+                f'{place}: name: "{row.name}" is also the row at {first}; give this one another '
+                "name"
+            )
+        names.add(key)
+        yield row
+    if not names:
+        raise ManifestError(f"{path}: has no rows; each needs a video or a clip")
+
+
+def _place_of(path: Path, defaults: Mapping[str, Any] | None, name: str, before: str) -> str:
+    """Where the first row of this name is; "" if that is `before`: another name's hash is equal."""
+    for row, place in _rows_and_places(path, defaults):
+        if row.name.lower() == name.lower():
+            return "" if place == before else place
+    return ""
+
+
+def _rows_and_places(path: Path, defaults: Mapping[str, Any] | None) -> Iterator[tuple[Row, str]]:
+    """Each row, and where its name is, or the row if it has none."""
     read = {".csv": _csv, ".yaml": _yaml, ".yml": _yaml}.get(path.suffix.lower())
     if read is None:
         raise ManifestError(f"{path}: expected a file that ends with .yaml, .yml or .csv")
-    rows: list[Row] = []
-    where: dict[str, str] = {}
-    for values, at in read(text, path):
-        row = _row({**(defaults or {}), **values}, at, path.parent)
-        place = at.get("", str(path))
-        if row.name.lower() in where:  # some disks do not tell upper from lower case
-            raise ManifestError(
-                f'{at.get("name", place)}: name: "{row.name}" is also the row at '
-                f"{where[row.name.lower()]}; give this one another name"
-            )
-        where[row.name.lower()] = place
-        rows.append(row)
-    if not rows:
-        raise ManifestError(f"{path}: has no rows; each needs a video or a clip")
-    return rows
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            for values, at in read(file, path):
+                row = _row({**(defaults or {}), **values}, at, path.parent)
+                yield row, at.get("name", at.get("", str(path)))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ManifestError(f"{path}: cannot be read ({error}); name a YAML or CSV file") from error
 
 
-Read = Sequence[tuple[dict[str, Any], dict[str, str]]]  # values, and where each key is; "": the row
+Read = Iterable[tuple[dict[str, Any], dict[str, str]]]  # values, and where each key is; "": the row
 
 
-def _yaml(text: str, path: Path) -> Read:
-    document = load_yaml(text, str(path))
+def _yaml(file: TextIO, path: Path) -> Read:
+    document = load_yaml(file.read(), str(path))
     _known(
         document.data,
         ("rows", "defaults"),
@@ -109,27 +130,23 @@ def _yaml(text: str, path: Path) -> Read:
         raise ManifestError(
             f"{document.where(('rows',))}: rows: expected a list, `- video: a.mp4` …"
         )
-    found = []
     for i, row in enumerate(rows):
         at = {"": document.where(("rows", i))}
         if not isinstance(row, dict):
             raise ManifestError(f"{at['']}: expected `key: value` lines, such as `video: a.mp4`")
         at |= {k: document.where(("defaults", k), key=True) for k in shared}
         at |= {k: document.where(("rows", i, k), key=True) for k in row}
-        found.append((shared | row, at))
-    return found
+        yield shared | row, at
 
 
-def _csv(text: str, path: Path) -> Read:
-    reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
-    found = []
+def _csv(file: TextIO, path: Path) -> Read:
+    reader = csv.DictReader(file, skipinitialspace=True)
     for values in reader:
         at = f"{path}:{reader.line_num}"
         if None in values:
             raise ManifestError(f"{at}: has more cells than the first line has columns")
         given = {k: v.strip() for k, v in values.items() if v is not None and v.strip()}
-        found.append((given, dict.fromkeys(("", *given), at)))
-    return found
+        yield given, dict.fromkeys(("", *given), at)
 
 
 def _known(data: Mapping[str, Any], names: Sequence[str], at: Mapping[str, str]) -> None:

@@ -8,17 +8,20 @@ import html
 import io
 import json
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from hoigs.core.whole_files import write_whole
+from hoigs.core.whole_files import written_whole
+from hoigs.studies.batch.folder import BatchFolder, in_turn
 from hoigs.studies.batch.manifest import Row
-from hoigs.studies.batch.stages import folder_of, stages_of
+from hoigs.studies.batch.stages import stages_of
 from hoigs.studies.batch.states import State
 
 METRICS = ("psnr", "ssim", "lpips")
 VIEW, REGION = "test frames", "full"
 THUMBNAIL = 160  # pixels high
+PAGE_ROWS = 1000  # that summary.html shows, each with a picture in it
 STYLE = (
     "body{font:15px system-ui,sans-serif;margin:2rem;color:#222}table{border-collapse:collapse}"
     "td,th{padding:.4rem .8rem;border-bottom:1px solid #ddd;text-align:left;vertical-align:middle}"
@@ -27,36 +30,47 @@ STYLE = (
 )
 
 
-def write_summary(rows: Sequence[Row], out: Path) -> list[Path]:
-    """Write the three files; rows that are not done are in them with the reason."""
-    found = [summary_of(row, out) for row in rows]
-    text = io.StringIO()
+def write_summary(folder: BatchFolder) -> list[Path]:
+    """Write the three files, row by row; rows that are not done are in them with the reason."""
+    names = ("summary.json", "summary.csv", "summary.html")
+    paths = [folder.path / name for name in names]
     columns = ["name", "state", *METRICS, "seconds", "source", "spec", "why"]
-    table = csv.DictWriter(text, columns, extrasaction="ignore")
-    table.writeheader()
-    table.writerows([{**row, **row["scores"]} for row in found])
-    files = {
-        "summary.json": json.dumps(found, indent=1, allow_nan=False),
-        "summary.csv": text.getvalue(),
-        "summary.html": _page(found, rows, out),
-    }
-    for name, content in files.items():
-        write_whole(out / name, content)
-    return [out / name for name in files]
+    shown: list[str] = []
+    count = done = 0
+    with ExitStack() as stack:
+        stack.enter_context(in_turn(folder.path / "summary"))
+        parts = [stack.enter_context(written_whole(path)) for path in paths]
+        as_json, as_csv = (
+            stack.enter_context(part.open("w", encoding="utf-8", newline="")) for part in parts[:2]
+        )
+        table = csv.DictWriter(as_csv, columns, extrasaction="ignore")
+        table.writeheader()
+        for row in folder.rows():
+            item = summary_of(row, folder)
+            as_json.write(f"{',' if count else '['}\n{json.dumps(item, allow_nan=False)}")
+            table.writerow({**item, **item["scores"]})
+            if count < PAGE_ROWS:
+                shown.append(_page_row(row, item, folder))
+            count, done = count + 1, done + (item["state"] == "done")
+        as_json.write("\n]\n" if count else "[]\n")
+        parts[2].write_text(_page(shown, count, done), encoding="utf-8")
+    return paths
 
 
-def summary_of(row: Row, out: Path) -> dict[str, Any]:
+def summary_of(row: Row, batch: BatchFolder) -> dict[str, Any]:
     """State, scores (numbers, or "not computed: why") and times of a row."""
-    folder = folder_of(out, row)
+    folder = batch.of(row)
     state = State.known(folder)
-    todo = state.todo(stages_of(row, out))
+    todo = state.todo(stages_of(row, folder))
     times = {name: done["seconds"] for name, done in state.done.items()}
     why = state.failed.get("why", "")
     return {
         "name": row.name,
         "state": "failed" if why else "done" if not todo else f"before {todo[0].name}",
         "why": why,
-        "log": f"rows/{row.name}/{state.failed['stage']}.log" if state.failed.get("stage") else "",
+        "log": f"{batch.relative(row)}/{state.failed['stage']}.log"
+        if state.failed.get("stage")
+        else "",
         "source": row.video or row.clip,
         "spec": row.spec,
         "scores": _scores(folder / "run" / "evaluation.json"),
@@ -81,27 +95,29 @@ def _value(value: Any) -> float | str:
     return f"not computed: {reason or 'the evaluation has no such score'}"
 
 
-def _page(found: Sequence[dict[str, Any]], rows: Sequence[Row], out: Path) -> str:
-    body = []
-    for row, item in zip(rows, found, strict=True):
-        report = folder_of(out, row) / "run" / "report.html"
-        name = html.escape(row.name)
-        link = f'<a href="rows/{name}/run/report.html">{name}</a>' if report.is_file() else name
-        log = f' <a href="{html.escape(item["log"])}">log</a>' if item["log"] else ""
-        body.append(
-            f"<tr><td>{_thumbnail(row, out)}</td><td>{link}</td>"
-            f'<td class="{item["state"]}">{html.escape(item["state"])}{log}</td>'
-            + "".join(_score_cell(item["scores"][m]) for m in METRICS)
-            + f'<td class="n">{item["seconds"]:.1f}</td>'
-            f'<td class="why">{html.escape(item["why"])}</td></tr>'
-        )
-    done = sum(item["state"] == "done" for item in found)
+def _page_row(row: Row, item: dict[str, Any], batch: BatchFolder) -> str:
+    name, page = html.escape(row.name), "run/report.html"
+    link = f'<a href="{batch.relative(row)}/{page}">{name}</a>'
+    log = f' <a href="{html.escape(item["log"])}">log</a>' if item["log"] else ""
+    return (
+        f"<tr><td>{_thumbnail(row, batch.of(row))}</td>"
+        f"<td>{link if (batch.of(row) / page).is_file() else name}</td>"
+        f'<td class="{item["state"]}">{html.escape(item["state"])}{log}</td>'
+        + "".join(_score_cell(item["scores"][m]) for m in METRICS)
+        + f'<td class="n">{item["seconds"]:.1f}</td>'
+        f'<td class="why">{html.escape(item["why"])}</td></tr>'
+    )
+
+
+def _page(body: Sequence[str], count: int, done: int) -> str:
     heads = "".join(f'<th class="n">{m.upper()}</th>' for m in METRICS)
+    rest = f" The first {len(body)} rows; all are in summary.csv." if count > len(body) else ""
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Batch</title>'
-        f"<style>{STYLE}</style><h1>{done} of {len(found)} rows done</h1>"
-        f"<p>Scores of the {VIEW}, whole images.</p><table><tr><th></th><th>row</th><th>state</th>"
-        f'{heads}<th class="n">seconds</th><th></th></tr>{"".join(body)}</table></html>\n'
+        f"<style>{STYLE}</style><h1>{done} of {count} rows done</h1>"
+        f"<p>Scores of the {VIEW}, whole images.{rest}</p><table><tr><th></th><th>row</th>"
+        f'<th>state</th>{heads}<th class="n">seconds</th><th></th></tr>{"".join(body)}</table>'
+        "</html>\n"
     )
 
 
@@ -111,9 +127,9 @@ def _score_cell(value: float | str) -> str:
     return f'<td class="n">{value:.3f}</td>'
 
 
-def _thumbnail(row: Row, out: Path) -> str:
+def _thumbnail(row: Row, folder: Path) -> str:
     """The middle frame of the row's clip as an image in the page; empty before it is prepared."""
-    clip = folder_of(out, row) / "clip" if row.video else _clip_folder(row.clip)
+    clip = folder / "clip" if row.video else _clip_folder(row.clip)
     images = sorted((clip / "images").glob("*")) if clip else []
     if not images:
         return ""

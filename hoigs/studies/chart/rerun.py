@@ -11,9 +11,10 @@ from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.evaluation.protocol import NotComputed, Value
 from hoigs.studies.chart.data import AXES
 from hoigs.studies.chart.run import measured
+from hoigs.studies.execution.executor import Executor
 from hoigs.studies.jobs.cost import read_study
 from hoigs.studies.jobs.job import Job, digest_folder, make_job
-from hoigs.studies.jobs.pool import run_jobs
+from hoigs.studies.jobs.run_jobs import run_jobs
 
 TOLERANCE_DB = 0.05
 
@@ -54,11 +55,12 @@ class Rerun:
         return True
 
 
-def rerun(out: Path, cell: str, threads: int = 1) -> Rerun:
+def rerun(out: Path, cell: str, executor: Executor | None = None) -> Rerun:
     """Train and score a cell once more, below `out`/reruns; the first run is left as it is.
 
     Args:
         out: folder of the chart. cell: "CLIP/RUN" as the chart's files name it, or its folder.
+        executor: where it runs; default this machine.
 
     Raises:
         HoigsError: there is no such cell, its clip has changed, or it failed this time.
@@ -74,7 +76,7 @@ def rerun(out: Path, cell: str, threads: int = 1) -> Rerun:
         str(folder / "spec.yaml"), (), device=job.device, lpips_weights=job.lpips_weights,
         plugins=job.plugins,
     )  # fmt: skip
-    failed = run_jobs([again], threads=threads)
+    failed = run_jobs([again], executor)
     if failed:
         raise HoigsError(f"{cell} failed this time: {failed[again.run]}")
     first, second = measured(replace(job, run=str(folder))), measured(again)

@@ -9,11 +9,12 @@ from typing import Any
 from hoigs.evaluation.protocol import NotComputed, Value
 from hoigs.studies.chart.data import ACCURACY, Cell, CurvePoint
 from hoigs.studies.chart.plan import ChartStudy, Planned, plan
+from hoigs.studies.execution.executor import Executor
 from hoigs.studies.jobs.cost import read_cost
 from hoigs.studies.jobs.job import Job, JobState
-from hoigs.studies.jobs.pool import Report, run_jobs
 from hoigs.studies.jobs.protocol import VIEW, protocol_of
 from hoigs.studies.jobs.results import Measure, measures_of
+from hoigs.studies.jobs.run_jobs import Report, run_jobs
 from hoigs.studies.jobs.variants import definition
 
 # axis name -> measure of an evaluation
@@ -28,17 +29,14 @@ MEASURES: dict[str, Measure] = {
 def run_chart(
     study: ChartStudy,
     *,
-    workers: int = 1,
-    threads: int = 1,
+    executor: Executor | None = None,
     limit_s: float | None = None,
     report: Report | None = None,
 ) -> list[Cell]:
-    """Run what is not done yet, and gather all cells; see `pool.run_jobs`."""
+    """Run what is not done yet, and gather all cells; see `run_jobs`."""
     planned = plan(study)
     jobs = {p.job.run: p.job for p in planned}  # two labels of one training are one job
-    failed = run_jobs(
-        list(jobs.values()), workers=workers, threads=threads, limit_s=limit_s, report=report
-    )
+    failed = run_jobs(list(jobs.values()), executor, limit_s=limit_s, report=report)
     return [gather(p, study.out, failed) for p in planned]
 
 

@@ -62,6 +62,11 @@ class Job:
         return self.folder.with_name(f"{self.folder.name}.log")
 
     @property
+    def lease(self) -> Path:
+        """What the driver of this job locks; the run folder itself is locked by its training."""
+        return self.folder.with_name(f"{self.folder.name}.job")
+
+    @property
     def identity(self) -> dict[str, str]:
         """A run with another identity belongs to another job, and is replaced."""
         return {"spec_hash": self.spec_hash, "clip_digest": self.clip_digest}

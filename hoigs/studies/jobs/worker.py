@@ -1,11 +1,8 @@
-"""A job's own process: `python -m hoigs.studies.jobs.worker JOB RUNS_AT_ONCE PARENT`."""
+"""The module that a job's own process runs: `hoigs.studies.jobs.worker JOB RUNS_AT_ONCE`."""
 
 from __future__ import annotations
 
-import os
 import sys
-import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +15,6 @@ if TYPE_CHECKING:
     from hoigs.runs.loaded_run import LoadedRun
 
 TIMED_FRAMES, TIMING_BUDGET_S = 30, 15.0  # rough, as other jobs run beside
-PARENT_POLL_S = 0.25
 
 
 def run_job(job: Job, runs_at_once: int = 1) -> None:
@@ -82,19 +78,11 @@ def train_job(job: Job, runs_at_once: int, **options: Any) -> LoadedRun | None:
 
 def main(kind: type[Job] = Job, run: Callable[[Any, int], None] = run_job) -> None:
     """Run the job in argv; user errors are one message and exit code 2, as on the command line."""
-    threading.Thread(target=_end_with, args=(int(sys.argv[3]),), daemon=True).start()
     try:
         run(kind.parse(sys.argv[1]), int(sys.argv[2]))
     except HoigsError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-
-
-def _end_with(parent: int) -> None:
-    """Exit when the parent has been killed, so that no other study runs beside this job."""
-    while os.getppid() == parent:
-        time.sleep(PARENT_POLL_S)
-    os._exit(1)
 
 
 if __name__ == "__main__":

@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.evaluation.protocol import Value
+from hoigs.studies.execution.executor import Executor
 from hoigs.studies.jobs.cost import read_cost
 from hoigs.studies.jobs.job import Job, JobState
-from hoigs.studies.jobs.pool import Report, run_jobs
 from hoigs.studies.jobs.protocol import protocol_of
+from hoigs.studies.jobs.run_jobs import Report, run_jobs
 from hoigs.studies.stress.bench import TINY, Bench
 from hoigs.studies.stress.capability import MEANING, Capability
 from hoigs.studies.stress.case import Case
@@ -56,18 +57,18 @@ class _Progress:
 def run_stress(
     study: StressStudy,
     *,
-    workers: int = 1,
-    threads: int = 1,
+    executor: Executor | None = None,
     limit_s: float | None = None,
     report: Report | None = None,
     log: Callable[[str], None] = lambda line: None,
 ) -> list[Verdict]:
-    """The verdict on every case for every spec, in order; options as for `pool.run_jobs`.
+    """The verdict on every case for every spec, in order; options as for `run_jobs`.
 
     A seed runs harder values until it fails one, and counts as failing all harder ones
     (`StressStudy.whole` runs them too).
 
     Args:
+        executor: where the trainings run; the direct checks run here, as many at a time.
         report: called with jobs, as for `run_jobs`. log: called with lines of text on the rest.
 
     Raises:
@@ -78,6 +79,7 @@ def run_stress(
     for row in study.specs:  # raises before clips are generated
         Spec.load(str(row.spec), overrides=[*study.settings, *row.settings], registry=registry)
     names = [n for c in study.cases if c.sweep is not None for n in clip_names(c.sweep, study.base)]
+    workers = executor.slots if executor else 1
     make_clips([TINY, STATIC, *names], workers, log)
     specs: dict[str, Composed] = {
         row.label: (str(row.spec), (*study.settings, *row.settings), tuple(map(str, study.plugins)))
@@ -92,7 +94,7 @@ def run_stress(
     direct = run_direct(study.cases, specs, has, workers, on_result)
     chains = plan_chains(study, has)
     left = None if deadline is None else max(0.0, deadline - time.monotonic())
-    progress = _train(study, chains, workers, threads, left, report)
+    progress = _train(study, chains, executor, left, report)
     return [
         _verdict(case, row.label, has[row.label], direct, progress)
         for case in study.cases
@@ -103,8 +105,7 @@ def run_stress(
 def _train(
     study: StressStudy,
     chains: Sequence[Chain],
-    workers: int,
-    threads: int,
+    executor: Executor | None,
     limit_s: float | None,
     report: Report | None,
 ) -> list[_Progress]:
@@ -127,9 +128,7 @@ def _train(
                 found.append(job)
         return found
 
-    run_jobs(
-        advance(), workers=workers, threads=threads, limit_s=limit_s, report=report, follow=follow
-    )
+    run_jobs(advance(), executor, limit_s=limit_s, report=report, follow=follow)
     return progress
 
 

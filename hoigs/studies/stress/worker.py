@@ -1,4 +1,4 @@
-"""The process of one StressJob: `python -m hoigs.studies.stress.worker JOB RUNS_AT_ONCE PARENT`."""
+"""The module that a StressJob's process runs: `hoigs.studies.stress.worker JOB RUNS_AT_ONCE`."""
 
 from __future__ import annotations
 

@@ -10,12 +10,13 @@ from typing import Any
 
 from hoigs.core.errors import HoigsError
 from hoigs.evaluation.protocol import Protocol
+from hoigs.studies.execution.executor import Executor
 from hoigs.studies.jobs.clip_folders import ClipFolders
 from hoigs.studies.jobs.cost import read_cost
 from hoigs.studies.jobs.job import SCORES, Job, JobState, make_job
-from hoigs.studies.jobs.pool import Report, run_jobs
 from hoigs.studies.jobs.results import Measure, RowResult, TableResult, measures_of
 from hoigs.studies.jobs.rows import Row, TableSet
+from hoigs.studies.jobs.run_jobs import Report, run_jobs
 
 ONLY_BUILTIN = "its noise needs a built-in clip"
 
@@ -106,17 +107,14 @@ def _cell(
 def run_study(
     study: Study,
     *,
-    workers: int = 1,
-    threads: int = 1,
+    executor: Executor | None = None,
     limit_s: float | None = None,
     report: Report | None = None,
 ) -> list[TableResult]:
-    """Run the jobs that are not done, and gather all tables; see `pool.run_jobs`."""
+    """Run the jobs that are not done, and gather all tables; see `run_jobs`."""
     cells = plan(study)
     jobs = {cell.job.run: cell.job for cell in cells if cell.job is not None}
-    failed = run_jobs(
-        list(jobs.values()), workers=workers, threads=threads, limit_s=limit_s, report=report
-    )
+    failed = run_jobs(list(jobs.values()), executor, limit_s=limit_s, report=report)
     return gather(study, cells, failed)
 
 

@@ -9,17 +9,21 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+
+import hoigs
+from hoigs.studies.execution.local import LocalExecutor
 
 # in place of `hoigs`: notes its start and end, and makes what the stage would make
 STAGE = """
 import os, sys, time
 from pathlib import Path
-from hoigs.studies.jobs.command import end_with
-end_with(int(sys.argv[1]))
-words = sys.argv[2:]
+from hoigs.studies.execution.command import end_with
+end_with(int(sys.argv[1]), sys.argv[2])
+words = sys.argv[4:]
 def note(text):
     with open(os.environ["NOTES"], "a") as file:
         file.write(f"{text} {words[0]} {target.parent.name} {os.getpid()}\\n")
@@ -41,7 +45,7 @@ note("end")
 DRIVER = """
 import sys
 import hoigs
-from hoigs.studies.jobs.executor import LocalExecutor
+from hoigs.studies.execution.local import LocalExecutor
 where = LocalExecutor(2, program=(sys.executable, sys.argv[1]))
 done = hoigs.batch(sys.argv[2], sys.argv[3], executor=where)
 sys.exit(len(done.failed))
@@ -125,6 +129,38 @@ def test_after_a_kill_every_row_is_done_once(tmp_path, victim):
     assert all_gone([int(pid) for *_, pid in batches.noted()])
 
 
+def test_two_drivers_in_threads_of_one_process(tmp_path, monkeypatch):
+    batches = Batches(tmp_path, ["a", "b", "c"])
+    monkeypatch.setenv("NOTES", str(batches.notes))
+    monkeypatch.setenv("SECONDS", "0.1")
+
+    def drive(_: int) -> hoigs.batch:
+        where = LocalExecutor(2, program=(sys.executable, str(tmp_path / "stage.py")))
+        return hoigs.batch(tmp_path / "rows.yaml", batches.out, executor=where)
+
+    with ThreadPoolExecutor(2) as pool:
+        assert [done.failed for done in pool.map(drive, range(2))] == [{}, {}]
+    assert set(batches.ends().values()) == {1} and len(batches.ends()) == 9
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
+def test_a_driver_whose_lease_is_taken_stops_its_stage_at_once(tmp_path):
+    batches = Batches(tmp_path, ["a"])
+    driver = batches.start(seconds=60)
+    try:
+        stage = batches.wait_for("start", "train")
+        lock = batches.out / "rows" / ".a.lock"
+        record = json.loads(lock.read_text()) | {"token": "its", "pid": os.getpid()}
+        lock.with_suffix(".new").write_text(json.dumps(record | {"began": None}))
+        lock.with_suffix(".new").replace(lock)
+        assert all_gone([stage]) and driver.poll() is None
+        assert not batches.ends(), "it was killed while it worked"
+    finally:
+        driver.terminate()
+        driver.wait(20)
+    assert json.loads(lock.read_text())["token"] == "its"
+
+
 def test_what_goes_wrong_with_a_row_is_on_its_record(tmp_path):
     """More memory than the machine has, and a damaged record."""
     batches = Batches(tmp_path, ["big", "spoilt", "fine"])
@@ -138,3 +174,42 @@ def test_what_goes_wrong_with_a_row_is_on_its_record(tmp_path):
     assert [found[n]["state"] for n in ("big", "spoilt", "fine")] == ["failed", "failed", "done"]
     assert "damaged" in found["spoilt"]["why"] and "memory_gb" in found["big"]["why"]
     assert json.loads((batches.out / "rows/big/state.json").read_text())["failed"]["why"]
+
+
+class Ended:
+    """A process that has ended, or was lost with its machine."""
+
+    device = "elsewhere"
+
+    def __init__(self, code: int, lost: bool) -> None:
+        self.code, self.lost = code, lost
+
+    def poll(self) -> int:
+        return self.code
+
+    def stop(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("losses", "state"), [(3, "done"), (4, "failed")])
+def test_a_machine_that_is_lost_is_no_failure_of_a_stage(tmp_path, monkeypatch, losses, state):
+    monkeypatch.setattr("hoigs.studies.batch.drive.RETRY_S", 0.0)
+    batches = Batches(tmp_path, ["a"])
+
+    class Losing:
+        slots = 1
+
+        def start(self, command, log, needs, lease):
+            words = list(command[1:])
+            target = Path(words[words.index("--out") + 1] if "--out" in words else words[1])
+            self.started = getattr(self, "started", 0) + 1
+            if self.started <= losses:
+                log.write_text("error: Ray lost the process\n")
+                return Ended(1, lost=True)
+            target.mkdir(parents=True, exist_ok=True)
+            (target / "evaluation.json").write_text("{}")
+            return Ended(0, lost=False)
+
+    done = hoigs.batch(tmp_path / "rows.yaml", batches.out, executor=Losing(), retries=0)
+    assert batches.states() == {"a": state}
+    assert list(done.failed.values()) == (["Ray lost the process"] if state == "failed" else [])

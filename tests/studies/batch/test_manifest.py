@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
-from hoigs.studies.batch.manifest import ManifestError, read_manifest
+from hoigs.studies.batch import manifest
+from hoigs.studies.batch.folder import BATCH, BatchFolder
+from hoigs.studies.batch.manifest import ManifestError, each_row, read_manifest
+from hoigs.studies.batch.summary import write_summary
 
 
 def test_yaml_and_csv_give_the_same_rows(tmp_path):
@@ -43,3 +48,40 @@ def test_mistakes_are_found_where_they_are(tmp_path, text, message):
     (tmp_path / "m.yaml").write_text(text)
     with pytest.raises(ManifestError, match=message):
         read_manifest(tmp_path / "m.yaml")
+
+
+def test_rows_are_checked_before_a_folder_is_made(tmp_path):
+    (tmp_path / "m.csv").write_text("clip,name\nbuiltin:carry,a\nbuiltin:carry,A\n")
+    with pytest.raises(ManifestError, match=r'm.csv:3: name: "A" is also the row at .*m.csv:2'):
+        BatchFolder.begin(tmp_path / "out", each_row(tmp_path / "m.csv"))
+    assert not list(tmp_path.glob("out/*"))
+    (tmp_path / "m.csv").write_text("clip,name\ngone,a\n")
+    with pytest.raises(ManifestError, match="does not exist"):
+        BatchFolder.begin(tmp_path / "out2", each_row(tmp_path / "m.csv"))
+    assert not (tmp_path / "out2").exists()
+
+
+def test_names_with_equal_hashes_are_two_rows(tmp_path, monkeypatch):
+    monkeypatch.setattr(manifest, "hash", lambda name: 0, raising=False)
+    (tmp_path / "m.csv").write_text("clip,name\nbuiltin:carry,a\nbuiltin:carry,b\n")
+    assert [row.name for row in each_row(tmp_path / "m.csv")] == ["a", "b"]
+
+
+@pytest.mark.parametrize(("many", "place"), [(3, "rows/[0-9a-f][0-9a-f]"), (4, "rows")])
+def test_folders_of_many_rows_fan_out_and_stay_where_they_are(tmp_path, many, place):
+    lines = [f"builtin:carry,row{i}" for i in range(3)]
+    (tmp_path / "m.csv").write_text("\n".join(["clip,name", *lines]))
+    made = BatchFolder.begin(tmp_path / "out", each_row(tmp_path / "m.csv"), many)
+    for row in made.rows():
+        made.of(row).mkdir()
+    assert len(list((tmp_path / "out").glob(f"{place}/row?"))) == 3
+    (tmp_path / "m.csv").write_text("\n".join(["clip,name", *lines, "builtin:carry,row3"]))
+    again = BatchFolder.begin(tmp_path / "out", each_row(tmp_path / "m.csv"), 1)
+    assert again == made == BatchFolder.open(tmp_path / "out")
+    assert [row.name for row in again.rows()] == ["row0", "row1", "row2", "row3"]
+    write_summary(again)
+    found = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [item["name"] for item in found] == ["row0", "row1", "row2", "row3"]
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(
+        [BATCH, "rows", "summary.csv", "summary.html", "summary.json"]
+    )

@@ -9,6 +9,7 @@ import pytest
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.spec.schema import Spec
+from hoigs.studies.execution.local import LocalExecutor
 from hoigs.studies.jobs.job import Job
 from hoigs.studies.jobs.variants import parse_variants
 from hoigs.studies.stress.bench import Bench
@@ -49,7 +50,7 @@ def test_a_study_is_run_once_and_goes_on(tmp_path: Path) -> None:
     def report(job: Job, word: str) -> None:
         words.append(word)
 
-    stopped = run_stress(wanted, workers=1, limit_s=0.0, report=report)
+    stopped = run_stress(wanted, limit_s=0.0, report=report)
     by_case = {v.case: v for v in stopped}
     assert by_case["F49"].status == "not run" and not any(t == "done" for t in words)
     assert by_case["F20"].status == "pass" and by_case["F20"].ours
@@ -58,7 +59,9 @@ def test_a_study_is_run_once_and_goes_on(tmp_path: Path) -> None:
     assert "rotations at keyframes" in by_case["F04"].measured
 
     words.clear()
-    (verdict,) = run_stress(study(tmp_path, "F49"), workers=2, report=report)
+    (verdict,) = run_stress(
+        study(tmp_path, "F49"), executor=LocalExecutor(2, threads=1), report=report
+    )
     assert verdict.status in ("pass", "nature") and len(verdict.seeds) == 1
     assert verdict.machines and "2 frames of split 'test'" in verdict.protocol[0]
     values = [level.value for level in verdict.seeds[0].levels]
@@ -71,7 +74,9 @@ def test_a_study_is_run_once_and_goes_on(tmp_path: Path) -> None:
     assert words.count("done") == sum(len(s.levels) for s in verdict.seeds)
 
     words.clear()
-    (again,) = run_stress(study(tmp_path, "F49"), workers=2, report=report)
+    (again,) = run_stress(
+        study(tmp_path, "F49"), executor=LocalExecutor(2, threads=1), report=report
+    )
     assert again == verdict and set(words) == {"done before"}
 
 

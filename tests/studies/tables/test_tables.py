@@ -11,9 +11,10 @@ import pytest
 
 from hoigs.cli.main import main
 from hoigs.core.errors import HoigsError
+from hoigs.studies.execution.local import LocalExecutor
 from hoigs.studies.jobs.job import Job, JobState, digest_folder
-from hoigs.studies.jobs.pool import run_jobs
 from hoigs.studies.jobs.rows import Row, TableSet
+from hoigs.studies.jobs.run_jobs import run_jobs
 from hoigs.studies.jobs.worker import run_job
 from hoigs.studies.tables import run as studies
 from hoigs.studies.tables.run import ONLY_BUILTIN, Study, plan, run_study
@@ -52,7 +53,9 @@ def done(tmp_path_factory: pytest.TempPathFactory):
     words: list[tuple[str, str]] = []
     study = _study(out)
     results = run_study(
-        study, workers=2, threads=1, report=lambda job, word: words.append((job.folder.name, word))
+        study,
+        executor=LocalExecutor(2, threads=1),
+        report=lambda job, word: words.append((job.folder.name, word)),
     )
     return study, results, words
 

@@ -1,0 +1,180 @@
+"""LocalExecutor: processes on this machine, on all its GPUs."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from hoigs.core.errors import HoigsError
+from hoigs.core.machine.cpus import available_cpus
+from hoigs.studies.execution.executor import Needs, Process
+
+PROGRAM = (sys.executable, "-m", "hoigs.studies.execution.command")
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+ROUNDING = 1e-6  # of sums of shares of a GPU
+
+
+class LocalExecutor:
+    """Processes on this machine, each with its share of cores, and one GPU where there are some.
+
+    Args:
+        slots: processes at a time. threads: of each; default cores / slots.
+        address: must be None; there is no cluster.
+        memory_gb: of all together; default the memory of the machine.
+        program: what runs a command; its arguments are those of `hoigs.studies.execution.command`.
+
+    Raises:
+        HoigsError: an address was given.
+    """
+
+    def __init__(
+        self,
+        slots: int = 1,
+        threads: int | None = None,
+        address: str | None = None,
+        memory_gb: float | None = None,
+        program: Sequence[str] = PROGRAM,
+    ) -> None:
+        if address is not None:
+            raise HoigsError(f"--address {address}: is for --executor ray; local has no cluster")
+        self.slots = slots
+        self._threads = threads or max(1, available_cpus() // slots)
+        self._memory = memory_gb if memory_gb is not None else _memory_gb()
+        self._program = tuple(program)
+        self._gpus = visible_gpus()
+        self._next_gpu = 0
+        self._running: list[_LocalProcess] = []
+
+    def start(
+        self, command: Sequence[str], log: Path, needs: Needs, lease: str = ""
+    ) -> Process | None:
+        """As `Executor.start`.
+
+        Raises:
+            HoigsError: it needs more memory than there is for all, or more than one GPU.
+        """
+        if needs.memory_gb > self._memory:
+            raise HoigsError(
+                f"needs {needs.memory_gb:g} GB of memory, and there are {self._memory:.1f}; lower "
+                "the row's memory_gb"
+            )
+        share = gpu_share(needs, len(self._gpus), self.slots) if self._gpus else 0.0
+        self._running = [p for p in self._running if p.poll() is None]
+        used = sum(p.memory_gb for p in self._running)
+        if len(self._running) >= self.slots or used + needs.memory_gb > self._memory:
+            return None
+        gpu = self._least_loaded(share) if share else None
+        if share and gpu is None:
+            return None
+        environment = thread_settings(self._threads)
+        if gpu is not None:
+            environment["CUDA_VISIBLE_DEVICES"] = gpu
+        process = start_process([*self._program, str(os.getpid()), lease, *command], log,
+                                environment)  # fmt: skip
+        started = _LocalProcess(process, needs.memory_gb, gpu, share)
+        self._running.append(started)
+        return started
+
+    def _least_loaded(self, share: float) -> str | None:
+        """The GPU with the most room, if it has enough; among equals, the next in turn."""
+        load = [sum(p.share for p in self._running if p.gpu == gpu) for gpu in self._gpus]
+        count = len(self._gpus)
+        turn = [(self._next_gpu + i) % count for i in range(count)]
+        chosen = min(turn, key=lambda i: round(load[i], 6))
+        if load[chosen] + share > 1 + ROUNDING:
+            return None
+        self._next_gpu = (chosen + 1) % count
+        return self._gpus[chosen]
+
+
+class _LocalProcess:
+    lost = False  # the machine is that of the driver
+
+    def __init__(
+        self, process: subprocess.Popen[bytes], memory_gb: float, gpu: str | None, share: float
+    ) -> None:
+        self._process, self.memory_gb, self.gpu, self.share = process, memory_gb, gpu, share
+        self.device = "cpu" if gpu is None else f"GPU {gpu}"
+        self._ended = False
+
+    def poll(self) -> int | None:
+        code = self._process.poll()
+        if code is not None and not self._ended:
+            self._ended = True
+            end_group(self._process, signal.SIGKILL)  # what a killed process leaves behind
+        return code
+
+    def stop(self) -> None:
+        if self.poll() is None:
+            stop_process(self._process)
+            self.poll()
+
+
+def start_process(
+    command: Sequence[str], log: Path, settings: dict[str, str], folder: str | None = None
+) -> subprocess.Popen[bytes]:
+    """A process with a group of its own, so that it can be ended with all that it started.
+
+    Args:
+        log: gets its output. settings: more environment. folder: where it starts.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("ab") as file:
+        return subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
+            env=os.environ | settings, cwd=folder, start_new_session=True,
+        )  # fmt: skip
+
+
+def stop_process(process: subprocess.Popen[bytes]) -> None:
+    """End a process of `start_process` and its group: by SIGTERM, after 10 s by SIGKILL."""
+    end_group(process, signal.SIGTERM)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(timeout=10)
+    end_group(process, signal.SIGKILL)
+    process.wait()
+
+
+def end_group(process: subprocess.Popen[bytes], number: int) -> None:
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, number)
+
+
+def thread_settings(threads: int) -> dict[str, str]:
+    """Environment of a process that computes with so many threads."""
+    return dict.fromkeys(THREADS, str(threads))
+
+
+def gpu_share(needs: Needs, gpus: int, slots: int) -> float:
+    """Share of a GPU for a process, where there are `gpus` for `slots` processes.
+
+    Raises:
+        HoigsError: it is not between 0 and 1.
+    """
+    if needs.gpus is None:
+        return 1.0 / max(1, math.ceil(slots / gpus))
+    if not 0 <= needs.gpus <= 1:
+        raise HoigsError(f"needs {needs.gpus:g} GPUs; expected a share of one, from 0 to 1")
+    return needs.gpus
+
+
+def visible_gpus() -> list[str]:
+    """GPUs of CUDA_VISIBLE_DEVICES, else all that the driver lists; torch is not imported."""
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if given is not None:
+        return [gpu.strip() for gpu in given.split(",") if gpu.strip() not in ("", "-1")]
+    if shutil.which("nvidia-smi") is None:
+        return []
+    listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
+    return [str(i) for i in range(sum(x.startswith("GPU ") for x in listed.stdout.splitlines()))]
+
+
+def _memory_gb() -> float:
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
