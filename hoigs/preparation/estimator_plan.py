@@ -176,6 +176,8 @@ def _choose(
         return Choice(place, use, "chosen by you", COST.get(use))
     if place == "object":
         return _object(source, options, given)
+    if place in ("landmarks", "masks") and not options.people:
+        return Choice(place, "none", "--person none", 0.0)
     if place in source.beside:
         files = source.beside[place]
         return Choice(place, files.use, f"{files.settings.get('path')} lies beside the video", 0.0)
@@ -207,11 +209,26 @@ def _of_preset(place: Place, options: PrepareOptions) -> Choice:
         why = "nothing beside the video; works without a network"
         if options.preset == "auto":
             why += " (--estimators hub: networks to download)"
+        if place == "landmarks":
+            why = f"{_people(options)}{why}"
     if place == "object":
         why = "; ".join(_shown(name, options) for name in options.objects)
         if not _installed(spec.use):
             return Choice(place, "none", f"{spec.use} is not installed", 0.0)
     return Choice(place, spec.use, why, COST.get(spec.use), spec)
+
+
+def _people(options: PrepareOptions) -> str:
+    """Whose, where there is a choice."""
+    shown = [name for name in options.people if name in options.prompts]
+    if not shown:
+        return ""
+    frames = {n: options.prompts[n].places() for n in shown}
+    texts = [
+        f"{n} in frame {', '.join('first' if at.frame is None else str(at.frame) for at in where)}"
+        for n, where in frames.items()
+    ]
+    return f"{'; '.join(texts)}; "
 
 
 def _shown(name: str, options: PrepareOptions) -> str:

@@ -21,6 +21,7 @@ from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.body.silhouette import posed
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.nobody import Nobody
 
 SEEN, RARELY = 0.3, 0.2  # visibility; share of frames: a part seen in fewer of them is a guess
 PARTS = {"head": (0, 7, 8), "arms": (13, 14, 15, 16), "legs": (25, 26, 27, 28)}  # landmarks
@@ -60,6 +61,36 @@ class FittedBody:
         """Median depth of the pelvis, metres."""
         depths = [c.to_camera(p)[2] for c, p in zip(cameras, self.joints[:, PELVIS], strict=True)]
         return float(torch.stack(depths).median())
+
+
+@dataclass(frozen=True)
+class FittedPeople:
+    """Everybody's body, by name, the first one's first; in a clip of objects alone, `nobody`."""
+
+    people: dict[str, FittedBody]
+    nobody: Nobody | None = None
+
+    @property
+    def first(self) -> FittedBody | None:
+        return next(iter(self.people.values()), None)
+
+    @property
+    def world(self) -> FittedBody | Nobody:
+        """What gives the world its unit, its floor and its depth."""
+        found = self.first or self.nobody
+        assert found is not None  # one of both is made
+        return found
+
+    def warnings(self) -> list[str]:
+        """Sentences for the report, which name the person where there are several."""
+        if self.nobody is not None:
+            return self.nobody.warnings
+        several = len(self.people) > 1
+        return [
+            f"{name}: {text}" if several else text
+            for name, person in self.people.items()
+            for text in person.warnings
+        ]
 
 
 def fit_person(

@@ -42,7 +42,7 @@ class ChosenCameras:
 
 def choose_cameras(
     video: Frames,
-    landmarks: RawLandmarks,
+    landmarks: RawLandmarks | None,
     masks: GivenMasks,
     model: Path | None,
     options: PrepareOptions,
@@ -54,7 +54,8 @@ def choose_cameras(
     """Cameras as `options.camera` requests them.
 
     Args:
-        landmarks, masks: of the raw frames. model: a COLMAP model that is there already, or None.
+        landmarks, masks: of the raw frames; landmarks None: nobody is looked for.
+        model: a COLMAP model that is there already, or None.
         given: cameras.npz or MegaSaM's npz, or None.
         bodies: whose lens a still camera has, unless another is given.
         folder: to work in; it may be removed when the result has been kept.
@@ -112,7 +113,7 @@ def known_lens(options: PrepareOptions, video: Frames) -> tuple[Lens, str] | Non
 
 def _static(
     video: Frames,
-    landmarks: RawLandmarks,
+    landmarks: RawLandmarks | None,
     options: PrepareOptions,
     lens: tuple[Lens, str] | None,
     motion: BackgroundMotion,
@@ -136,7 +137,7 @@ def _static(
 
 def _turning(
     video: Frames,
-    landmarks: RawLandmarks,
+    landmarks: RawLandmarks | None,
     masks: GivenMasks,
     options: PrepareOptions,
     lens: tuple[Lens, str] | None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -68,7 +68,7 @@ class Source:
 def find_source(
     path: Path,
     *,
-    human: str = "human",
+    people: Sequence[str] = ("human",),
     object_name: str = "object",
     given: Collection[str] = (),
     own_cameras: bool = False,
@@ -77,6 +77,7 @@ def find_source(
     """The inputs in a folder, or beside a video file.
 
     Args:
+        people: names of those who are looked for; none: no landmarks are needed.
         complete: landmarks and masks have to be there; False: `Source.absent` names those that are
             not.
         given: "masks", "landmarks" or "depth" that estimators give: no files are needed for them.
@@ -95,7 +96,9 @@ def find_source(
         raise SourceError(f"{video} is empty: 0 bytes; copy it again")
     beside: dict[EstimateKind, ComponentSpec] = {}
     absent: set[str] = set()
-    if (folder / LANDMARKS).is_file():
+    if not people:
+        pass
+    elif (folder / LANDMARKS).is_file():
         beside["landmarks"] = _files("landmarks", LANDMARKS)
     elif "landmarks" not in given and not complete:
         absent.add("landmarks")
@@ -109,13 +112,13 @@ def find_source(
     ball = folder / "ball_track.npz"
     if "masks" not in given:
         lacking: list[str] = []
-        spec, masked = _find_masks(folder, human, object_name, lacking)
+        spec, masked = _find_masks(folder, people, object_name, lacking)
         if masked or complete:
             beside["masks"] = spec
         if complete:
             missing += lacking
         else:
-            absent |= {"masks"} if human not in masked else set()
+            absent |= {"masks"} if set(people) - set(masked) else set()
     if object_name not in masked and not ball.is_file():
         absent.add("object")
     if (folder / "depth").is_dir():
@@ -176,13 +179,14 @@ def _find_video(folder: Path, missing: list[str]) -> Path | None:
 
 
 def _find_masks(
-    folder: Path, human: str, object_name: str, missing: list[str]
+    folder: Path, people: Sequence[str], object_name: str, missing: list[str]
 ) -> tuple[ComponentSpec, tuple[str, ...]]:
     """The estimator that reads them, and the entities that it reads."""
-    names = (human, object_name)
+    names = (*people, object_name)
     apart = tuple(n for n in names if (folder / "masks" / n).is_dir())
     together = folder / "hoi_mask"
-    if apart != names and together.is_dir() and any(together.glob("*.png")):
+    one = len(people) == 1  # whom it can be separated from the object by
+    if one and apart != names and together.is_dir() and any(together.glob("*.png")):
         return _files("masks", "hoi_mask", holds="together", resize=True), names
     for name in names:
         # a tracked ball gives the object's mask, so the person's alone is enough
