@@ -208,6 +208,14 @@ class EstimateReader:
         except ValueError as error:
             raise SourceError(f"estimators.{role}: {error}") from error
 
+    def people(self) -> tuple[FramePrompt, ...]:
+        """A box about everybody, from a quick look; see `Estimator.people`. Empty where files
+        beside the video say who is meant."""
+        if {"landmarks", "masks"} & set(self.source.beside):
+            return ()
+        estimator = self.estimators["landmarks"]
+        return estimator.people(self.request("landmarks"))
+
     def request(self, kind: Place) -> VideoRequest:
         """The video as estimators see it: whole, at its own size."""
         video, options = self.video, self.options

@@ -68,7 +68,7 @@ def nobody(masks: MaskStack | None, track: CameraTrack, size: float | None) -> N
     )
     warnings = [] if size is not None else [
         f"nobody is in the clip, so nothing shows its scale: the object is taken to be {SIZE:g} m "
-        "across (--object-size, if you know it), and all distances follow"
+        "across (--set object_size=0.2, if it is), and all distances follow"
     ]  # fmt: skip
     return Nobody(scale, depths, HEIGHT * float(np.median(depths)), text, warnings)
 

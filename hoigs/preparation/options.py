@@ -146,6 +146,10 @@ class PrepareOptions(ComponentConfig):
         default_factory=dict, description="by entity, where or what it is"
     )
     human: str = Field(default="human", description="name of the person's entity")
+    everybody: bool = Field(
+        default=False,
+        description="fit all people who are seen by a quick look, where no prompt says who",
+    )
     further_people: tuple[str, ...] = Field(
         default=(),
         description="names of more people, each with a prompt; the estimators of landmarks and "

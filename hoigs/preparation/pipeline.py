@@ -19,6 +19,7 @@ from hoigs.preparation.bodies.body_file import FileBody
 from hoigs.preparation.body.silhouette import silhouette
 from hoigs.preparation.cameras.calibration import calibration_file
 from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras, known_lens
+from hoigs.preparation.choose_people import chosen_people
 from hoigs.preparation.entity_masks import (
     EntityMasks,
     disjoint,
@@ -81,10 +82,11 @@ class Pipeline:
         stages: Stages,
         work: WorkFolder,
         bodies: FileBody | None = None,
+        announce: Callable[[str], object] = str,
     ) -> None:
         self.source, self.out, self.body = source, out, body
         self.options, self.stages, self.work = options, stages, work
-        self.estimators, self.bodies = estimators, bodies
+        self.estimators, self.bodies, self.announce = estimators, bodies, announce
         self.warnings: list[str] = []
         self.provenance: dict[str, str] = {}
         self.worth_keeping = False
@@ -203,6 +205,7 @@ class Pipeline:
             self.source, self.video, self.options, self.estimators, self.work.root / "estimators"
         )
         self._without_unusable_depth()
+        self._choose_people()
         beside = self.source.beside
         used = {k: e for k, e in self.estimators.items() if k in ("landmarks", "masks")}
         paths = [
@@ -224,6 +227,17 @@ class Pipeline:
             self.worth_keeping = False
             raise
         self.warnings += self.reader.notes_on_person()
+
+    def _choose_people(self) -> None:
+        """Takes one of several people, or all, where nobody was clicked on, and says so first."""
+        people, prompts = self.options.people, self.options.prompts
+        if not people or any(name in prompts for name in people):
+            return
+        self.options, said = chosen_people(self.options, self.reader.people())
+        if said:
+            self.announce(said)
+            self.warnings.append(said)
+            self.reader = replace(self.reader, options=self.options)
 
     def _prompts(self, *names: str) -> dict[str, Any]:
         """The prompts of people and of `names`, as JSON."""

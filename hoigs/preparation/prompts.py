@@ -12,7 +12,7 @@ from hoigs.preparation.video.frames import FrameList
 
 _NUMBER = r"\d+(?:\.\d+)?"
 _PLACE = re.compile(rf"\s*([-!]?)\s*({_NUMBER}(?:\s*,\s*{_NUMBER})+)\s*(?:@\s*(\d+))?\s*")
-NONE = "none"
+NONE, ALL = "none", "all"
 HOW = (
     '"640,402" is a point on it in the first frame used, "640,402@120" in frame 120 of the '
     'video, "-700,380" a point that is not on it, "600,350,700,450" its box x0,y0,x1,y1, '
@@ -133,6 +133,10 @@ def _people(
         if not update.get("find_object", options.find_object):
             raise SpecError("--person none and --object none leave nothing to fit: give one")
         return {"find_person": False}
+    if any(place.strip() == ALL for _, place in named):
+        if len(texts) > 1 or named[0][0]:
+            raise SpecError("--person all takes everybody: leave the others out, and names")
+        return {"everybody": True}
     objects = (update.get("object", options.object), *update.get("further_objects", ()))
     found = named_people(named, options, objects)
     return found | {"prompts": {**update.get("prompts", {}), **found["prompts"]}}

@@ -26,6 +26,7 @@ from hoigs.core.interfaces.estimator import (
     EstimateKind,
     Estimates,
     Estimator,
+    FramePrompt,
     Landmarks,
     LazyFrames,
     VideoRequest,
@@ -35,9 +36,11 @@ from hoigs.plugins.estimators.common.environments import HEAVY, MEDIAPIPE
 from hoigs.plugins.estimators.common.subprocess import run_tool, settings_key
 
 SCRIPT = Path(__file__).with_name("mediapipe_script.py")
-IMPORTED = [SCRIPT.with_name(f"mediapipe_{name}.py") for name in ("guided", "chosen", "people")]
+PARTS = ("guided", "chosen", "people", "look")
+IMPORTED = [SCRIPT.with_name(f"mediapipe_{part}.py") for part in PARTS]
 INSTALL = "run `hoigs estimators install mediapipe` and leave `python` out"
 OTHERS, FOLLOWED = 0.1, 0.8  # shares of the frames, above and below which there is something to say
+LOOKS = 7  # frames that are looked at for several people, less one
 HIPS = [23, 24]  # of the 33 landmarks
 LONGEST = 1280  # pixels: larger frames are made smaller, which the models do in any case
 
@@ -149,6 +152,17 @@ class MediapipeEstimator(Estimator):
         notes = _lost(given, images) if chosen else _others(found["several"], images[people[0]])
         return Estimates(EntityMasks(masks, None, text, notes=notes), landmarks)
 
+    def people(self, video: VideoRequest) -> tuple[FramePrompt, ...]:
+        numbers = video.numbers
+        shown = sorted({numbers[i * (len(numbers) - 1) // LOOKS] for i in range(LOOKS + 1)})
+        settings = {"pose": self._settings(), "look": shown}
+        settings["scripts"] = [zlib.crc32(path.read_bytes()) for path in (SCRIPT, *IMPORTED)]
+        out = video.work / f"people-{settings_key(settings)}.npz"
+        if not out.is_file():
+            self._run(self._python(video), out, shown, None, video, no_progress, look=True)
+        with np.load(out, allow_pickle=False) as file:
+            return _together(file["people"], shown, video)
+
     def _python(self, video: VideoRequest) -> Path:
         if self.config.python is None:
             return MEDIAPIPE.python()
@@ -160,14 +174,14 @@ class MediapipeEstimator(Estimator):
 
     def _run(
         self, python: Path, out: Path, order: Sequence[int], chosen: dict[str, Any] | None,
-        video: VideoRequest, progress: Progress,
+        video: VideoRequest, progress: Progress, look: bool = False,
     ) -> None:  # fmt: skip
         out.parent.mkdir(parents=True, exist_ok=True)
         half = out.with_suffix(".part")
         settings = {
             "width": video.width, "height": video.height, "count": len(order), "longest": LONGEST,
             "masks": self.config.masks, "people": chosen, "pose": self._settings(),
-            "out": str(half.absolute()),
+            "out": str(half.absolute()), "look": look,
         }  # fmt: skip
         # -I: the script's own folder, where modules of hoigs lie, is not searched for imports
         argv = [str(python.absolute()), "-I", str(SCRIPT), json.dumps(settings)]
@@ -194,6 +208,28 @@ class MediapipeEstimator(Estimator):
         spread = np.full((video.frames, 33, 4), np.nan, np.float32)
         spread[given.start : given.stop] = rows
         return spread
+
+
+def _together(
+    rows: Float[np.ndarray, "N 5"], shown: Sequence[int], video: VideoRequest
+) -> tuple[FramePrompt, ...]:
+    """Everybody in the frame that shows most people, the surest first."""
+    if not len(rows):
+        return ()
+    places = rows[:, 0].astype(int)
+    counts = np.bincount(places)
+    # what is seen once only may be a coat on a chair
+    counts[counts > 1] = 1 if (counts > 1).sum() < min(2, len(shown)) else counts[counts > 1]
+    place = int(np.lexsort((np.bincount(places, rows[:, 1]), counts))[-1])
+    here = rows[places == place]
+    here = here[np.argsort(-here[:, 1])][: counts[place]]
+    prompts = []
+    for _, _, x, y, side in here.tolist():
+        half, limits = side / 2 / 1.25, (video.width, video.height)
+        low = [max(0.0, v - half) for v in (x, y)]
+        high = [min(float(most), v + half) for v, most in zip((x, y), limits, strict=True)]
+        prompts.append(FramePrompt(shown[place], (), (*low, *high)))
+    return tuple(prompts)
 
 
 def _others(several: Bool[np.ndarray, " N"], image: Float[np.ndarray, "F 33 4"]) -> tuple[str, ...]:

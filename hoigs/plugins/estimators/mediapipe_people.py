@@ -167,7 +167,8 @@ class People:
             more = likeness[a, a] - likeness[a, b]
             if abs(more) < UNLIKE:  # alike: whose way leads here?
                 middle = np.array(seen[a][0][:2])
-                away = [np.linalg.norm(self.people[n].expected() - middle) for n in (a, b)]
+                ways = (self.people[n].expected() - middle for n in (a, b))
+                away = [float(np.linalg.norm(way)) for way in ways]
                 more = away[1] - away[0]
             wrong.add(b if more > 0 else a)
         return wrong

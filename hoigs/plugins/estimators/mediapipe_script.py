@@ -37,7 +37,10 @@ def main() -> None:
     width, height, count = settings["width"], settings["height"], settings["count"]
     factor = min(1.0, settings["longest"] / max(width, height))
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    finder = Finder(cv2, mediapipe.solutions, settings, size[0] / width)
+    looks = settings.get("look")
+    finder: Any = Lookout(settings) if looks else Finder(
+        cv2, mediapipe.solutions, settings, size[0] / width
+    )  # fmt: skip
     for i in range(count):
         pixels = sys.stdin.buffer.read(height * width * 3)
         if len(pixels) != height * width * 3:
@@ -51,6 +54,25 @@ def main() -> None:
             sys.exit(str(error))
     with Path(settings["out"]).open("wb") as out:
         np.savez_compressed(out, size=np.array(size), **finder.arrays(width / size[0]))
+
+
+class Lookout:
+    """Who is in each frame: `people` [N, 5], the frame's place and what `Look.people` gives."""
+
+    def __init__(self, settings) -> None:
+        from mediapipe_look import Look
+
+        self.look = Look(settings["pose"]["model_complexity"])
+        self.rows: list[tuple[float, ...]] = []
+
+    def add(self, place, image) -> None:
+        self.rows += [(place, *one) for one in self.look.people(image)]
+
+    def arrays(self, scale):
+        """What is written; `scale`: pixels of the video a pixel of the images here."""
+        rows = np.array(self.rows, np.float32).reshape(-1, 5)
+        rows[:, 2:] *= scale
+        return {"people": rows}
 
 
 class Finder:
@@ -206,7 +228,7 @@ class Finder:
 
     def arrays(self, scale):
         """What is written; `scale`: pixels of the video a pixel of the images here."""
-        rows = dict(self.rows)
+        rows: dict[str, np.ndarray] = dict(self.rows)
         rows["image_xyzv"][..., :3] *= scale
         if self.masks:
             rows["person"] = np.array(self.person)

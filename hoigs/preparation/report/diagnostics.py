@@ -122,7 +122,8 @@ def _bodies(report: Measures) -> Iterator[MeasureDiagnostic]:
             "median distance of visible landmarks",
             _judge(pixels / max(report.width, report.height), 0.01, 0.02),
             "look at overlay.mp4: if the landmarks jump, use another estimator "
-            "(estimators.landmarks); if all of the body is off, so may be the focal length or cameras",
+            "(estimators.landmarks); if all of the body is off, the focal length or the cameras "
+            "are",
         )
 
 
