@@ -10,7 +10,7 @@ from hoigs.core.errors import PluginError, SpecError
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import ComponentSpec
 from hoigs.preparation.bodies.as_landmarks import BodyFileEstimator
-from hoigs.preparation.bodies.body_file import FileBody
+from hoigs.preparation.bodies.file_body import FileBody
 from hoigs.preparation.options import Place, PrepareOptions
 from hoigs.preparation.video.header import video_header
 from hoigs.preparation.video.source import Source, numbered_frames

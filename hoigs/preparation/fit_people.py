@@ -9,7 +9,7 @@ from functools import partial
 import torch
 
 from hoigs.core.interfaces.body import BodyModel
-from hoigs.preparation.bodies.body_file import FileBody
+from hoigs.preparation.bodies.file_body import FileBody
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.estimates import RawEstimates, UndistortedEstimates
 from hoigs.preparation.options import PrepareOptions

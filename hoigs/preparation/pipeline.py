@@ -15,7 +15,7 @@ import hoigs
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.clip import BodyTrack
-from hoigs.preparation.bodies.body_file import FileBody
+from hoigs.preparation.bodies.file_body import FileBody
 from hoigs.preparation.body.silhouette import silhouette
 from hoigs.preparation.cameras.calibration import calibration_file
 from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras, known_lens

@@ -11,7 +11,7 @@ import numpy as np
 from hoigs.core.diagnostics import ranges
 from hoigs.core.npz import holds
 from hoigs.core.values.lens import Lens
-from hoigs.preparation.bodies.body_file import FileBody
+from hoigs.preparation.bodies.file_body import FileBody
 from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
 from hoigs.preparation.cameras.camera_track import (
     CameraTrack,
