@@ -133,7 +133,7 @@ class PrepareOptions(ComponentConfig):
     )
     bodies: str | None = Field(
         default=None,
-        description="file of bodies that GVHMR, WHAM, TRAM, PHALP or PromptHMR has fitted, relative to its "
+        description="file of bodies of GVHMR, WHAM, TRAM, PHALP or PromptHMR, relative to the video's "
         "folder; None: the one that lies beside it, if any",
     )
     find_object: bool = Field(

@@ -144,8 +144,8 @@ def _phalp(rows: list[Mapping[str, Any]], path: Path) -> FileBody:
                 seen.setdefault(who, []).append((int(row.get("time", number)), smpl, camera))
     if not seen:
         raise SourceError(f"{path}, of PHALP, has followed nobody")
-    tracks = list(seen.values())
-    person = sorted(max(tracks, key=len), key=lambda one: one[0])
+    longest = max(seen, key=lambda who: len(seen[who]))
+    person = sorted(seen[longest], key=lambda one: one[0])
     parts = {
         "global_orient": [_part(smpl, "global_orient", path) for _, smpl, _ in person],
         "body_pose": [_part(smpl, "body_pose", path) for _, smpl, _ in person],
