@@ -114,6 +114,9 @@ def fit_person(
         height: of the person who stands upright, metres; None: the body model's mean.
     """
     strays = landmarks.strays()
+    jumps = landmarks.without(strays).jumps()
+    landmarks = landmarks.without(strays | jumps)
+    strays |= landmarks.strays()  # single frames between those that jumped
     landmarks = landmarks.without(strays)
     options = FitOptions(scale=not track.metric, steps=steps)
     if height is not None:
@@ -144,7 +147,8 @@ def fit_person(
         warnings=[
             *_warnings(residual, found, solid, track.cameras),
             *_unseen(landmarks),
-            *_strays(strays),
+            *_left_out(strays, "stand alone between frames without any"),
+            *_left_out(jumps, "beside frames without any are off the person's way"),
         ],
     )
 
@@ -155,14 +159,11 @@ def stature(body: BodyModel) -> float:
     return float(vertices[:, 1].max() - vertices[:, 1].min())
 
 
-def _strays(strays: Bool[Tensor, " F"]) -> list[str]:
-    frames = strays.nonzero()[:, 0].tolist()
+def _left_out(which: Bool[Tensor, " F"], why: str) -> list[str]:
+    frames = which.nonzero()[:, 0].tolist()
     if not frames:
         return []
-    return [
-        f"landmarks of {len(frames)} frames ({ranges(frames)}) stand alone between frames without "
-        "any, and were left out"
-    ]
+    return [f"landmarks of {len(frames)} frames ({ranges(frames)}) {why}, and were left out"]
 
 
 def _warnings(residual: float, found: int, solid: int, cameras: Sequence[Camera]) -> list[str]:
