@@ -17,6 +17,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 LANDMARKS = "pose_mediapipe.npz"
 CAMERAS = "cameras.npz"
 MEGASAM = frozenset({"images", "depths", "intrinsic", "cam_c2w"})  # arrays of its npz
+VGGT = frozenset({"extrinsic", "intrinsic", "depth", "images"})  # likewise
 FRAME_FOLDERS = ("frames", "images")  # where a folder of frames may keep them
 _COLMAP_FILES = ("cameras", "images", "points3D")
 _LAYOUT = """  FOLDER/
@@ -27,8 +28,8 @@ _LAYOUT = """  FOLDER/
                          from a video segmenter; or masks/human/ and masks/object/ apart
     depth/               depth maps as .npz, in an array named metric_depth or disparity
     sparse/              a COLMAP model, or cameras.npz (K, world_to_camera, points, in metres),
-                         or MegaSaM's npz, if you have one; else hoigs checks whether the camera
-                         moves, and then runs structure from motion itself
+                         or MegaSaM's or VGGT's npz, if you have one; else hoigs checks
+                         whether the camera moves, and then runs structure from motion itself
     ball_track.npz       xyr [F, 3] pixels, if the object is a ball: centre and radius"""
 
 
@@ -50,7 +51,7 @@ class Source:
             gives.
         masked: entities whose masks `beside` reads.
         colmap: folder of a COLMAP model, or None.
-        cameras: cameras.npz or MegaSaM's npz, or None. ball: ball_track.npz, or None.
+        cameras: cameras.npz, or MegaSaM's or VGGT's npz, or None. ball: ball_track.npz, or None.
         absent: which of "landmarks", "masks" (the person's) and "object" (the object's masks, or
             its track) are not there and given by no other estimator.
     """
@@ -215,13 +216,14 @@ def _find_colmap(folder: Path, missing: list[str]) -> Path | None:
 
 
 def _find_cameras(folder: Path) -> Path | None:
-    """cameras.npz, or else the one file that holds MegaSaM's arrays, whatever its name."""
+    """cameras.npz, or else the one file that holds arrays of MegaSaM or VGGT, whatever its name."""
     if (folder / CAMERAS).is_file():
         return folder / CAMERAS
-    found = [path for path in sorted(folder.glob("*.npz")) if holds(path, MEGASAM)]
+    files = sorted(folder.glob("*.npz"))
+    found = [path for path in files if holds(path, MEGASAM) or holds(path, VGGT)]
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
-        raise SourceError(f"{folder} holds cameras of MegaSaM in {names}: leave one there")
+        raise SourceError(f"{folder} holds cameras of MegaSaM or VGGT in {names}: leave one there")
     return found[0] if found else None
 
 
