@@ -153,7 +153,7 @@ class Frames(ABC):
             if at == number:
                 self._reading = at, stream
                 return picture.rgb(self.native_width, self.native_height)
-        raise SourceError(f"{self.path} has {at + 1} frames, none of number {number}")
+        raise SourceError(f"{self.path} has {self.count()} frames, none of number {number}")
 
     def count(self) -> int:
         """Frames of the whole source, those beyond the last chosen one too."""
