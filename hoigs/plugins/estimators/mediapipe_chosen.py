@@ -104,7 +104,9 @@ class ChosenPose:
             # the same once more, in the square that it will be followed in
             closer = self.look(image, square_of(found[0]))
             if closer is None or not self.agrees(closer[2], inside, outside):
-                continue
+                if box is None:
+                    continue
+                closer = found  # seen in the box that was drawn about them
             value = closer[0][:, 3].mean()  # more of the person
             if best is None or value > best[0]:
                 best = value, square_of(closer[0]), closer

@@ -115,6 +115,27 @@ def test_people_who_cross_stay_themselves(people: ModuleType) -> None:
                 assert seen[name][0][[11, 12], 0].mean() == pytest.approx(x)
 
 
+def test_people_without_a_face_are_looked_for(people: ModuleType) -> None:
+    module = importlib.import_module("mediapipe_look")
+    look = object.__new__(module.Look)
+    look.landmarks = (Graph(), Box)
+    found = look.faceless(image(0), [])
+    assert sorted(round(x / 10) for _, x, _, _ in found) == pytest.approx([6, 20], abs=4)
+    assert all(sure < 0.6 for sure, *_ in found)
+    (other,) = look.faceless(image(0), [(0.9, float(LEFT), 90.0, 150.0)])
+    assert abs(other[1] - RIGHT) < 40
+
+
+def test_several_people_are_those_of_the_frame_that_shows_most() -> None:
+    rows = [(0, 0.9, 50, 90, 100), (1, 0.8, 60, 90, 100), (1, 0.9, 200, 90, 100)]
+    seen = np.array([*rows, (2, 0.7, 60, 90, 100), (2, 0.7, 200, 90, 100)], np.float32)
+    first, second = mediapipe._together(seen, [5, 6, 7], video())
+    assert first.frame == second.frame == 6 and first.box == (160, 50, 240, 130)
+    (alone,) = mediapipe._together(seen[:3], [5, 6], video())  # two people once: one is a coat
+    assert alone.frame in (5, 6)
+    assert mediapipe._together(np.zeros((0, 5), np.float32), [5], video()) == ()
+
+
 def test_clicks_on_two_people_are_not_one_person(people: ModuleType) -> None:
     graph = Crossing()
     clicks = {"red": {0: ([(50, 90, True)], None), 3: ([(240, 90, True)], None)}}
