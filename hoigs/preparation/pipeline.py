@@ -30,6 +30,7 @@ from hoigs.preparation.estimates import (
     EstimateReader,
     Estimators,
     FoundObject,
+    RawEstimates,
     UndistortedEstimates,
     UndistortedPerson,
     identity,
@@ -206,6 +207,21 @@ class Pipeline:
         )
         self._without_unusable_depth()
         self._choose_people()
+        try:
+            self.raw = self._people_and_masks()
+        except NobodyFoundError as error:
+            if self.options.object not in self.options.prompts or not self.options.find_object:
+                self.worth_keeping = False
+                raise
+            said = f"{error}; so the clip has the object alone (--person X,Y@FRAME shows somebody)"
+            self.announce(said)
+            self.warnings.append(said)
+            self.options = self.options.model_copy(update={"find_person": False})
+            self.reader = replace(self.reader, options=self.options)
+            self.raw = self._people_and_masks()
+        self.warnings += self.reader.notes_on_person()
+
+    def _people_and_masks(self) -> RawEstimates:
         beside = self.source.beside
         used = {k: e for k, e in self.estimators.items() if k in ("landmarks", "masks")}
         paths = [
@@ -219,14 +235,9 @@ class Pipeline:
             self._prompts(*((self.options.object,) if self.reader.of_both else ())),
         ]
         self.worth_keeping |= any(kind not in beside for kind in used)
-        try:
-            self.raw = self._stage(
-                "evidence", lambda: self.reader.landmarks_and_masks(self.stages.advance), made_from
-            )
-        except NobodyFoundError:
-            self.worth_keeping = False
-            raise
-        self.warnings += self.reader.notes_on_person()
+        return self._stage(
+            "evidence", lambda: self.reader.landmarks_and_masks(self.stages.advance), made_from
+        )
 
     def _choose_people(self) -> None:
         """Takes one of several people, or all, where nobody was clicked on, and says so first."""

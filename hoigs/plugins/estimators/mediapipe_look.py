@@ -54,7 +54,7 @@ class Look:
         """Likewise those without a face, whom two squares show, and who are none of the found."""
         height, width = image.shape[:2]
         seen: list[tuple[float, float, float, float]] = []
-        more = []
+        more: list[tuple[float, float, float, float]] = []
         for side in (s * height for s in SQUARES):
             for x in np.arange(side / 4, width, side / 2):
                 for y in (row * height for row in ROWS):
