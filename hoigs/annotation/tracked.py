@@ -44,6 +44,8 @@ class TrackedMasks:
             for name, stack in ((human, people), (object_name, masks.object)):
                 if stack is not None:
                     self._stacks[name] = stack
+            for name, person in evidence.further.items():
+                self._stacks[name] = person.masks
         sure: dict[str, np.ndarray | None] = {}
         if isinstance(found, FoundObject):
             for name, thing in {object_name: found, **found.further}.items():

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from hoigs.preparation.video.packet_index import packet_index
 from hoigs.preparation.video.pictures import FilePicture, Picture, VideoPicture
 from hoigs.preparation.video.source import SourceError, numbered_frames
 
@@ -137,17 +138,10 @@ class ScrubbedVideo:
         cursor = _Cursor(self.path)
         rate = cursor.video.average_rate or cursor.video.guessed_rate or 30
         self.fps = float(rate)
-        shown = [
-            p
-            for p in cursor.container.demux(cursor.video)
-            if p.size and not getattr(p, "is_discard", False)
-        ]
-        packets = sorted((p.pts, p.is_keyframe) for p in shown if p.pts is not None)
+        index = packet_index(cursor.container, cursor.video)
         cursor.container.close()
-        if len({time for time, _ in packets}) == len(shown):
-            self._times = [time for time, _ in packets]
-            self.count = len(packets)
-            self.keyframes = [i for i, (_, key) in enumerate(packets) if key] or [0]
+        if index is not None:
+            self._times, self.count, self.keyframes = index.times, len(index), index.keyframes
         else:  # frames are found by counting
             self.count, self.keyframes = sum(1 for _ in _Cursor(self.path).frames), [0]
 

@@ -32,7 +32,8 @@ def run(
         _say(done=min(1.0, done / share), text=what)
 
     def announce(plan: EstimatorPlan) -> None:
-        _say(plan=plan.rows(), notes=plan.notes)
+        rows = {"plan": plan.rows()} if plan.choices else {}
+        _say(**rows, notes=plan.notes)
 
     given = PrepareOptions.model_validate({**options, "overwrite": replace})
     if not whole:

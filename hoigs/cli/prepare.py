@@ -36,7 +36,8 @@ def prepare(
         typer.Option(
             "--person",
             help="Which person to fit where several are seen: a point on them, 320,210 or "
-            "320,210@FRAME, or a box, as with --object. Repeatable.",
+            "320,210@FRAME, or a box, as with --object; several people with names, "
+            "anna=320,210; all, or none. Repeatable.",
         ),
     ] = None,
     estimators: Annotated[
@@ -175,7 +176,8 @@ def prepare(
 
 def _announce(plan: EstimatorPlan) -> None:
     title = "plan" if plan.frames is None else f"plan for {plan.frames} frames"
-    print_table(title, ("what", "from", "why", "about, on 2 cores"), plan.rows())
+    if plan.choices:
+        print_table(title, ("what", "from", "why", "about, on 2 cores"), plan.rows())
     for note in plan.notes:
         typer.echo(printable(note))
 

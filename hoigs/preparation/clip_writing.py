@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -11,15 +12,18 @@ from jaxtyping import Float
 
 from hoigs.core.clip_folder.write import ClipWriter
 from hoigs.core.interfaces.body import PELVIS
+from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import POSES_ESTIMATED
 from hoigs.preparation.cameras.camera_track import parallax
 from hoigs.preparation.cameras.multiview import angular_factor, full_factor
 from hoigs.preparation.objects.make_object import MadeObject
+from hoigs.preparation.person import FittedBody
 from hoigs.preparation.pipeline import Pipeline
 from hoigs.preparation.report.object_picture import save_object_picture, shown_frame
-from hoigs.preparation.report.overlay import OverlayVideo
+from hoigs.preparation.report.overlay import OverlayVideo, several
 from hoigs.preparation.report.report import PrepareReport
 from hoigs.preparation.stages.cleanup import Cleanup
+from hoigs.preparation.video.source import SourceError
 
 BODY_JOINTS = 22  # without the hands', which are not fitted
 
@@ -27,8 +31,12 @@ BODY_JOINTS = 22  # without the hands', which are not fitted
 def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
     """Writes and checks what the other stages made, and gives the folder its name."""
     options = made.options
-    entities: dict[str, Literal["human", "object"]] = {options.human: "human"}
+    entities: dict[str, Literal["human", "object"]] = dict.fromkeys(made.people.people, "human")
     entities |= dict.fromkeys(made.objects_made, "object")
+    if not entities:
+        raise SourceError(
+            "no object was found in a clip without people: point at it with --object X,Y"
+        )
     with ClipWriter(
         made.out, fps=made.video.fps, entities=entities, image_format=options.image_format,
         quality=options.quality, depth_kind="none" if made.depth is None else "metric",
@@ -37,7 +45,8 @@ def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
         cleanup.register(writer.root)
         with made.stages.stage("writing"):
             _write_frames(made, writer)
-        writer.set_body(options.human, made.body_track)
+        for name, poses in made.body_tracks().items():
+            writer.set_body(name, poses)
         for name, thing in made.objects_made.items():
             writer.set_object(name, thing.track)
         writer.set_points(made.scene.points, made.scene.colors)
@@ -60,19 +69,23 @@ def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
 def _write_frames(made: Pipeline, writer: ClipWriter) -> None:
     options = made.options
     picture = _object_picture(made)
+    count = len(made.people.people)
     overlay = OverlayVideo(
-        writer.root / "overlay.mp4", made.video.fps, options.overlay_width, made.body.faces
+        writer.root / "overlay.mp4",
+        made.video.fps,
+        options.overlay_width,
+        several(made.body.faces, count),
     )
     with overlay:
-        rows = zip(
-            made.images(), made.cameras, made.masks.human, made.masks.blank,
-            made.person.posed(made.body), strict=True,
-        )  # fmt: skip
-        for i, (image, camera, human, blank, (vertices, _)) in enumerate(
-            made.stages.track(rows, len(made.video))
-        ):
-            tracks = {name: thing.track for name, thing in made.objects_made.items()}
-            masks = {options.human: human} | {n: made.object_masks(n)[i] for n in tracks}
+        people = [person.posed(made.body) for person in made.people.people.values()]
+        nobody = [torch.zeros(0, 3)]
+        rows = zip(made.images(), made.cameras, made.masks.blank, strict=True)
+        stacks, tracks = made.people_masks(), {n: t.track for n, t in made.objects_made.items()}
+        for i, (image, camera, blank) in enumerate(made.stages.track(rows, len(made.video))):
+            vertices = torch.cat(nobody + [next(one)[0] for one in people])
+            masks = {n: stack[i] for n, stack in stacks.items()}
+            human = np.logical_or.reduce([np.zeros_like(blank), *masks.values()])
+            masks |= {n: made.object_masks(n)[i] for n in tracks}
             points = [t.points @ t.rotations[i].mT + t.translations[i] for t in tracks.values()]
             writer.add_frame(image, camera, masks, made.metres(i), blank)
             objects = made.masks.objects(i)
@@ -95,14 +108,14 @@ def _object_picture(made: Pipeline) -> int | None:
 
 def _report(made: Pipeline, name: str) -> PrepareReport:
     middle = torch.median(made.scene.points, dim=0).values
-    options, person, figures = made.options, made.person, made.track.figures
-    coverage = {options.human: made.masks.human}
-    pelvis = person.joints[:, PELVIS]
-    moving = person.joints[:, :BODY_JOINTS]
-    for held, thing in made.objects_made.items():
-        coverage[held] = made.object_masks(held)
-        moving = torch.cat((moving, thing.track.translations[:, None]), 1)
-    focal, depth = float(made.cameras[0].K[0, 0]), made.depth
+    options, person, figures = made.options, made.people.first, made.track.figures
+    coverage = made.people_masks()
+    joints = [one.joints[:, :BODY_JOINTS] for one in made.people.people.values()]
+    places = [thing.track.translations[:, None] for thing in made.objects_made.values()]
+    moving = torch.cat([*joints, *places], 1)
+    middle_of_motion = moving[:, PELVIS]  # of the first person, or the first object
+    coverage |= {held: made.object_masks(held) for held in made.objects_made}
+    depth = made.depth
     return PrepareReport(
         name=name,
         video=made.source.video.name,
@@ -113,14 +126,14 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         camera=made.track.kind,
         parallax_degrees=parallax(made.cameras, middle),
         coverage={n: m.coverage().round(5).tolist() for n, m in coverage.items()},
-        body_residual_px=person.residual_px,
-        scene_scale=person.scene_scale,
+        body_residual_px=None if person is None else person.residual_px,
+        scene_scale=made.people.world.scene_scale,
         object_scale_spread=None if made.object_made is None else made.object_made.spread,
         object_observed=(
             None if made.object is None else float(made.object.observed.float().mean())
         ),
         scene_points=len(made.scene.points),
-        body=person.report,
+        body={} if person is None else person.report,
         provenance=made.provenance,
         warnings=made.warnings,
         seconds=made.stages.seconds,
@@ -128,8 +141,15 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         reprojection_px=figures.get("reprojection_px"),
         displacement_px=figures.get("displacement_px"),
         sharpness=[round(value, 4) for value in made.video.sharpness],
-        body_residuals_px=_numbers(person.residuals.numpy(), 2),
-        body_residual_m=round(person.residual_px * person.distance(made.cameras) / focal, 4),
+        body_residuals_px=[] if person is None else _numbers(person.residuals.numpy(), 2),
+        body_residual_m=None if person is None else _metres_off(person, made.cameras),
+        further_people={
+            name: {
+                "body_residual_px": other.residual_px,
+                "body_residual_m": _metres_off(other, made.cameras),
+            }
+            for name, other in list(made.people.people.items())[1:]
+        },
         depth_residual=None if depth is None else depth.typical,
         depth_residuals=[] if depth is None else _numbers(depth.residual, 4),
         depth_against="" if depth is None else depth.against,
@@ -144,9 +164,14 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
             for other, thing in made.objects_made.items()
             if other != options.object
         },
-        omega=angular_factor(made.cameras, pelvis, made.video.fps),
+        omega=angular_factor(made.cameras, middle_of_motion, made.video.fps),
         big_omega=full_factor(made.cameras, moving),
     )
+
+
+def _metres_off(person: FittedBody, cameras: Sequence[Camera]) -> float:
+    """The distance from the landmarks at the person's."""
+    return round(person.residual_px * person.distance(cameras) / float(cameras[0].K[0, 0]), 4)
 
 
 def _object_measures(made: MadeObject) -> dict[str, Any]:

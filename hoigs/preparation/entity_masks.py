@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,13 +17,21 @@ from hoigs.preparation.objects.ball import BallTrack
 
 @dataclass(frozen=True)
 class EntityMasks:
-    """The final masks: of the person, of the object, of pixels that show no scene, and of `further`
-    objects by name."""
+    """The final masks: of the person, of the object, of pixels that show no scene, and by name of
+    `further` objects and `people`. Without a person or an object, its masks are empty."""
 
     human: MaskStack
     object: MaskStack
     blank: MaskStack
     further: dict[str, MaskStack] = field(default_factory=dict)
+    people: dict[str, MaskStack] = field(default_factory=dict)
+
+    def humans(self) -> MaskStack:
+        """Pixels that show anybody."""
+        if not self.people:
+            return self.human
+        stacks = zip(self.human, *self.people.values(), strict=True)
+        return MaskStack(np.logical_or.reduce(rows) for rows in stacks)
 
     def objects(self, frame: int) -> Bool[np.ndarray, "H W"]:
         """Pixels of a frame that show any object."""
@@ -39,7 +47,9 @@ class EntityMasks:
 
     def moving(self, frame: int) -> Bool[np.ndarray, "H W"]:
         """Pixels of a frame that show no scene that stands still."""
-        return self.human[frame] | self.objects(frame) | self.blank[frame]
+        people = [masks[frame] for masks in self.people.values()]
+        shown = [self.human[frame], *people, self.objects(frame), self.blank[frame]]
+        return np.logical_or.reduce(shown)
 
 
 def disjoint(
@@ -57,6 +67,19 @@ def disjoint(
             taken |= kept[k]
         for k, stack in enumerate(found):
             stack.append(kept[k])
+    return found
+
+
+def without_others(
+    people: Mapping[str, MaskStack], first: MaskStack, things: Sequence[MaskStack]
+) -> dict[str, MaskStack]:
+    """Masks of further people without common pixels: objects' win, then those of earlier ones."""
+    found: dict[str, MaskStack] = {}
+    for name, stack in people.items():
+        taken = zip(first, *things, *found.values(), strict=True)
+        found[name] = MaskStack(
+            mask & ~np.logical_or.reduce(rows) for mask, rows in zip(stack, taken, strict=True)
+        )
     return found
 
 

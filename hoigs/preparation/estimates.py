@@ -23,6 +23,7 @@ from hoigs.core.interfaces.estimator import (
     VideoRequest,
     checked,
 )
+from hoigs.core.interfaces.estimator import Frames as FrameArrays
 from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.given import GivenMasks, RawLandmarks, chosen_landmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
@@ -37,11 +38,26 @@ Estimators = Mapping[Place, Estimator]
 
 
 @dataclass(frozen=True)
-class RawEstimates:
-    """Landmarks and masks of the chosen frames, at their size; distortion still in."""
+class RawPerson:
+    """Landmarks and masks of one of further people, likewise."""
 
     landmarks: RawLandmarks
+    masks: MaskStack
+
+
+@dataclass(frozen=True)
+class RawEstimates:
+    """Landmarks and masks of the chosen frames, at their size; distortion still in.
+
+    Attributes:
+        landmarks: of the first person; None: nobody is looked for, and the person's masks are
+            empty.
+        further: other people by name (`PrepareOptions.further_people`).
+    """
+
+    landmarks: RawLandmarks | None
     masks: GivenMasks
+    further: dict[str, RawPerson] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -65,12 +81,21 @@ class FoundObject:
 
 
 @dataclass(frozen=True)
-class UndistortedEstimates:
-    """The same on the cameras' undistorted images, and the object if it is a tracked ball."""
+class UndistortedPerson:
+    """`RawPerson` on the cameras' undistorted images."""
 
     landmarks: LandmarkTrack
+    masks: MaskStack
+
+
+@dataclass(frozen=True)
+class UndistortedEstimates:
+    """`RawEstimates` on the cameras' undistorted images, and the object if it is a tracked ball."""
+
+    landmarks: LandmarkTrack | None
     masks: GivenMasks
     ball: BallTrack | None
+    further: dict[str, UndistortedPerson] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -89,10 +114,44 @@ class EstimateReader:
 
     def landmarks_and_masks(self, progress: Callable[[float], None]) -> RawEstimates:
         """Landmarks first: they are read fast, and a clip without them cannot be made."""
-        landmarks = self._landmarks(progress)
+        if not self.options.people:
+            return RawEstimates(None, self._objects_alone(progress))
+        first, *further = self.options.people
+        landmarks = {name: self._landmarks(name, progress) for name in self.options.people}
+        masks = self._masks((first, self.options.object), progress)
+        if not further:
+            return RawEstimates(landmarks[first], masks)
+        found = self.estimate("masks", progress).masks
+        assert found is not None  # `checked` saw to it
+        stacks = {name: self._stack(self._given(found, name)) for name in further}
+        together = zip(*stacks.values(), strict=True)
+        masks = replace(masks, others=MaskStack(np.logical_or.reduce(rows) for rows in together))
         return RawEstimates(
-            landmarks, self._masks((self.options.human, self.options.object), progress)
+            landmarks[first], masks, {n: RawPerson(landmarks[n], stacks[n]) for n in further}
         )
+
+    def _given(self, found: EntityMasks, name: str) -> FrameArrays:
+        """Masks of a person.
+
+        Raises:
+            SourceError: there are none.
+        """
+        if name not in found.entities:
+            raise SourceError(
+                f"estimators.masks: {_name(self.estimators['masks'])} gave masks of "
+                f"{_listed(found.entities)}, not of {name}: several people need masks of each"
+            )
+        return found.entities[name]
+
+    def _objects_alone(self, progress: Callable[[float], None]) -> GivenMasks:
+        """Masks of a video in which nobody is looked for: the person's are empty."""
+        nobody = np.zeros((self.video.height, self.video.width), bool)
+        human, thing = MaskStack(nobody for _ in self.video.indices), None
+        if "masks" in self.estimators and self.of_both:
+            found = self.estimate("masks", progress).masks
+            if found is not None and self.options.object in found.entities:
+                thing = self._stack(found.entities[self.options.object])
+        return GivenMasks(human=human, object=thing)
 
     def object_masks(self, progress: Callable[[float], None]) -> FoundObject:
         """Masks of each object alone, from an estimator that has seen the person's.
@@ -149,6 +208,14 @@ class EstimateReader:
         except ValueError as error:
             raise SourceError(f"estimators.{role}: {error}") from error
 
+    def people(self) -> tuple[FramePrompt, ...]:
+        """A box about everybody, from a quick look; see `Estimator.people`. Empty where files
+        beside the video say who is meant."""
+        if {"landmarks", "masks"} & set(self.source.beside):
+            return ()
+        estimator = self.estimators["landmarks"]
+        return estimator.people(self.request("landmarks"))
+
     def request(self, kind: Place) -> VideoRequest:
         """The video as estimators see it: whole, at its own size."""
         video, options = self.video, self.options
@@ -168,14 +235,16 @@ class EstimateReader:
             known=self._known() if kind == "object" else None,
         )
 
-    def _known(self) -> Estimates:
-        """What was found of the person; estimators keep their results, so this is fast."""
+    def _known(self) -> Estimates | None:
+        """What was found of people; estimators keep their results, so this is fast."""
+        if not self.options.people:
+            return None
         masks = self.estimate("masks", lambda _done: None).masks
         return Estimates(masks, self.estimate("landmarks", lambda _done: None).landmarks)
 
     def notes_on_person(self) -> tuple[str, ...]:
         """What the estimator of masks finds doubtful in those of the person."""
-        if "masks" not in self.estimators:
+        if "masks" not in self.estimators or not self.options.people:
             return ()
         masks = self.estimate("masks", lambda _done: None).masks
         return () if masks is None else masks.notes
@@ -189,28 +258,27 @@ class EstimateReader:
 
     def _entities(self, kind: Place) -> tuple[EntityRequest, ...]:
         options = self.options
-        person = _request(options, options.human, "human")
+        people = tuple(_request(options, name, "human") for name in options.people)
         thing = _request(options, options.object, "object")
         if kind == "object":
             return (thing, *(_request(options, n, "object") for n in options.further_objects))
         if kind == "masks" and kind in self.source.beside:
-            return tuple(e for e in (person, thing) if e.name in self.source.masked)
-        if not self.of_both:
-            return (person,)
-        return (person, thing)
+            return tuple(e for e in (*people, thing) if e.name in self.source.masked)
+        return (*people, thing) if self.of_both else people
 
     @property
     def of_both(self) -> bool:
         """The estimator of masks gives those of the object, too."""
         return self.options.find_object and "object" not in self.estimators
 
-    def _landmarks(self, progress: Callable[[float], None]) -> RawLandmarks:
+    def _landmarks(self, name: str, progress: Callable[[float], None]) -> RawLandmarks:
         tracks = self.estimate("landmarks", progress).landmarks
-        name = self.options.human
         who = f"estimators.landmarks: {_name(self.estimators['landmarks'])}"
         if name not in tracks:
             raise SourceError(f"{who} gave landmarks of {_listed(tracks)}, not of {name}")
         track: Landmarks = tracks[name]
+        if len(self.options.people) > 1:
+            who += f", {name}"
         return chosen_landmarks(
             track.image_xyzv, track.world_xyzv, self.video, who, track.provenance or "given"
         )

@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hoigs.core.errors import PluginError, SpecError
+from hoigs.core.npz import holds
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import ComponentSpec
 from hoigs.preparation.bodies.as_landmarks import BodyFileEstimator
-from hoigs.preparation.bodies.body_file import FileBody
+from hoigs.preparation.bodies.file_body import FileBody
 from hoigs.preparation.options import Place, PrepareOptions
 from hoigs.preparation.video.header import video_header
-from hoigs.preparation.video.source import Source, numbered_frames
+from hoigs.preparation.video.source import MEGASAM, VGGT, Source, numbered_frames
 from hoigs.preparation.video.span import Span
 
 # seconds of a processor a frame of 1280x720, about, as benchmarks/prepare_alone.py measures them;
@@ -88,11 +89,13 @@ class EstimatorPlan:
     Attributes:
         choices: what gives each kind of estimate.
         frames: of the video, about; None: unknown. notes: sentences about what was found.
+        cameras: the file or folder beside the video that has them; "": none.
     """
 
     choices: dict[Place, Choice]
     frames: int | None = None
     notes: tuple[str, ...] = ()
+    cameras: str = ""
 
     def specs(self) -> dict[Place, ComponentSpec]:
         """Estimators of the preset."""
@@ -115,8 +118,12 @@ class EstimatorPlan:
             seconds = 0.0 if choice.use in met and choice.place != "object" else choice.seconds
             met.add(choice.use)
             rows.append((choice.what, choice.use, choice.why, self._time(seconds)))
-        rows.append(("everything else", "hoigs", "cameras, body, object, scene, the clip",
-                     self._time(STAGES_COST)))  # fmt: skip
+        rest = "body, object, scene, the clip"
+        if self.cameras:
+            rows.append(("cameras", self.cameras, "lies beside the video", ""))
+        else:
+            rest = f"cameras, {rest}"
+        rows.append(("everything else", "hoigs", rest, self._time(STAGES_COST)))
         return rows
 
     def _time(self, seconds: float | None) -> str:
@@ -145,7 +152,16 @@ def plan_estimators(
         if choice is not None:
             found[place] = choice
     _check_prompt(found, options)
-    return EstimatorPlan(found, _frames(source.video, options))
+    known = source.cameras or source.colmap
+    cameras = "" if known is None else _cameras(known)
+    return EstimatorPlan(found, _frames(source.video, options), cameras=cameras)
+
+
+def _cameras(path: Path) -> str:
+    """Whose they are, and the file's name."""
+    programs = {"MegaSaM's": MEGASAM, "VGGT's": VGGT}
+    who = next((name for name, arrays in programs.items() if holds(path, arrays)), "")
+    return f"{who} {path.name}".strip() if path.is_file() else f"COLMAP's {path.name}"
 
 
 def _frames(video: Path, options: PrepareOptions) -> int | None:
@@ -176,6 +192,8 @@ def _choose(
         return Choice(place, use, "chosen by you", COST.get(use))
     if place == "object":
         return _object(source, options, given)
+    if place in ("landmarks", "masks") and not options.people:
+        return Choice(place, "none", "--person none", 0.0)
     if place in source.beside:
         files = source.beside[place]
         return Choice(place, files.use, f"{files.settings.get('path')} lies beside the video", 0.0)
@@ -207,11 +225,26 @@ def _of_preset(place: Place, options: PrepareOptions) -> Choice:
         why = "nothing beside the video; works without a network"
         if options.preset == "auto":
             why += " (--estimators hub: networks to download)"
+        if place == "landmarks":
+            why = f"{_people(options)}{why}"
     if place == "object":
         why = "; ".join(_shown(name, options) for name in options.objects)
         if not _installed(spec.use):
             return Choice(place, "none", f"{spec.use} is not installed", 0.0)
     return Choice(place, spec.use, why, COST.get(spec.use), spec)
+
+
+def _people(options: PrepareOptions) -> str:
+    """Whose, where there is a choice."""
+    shown = [name for name in options.people if name in options.prompts]
+    if not shown:
+        return ""
+    frames = {n: options.prompts[n].places() for n in shown}
+    texts = [
+        f"{n} in frame {', '.join('first' if at.frame is None else str(at.frame) for at in where)}"
+        for n, where in frames.items()
+    ]
+    return f"{'; '.join(texts)}; "
 
 
 def _shown(name: str, options: PrepareOptions) -> str:

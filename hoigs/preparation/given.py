@@ -70,11 +70,13 @@ def chosen_landmarks(
 
 @dataclass(frozen=True)
 class GivenMasks:
-    """Masks as the source has them: together, or the person's and perhaps the object's apart."""
+    """Masks as the source has them: together, or the person's and perhaps the object's apart; and
+    those of further people, all in one."""
 
     together: MaskStack | None = None
     human: MaskStack | None = None
     object: MaskStack | None = None
+    others: MaskStack | None = None
 
     def named(self) -> dict[str, MaskStack]:
         """Those that there are, by the name of the field."""

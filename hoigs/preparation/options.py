@@ -133,16 +133,28 @@ class PrepareOptions(ComponentConfig):
     )
     bodies: str | None = Field(
         default=None,
-        description="file of bodies that GVHMR or WHAM has fitted to the video, relative to its "
-        "folder; None: the one that lies beside it, if any",
+        description="file of bodies of GVHMR, WHAM, TRAM, PHALP or PromptHMR, relative to the "
+        "video's folder; None: the one that lies beside it, if any",
     )
     find_object: bool = Field(
         default=True, description="look for an object; False: the clip has the person alone"
+    )
+    find_person: bool = Field(
+        default=True, description="look for people; False: the clip has objects alone"
     )
     prompts: dict[str, Prompt] = Field(
         default_factory=dict, description="by entity, where or what it is"
     )
     human: str = Field(default="human", description="name of the person's entity")
+    everybody: bool = Field(
+        default=False,
+        description="fit all people who are seen by a quick look, where no prompt says who",
+    )
+    further_people: tuple[str, ...] = Field(
+        default=(),
+        description="names of more people, each with a prompt; the estimators of landmarks and "
+        "masks give those of all",
+    )
     object: str = Field(default="object", description="name of the object's entity")
     further_objects: tuple[str, ...] = Field(
         default=(),
@@ -154,6 +166,12 @@ class PrepareOptions(ComponentConfig):
         'rotation stays unknown; "texture": from hands, outlines and texture; "outline": its place '
         'and roll only; "auto": as a ball where its masks are round in all frames, or else by '
         "texture, and by outline where that cannot be",
+    )
+    object_size: float | None = Field(
+        default=None,
+        gt=0,
+        description="of the object across, metres, in a clip without people, where it sets the "
+        "unit of the world; None: 0.3. With people their height does",
     )
     ball_radius: float | None = Field(
         default=None,
@@ -187,6 +205,11 @@ class PrepareOptions(ComponentConfig):
         return self.camera in ("static", "turning", "sfm")
 
     @property
+    def people(self) -> tuple[str, ...]:
+        """Names of all people, the first one's first."""
+        return (self.human, *self.further_people) if self.find_person else ()
+
+    @property
     def objects(self) -> tuple[str, ...]:
         """Names of all objects, the first one's first."""
         return (self.object, *self.further_objects)
@@ -211,6 +234,12 @@ class PrepareOptions(ComponentConfig):
         given = [n for n in ("focal", "intrinsics", "calibration") if getattr(self, n) is not None]
         if len(given) > 1:
             raise ValueError(f"{' and '.join(given)} both give the focal length: leave one out")
+        return self
+
+    @model_validator(mode="after")
+    def _somebody_or_something(self) -> PrepareOptions:
+        if not (self.find_person or self.find_object):
+            raise ValueError("neither people nor objects are looked for: nothing would be fitted")
         return self
 
     @model_validator(mode="after")

@@ -21,6 +21,7 @@ from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.body.silhouette import posed
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.nobody import Nobody
 
 SEEN, RARELY = 0.3, 0.2  # visibility; share of frames: a part seen in fewer of them is a guess
 PARTS = {"head": (0, 7, 8), "arms": (13, 14, 15, 16), "legs": (25, 26, 27, 28)}  # landmarks
@@ -62,6 +63,36 @@ class FittedBody:
         return float(torch.stack(depths).median())
 
 
+@dataclass(frozen=True)
+class FittedPeople:
+    """Everybody's body, by name, the first one's first; in a clip of objects alone, `nobody`."""
+
+    people: dict[str, FittedBody]
+    nobody: Nobody | None = None
+
+    @property
+    def first(self) -> FittedBody | None:
+        return next(iter(self.people.values()), None)
+
+    @property
+    def world(self) -> FittedBody | Nobody:
+        """What gives the world its unit, its floor and its depth."""
+        found = self.first or self.nobody
+        assert found is not None  # one of both is made
+        return found
+
+    def warnings(self) -> list[str]:
+        """Sentences for the report, which name the person where there are several."""
+        if self.nobody is not None:
+            return self.nobody.warnings
+        several = len(self.people) > 1
+        return [
+            f"{name}: {text}" if several else text
+            for name, person in self.people.items()
+            for text in person.warnings
+        ]
+
+
 def fit_person(
     landmarks: LandmarkTrack,
     track: CameraTrack,
@@ -83,6 +114,9 @@ def fit_person(
         height: of the person who stands upright, metres; None: the body model's mean.
     """
     strays = landmarks.strays()
+    jumps = landmarks.without(strays).jumps()
+    landmarks = landmarks.without(strays | jumps)
+    strays |= landmarks.strays()  # single frames between those that jumped
     landmarks = landmarks.without(strays)
     options = FitOptions(scale=not track.metric, steps=steps)
     if height is not None:
@@ -113,7 +147,8 @@ def fit_person(
         warnings=[
             *_warnings(residual, found, solid, track.cameras),
             *_unseen(landmarks),
-            *_strays(strays),
+            *_left_out(strays, "stand alone between frames without any"),
+            *_left_out(jumps, "beside frames without any are off the person's way"),
         ],
     )
 
@@ -124,14 +159,11 @@ def stature(body: BodyModel) -> float:
     return float(vertices[:, 1].max() - vertices[:, 1].min())
 
 
-def _strays(strays: Bool[Tensor, " F"]) -> list[str]:
-    frames = strays.nonzero()[:, 0].tolist()
+def _left_out(which: Bool[Tensor, " F"], why: str) -> list[str]:
+    frames = which.nonzero()[:, 0].tolist()
     if not frames:
         return []
-    return [
-        f"landmarks of {len(frames)} frames ({ranges(frames)}) stand alone between frames without "
-        "any, and were left out"
-    ]
+    return [f"landmarks of {len(frames)} frames ({ranges(frames)}) {why}, and were left out"]
 
 
 def _warnings(residual: float, found: int, solid: int, cameras: Sequence[Camera]) -> list[str]:

@@ -15,25 +15,35 @@ import hoigs
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.clip import BodyTrack
-from hoigs.preparation.bodies.body_file import FileBody
+from hoigs.preparation.bodies.file_body import FileBody
 from hoigs.preparation.body.silhouette import silhouette
 from hoigs.preparation.cameras.calibration import calibration_file
 from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras, known_lens
-from hoigs.preparation.entity_masks import EntityMasks, disjoint, entity_masks
+from hoigs.preparation.choose_people import chosen_people
+from hoigs.preparation.entity_masks import (
+    EntityMasks,
+    disjoint,
+    entity_masks,
+    without_others,
+)
 from hoigs.preparation.estimates import (
     EstimateReader,
     Estimators,
     FoundObject,
+    RawEstimates,
     UndistortedEstimates,
+    UndistortedPerson,
     identity,
     paths_of,
 )
+from hoigs.preparation.fit_people import fit_people
 from hoigs.preparation.given import GivenMasks
 from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.nobody import nobody
 from hoigs.preparation.objects.ball import BallTrack, load_ball, refine_ball
 from hoigs.preparation.objects.make_object import MadeObject
 from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.person import FittedBody, fit_person
+from hoigs.preparation.person import FittedPeople
 from hoigs.preparation.place_objects import place_objects
 from hoigs.preparation.prompts import check_prompts, placed_prompts
 from hoigs.preparation.saved import from_result, to_result
@@ -55,7 +65,7 @@ from hoigs.preparation.video.header import missing_frames
 from hoigs.preparation.video.source import NobodyFoundError, Source, SourceError
 from hoigs.preparation.video.span import Span
 
-FORMAT = 8  # of what the stages keep; another number makes older results unread
+FORMAT = 10  # of what the stages keep; another number makes older results unread
 LARGEST, REDUCED = 1920, 1280  # longer sides, pixels: of frames that are kept, and of smaller ones
 T = TypeVar("T")
 
@@ -73,10 +83,11 @@ class Pipeline:
         stages: Stages,
         work: WorkFolder,
         bodies: FileBody | None = None,
+        announce: Callable[[str], object] = str,
     ) -> None:
         self.source, self.out, self.body = source, out, body
         self.options, self.stages, self.work = options, stages, work
-        self.estimators, self.bodies = estimators, bodies
+        self.estimators, self.bodies, self.announce = estimators, bodies, announce
         self.warnings: list[str] = []
         self.provenance: dict[str, str] = {}
         self.worth_keeping = False
@@ -195,6 +206,22 @@ class Pipeline:
             self.source, self.video, self.options, self.estimators, self.work.root / "estimators"
         )
         self._without_unusable_depth()
+        self._choose_people()
+        try:
+            self.raw = self._people_and_masks()
+        except NobodyFoundError as error:
+            if self.options.object not in self.options.prompts or not self.options.find_object:
+                self.worth_keeping = False
+                raise
+            said = f"{error}; so the clip has the object alone (--person X,Y@FRAME shows somebody)"
+            self.announce(said)
+            self.warnings.append(said)
+            self.options = self.options.model_copy(update={"find_person": False})
+            self.reader = replace(self.reader, options=self.options)
+            self.raw = self._people_and_masks()
+        self.warnings += self.reader.notes_on_person()
+
+    def _people_and_masks(self) -> RawEstimates:
         beside = self.source.beside
         used = {k: e for k, e in self.estimators.items() if k in ("landmarks", "masks")}
         paths = [
@@ -208,19 +235,25 @@ class Pipeline:
             self._prompts(*((self.options.object,) if self.reader.of_both else ())),
         ]
         self.worth_keeping |= any(kind not in beside for kind in used)
-        try:
-            self.raw = self._stage(
-                "evidence", lambda: self.reader.landmarks_and_masks(self.stages.advance), made_from
-            )
-        except NobodyFoundError:
-            self.worth_keeping = False
-            raise
-        self.warnings += self.reader.notes_on_person()
+        return self._stage(
+            "evidence", lambda: self.reader.landmarks_and_masks(self.stages.advance), made_from
+        )
+
+    def _choose_people(self) -> None:
+        """Takes one of several people, or all, where nobody was clicked on, and says so first."""
+        people, prompts = self.options.people, self.options.prompts
+        if not people or any(name in prompts for name in people):
+            return
+        self.options, said = chosen_people(self.options, self.reader.people())
+        if said:
+            self.announce(said)
+            self.warnings.append(said)
+            self.reader = replace(self.reader, options=self.options)
 
     def _prompts(self, *names: str) -> dict[str, Any]:
-        """The prompts of the person and of `names`, as JSON."""
+        """The prompts of people and of `names`, as JSON."""
         prompts = self.options.prompts
-        wanted = (self.options.human, *names)
+        wanted = (*self.options.people, *names)
         return {n: prompts[n].model_dump(mode="json") for n in wanted if n in prompts}
 
     def _object_masks(self) -> None:
@@ -286,10 +319,19 @@ class Pipeline:
 
     def _inputs(self) -> None:
         def make() -> UndistortedEstimates:
-            landmarks, masks = self.raw.landmarks, self.raw.masks
-            placed = self.track.undistort, self.track.positions
+            raw, placed = self.raw, (self.track.undistort, self.track.positions)
+            undistort, rows = placed
             return UndistortedEstimates(
-                landmarks.undistorted(*placed), masks.undistorted(*placed), self._ball()
+                None if raw.landmarks is None else raw.landmarks.undistorted(*placed),
+                raw.masks.undistorted(*placed),
+                self._ball(),
+                {
+                    name: UndistortedPerson(
+                        person.landmarks.undistorted(*placed),
+                        MaskStack(undistort.mask(person.masks[i]) for i in rows),
+                    )
+                    for name, person in raw.further.items()
+                },
             )
 
         ball = self.source.ball
@@ -303,43 +345,53 @@ class Pipeline:
         return refine_ball(rough, self.images())
 
     def _body(self) -> None:
-        def make() -> FittedBody:
-            found, video = self.estimates, self.video
-            times = torch.tensor(video.times)
-            person = fit_person(
-                found.landmarks, self.track, self.body, self.options.fit_steps,
-                self.stages.advance, self.raw.landmarks.source, found.masks.persons(found.ball),
-                times, None if self.bodies is None else self.bodies.rotations(video.indices),
-                self.options.person_height,
-            )  # fmt: skip
-            self.provenance["body"] = person.provenance
-            if self.bodies is not None:
-                self.provenance["body"] += f"; {self.bodies.used(video.indices)}"
-            self.warnings.extend(person.warnings)
-            return person
-
         model: list[Any] = [
             type(self.body).__qualname__, self.body.num_betas, len(self.body.parents)
         ]  # fmt: skip
         if self.bodies is not None:
             model.append(fingerprint([self.bodies.path]))
-        self.person = self._stage("body", make, model)
-        scale = self.person.scene_scale
+        if not self.options.people:  # its size is the unit
+            model.append(self._keys["object_masks"])
+        self.people: FittedPeople = self._stage("body", self._fit_people, model)
+        scale = self.people.world.scene_scale
         self.cameras = [camera.scaled(scale) for camera in self.track.cameras]
+
+    def _fit_people(self) -> FittedPeople:
+        if not self.options.people:
+            world = nobody(self._given_masks().object, self.track, self.options.object_size)
+            found = FittedPeople({}, world)
+            self.provenance["body"] = world.provenance
+        else:
+            fitted = fit_people(
+                self.options.people, self.estimates, self.raw, self.track, self.body,
+                self.options, self.video, self.bodies, self.stages.advance,
+            )  # fmt: skip
+            found = FittedPeople(fitted)
+            for k, (name, person) in enumerate(fitted.items()):
+                self.provenance[f"body {name}" if k else "body"] = person.provenance
+        self.warnings += found.warnings()
+        return found
 
     def _masks(self) -> None:
         def make() -> EntityMasks:
+            first = self.people.first
             human, object_masks, text = entity_masks(
                 self._given_masks(), self.estimates.ball, self.images, self._silhouettes,
-                self.person.found,
+                np.zeros(len(self.video), bool) if first is None else first.found,
             )  # fmt: skip
             found = self.found_object
             further: dict[str, MaskStack] = {}
             self.provenance["masks"] = text if found is None else f"{text}: {found.provenance}"
             if found is not None and found.further:
                 human, object_masks, further = self._further(human, object_masks, found)
-            blank = self._blank([human, object_masks, *further.values()])
-            return EntityMasks(human, object_masks, blank, further)
+            things = [object_masks, *further.values()]
+            people = without_others(
+                {name: person.masks for name, person in self.estimates.further.items()},
+                human,
+                things,
+            )
+            blank = self._blank([human, *people.values(), *things])
+            return EntityMasks(human, object_masks, blank, further, people)
 
         self.masks = self._stage("masks", make)
 
@@ -391,7 +443,8 @@ class Pipeline:
         return blank
 
     def _silhouettes(self) -> MaskStack:
-        pairs = zip(self.person.posed(self.body), self.cameras, strict=True)
+        assert self.people.first is not None  # masks of nobody are not separated
+        pairs = zip(self.people.first.posed(self.body), self.cameras, strict=True)
         return MaskStack(silhouette(v, self.body.faces, c) for (v, _), c in pairs)
 
     def _object(self) -> None:
@@ -401,9 +454,8 @@ class Pipeline:
 
     def _place_objects(self) -> dict[str, MadeObject]:
         placed = place_objects(
-            self.masks, self.estimates.ball, self.estimates.landmarks.image, self.cameras,
-            self.person.joints, self.body.parents, self.images, self.options, self.video.fps,
-            self.stages.advance,
+            self.masks, self.estimates, self.people, self.cameras, self.body.parents, self.images,
+            self.options, self.video.fps, self.stages.advance,
         )  # fmt: skip
         self.provenance |= placed.provenance
         self.warnings += placed.warnings
@@ -427,12 +479,15 @@ class Pipeline:
         if "depth" not in self.estimators:
             return None
         self.depth_maps = self._read_depth()
-        surfaces = [vertices for vertices, _ in self.person.posed(self.body)]
-        points = self.track.points * self.person.scene_scale
+        first = self.people.first
+        surfaces = [] if first is None else [vertices for vertices, _ in first.posed(self.body)]
+        points = self.track.points * self.people.world.scene_scale
         fit = fit_depth(
             self.depth_maps,
             lambda i: seen_points(points, self.cameras[i], self.masks.moving(i)),
-            lambda i: seen_surface(surfaces[i], self.cameras[i], self.masks.human[i]),
+            lambda i: seen_surface(
+                surfaces[i] if surfaces else torch.zeros(0, 3), self.cameras[i], self.masks.human[i]
+            ),
             len(self.video),
             self.stages.advance,
         )
@@ -454,7 +509,7 @@ class Pipeline:
 
     def _find_scene(self) -> ScenePoints:
         if not self.track.static:
-            scale = self.person.scene_scale
+            scale = self.people.world.scene_scale
             scene = camera_scene(
                 self.track.points * scale, self.track.colors, self.masks, self.cameras, self.images,
                 self.options.scene_points,
@@ -462,7 +517,8 @@ class Pipeline:
         else:
             scene = static_scene(
                 self.images, self.masks, self.cameras,
-                ground=self.person.ground, distance=self.person.distance(self.cameras),
+                ground=self.people.world.ground,
+                distance=self.people.world.distance(self.cameras),
                 backdrop=self.options.backdrop, count=self.options.scene_points,
                 metres=None if self.depth is None else self._metres_of,
             )  # fmt: skip
@@ -483,9 +539,17 @@ class Pipeline:
         """The final masks of an object."""
         return self.masks.object if name == self.options.object else self.masks.further[name]
 
-    @property
-    def body_track(self) -> BodyTrack:
-        return BodyTrack(self.options.body, self.person.poses, self.provenance["body"])
+    def people_masks(self) -> dict[str, MaskStack]:
+        """The final masks of everybody."""
+        names = list(self.people.people)
+        return dict(zip(names, (self.masks.human, *self.masks.people.values()), strict=False))
+
+    def body_tracks(self) -> dict[str, BodyTrack]:
+        """Everybody's poses."""
+        return {
+            name: BodyTrack(self.options.body, person.poses, person.provenance)
+            for name, person in self.people.people.items()
+        }
 
 
 def save_cameras(chosen: ChosenCameras) -> Result:

@@ -6,17 +6,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
-from jaxtyping import Float
-from torch import Tensor
-
 from hoigs.core.diagnostics import ranges
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.entity_masks import EntityMasks
+from hoigs.preparation.estimates import UndistortedEstimates
 from hoigs.preparation.masks.separate import Images
-from hoigs.preparation.objects.ball import BallTrack
 from hoigs.preparation.objects.doubts import doubts
+from hoigs.preparation.objects.hands import nearest_person
 from hoigs.preparation.objects.make_object import MadeObject, make_object
 from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.person import FittedPeople
 
 
 @dataclass(frozen=True)
@@ -34,10 +33,9 @@ class PlacedObjects:
 
 def place_objects(
     masks: EntityMasks,
-    ball: BallTrack | None,
-    landmarks: Float[Tensor, "F 33 3"],
+    estimates: UndistortedEstimates,
+    people: FittedPeople,
     cameras: Sequence[Camera],
-    joints: Float[Tensor, "F J 3"],
     parents: Sequence[int],
     images: Images,
     options: PrepareOptions,
@@ -47,11 +45,13 @@ def place_objects(
     """Tracks and shapes of all objects that the masks show.
 
     Args:
-        ball: of the first object, if its disc was tracked. landmarks: x, y in pixels and
-            visibility. joints: of the fitted body, metres, and `parents` of each.
+        estimates: with the first object's disc, if it was tracked as a ball, and the first
+            person's landmarks. people: the fitted bodies; an object goes with the hands of the one
+            who is nearest to it. parents: of their joints.
         images: gives the undistorted frames anew on every call.
     """
     placed, count = PlacedObjects(), len(options.objects)
+    humans, ball = masks.humans(), estimates.ball
     for k, name in enumerate(options.objects):
         first = k == 0
         stack = masks.object if first else masks.further.get(name)
@@ -61,14 +61,23 @@ def place_objects(
             _without(name, what, options, placed)
             continue
         assert stack is not None
+        joints = {owner: person.joints for owner, person in people.people.items()}
+        owner = nearest_person(joints, stack, cameras)
         made = make_object(
-            disc, stack, masks.human, masks.other_objects(None if first else name), cameras,
-            joints, parents, images, way=options.object_track, radius=options.ball_radius,
-            count=options.object_points, fps=fps, progress=partial(_share, progress, k, count),
+            disc, stack, humans, masks.other_objects(None if first else name), cameras,
+            None if owner is None else people.people[owner].joints, parents, images,
+            way=options.object_track, radius=options.ball_radius, count=options.object_points,
+            fps=fps, progress=partial(_share, progress, k, count),
+            depths=None if people.nobody is None else people.nobody.depths,
         )  # fmt: skip
         placed.objects[name] = made
         placed.provenance["object" if first else f"object {name}"] = made.track.provenance
-        said = [*doubts(stack, landmarks), *_remarks(made, disc is not None)]
+        if len(people.people) > 1:
+            placed.provenance[f"hands at {name}"] = (
+                f"{owner}'s, who is nearest to it in most frames"
+            )
+        marks = None if estimates.landmarks is None else estimates.landmarks.image
+        said = [*doubts(stack, marks), *_remarks(made, disc is not None)]
         placed.warnings.extend(text.replace("the object", what) for text in said)
     return placed
 

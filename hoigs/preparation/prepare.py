@@ -91,7 +91,9 @@ def prepare(
         object: where the object is, in place of its prompt in `options`: "640,402@0", or several
             such (`prompts.parse_prompts`); "none": there is none. Without it, the clicks that
             `annotate` stored beside the video hold.
-        person: which person to fit where several are seen, likewise: "320,210@0".
+        person: which person to fit where several are seen, likewise: "320,210@0"; several people
+            by names, "anna=320,210"; "all": everybody seen; "none": nobody, the clip has
+            objects alone.
         overrides: any field likewise: "estimators.masks.use=estimator:masks-files".
         options: ready-made, or a YAML or TOML file.
         body: the model to fit, whose key is `options.body`; by default it is made from that key.
@@ -102,7 +104,8 @@ def prepare(
             Or a preset, in place of `options.preset`.
         yes: install and download what is needed. consent: called with a question before that,
             where `yes` does not answer it; None: nothing is downloaded.
-        announce: called with the plan before work begins.
+        announce: called with the plan before work begins; and, where several people are seen, with
+            one of notes alone that say who is followed, before they are.
         allow_commands: let `options.estimators` run the programs that they name.
 
     Raises:
@@ -188,11 +191,14 @@ def _run(
     own = {} if isinstance(estimators, str) else (estimators or {})
     chosen = {**named, **own}
     bodies = body_beside(source, options.bodies)
+    if bodies is not None and len(options.people) != 1:
+        stored += (f"{bodies.path.name} is not used: it is of one person",)
+        bodies = None
     if bodies is not None and bodies.gives_landmarks(chosen, options.bodies is not None):
         body = body or _body(options.body)
         chosen["landmarks"] = BodyFileEstimator(bodies.path, body)
     found = find_source(
-        source, human=options.human, object_name=options.object, given=set(chosen),
+        source, people=options.people, object_name=options.object, given=set(chosen),
         own_cameras=options.own_cameras,
         complete=options.preset == "files",
     )  # fmt: skip
@@ -215,7 +221,10 @@ def _run(
         cleanup.remove()
         for name in with_dependents(redo):
             work.forget(name)
-        pipeline = Pipeline(found, out, body, options, chosen, stages, work, bodies)
+        pipeline = Pipeline(
+            found, out, body, options, chosen, stages, work, bodies,
+            lambda said: announce and announce(EstimatorPlan({}, notes=(said,))),
+        )  # fmt: skip
         try:
             pipeline.run(until)
             report = None if until else write_clip_folder(pipeline, cleanup)

@@ -9,7 +9,7 @@ from typing import Any
 
 from hoigs.core.errors import SpecError
 from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.prompts import named_objects, parse_prompts, split_name
+from hoigs.preparation.prompts import named_objects, named_people, split_name
 
 ENDING = ".prompts.json"
 VERSION = 1
@@ -84,7 +84,7 @@ def with_stored(
     Prompts that `options` have come before those of the file.
 
     Raises:
-        SpecError: the file cannot be read, or names several persons.
+        SpecError: the file cannot be read.
     """
     stored = None if video is None else read_prompts(video)
     if video is None or stored is None:
@@ -92,7 +92,7 @@ def with_stored(
     file = prompt_file(video).name
     prompts, said = options.prompts, []
     explicit = {"object": options.object in prompts or not options.find_object,
-                "person": options.human in prompts}  # fmt: skip
+                "person": options.human in prompts or not options.find_person}  # fmt: skip
     for kind, texts in (("person", stored.person), ("object", stored.object)):
         if not texts:
             continue
@@ -101,15 +101,8 @@ def with_stored(
             continue
         split = [split_name(text) for text in texts]
         if kind == "person":
-            if len({name for name, _ in split}) > 1:
-                raise SpecError(
-                    f"{file} has {len({n for n, _ in split})} persons; prepare follows one: remove "
-                    "the others with `hoigs annotate`"
-                )
-            name = split[0][0] or options.human
-            prompt = parse_prompts([place for _, place in split], "--person")
-            found: dict[str, Any] = {"human": name, "prompts": {**options.prompts, name: prompt}}
-            names = [name]
+            found: dict[str, Any] = named_people(split, options)
+            names = [found["human"], *found["further_people"]]
         else:
             found = named_objects(split, options)
             names = [found["object"], *found["further_objects"]]

@@ -12,7 +12,7 @@ from hoigs.preparation.video.frames import FrameList
 
 _NUMBER = r"\d+(?:\.\d+)?"
 _PLACE = re.compile(rf"\s*([-!]?)\s*({_NUMBER}(?:\s*,\s*{_NUMBER})+)\s*(?:@\s*(\d+))?\s*")
-NONE = "none"
+NONE, ALL = "none", "all"
 HOW = (
     '"640,402" is a point on it in the first frame used, "640,402@120" in frame 120 of the '
     'video, "-700,380" a point that is not on it, "600,350,700,450" its box x0,y0,x1,y1, '
@@ -112,17 +112,57 @@ def with_prompts(
     elif texts:
         update |= named_objects(named, options)
     if person := [person] if isinstance(person, str) else list(person):
-        split = [split_name(text) for text in person]
-        if any(place.strip() == NONE for _, place in split):
-            raise SpecError("--person none: a clip needs a person; leave --person out")
-        names = sorted({name for name, _ in split if name})
-        if len(names) > 1:
-            raise SpecError(f"--person: {' and '.join(names)} are given; one person is fitted")
-        human = names[0] if names else options.human
-        prompt = parse_prompts([place for _, place in split], "--person")
-        prompts = {**update.get("prompts", options.prompts), human: prompt}
-        update |= {"human": human, "prompts": prompts}
+        update |= _people(person, options, update)
     return PrepareOptions.model_validate({**options.model_dump(), **update}) if update else options
+
+
+def _people(
+    texts: Sequence[str], options: PrepareOptions, update: dict[str, Any]
+) -> dict[str, Any]:
+    """Fields of the options that the texts of --person set; `update`: those set before.
+
+    Raises:
+        SpecError: a text is wrong.
+    """
+    named = [split_name(text) for text in texts]
+    if any(place.strip() == NONE for _, place in named):
+        if len(texts) > 1 or named[0][0]:
+            raise SpecError(
+                "--person none says that there is nobody: leave the others out, and names"
+            )
+        if not update.get("find_object", options.find_object):
+            raise SpecError("--person none and --object none leave nothing to fit: give one")
+        return {"find_person": False}
+    if any(place.strip() == ALL for _, place in named):
+        if len(texts) > 1 or named[0][0]:
+            raise SpecError("--person all takes everybody: leave the others out, and names")
+        return {"everybody": True}
+    objects = (update.get("object", options.object), *update.get("further_objects", ()))
+    found = named_people(named, options, objects)
+    return found | {"prompts": {**update.get("prompts", {}), **found["prompts"]}}
+
+
+def named_people(
+    named: Sequence[tuple[str, str]], options: PrepareOptions, objects: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Names and prompts, as fields of the options, of people given by (name, place).
+
+    Raises:
+        SpecError: a place is wrong, or a person has an object's name.
+    """
+    places: dict[str, list[str]] = {}
+    for name, place in named:
+        places.setdefault(name or options.human, []).append(place)
+    for name in places:
+        if name in objects:
+            raise SpecError(f"--person {name}=: {name} is an object's name; give another")
+    prompts = {name: parse_prompts(texts, "--person") for name, texts in places.items()}
+    first, *further = prompts
+    return {
+        "human": first,
+        "further_people": tuple(further),
+        "prompts": {**options.prompts, **prompts},
+    }
 
 
 def named_objects(

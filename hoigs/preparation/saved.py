@@ -23,13 +23,20 @@ from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.cameras.choose import ChosenCameras
 from hoigs.preparation.entity_masks import EntityMasks
-from hoigs.preparation.estimates import FoundObject, RawEstimates, UndistortedEstimates
+from hoigs.preparation.estimates import (
+    FoundObject,
+    RawEstimates,
+    RawPerson,
+    UndistortedEstimates,
+    UndistortedPerson,
+)
 from hoigs.preparation.given import GivenMasks, RawLandmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.nobody import Nobody
 from hoigs.preparation.objects.ball import BallTrack
 from hoigs.preparation.objects.make_object import MadeObject
 from hoigs.preparation.objects.tracked import ObjectConfidence
-from hoigs.preparation.person import FittedBody
+from hoigs.preparation.person import FittedBody, FittedPeople
 from hoigs.preparation.scene.depth import DepthFit
 from hoigs.preparation.scene.scene_points import ScenePoints
 from hoigs.preparation.stages.work_folder import Result
@@ -39,8 +46,9 @@ CLASSES = {
     found.__name__: found
     for found in (
         BallTrack, BodyPose, CameraTrack, ChosenCameras, DepthFit, EntityMasks, FittedBody,
-        FoundObject, FrameList, GivenMasks, LandmarkTrack, Lens, MadeObject, ObjectConfidence,
-        ObjectTrack, RawEstimates, RawLandmarks, ScenePoints, UndistortedEstimates,
+        FittedPeople, FoundObject, FrameList, GivenMasks, LandmarkTrack, Lens, MadeObject, Nobody,
+        ObjectConfidence, ObjectTrack, RawEstimates, RawLandmarks, RawPerson, ScenePoints,
+        UndistortedEstimates, UndistortedPerson,
     )
 }  # fmt: skip
 

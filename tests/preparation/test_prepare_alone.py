@@ -10,12 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tiny import FRAMES, HEIGHT, WIDTH, landmarks, masks
-from tiny_mediapipe import FAKE, FAKE_CV2
+from tiny_mediapipe import FAKE, FAKE_CV2, FAKE_LOOK
 
 from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.environments.managed import MARKER, EnvironmentAbsentError
 from hoigs.core.errors import HoigsError, SpecError
-from hoigs.core.interfaces.estimator import EntityMasks, Estimates, Estimator, LazyFrames
+from hoigs.core.interfaces.estimator import (
+    EntityMasks,
+    Estimates,
+    Estimator,
+    FramePrompt,
+    Landmarks,
+    LazyFrames,
+)
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.estimators.common.environments import MEDIAPIPE
 from hoigs.plugins.readers.clip import ClipFolderReader
@@ -49,6 +56,7 @@ def environment(alone: Path, tmp_path: Path) -> None:
     np.savez(known, **landmarks())
     (package / "__init__.py").write_text(FAKE.replace("KNOWN", str(known)))
     (package.parent / "cv2.py").write_text(FAKE_CV2)
+    (package.parent / "mediapipe_look.py").write_text(FAKE_LOOK.replace("PEOPLE", "[]"))
     start = f"import sys, runpy; sys.path.insert(0, {str(package.parent)!r}); "
     start += "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
     python = MEDIAPIPE.folder / "bin" / "python"
@@ -148,6 +156,78 @@ def test_two_objects_are_followed(alone: Path, environment: None, tmp_path: Path
     assert report.further_objects["box"]["object_observed"] == 1
     assert {"object", "object box"} <= set(report.provenance)
     assert {"box seen", "box's poses", "mask of box"} <= {row[0] for row in report.rows()}
+
+
+class Two(Estimator):
+    """The tiny person, and the same again to the right."""
+
+    provides = frozenset({"landmarks", "masks"})
+
+    def __init__(self) -> None:
+        pass
+
+    def people(self, video) -> tuple[FramePrompt, ...]:
+        return (FramePrompt(3, (), (40, 8, 56, 60)), FramePrompt(3, (), (70, 8, 86, 60)))
+
+    def estimate(self, video, progress=None) -> Estimates:
+        names = video.named("human")
+        assert all(e.prompts for e in video.entities if e.kind == "human")
+        tracks, stacks = {}, {}
+        for name, shift in zip(names, (0, 30), strict=False):
+            known = landmarks()
+            known["image_xyzv"][..., 0] += shift
+            tracks[name] = Landmarks(known["image_xyzv"], known["world_xyzv"])
+            stacks[name] = LazyFrames(
+                video.frames, lambda i, s=shift: np.roll(np.logical_or(*masks(i)), s, 1)
+            )
+        return Estimates(EntityMasks(stacks), tracks)
+
+
+@pytest.mark.parametrize("person", ["all", ("anna=48,30", "ben=78,30"), ()])
+def test_several_people_are_fitted(alone: Path, tmp_path: Path, person) -> None:
+    out, two, notes = tmp_path / "clip", Two(), []
+    report = prepare(
+        alone, out, object="none", person=person, options=OPTIONS, body=AnnyBody(),
+        estimators={"landmarks": two, "masks": two}, announce=lambda plan: notes.extend(plan.notes),
+    )  # fmt: skip
+    assert check_clip(out) == []
+    clip = ClipFolderReader().read(out)
+    names = {"all": ["human", "human2"], (): ["human"]}.get(person, ["anna", "ben"])
+    assert (
+        list(clip.bodies) == names and [n for n in clip.kinds if clip.kinds[n] == "human"] == names
+    )
+    assert report.further_people.keys() == set(names[1:])
+    if person in ((), "all"):
+        assert notes and notes[0].startswith("2 people are seen in frame 3, at 48,34, 78,34: ")
+        assert notes[0] in report.warnings
+    if names[1:]:
+        first, second = (clip[4].masks[n].numpy() > 0 for n in names)
+        assert first.any() and second.any() and not (first & second).any()
+        apart = (clip.bodies[names[1]].poses.transl - clip.bodies[names[0]].poses.transl)[:, 0]
+        assert apart.mean() == pytest.approx(30 / (0.8 * WIDTH) * 2.8, rel=0.15)
+
+
+def test_a_clip_of_an_object_alone(alone: Path, tmp_path: Path) -> None:
+    class Ball(Estimator):
+        provides = frozenset({"masks"})
+
+        def __init__(self) -> None:
+            pass
+
+        def estimate(self, video, progress=None) -> Estimates:
+            assert video.known is None and video.named("human") == ()
+            return Estimates(EntityMasks({"object": LazyFrames(FRAMES, lambda i: masks(i)[1])}))
+
+    out = tmp_path / "clip"
+    report = prepare(
+        alone, out, person="none", object="20,36", options=OPTIONS, body=AnnyBody(),
+        estimators={"object": Ball()},
+    )  # fmt: skip
+    assert check_clip(out) == [] and report.body_residual_px is None
+    clip = ClipFolderReader().read(out)
+    assert not clip.bodies and set(clip.objects) == {"object"}
+    assert "nobody" in report.provenance["body"] and "--object-size" not in report.to_markdown()
+    assert any("taken to be 0.3 m" in text for text in report.warnings)
 
 
 def test_without_the_environment_nothing_is_done(alone: Path, tmp_path: Path) -> None:

@@ -94,7 +94,19 @@ def test_a_person_is_chosen_as_an_object_is() -> None:
     assert at.frame == 3 and at.points == [(320, 210, True), (500, 200, False)]
     assert options.prompts["object"].points == [(640, 402, True)]
     assert with_prompts(PrepareOptions(), (), person="anna=320,210").human == "anna"
-    with pytest.raises(SpecError, match="needs a person"):
-        with_prompts(PrepareOptions(), (), person="none")
-    with pytest.raises(SpecError, match="anna and ben are given"):
-        with_prompts(PrepareOptions(), (), person=["anna=3,2", "ben=5,2"])
+    alone = with_prompts(PrepareOptions(), "ball=3,4", person="none")
+    assert alone.people == () and alone.objects == ("ball",)
+    with pytest.raises(SpecError, match="leave nothing to fit"):
+        with_prompts(PrepareOptions(), "none", person="none")
+    with pytest.raises(SpecError, match="leave the others out"):
+        with_prompts(PrepareOptions(), person=["none", "3,4"], texts=())
+
+
+def test_several_people_have_names() -> None:
+    options = with_prompts(PrepareOptions(), "9,9", person=["anna=3,2", "ben=5,2", "anna=4,2@7"])
+    assert options.people == ("anna", "ben") and len(options.prompts["anna"].places()) == 2
+    assert set(options.prompts) == {"object", "anna", "ben"}
+    both = with_prompts(PrepareOptions(), (), person=["3,2", "anna=5,2"])
+    assert both.people == ("human", "anna")
+    with pytest.raises(SpecError, match="ball is an object's name"):
+        with_prompts(PrepareOptions(), "ball=3,4", person="ball=3,2")

@@ -35,6 +35,17 @@ class Pose:
 solutions = Box(pose=Box(Pose=Pose), selfie_segmentation=Box(SelfieSegmentation=Selfie))
 """
 
+# people whom a quick look finds in each frame: how sure, hips, side of the square
+FAKE_LOOK = """
+class Look:
+    def __init__(self, complexity):
+        pass
+    def people(self, image):
+        return PEOPLE
+    def faceless(self, image, found):
+        return []
+"""
+
 # what the script takes of OpenCV
 FAKE_CV2 = """
 import numpy

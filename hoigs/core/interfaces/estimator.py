@@ -280,6 +280,15 @@ class Estimator(Configurable, ABC):
         """
         return ()
 
+    def people(self, video: VideoRequest) -> tuple[FramePrompt, ...]:
+        """A box about everybody in one frame, from a quick look at a few of them, the first that
+        of the one whom it would follow; empty where it does not look.
+
+        Raises:
+            HoigsError: as `estimate`.
+        """
+        return ()
+
     @abstractmethod
     def estimate(self, video: VideoRequest, progress: Progress = no_progress) -> Estimates:
         """The estimates, lazily where it is large; callers pass it through `checked`.

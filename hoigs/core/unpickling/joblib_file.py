@@ -17,7 +17,7 @@ import numpy as np
 
 from hoigs.core.errors import ClipError
 from hoigs.core.npz import MOST_RATIO, SMALL_BYTES
-from hoigs.core.unpickling.pickles import refuse_unknown
+from hoigs.core.unpickling.pickles import refuse_unknown, storage
 
 WRAPPER = ("joblib.numpy_pickle", "NumpyArrayWrapper")
 
@@ -43,6 +43,8 @@ class _Unpickler(_PythonUnpickler):  # type: ignore[misc]  # which is Any
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == WRAPPER:
             return _Wrapper
+        if (module, name) == ("torch.storage", "_load_from_bytes"):
+            return storage
         refuse_unknown(module, name)
         return super().find_class(module, name)
 

@@ -43,12 +43,12 @@ def refuse_unknown(module: str, name: str) -> None:
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("torch.storage", "_load_from_bytes"):
-            return _storage
+            return storage
         refuse_unknown(module, name)
         return super().find_class(module, name)
 
 
-def _storage(content: bytes) -> Any:
+def storage(content: bytes) -> Any:
     """The numbers of a tensor; torch's own function would unpickle them without any check.
 
     Onto the CPU: the authors may have saved them from a GPU that is not here.

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -26,6 +26,7 @@ from hoigs.core.interfaces.estimator import (
     EstimateKind,
     Estimates,
     Estimator,
+    FramePrompt,
     Landmarks,
     LazyFrames,
     VideoRequest,
@@ -35,9 +36,11 @@ from hoigs.plugins.estimators.common.environments import HEAVY, MEDIAPIPE
 from hoigs.plugins.estimators.common.subprocess import run_tool, settings_key
 
 SCRIPT = Path(__file__).with_name("mediapipe_script.py")
-IMPORTED = [SCRIPT.with_name(f"mediapipe_{name}.py") for name in ("guided", "chosen")]
+PARTS = ("guided", "chosen", "people", "look")
+IMPORTED = [SCRIPT.with_name(f"mediapipe_{part}.py") for part in PARTS]
 INSTALL = "run `hoigs estimators install mediapipe` and leave `python` out"
 OTHERS, FOLLOWED = 0.1, 0.8  # shares of the frames, above and below which there is something to say
+LOOKS = 7  # frames that are looked at for several people, less one
 HIPS = [23, 24]  # of the 33 landmarks
 LONGEST = 1280  # pixels: larger frames are made smaller, which the models do in any case
 
@@ -80,7 +83,7 @@ class _IfMasks:
 
 
 class MediapipeEstimator(Estimator):
-    """Landmarks and mask of the one person of a video by MediaPipe, in one pass over it.
+    """Landmarks and mask of a person, or of all who are clicked on, by MediaPipe in one pass.
 
     It follows a person from frame to frame and loses one that jumps, so it is given every frame
     from the first wanted one to the last. Where no landmarks are found it looks again with a
@@ -116,17 +119,12 @@ class MediapipeEstimator(Estimator):
 
     def estimate(self, video: VideoRequest, progress: Progress = no_progress) -> Estimates:
         people = video.named("human") or ("human",)
-        if len(people) > 1:
-            raise HoigsError(
-                f"estimator:mediapipe finds one person, {len(people)} are requested; run it on a "
-                "video of each, or use estimator:landmarks-files"
-            )
         first = min(video.numbers, default=0)
-        count = max(video.numbers, default=-1) + 1 - first
-        order, chosen = _order(range(first, first + count), video)
-        settings = {"pose": self._settings(), "frames": count, "masks": self.config.masks}
+        given = range(first, max(video.numbers, default=-1) + 1)
+        order, chosen = _order(given, video)
+        settings = {"pose": self._settings(), "frames": len(given), "masks": self.config.masks}
         settings |= {"first": first} if first else {}
-        settings |= {"person": chosen} if chosen else {}
+        settings |= {"people": chosen} if chosen else {}
         # what other versions of the scripts found is not taken
         settings["scripts"] = [zlib.crc32(path.read_bytes()) for path in (SCRIPT, *IMPORTED)]
         out = video.work / f"mediapipe-{settings_key(settings)}.npz"
@@ -134,22 +132,36 @@ class MediapipeEstimator(Estimator):
             self._run(self._python(video), out, order, chosen, video, progress)
         with np.load(out, allow_pickle=False) as file:
             found = {name: file[name] for name in file.files}
-        if chosen:  # frames came from the prompt's forwards, then backwards
-            inverse = np.argsort(order)
-            found |= {k: v[inverse] for k, v in found.items() if k != "size"}
-        given = range(first, first + count)
-        image, world = (self._spread(found[k], given, video) for k in ("image_xyzv", "world_xyzv"))
         progress(1.0, "landmarks")
         text = f"MediaPipe Pose, complexity {self._complexity()}"
         text += ", of the person clicked on" if chosen else ""
-        landmarks = {people[0]: Landmarks(image, world, text)}
+        landmarks = {}
+        for k, name in enumerate(people):
+            image = self._spread(found["image_xyzv"][k], given, video)
+            world = self._spread(found["world_xyzv"][k], given, video)
+            landmarks[name] = Landmarks(image, world, text)
         if not self.config.masks:
             return Estimates(landmarks=landmarks)
-        person = _frames_of(found["person"], found["size"], first, video)
+        masks = {
+            name: _frames_of(found["person"][k], found["size"], first, video)
+            for k, name in enumerate(people)
+        }
         text = "MediaPipe's segmentation of selfies and of poses; it takes in what is held"
         text += "; of the person clicked on" if chosen else ""
-        notes = _lost(order, image) if chosen else _others(found["several"], image)
-        return Estimates(EntityMasks({people[0]: person}, None, text, notes=notes), landmarks)
+        images = {name: track.image_xyzv for name, track in landmarks.items()}
+        notes = _lost(given, images) if chosen else _others(found["several"], images[people[0]])
+        return Estimates(EntityMasks(masks, None, text, notes=notes), landmarks)
+
+    def people(self, video: VideoRequest) -> tuple[FramePrompt, ...]:
+        numbers = video.numbers
+        shown = sorted({numbers[i * (len(numbers) - 1) // LOOKS] for i in range(LOOKS + 1)})
+        settings = {"pose": self._settings(), "look": shown}
+        settings["scripts"] = [zlib.crc32(path.read_bytes()) for path in (SCRIPT, *IMPORTED)]
+        out = video.work / f"people-{settings_key(settings)}.npz"
+        if not out.is_file():
+            self._run(self._python(video), out, shown, None, video, no_progress, look=True)
+        with np.load(out, allow_pickle=False) as file:
+            return _together(file["people"], shown, video)
 
     def _python(self, video: VideoRequest) -> Path:
         if self.config.python is None:
@@ -162,14 +174,14 @@ class MediapipeEstimator(Estimator):
 
     def _run(
         self, python: Path, out: Path, order: Sequence[int], chosen: dict[str, Any] | None,
-        video: VideoRequest, progress: Progress,
+        video: VideoRequest, progress: Progress, look: bool = False,
     ) -> None:  # fmt: skip
         out.parent.mkdir(parents=True, exist_ok=True)
         half = out.with_suffix(".part")
         settings = {
             "width": video.width, "height": video.height, "count": len(order), "longest": LONGEST,
-            "masks": self.config.masks, "person": chosen, "pose": self._settings(),
-            "out": str(half.absolute()),
+            "masks": self.config.masks, "people": chosen, "pose": self._settings(),
+            "out": str(half.absolute()), "look": look,
         }  # fmt: skip
         # -I: the script's own folder, where modules of hoigs lie, is not searched for imports
         argv = [str(python.absolute()), "-I", str(SCRIPT), json.dumps(settings)]
@@ -180,12 +192,8 @@ class MediapipeEstimator(Estimator):
             )
         except HoigsError as error:
             said = log.read_text(errors="replace") if log.is_file() else ""
-            if chosen and (nobody := re.search(r"no person is found there: (\d+)", said)):
-                raise HoigsError(
-                    f"--person: MediaPipe finds no person at the click in frame "
-                    f"{order[int(nobody[1])]}; click on the middle of their body (belly or hips), "
-                    "in a frame that shows them well, or give a box"
-                ) from error
+            if chosen and (why := _misplaced(said)):
+                raise HoigsError(why) from error
             lacking = "has no mediapipe" in said
             raise HoigsError(f"{error}\n{INSTALL}" if lacking else str(error)) from error
         half.replace(out)
@@ -202,6 +210,28 @@ class MediapipeEstimator(Estimator):
         return spread
 
 
+def _together(
+    rows: Float[np.ndarray, "N 5"], shown: Sequence[int], video: VideoRequest
+) -> tuple[FramePrompt, ...]:
+    """Everybody in the frame that shows most people, the surest first."""
+    if not len(rows):
+        return ()
+    places = rows[:, 0].astype(int)
+    counts = np.bincount(places)
+    # what is seen once only may be a coat on a chair
+    counts[counts > 1] = 1 if (counts > 1).sum() < min(2, len(shown)) else counts[counts > 1]
+    place = int(np.lexsort((np.bincount(places, rows[:, 1]), counts))[-1])
+    here = rows[places == place]
+    here = here[np.argsort(-here[:, 1])][: counts[place]]
+    prompts = []
+    for _, _, x, y, side in here.tolist():
+        half, limits = side / 2 / 1.25, (video.width, video.height)
+        low = [max(0.0, v - half) for v in (x, y)]
+        high = [min(float(most), v + half) for v, most in zip((x, y), limits, strict=True)]
+        prompts.append(FramePrompt(shown[place], (), (*low, *high)))
+    return tuple(prompts)
+
+
 def _others(several: Bool[np.ndarray, " N"], image: Float[np.ndarray, "F 33 4"]) -> tuple[str, ...]:
     """What there is to say if others are seen beside the person who was followed."""
     count = int(several.sum())
@@ -215,40 +245,70 @@ def _others(several: Bool[np.ndarray, " N"], image: Float[np.ndarray, "F 33 4"])
     )
 
 
-def _lost(order: Sequence[int], image: Float[np.ndarray, "F 33 4"]) -> tuple[str, ...]:
-    """What there is to say if the person clicked on was lost in many of the frames in `order`."""
-    seen = np.isfinite(image[order, 0, 0])
-    if seen.mean() >= FOLLOWED:
-        return ()
-    return (
-        f"the person clicked on was followed in {int(seen.sum())} of {len(order)} frames; click on "
-        f"them in another frame, too, such as {order[int(seen.argmin())]}",
-    )
+def _misplaced(log: str) -> str:
+    """What the script has against a click, "" if nothing."""
+    if nobody := re.search(r"no person is found there: (\d+) of (.*)", log):
+        return (
+            f"--person: MediaPipe finds no person at the click in frame {nobody[1]} ({nobody[2]}); "
+            "click on the middle of their body (belly or hips), in a frame that shows them well, "
+            "or give a box; if clicks of this frame are on two people, name them: --person "
+            "anna=300,200"
+        )
+    if other := re.search(r"someone else is there: (\d+) of (.*)", log):
+        return (
+            f"--person: the click in frame {other[1]} is on someone else than the person followed "
+            f"from the first click ({other[2]}); to fit both, name the other: --person "
+            f"anna=X,Y@{other[1]}"
+        )
+    return ""
+
+
+def _lost(given: range, images: Mapping[str, Float[np.ndarray, "F 33 4"]]) -> tuple[str, ...]:
+    """What there is to say of those clicked on who were lost in many of the frames."""
+    notes = []
+    for name, image in images.items():
+        seen = np.isfinite(image[given, 0, 0])
+        if seen.mean() < FOLLOWED:
+            who = "the person clicked on" if len(images) == 1 else name
+            notes.append(
+                f"{who} was followed in {int(seen.sum())} of {len(given)} frames; click on them in "
+                f"another frame, too, such as {given[int(seen.argmin())]}"
+            )
+    return tuple(notes)
 
 
 def _order(given: range, video: VideoRequest) -> tuple[list[int], dict[str, Any] | None]:
-    """The frames as they are shown, and where among them the person's prompts are: from the first
-    prompt's frame forwards, then backwards; without a prompt forwards, and None.
+    """The frames as they are shown, and people's prompts: the first one's frame of each of several,
+    from the first of these forwards, then from the last of them backwards. Without a prompt
+    forwards, and None.
 
     Raises:
-        HoigsError: a prompt is in a frame that is not used.
+        HoigsError: a prompt is in a frame that is not used, or one of several people has none.
     """
-    person = next((e for e in video.entities if e.kind == "human"), None)
-    if person is None or not person.prompts:
+    people = [e for e in video.entities if e.kind == "human"]
+    without = [e.name for e in people if not e.prompts]
+    if not people or (len(people) == 1 and without):
         return list(given), None
-    for prompt in person.prompts:
+    if without:
+        raise HoigsError(
+            f"estimator:mediapipe: {len(people)} people are requested, and nothing says who "
+            f"{' and '.join(without)} is: click on each, such as --person {without[0]}=320,210"
+        )
+    for prompt in (p for e in people for p in e.prompts):
         if prompt.frame not in given:
             raise HoigsError(
                 f"--person: the click in frame {prompt.frame} is not in a frame that is used; "
                 f"these are {given.start} to {given.stop - 1}"
             )
-    first = min(p.frame for p in person.prompts)
-    order = [*range(first, given.stop), *reversed(range(given.start, first))]
-    prompts = [
-        [order.index(p.frame), [[q.x, q.y, q.inside] for q in p.points], p.box]
-        for p in person.prompts
-    ]
-    return order, {"prompts": prompts, "back": given.stop - first}
+    begins = [e.prompts[0].frame for e in people]
+    shown = sorted(set(begins)) if len(begins) > 1 else []
+    order = [*shown, *range(min(begins), given.stop), *reversed(range(given.start, max(begins)))]
+    prompts = {
+        e.name: [[p.frame, [[q.x, q.y, q.inside] for q in p.points], p.box] for p in e.prompts]
+        for e in people
+    }
+    back = len(shown) + given.stop - min(begins)
+    return order, {"prompts": prompts, "order": order, "back": back, "shown": len(shown)}
 
 
 def _frames(video: VideoRequest, order: Sequence[int], progress: Progress) -> Iterator[np.ndarray]:

@@ -1,7 +1,7 @@
 """Read by `mediapipe_script.py`: landmarks of the one of several people whom the user clicked on.
 
 MediaPipe's detector takes whom it likes. Its model of landmarks is therefore shown the square
-about the person clicked on, found in that frame and followed from there, forwards and backwards.
+about the person clicked on, found in that frame and followed from there (`mediapipe_people.py`).
 It imports nothing of hoigs.
 """
 
@@ -17,6 +17,8 @@ SEEN = 0.5  # visibility
 MARGIN = 1.25  # of the landmarks' box, the next square
 STEADY, SHRINKS = 0.7, 0.95  # shares of its last side that a square keeps as it grows, or shrinks
 WIDER = (1.0, 1.4)  # sides in which someone who is lost is looked for
+WHOLE, MORE = (1.8, 0.0, 0.4), 2  # sides of a square for limbs, and down; landmarks worth it
+SAME = 0.08  # in sides, mean distance of landmarks of one and the same person
 JUMP, GROWTH = 0.35, 1.6  # in sides, from frame to frame: what moves or grows more is someone else
 
 
@@ -25,44 +27,63 @@ class ChosenPose:
 
     Args:
         graph, rect: of `landmark_graph`.
-        prompts: by number of a frame, as they come: points (x, y, on the person or not) and a box
+        prompts: by number of a frame: points (x, y, on the person or not) and a box
             (x0, y0, x1, y1) or None, pixels of the images here.
-        back: number of the first frame of those that go backwards from the first prompt's.
     """
 
-    def __init__(self, graph, rect, prompts, back) -> None:
-        self.graph, self.rect, self.prompts, self.back = graph, rect, prompts, back
+    def __init__(self, graph, rect, prompts) -> None:
+        self.graph, self.rect, self.prompts = graph, rect, prompts
         self.square = (0.0, 0.0, 0.0)  # x, y of the middle and side, pixels: until it is found
         self.first: tuple[float, float, float] | None = None
 
-    def process(self, number, image):
-        """Landmarks in the image and in space, and the person's mask; None where they are lost.
+    def prompted(self, number, image):
+        """The next square, and landmarks in the image and in space and the mask of the person at
+        the frame's prompt.
 
         Raises:
-            LookupError: nobody is found where a prompt says; its one argument ends with `number`.
+            LookupError: nobody is found there; its one argument ends with `number`.
         """
-        if number == self.back and self.first is not None:
-            self.square = self.first
-        if number in self.prompts:
-            found = self.search(image, *self.prompts[number])
-            if found is None:
-                raise LookupError(f"no person is found there: {number}")
-            self.square, found = found
-            self.first = self.first or self.square
-            return found
+        found = self.search(image, *self.prompts[number])
+        if found is None:
+            raise LookupError(f"no person is found there: {number}")
+        return found
+
+    def followed(self, image, doubt=False):
+        """The same of the person in the square; None where they are lost.
+
+        Args:
+            doubt: look in a wider square, too, and take it if it shows more of them.
+        """
         x, y, side = self.square
+        found = None
         for wider in WIDER:
             found = self.look(image, (x, y, wider * side))
             if found is None:
                 continue
             x1, y1, side1 = square_of(found[0])
-            if np.hypot(x1 - x, y1 - y) > JUMP * side or not 1 / GROWTH < side1 / side < GROWTH:
-                continue
-            # quickly smaller, it would leave a limb out, see less, and be smaller again
-            kept = STEADY if side1 > side else SHRINKS
-            self.square = (x1, y1, kept * side + (1 - kept) * side1)
-            return found
-        return None  # the square waits where it was
+            if np.hypot(x1 - x, y1 - y) < JUMP * side and 1 / GROWTH < side1 / side < GROWTH:
+                break
+            found = None
+        if found is None:
+            return None
+        # quickly smaller, it would leave a limb out, see less, and be smaller again
+        kept = STEADY if side1 > side else SHRINKS
+        square = (x1, y1, kept * side + (1 - kept) * side1)
+        for down in WHOLE[1:] if doubt else ():
+            whole = self.look(image, (x1, y1 + down * side, WHOLE[0] * side))
+            if whole is not None and shows_more(whole[0], found[0], side):
+                return square_of(whole[0]), whole
+        return square, found
+
+    def take(self, square):
+        """This is where the person is."""
+        self.square = square
+        self.first = self.first or square
+
+    def restart(self):
+        """Goes back to where the person was found first."""
+        if self.first is not None:
+            self.square = self.first
 
     def search(self, image, points, box):
         """The next square, and what is seen in the one with the best person on the prompt."""
@@ -83,7 +104,9 @@ class ChosenPose:
             # the same once more, in the square that it will be followed in
             closer = self.look(image, square_of(found[0]))
             if closer is None or not self.agrees(closer[2], inside, outside):
-                continue
+                if box is None:
+                    continue
+                closer = found  # seen in the box that was drawn about them
             value = closer[0][:, 3].mean()  # more of the person
             if best is None or value > best[0]:
                 best = value, square_of(closer[0]), closer
@@ -105,6 +128,20 @@ class ChosenPose:
         if found is None or score(found[0][:, 3]) < KEPT or (found[0][:, 3] > SEEN).sum() < 4:
             return None
         return found
+
+
+def shows_more(points, others, side) -> bool:
+    """Whether landmarks are those of the same person, and more of them."""
+    more = (points[:, 3] > SEEN).sum() > (others[:, 3] > SEEN).sum() + MORE
+    return bool(more and same(points, others, side))
+
+
+def same(points, others, side) -> bool:
+    """Whether landmarks are of one person, by those that are seen in both."""
+    both = (points[:, 3] > SEEN) & (others[:, 3] > SEEN)
+    if both.sum() < 4:
+        return False
+    return bool(np.linalg.norm((points - others)[both, :2], axis=1).mean() < SAME * side)
 
 
 def square_of(points):

@@ -1,8 +1,9 @@
 """Run by the Python of an environment with mediapipe; it imports nothing of hoigs.
 
-Reads RGB frames from standard input and writes one .npz file: image_xyzv and world_xyzv
-[N, 33, 4], NaN where no person is found; and, if masks are wanted, `person`, the bits of boolean
-masks [N, H, ceil(W / 8)], their `size`, and `several` [N], whether other people are seen.
+Reads RGB frames from standard input and writes one .npz file: of each person image_xyzv and
+world_xyzv [P, N, 33, 4], NaN where they are not found; and, if masks are wanted, `person`, the bits
+of boolean masks [P, N, H, ceil(W / 8)], their `size`, and `several` [N], whether other people are
+seen. P is 1, or the number of people who were clicked on.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ TALL = 0.3  # height of the landmarks in heights of the mask, below which they a
 SEEN = 0.5  # visibility
 OTHER, ELSEWHERE = 0.25, 0.2  # of the largest part's area; of a part, that is the person's own
 AROUND, EDGE = 0.01, 0.2  # in longer sides and of 1: about a person's own mask
+ROWS = ("image_xyzv", "world_xyzv")
 SOFT = 1 / 640  # of the longer side: standard deviation by which the person's mask is smoothed
 
 
@@ -35,7 +37,10 @@ def main() -> None:
     width, height, count = settings["width"], settings["height"], settings["count"]
     factor = min(1.0, settings["longest"] / max(width, height))
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    finder = Finder(cv2, mediapipe.solutions, settings, size[0] / width)
+    looks = settings.get("look")
+    finder: Any = Lookout(settings) if looks else Finder(
+        cv2, mediapipe.solutions, settings, size[0] / width
+    )  # fmt: skip
     for i in range(count):
         pixels = sys.stdin.buffer.read(height * width * 3)
         if len(pixels) != height * width * 3:
@@ -49,6 +54,28 @@ def main() -> None:
             sys.exit(str(error))
     with Path(settings["out"]).open("wb") as out:
         np.savez_compressed(out, size=np.array(size), **finder.arrays(width / size[0]))
+
+
+class Lookout:
+    """Who is in each frame: `people` [N, 5], the frame's place and what `Look.people` gives."""
+
+    def __init__(self, settings) -> None:
+        from mediapipe_look import Look
+
+        self.look = Look(settings["pose"]["model_complexity"])
+        self.rows: list[tuple[float, ...]] = []
+
+    def add(self, place, image) -> None:
+        found = self.look.people(image)
+        if place % 2 == 0:
+            found += self.look.faceless(image, found)
+        self.rows += [(place, *one) for one in found]
+
+    def arrays(self, scale):
+        """What is written; `scale`: pixels of the video a pixel of the images here."""
+        rows = np.array(self.rows, np.float32).reshape(-1, 5)
+        rows[:, 2:] *= scale
+        return {"people": rows}
 
 
 class Finder:
@@ -66,56 +93,79 @@ class Finder:
         self.guided: Any = None  # made where it is needed
         self.complexity = settings["pose"]["model_complexity"]
         self.following = False  # a person whom `guided` found and the detector does not
-        self.rows: dict[str, list] = {"image_xyzv": [], "world_xyzv": []}
-        self.person: list[np.ndarray] = []
-        self.several: list[bool] = []  # whether others are seen beside the person followed
-        self.chosen: Any = None
-        if settings["person"] is not None:
-            from mediapipe_chosen import ChosenPose
+        self.people: Any = None
+        names, frames = [""], range(settings["count"])
+        if settings["people"] is not None:
             from mediapipe_guided import landmark_graph
+            from mediapipe_people import People
 
+            given = settings["people"]
+            order, places = given["order"], (given["back"], given["shown"])
             prompts = {
-                number: (
-                    [(factor * x, factor * y, on) for x, y, on in points],
-                    None if box is None else [factor * c for c in box],
-                )
-                for number, points, box in settings["person"]["prompts"]
+                name: {
+                    number: (
+                        [(factor * x, factor * y, on) for x, y, on in points],
+                        None if box is None else [factor * c for c in box],
+                    )
+                    for number, points, box in clicks
+                }
+                for name, clicks in given["prompts"].items()
             }
-            back = settings["person"]["back"]
-            self.chosen = ChosenPose(*landmark_graph(self.complexity), prompts, back)
+            self.people = People(*landmark_graph(self.complexity), prompts, order, *places)
+            names, frames = list(prompts), range(min(order), max(order) + 1)
+        self.first, rows = frames[0], (len(names), len(frames), 33, 4)
+        self.names, self.rows = names, {n: np.full(rows, np.nan, np.float32) for n in ROWS}
+        self.person: list[list[np.ndarray | None]] = [[None] * len(frames) for _ in names]
+        self.several = np.zeros(len(frames), bool)  # others are seen beside the person followed
 
-    def add(self, number, image) -> None:
+    def add(self, place, image) -> None:
+        """The frame that comes at this place."""
         wide = None if self.selfie is None else self.selfie.process(image).segmentation_mask
-        if self.chosen is None:
-            image_xyzv, world_xyzv, own = self.landmarks(image, wide)
-        else:
-            nothing = np.full((33, 4), np.nan)
-            found = self.chosen.process(number, image) or (nothing, nothing, None)
-            image_xyzv, world_xyzv, own = found
-        self.rows["image_xyzv"].append(image_xyzv)
-        self.rows["world_xyzv"].append(world_xyzv)
-        if wide is None:
+        if self.people is not None:
+            self.add_people(place, image, wide)
             return
-        if self.chosen is not None:
-            self.keep(image, np.zeros_like(wide) if own is None else self.of_one(image, wide, own))
-            return
+        image_xyzv, world_xyzv, own = self.landmarks(image, wide)
+        self.rows["image_xyzv"][0, place], self.rows["world_xyzv"][0, place] = (
+            image_xyzv, world_xyzv
+        )  # fmt: skip
+        if wide is not None:
+            self.person[0][place] = self.bits(image, self.of_anybody(place, image, wide, own))
+
+    def of_anybody(self, place, image, wide, own):
+        """The mask of the person whom the detector took."""
         if self.following and own is not None:
-            self.several.append(False)
-            self.keep(image, own)  # segmentation of selfies takes tables in where there is no head
-            return
-        self.several.append(own is not None and self.another(wide, own))
-        if self.several[-1]:
-            self.keep(image, self.of_one(image, wide, own))
-            return
+            return own  # segmentation of selfies takes tables in where there is no head
+        self.several[place] = own is not None and self.another(wide, own)
+        if self.several[place]:
+            return self.of_one(image, wide, own)
         near = self.near(image, wide > 0.5)
         mean = wide if near is None else (wide + near) / 2
-        person = mean if own is None else (2 * mean + own) / 3
-        self.keep(image, person)
+        return mean if own is None else (2 * mean + own) / 3
 
-    def keep(self, image, person) -> None:
+    def add_people(self, place, image, wide) -> None:
+        """Those who were clicked on; where masks overlap, the model of landmarks decides."""
+        found = self.people.process(place, image)
+        i = self.people.order[place] - self.first
+        seen = {name: f for name, f in found.items() if f is not None}
+        for name, (image_xyzv, world_xyzv, _) in seen.items():
+            k = self.names.index(name)
+            self.rows["image_xyzv"][k, i], self.rows["world_xyzv"][k, i] = image_xyzv, world_xyzv
+        if wide is None:
+            return
+        owns = {name: own for name, (_, _, own) in seen.items()}
+        for name in found:
+            mask = np.zeros_like(wide)
+            if name in owns:
+                mask = self.of_one(image, wide, owns[name])
+                others = [own for n, own in owns.items() if n != name]
+                mask = np.where(np.all([owns[name] >= o for o in others], axis=0), mask, 0.0)
+            self.person[self.names.index(name)][i] = self.bits(image, mask)
+
+    def bits(self, image, person):
+        """A mask as bits."""
         # cells of the models are several pixels wide: without this, edges are stairs
         person = self.cv2.GaussianBlur(person, (0, 0), max(1.0, SOFT * max(image.shape)))
-        self.person.append(np.packbits(person > 0.5, axis=1))
+        return np.packbits(person > 0.5, axis=1)
 
     def another(self, wide, own) -> bool:
         """Whether the mask of people has a large part that is not of the person followed."""
@@ -181,11 +231,11 @@ class Finder:
 
     def arrays(self, scale):
         """What is written; `scale`: pixels of the video a pixel of the images here."""
-        rows = {name: np.array(found, np.float32) for name, found in self.rows.items()}
+        rows: dict[str, np.ndarray] = dict(self.rows)
         rows["image_xyzv"][..., :3] *= scale
         if self.masks:
             rows["person"] = np.array(self.person)
-            rows["several"] = np.array(self.several or [False] * len(self.person))
+            rows["several"] = self.several
         return rows
 
 

@@ -13,7 +13,8 @@ from hoigs.core.interfaces.estimator import Estimates, Estimator, Landmarks, Vid
 from hoigs.core.maths.skinning import skin
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.values.moment import BodyPose
-from hoigs.preparation.bodies.body_file import FileBody, read_bodies
+from hoigs.preparation.bodies.body_file import read_bodies
+from hoigs.preparation.bodies.file_body import FileBody
 from hoigs.preparation.body.landmarks import points_of
 from hoigs.preparation.video.source import SourceError
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 from torch import Tensor
 
 from hoigs.core.interfaces.body import BodyModel
@@ -21,6 +22,9 @@ USED = tuple(sorted((*JOINTS, *KNUCKLES, 0, 7, 8, *FEET)))  # landmarks that `po
 SOLID = (11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)  # in space: torso and limbs start on them
 ALONE = 3  # frames: shorter runs of landmarks between gaps of as many are not believed,
 FEW = 0.2  # unless they are more than this share of those with landmarks
+SHOULDERS = [11, 12]
+NEAR_GAP, AROUND, LEAST = 6, 15, 8  # frames: from a gap, to compare with, and how many of them
+JUMP = 0.34  # of the shoulders' distance from the way of those around: not this person
 ENOUGH = 8  # landmarks of USED in the image, with which a frame counts
 
 
@@ -68,6 +72,30 @@ class LandmarkTrack:
         for row in ((ends - starts < ALONE) & (before >= ALONE) & (after >= ALONE)).nonzero():
             stray[starts[row] : ends[row]] = True
         return stray if stray.sum() < FEW * found.sum() else torch.zeros_like(found)
+
+    def jumps(self) -> Bool[Tensor, " F"]:
+        """Frames of `found` near gaps whose shoulders are far from the way on which those of most
+        frames around lie: as a detector loses a person, or finds them again, it puts them anywhere.
+        """
+        from scipy import stats  # on use: it takes a while to import
+
+        found, places = self.found.numpy(), self.image[:, SHOULDERS, :2].double().numpy()
+        known = found & np.isfinite(places).all((1, 2))
+        jump = np.zeros_like(found)
+        if known.all() or known.sum() < 2 * LEAST:
+            return torch.from_numpy(jump)
+        broad = float(np.median(np.linalg.norm(places[known, 0] - places[known, 1], axis=-1)))
+        near = ndimage.binary_dilation(~known, iterations=NEAR_GAP) & known
+        middle, frames = places.mean(1), np.arange(len(found))
+        for i in np.flatnonzero(near).tolist():
+            around = known & (np.abs(frames - i) <= AROUND) & (frames != i)
+            if around.sum() < LEAST:
+                continue
+            rows = np.flatnonzero(around)
+            slopes = [stats.theilslopes(middle[rows, axis], rows) for axis in (0, 1)]
+            way = np.array([s.intercept + s.slope * i for s in slopes])
+            jump[i] = np.linalg.norm(middle[i] - way) > JUMP * broad
+        return torch.from_numpy(jump)
 
     def without(self, frames: Bool[Tensor, " F"]) -> LandmarkTrack:
         """The same with these frames not found."""

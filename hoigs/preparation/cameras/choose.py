@@ -11,7 +11,7 @@ import numpy as np
 from hoigs.core.diagnostics import ranges
 from hoigs.core.npz import holds
 from hoigs.core.values.lens import Lens
-from hoigs.preparation.bodies.body_file import FileBody
+from hoigs.preparation.bodies.file_body import FileBody
 from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
 from hoigs.preparation.cameras.camera_track import (
     CameraTrack,
@@ -25,10 +25,11 @@ from hoigs.preparation.cameras.motion import BackgroundMotion, background_motion
 from hoigs.preparation.cameras.sfm import structure_from_motion
 from hoigs.preparation.cameras.static_focal import static_focal
 from hoigs.preparation.cameras.turning_cameras import turning_cameras
+from hoigs.preparation.cameras.vggt import vggt_cameras
 from hoigs.preparation.given import GivenMasks, RawLandmarks
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames
-from hoigs.preparation.video.source import MEGASAM, SourceError
+from hoigs.preparation.video.source import MEGASAM, VGGT, SourceError
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class ChosenCameras:
 
 def choose_cameras(
     video: Frames,
-    landmarks: RawLandmarks,
+    landmarks: RawLandmarks | None,
     masks: GivenMasks,
     model: Path | None,
     options: PrepareOptions,
@@ -54,8 +55,9 @@ def choose_cameras(
     """Cameras as `options.camera` requests them.
 
     Args:
-        landmarks, masks: of the raw frames. model: a COLMAP model that is there already, or None.
-        given: cameras.npz or MegaSaM's npz, or None.
+        landmarks, masks: of the raw frames; landmarks None: nobody is looked for.
+        model: a COLMAP model that is there already, or None.
+        given: cameras.npz, or MegaSaM's or VGGT's npz, or None.
         bodies: whose lens a still camera has, unless another is given.
         folder: to work in; it may be removed when the result has been kept.
 
@@ -70,7 +72,9 @@ def choose_cameras(
             "--camera sfm, static or turning to make the cameras anew"
         )
     if not options.own_cameras and given is not None:
-        read = megasam_cameras if holds(given, MEGASAM) else given_cameras
+        read = given_cameras
+        for arrays, reader in ((MEGASAM, megasam_cameras), (VGGT, vggt_cameras)):
+            read = reader if holds(given, arrays) else read
         return ChosenCameras(read(video, given))
     if not options.own_cameras and model is not None:
         return ChosenCameras(colmap_cameras(video, model))
@@ -112,7 +116,7 @@ def known_lens(options: PrepareOptions, video: Frames) -> tuple[Lens, str] | Non
 
 def _static(
     video: Frames,
-    landmarks: RawLandmarks,
+    landmarks: RawLandmarks | None,
     options: PrepareOptions,
     lens: tuple[Lens, str] | None,
     motion: BackgroundMotion,
@@ -136,7 +140,7 @@ def _static(
 
 def _turning(
     video: Frames,
-    landmarks: RawLandmarks,
+    landmarks: RawLandmarks | None,
     masks: GivenMasks,
     options: PrepareOptions,
     lens: tuple[Lens, str] | None,

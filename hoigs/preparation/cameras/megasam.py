@@ -41,7 +41,7 @@ def megasam_cameras(video: Frames, path: Path) -> CameraTrack:
     depths, images = arrays["depths"], arrays["images"]
     chosen = np.unique(np.linspace(0, len(video) - 1, VIEWS).round().astype(int))
     rows = [video.indices[i] for i in chosen]
-    points, colors = _scene(depths[rows].astype(np.float64), images[rows], K, views[chosen])
+    points, colors = depth_points(depths[rows].astype(np.float64), images[rows], K, views[chosen])
     if not len(points):
         raise SourceError(f"{path}: no point of its depth is seen alike by two frames")
     own = torch.from_numpy(K * np.append(scale, 1.0)[:, None]).float()
@@ -93,7 +93,7 @@ def _checked(
     return K, scale, np.linalg.inv(back)
 
 
-def _scene(
+def depth_points(
     depths: Float[np.ndarray, "V H W"],
     images: np.ndarray,
     K: Float[np.ndarray, "3 3"],

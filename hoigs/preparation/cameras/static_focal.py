@@ -27,7 +27,7 @@ class StaticFocal:
     known: bool = False
 
 
-def static_focal(video: Frames, landmarks: RawLandmarks, given: float | None) -> StaticFocal:
+def static_focal(video: Frames, landmarks: RawLandmarks | None, given: float | None) -> StaticFocal:
     """The first of: `given`, the file's metadata, a distinct estimate from the person (`focal`),
     0.8 of the longer side.
     """
@@ -37,9 +37,10 @@ def static_focal(video: Frames, landmarks: RawLandmarks, given: float | None) ->
     if found is not None:
         return StaticFocal(found[0], f"from {found[1]}", known=True)
     longer = max(video.native_width, video.native_height)
-    curve = focal_curve(
-        landmarks.image[..., [0, 1, 3]], landmarks.world[..., :3], (video.width, video.height)
-    )
+    curve = None
+    if landmarks is not None:
+        size = (video.width, video.height)
+        curve = focal_curve(landmarks.image[..., [0, 1, 3]], landmarks.world[..., :3], size)
     figures = {} if curve is None else _figures(curve, longer)
     if curve is not None and curve.distinct:
         return _estimated(curve, longer, figures)

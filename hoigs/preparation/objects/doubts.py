@@ -20,12 +20,12 @@ ALIEN = 0.5  # of a person's landmarks on the object, median: the estimator took
 VISIBLE = 0.5  # landmarks that are surer than this
 
 
-def doubts(masks: MaskStack, landmarks: Float[Tensor, "F 33 3"]) -> list[str]:
+def doubts(masks: MaskStack, landmarks: Float[Tensor, "F 33 3"] | None) -> list[str]:
     """Sentences for the report: the border cuts the object often, its mask has several large
     parts, or most of the person's landmarks lie on it.
 
     Args:
-        landmarks: x, y in pixels and visibility; NaN where unknown.
+        landmarks: x, y in pixels and visibility, NaN where unknown; None: of nobody.
     """
     outlines = outlines_of(masks)
     seen = np.flatnonzero(outlines.observed)
@@ -42,7 +42,7 @@ def doubts(masks: MaskStack, landmarks: Float[Tensor, "F 33 3"]) -> list[str]:
             f"the object's mask has two large parts in {100 * parted:.0f} % of the frames: if they "
             "are two objects, both are tracked as one; point at one of them (--object X,Y)"
         )
-    shares = list(_on_object(masks, landmarks, seen.tolist()))
+    shares = [] if landmarks is None else list(_on_object(masks, landmarks, seen.tolist()))
     if shares and float(np.median(shares)) > ALIEN:
         found.append(
             f"{100 * float(np.median(shares)):.0f} % of the person's landmarks lie on the object "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +45,7 @@ class HandMotion:
             stands straightest.
         pieces: number of each frame's piece: within one the rotations are known against each
             other, between two they are not (a flight lies between them).
+        anybody: there are hands; without them nothing is thrown, and what moves is one piece.
     """
 
     held: Bool[np.ndarray, " F"]
@@ -55,11 +56,12 @@ class HandMotion:
     near: Bool[np.ndarray, "F 2"]
     pieces: np.ndarray
     up: Float[np.ndarray, " 3"]
+    anybody: bool = True
 
     @property
     def free(self) -> Bool[np.ndarray, " F"]:
-        """Frames in which it neither rests nor is held."""
-        return ~(self.held | self.rests)
+        """Frames in which it flies: it neither rests nor is held, in a clip with hands."""
+        return ~(self.held | self.rests) & self.anybody
 
 
 def hand_motion(
@@ -97,6 +99,38 @@ def hand_motion(
     if known.any():
         depths = fill_gaps(palm_depths, known)
     return HandMotion(held, rests, rotations, depths, palms, near, pieces, upward(places))
+
+
+def no_hands(
+    outlines: Outlines, depths: Float[np.ndarray, " F"], cameras: Sequence[Camera], fps: float
+) -> HandMotion:
+    """Of an object in a clip without people, at supposed depths along the view, metres."""
+    count = len(depths)
+    rests = _cleaned(_rests(outlines, depths, cameras, fps)[:, None], round(SHORTEST * fps))[:, 0]
+    if not rests.all():  # a thing that turns on its spot rests by its middle
+        rests = np.zeros_like(rests)
+    nothing = np.zeros((count, 2, 3))
+    return HandMotion(
+        np.zeros(count, bool), rests, np.tile(np.eye(3), (count, 1, 1)), depths, nothing,
+        np.zeros((count, 2), bool), np.zeros(count, int), np.array((0.0, -1.0, 0.0)), False,
+    )  # fmt: skip
+
+
+def nearest_person(
+    joints: Mapping[str, Float[Tensor, "F J 3"]], masks: MaskStack, cameras: Sequence[Camera]
+) -> str | None:
+    """Name of the one whose wrist is nearest to an object in most frames; None without people."""
+    if len(joints) < 2:
+        return next(iter(joints), None)
+    wrists = {
+        name: places[:, [LEFT_WRIST, RIGHT_WRIST]].double().numpy()
+        for name, places in joints.items()
+    }
+    away = np.stack([_palm_distances(p, masks, cameras).min(1) for p in wrists.values()])
+    seen = np.isfinite(away).any(0)
+    if not seen.any():
+        return next(iter(joints))
+    return list(joints)[int(np.bincount(away[:, seen].argmin(0)).argmax())]
 
 
 def along_bones(joints: Float[Tensor, "F J 3"], parents: Sequence[int]) -> Float[Tensor, "F B 3"]:

@@ -54,13 +54,16 @@ def round_object(
     cones: Cones,
     masks: MaskStack,
     cameras: Sequence[Camera],
-    joints: Float[Tensor, "F J 3"],
+    joints: Float[Tensor, "F J 3"] | None,
     parents: Sequence[int],
     radius: float | None,
     count: int,
 ) -> tuple[ObjectTrack, Float[Tensor, "P 3"], ObjectConfidence]:
     """A ball of round masks: track (grey), outward normals, and how far it may be trusted."""
-    touched = None if radius is not None else contact_radius(cones, joints, cameras)
+    touched = clear = None
+    if radius is None and joints is not None:
+        touched = contact_radius(cones, joints, cameras)
+        clear = clear_radius(cones, masks, joints, parents, cameras)
     if radius is not None:
         size, text = radius, f"its radius was given as {radius:g} m"
     elif touched is not None:
@@ -71,7 +74,6 @@ def round_object(
         )
     else:
         size, text = FOOTBALL, f"no limb comes near it: its radius is taken as {FOOTBALL} m"
-    clear = None if radius is not None else clear_radius(cones, masks, joints, parents, cameras)
     if clear is not None and clear[0] < size:
         size = clear[0]
         text += (
@@ -138,7 +140,7 @@ def make_object(
     humans: MaskStack,
     others: MaskStack,
     cameras: Sequence[Camera],
-    joints: Float[Tensor, "F J 3"],
+    joints: Float[Tensor, "F J 3"] | None,
     parents: Sequence[int],
     images: Images,
     *,
@@ -147,13 +149,15 @@ def make_object(
     count: int,
     fps: float,
     progress: Callable[[float], None],
+    depths: Float[np.ndarray, " F"] | None = None,
 ) -> MadeObject:
     """A ball's track, or that of something held by its texture; by its outline where that cannot
     be, and the confidence names why.
 
     Args:
         others: pixels of other objects, which hide this one wherever the person's limbs are.
-        joints: of the body, world, metres. parents: of the joints. way: how; "auto": as a ball
+        joints: of the body, world, metres; None: nobody is there, and the object is at `depths`
+            along the view. parents: of the joints. way: how; "auto": as a ball
             where all masks are round, or else by texture. radius: of a ball, metres; None: a
             football's for a tracked ball, and for a round mask that which the limbs at it give.
             count: of points.
@@ -182,7 +186,17 @@ def make_object(
         if way == "outline":
             raise UntrackableError("object_track is outline")
         track, normals, confidence = tracked_object(
-            masks, humans, others, cameras, joints, parents, images, count, fps, progress
+            masks,
+            humans,
+            others,
+            cameras,
+            joints,
+            parents,
+            images,
+            count,
+            fps,
+            progress,
+            depths=depths,
         )
         spread = float(np.nanmean(confidence.outline) / track.points.norm(dim=-1).mean())
         if not spread < FARTHEST_OUTLINE:
@@ -191,8 +205,8 @@ def make_object(
                 f"% of its size ({100 * FARTHEST_OUTLINE:.0f} % at most)"
             )
     except UntrackableError as reason:
-        wrists = joints[:, [LEFT_WRIST, RIGHT_WRIST]]
-        track, normals, spread = held_object(masks, list(cameras), wrists, count)
+        wrists = None if joints is None else joints[:, [LEFT_WRIST, RIGHT_WRIST]]
+        track, normals, spread = held_object(masks, list(cameras), wrists, count, depths)
         reasons.append(str(reason))
         confidence = ObjectConfidence.none("outline", len(cameras), "; ".join(reasons))
     return _colored(track, normals, spread, confidence, masks, hiding, cameras, images)

@@ -28,8 +28,9 @@ SMOOTHING = 15  # frames
 def held_object(
     masks: MaskStack,
     cameras: Sequence[Camera],
-    wrists: Float[Tensor, "F 2 3"],
+    wrists: Float[Tensor, "F 2 3"] | None,
     count: int,
+    depths: Float[np.ndarray, " F"] | None = None,
 ) -> tuple[ObjectTrack, Float[Tensor, "P 3"], float]:
     """A held object: its mask's centroid at the hands' depth, its outline inflated to a shape.
 
@@ -37,14 +38,21 @@ def held_object(
     axes is left to training.
 
     Args:
-        masks: of the object. wrists: left and right, world, metres. count: of points, about.
+        masks: of the object. wrists: left and right, world, metres; None: nobody is there.
+        count: of points, about. depths: of the object, supposed, where nobody is there.
 
     Returns:
         the track (grey: colours are sampled afterwards), the points' outward normals, and the
         spread of the object's apparent over its expected size.
     """
     outlines = outlines_of(masks)
-    depths = _depths(outlines, hand_depths(masks, cameras, wrists))
+    by = "the nearest wrist"
+    if wrists is not None:
+        depths = hand_depths(masks, cameras, wrists)
+    assert depths is not None  # one of both is given
+    if wrists is None:
+        by = "a supposed size"
+    depths = _depths(outlines, depths)
     pixels = torch.from_numpy(outlines.centers).float()
     translations = torch.stack(
         [c.unproject(p, torch.tensor(float(d))) for c, p, d in zip(cameras, pixels, depths)]
@@ -63,7 +71,7 @@ def held_object(
         translations=translations,
         observed=torch.from_numpy(outlines.observed),
         provenance=(
-            "mask centroid; depth from the nearest wrist and the outline's length; of the "
+            f"mask centroid; depth from {by} and the outline's length; of the "
             f"rotation only the roll in the image; shape from the outline of frame {best}, half "
             "as thick as wide: a weak guess"
         ),

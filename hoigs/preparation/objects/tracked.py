@@ -27,7 +27,7 @@ from hoigs.preparation.objects.alignment import (
 )
 from hoigs.preparation.objects.crops import Crops, make_crops
 from hoigs.preparation.objects.flights import flights_by_texture
-from hoigs.preparation.objects.hands import HandMotion, along_bones, hand_motion
+from hoigs.preparation.objects.hands import HandMotion, along_bones, hand_motion, no_hands
 from hoigs.preparation.objects.search import grasps_by_texture
 from hoigs.preparation.objects.surface import hull, with_samples
 
@@ -78,15 +78,19 @@ def tracked_object(
     humans: MaskStack,
     others: MaskStack,
     cameras: Sequence[Camera],
-    joints: Float[Tensor, "F J 3"],
+    joints: Float[Tensor, "F J 3"] | None,
     parents: Sequence[int],
     images: Images,
     count: int,
     fps: float,
     progress: Callable[[float], None],
     levels: Sequence[Level] = LEVELS,
+    depths: Float[np.ndarray, " F"] | None = None,
 ) -> tuple[ObjectTrack, Float[Tensor, "P 3"], ObjectConfidence]:
     """Poses and shape by `align`, started from the hands.
+
+    Args:
+        joints: of the body, world, metres; None: nobody is there, and the object is at `depths`.
 
     Returns:
         the track (grey: colours are sampled afterwards), the points' outward normals, and how far
@@ -98,13 +102,19 @@ def tracked_object(
     """
     outlines = outlines_of(masks)
     _check(outlines)
-    hands = hand_motion(joints, masks, outlines, cameras, fps)
+    bones = torch.zeros(len(cameras), 0, 3)
+    if joints is not None:
+        hands, bones = (
+            hand_motion(joints, masks, outlines, cameras, fps),
+            along_bones(joints, parents),
+        )
+    else:
+        assert depths is not None
+        hands = no_hands(outlines, depths, cameras, fps)
     shown = outlines.observed
     radius = _radius(outlines, hands, cameras)
     behind = hands.depths + BEHIND * radius
-    crops = make_crops(
-        images, masks, humans, others, cameras, shown, SIDE, along_bones(joints, parents), behind
-    )
+    crops = make_crops(images, masks, humans, others, cameras, shown, SIDE, bones, behind)
     contrast = crops.contrast(BLUR)
     if contrast < FAINTEST:
         raise UntrackableError(

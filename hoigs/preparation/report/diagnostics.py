@@ -108,17 +108,27 @@ def _frames(report: Measures) -> Iterator[MeasureDiagnostic]:
         )
 
 
+def _bodies(report: Measures) -> Iterator[MeasureDiagnostic]:
+    people = {"body": (report.body_residual_px, report.body_residual_m)}
+    for name, found in report.further_people.items():
+        people[f"body of {name}"] = found["body_residual_px"], found["body_residual_m"]
+    for name, (pixels, away) in people.items():
+        if pixels is None:
+            continue
+        metres = "" if away is None else f", {100 * away:.1f} cm"
+        yield _judged(
+            f"{name} on its landmarks",
+            f"{pixels:.1f} px{metres}",
+            "median distance of visible landmarks",
+            _judge(pixels / max(report.width, report.height), 0.01, 0.02),
+            "look at overlay.mp4: if the landmarks jump, use another estimator "
+            "(estimators.landmarks); if all of the body is off, the focal length or the cameras "
+            "are",
+        )
+
+
 def _tracks(report: Measures) -> Iterator[MeasureDiagnostic]:
-    longer = max(report.width, report.height)
-    metres = "" if report.body_residual_m is None else f", {100 * report.body_residual_m:.1f} cm"
-    yield _judged(
-        "body on its landmarks",
-        f"{report.body_residual_px:.1f} px{metres}",
-        "median distance of visible landmarks",
-        _judge(report.body_residual_px / longer, 0.01, 0.02),
-        "look at overlay.mp4: if the landmarks jump, use another estimator (estimators.landmarks); "
-        "if all of the body is off, the focal length or the cameras are",
-    )
+    yield from _bodies(report)
     if report.object_scale_spread is not None:
         yield _judged(
             "object's apparent size",

@@ -15,7 +15,8 @@ class Measures:
         camera: "static", "turning" or "moving". parallax_degrees: largest angle between two views
             of the scene's middle; under about 5 the geometry is weakly known.
         coverage: by entity, part of the image that the mask covers in each frame, 0..1.
-        body_residual_px: median distance of fitted to given landmarks, in frame pixels.
+        body_residual_px: median distance of fitted to given landmarks, in frame pixels, of the
+            first person; None without people.
         body: whatever else the body fit reports.
         scene_scale: metres a COLMAP unit; 1 for a static camera.
         object_scale_spread: standard deviation over frames of the object's apparent over its
@@ -43,7 +44,8 @@ class Measures:
         hand_distance_m: of each frame, from the nearest palm to its surface while held; negative
             inside.
         object_name: of the object that the measures above are of.
-        further_objects: by name, the same measures of the other objects.
+        further_objects: by name, the same measures of the other objects. further_people: by name,
+            body_residual_px and body_residual_m of the other people.
         omega, big_omega: effective multi-view factors (`multiview`).
     """
 
@@ -56,7 +58,7 @@ class Measures:
     camera: str
     parallax_degrees: float
     coverage: dict[str, list[float]]
-    body_residual_px: float
+    body_residual_px: float | None
     scene_scale: float
     object_scale_spread: float | None
     object_observed: float | None
@@ -84,5 +86,6 @@ class Measures:
     hand_distance_m: list[float | None] = field(default_factory=list)
     object_name: str = "object"
     further_objects: dict[str, dict[str, Any]] = field(default_factory=dict)
+    further_people: dict[str, dict[str, float]] = field(default_factory=dict)
     omega: float | None = None
     big_omega: float | None = None

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import TracebackType
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 from torch import Tensor
@@ -81,6 +82,14 @@ class OverlayVideo:
         draw_outline(drawn, object_mask, OBJECT_COLOR)
         draw_points(drawn, points, camera, TRACK_COLOR)
         return drawn
+
+
+def several(faces: Int[Tensor, "T 3"], count: int) -> Int[Tensor, "N 3"]:
+    """Faces of so many bodies whose vertices follow each other."""
+    size = int(faces.max()) + 1
+    return torch.cat(
+        [torch.zeros(0, 3, dtype=faces.dtype)] + [faces + k * size for k in range(count)]
+    )
 
 
 def draw_outline(

@@ -28,7 +28,8 @@ class PrepareReport(Measures):
             ("video", self.video, ""),
             ("frames", f"{self.frames} of {self.width}x{self.height}", f"{self.fps:g} fps"),
             ("camera", self.camera, f"parallax {self.parallax_degrees:.1f} degrees"),
-            ("body", f"{self.body_residual_px:.1f} px", "median distance from the landmarks"),
+            self._body_row("body", self.body_residual_px),
+            *(self._body_row(n, m["body_residual_px"]) for n, m in self.further_people.items()),
             ("scene scale", f"{self.scene_scale:.4g}", "metres a unit of the source"),
         ]
         if self.object_observed is None or self.object_scale_spread is None:
@@ -52,6 +53,12 @@ class PrepareReport(Measures):
         rows += [(f"mask of {n}", *_coverage(c)) for n, c in self.coverage.items()]
         rows.append(("time", f"{sum(self.seconds.values()):.0f} s", _times(self.seconds)))
         return rows
+
+    @staticmethod
+    def _body_row(name: str, residual: float | None) -> tuple[str, str, str]:
+        if residual is None:
+            return name, "none", "nobody was looked for"
+        return name, f"{residual:.1f} px", "median distance from the landmarks"
 
     def to_markdown(self) -> str:
         table = "\n".join(f"| {what} | {value} | {note} |" for what, value, note in self.rows())

@@ -28,11 +28,15 @@ PLAN = {
     "frames": Stage(
         2, (), ("width", "every", "fps", "max_frames", "pick", "folder_fps", "start", "end")
     ),
-    "evidence": Stage(30, ("frames",), ("human", "object"), slow=True),
+    "evidence": Stage(
+        30, ("frames",), ("human", "further_people", "find_person", "object"), slow=True
+    ),
     "object_masks": Stage(30, ("evidence",), ("object", "further_objects"), slow=True),
     "cameras": Stage(3, ("frames", "evidence"), ("camera", "focal", "intrinsics", "calibration")),
     "inputs": Stage(6, ("evidence", "cameras"), ("find_object",)),
-    "body": Stage(40, ("inputs",), ("body", "fit_steps", "person_height"), slow=True),
+    "body": Stage(
+        40, ("inputs",), ("body", "fit_steps", "person_height", "object_size"), slow=True
+    ),
     "masks": Stage(10, ("inputs", "body", "object_masks"), ("keep_black",), slow=True),
     "object": Stage(40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True),
     "depth": Stage(4, ("masks",), ("prompts",), slow=True),

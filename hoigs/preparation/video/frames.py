@@ -5,13 +5,16 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
 from jaxtyping import UInt8
 
+from hoigs.preparation.video.packet_index import PacketIndex, packet_index
 from hoigs.preparation.video.pictures import FilePicture, Picture, VideoPicture
 from hoigs.preparation.video.sharpness import sharpness
 from hoigs.preparation.video.source import IMAGE_SUFFIXES, SourceError, numbered_frames
@@ -19,6 +22,7 @@ from hoigs.preparation.video.span import Span
 
 Pick = Literal["sharpest", "first"]
 UNEVEN = 0.1  # of the gap between frames: times that are so far from even ones are kept
+FAR = 30  # frames ahead, from which on decoding begins anew at a keyframe
 LATE = 0.05  # of a window: a frame this little before it belongs to it, for times are rounded
 
 
@@ -142,26 +146,32 @@ class Frames(ABC):
     def read(self, number: int) -> UInt8[np.ndarray, "H W 3"]:
         """Frame `number` of the source at its own size; going forwards is the cheap way."""
         at, stream = self._reading or (-1, None)
-        if stream is None or number <= at:
-            at, stream = -1, self._pictures()
+        if stream is None or not at < number <= at + FAR:
+            at, stream = number - 1, self._pictures(number)
         for picture in stream:
             at += 1
             if at == number:
                 self._reading = at, stream
                 return picture.rgb(self.native_width, self.native_height)
-        raise SourceError(f"{self.path} has {at + 1} frames, none of number {number}")
+        raise SourceError(f"{self.path} has {self.count()} frames, none of number {number}")
 
     def count(self) -> int:
         """Frames of the whole source, those beyond the last chosen one too."""
         return sum(1 for _ in self._pictures())
 
     @abstractmethod
-    def _pictures(self) -> Iterator[Picture]:
-        """All frames of the source in order; sets `_rate` where the source has one."""
+    def _pictures(self, first: int = 0) -> Iterator[Picture]:
+        """The frames of the source from `first` on, in order; sets `_rate` where the source has
+        one."""
+
+    def _begin(self, span: Span) -> tuple[int, float]:
+        """Number of a frame from which a survey finds the span's first one, and seconds of the
+        source's first frame by its own clock."""
+        return 0, 0.0
 
     def _chosen(self) -> Iterator[Picture]:
-        wanted, last = set(self.indices), self.indices[-1]
-        for number, picture in enumerate(self._pictures()):
+        wanted, first, last = set(self.indices), self.indices[0], self.indices[-1]
+        for number, picture in enumerate(self._pictures(first), first):
             if number in wanted:
                 yield picture
             if number == last:
@@ -170,9 +180,10 @@ class Frames(ABC):
     def _survey(self, windows: _Windows, span: Span) -> FrameList:
         """Looks at every frame of the span, so that damage shows before any work."""
         native: tuple[int, int] | None = None
-        count, begun, seconds = 0, -1.0, -1.0
+        start, begun = self._begin(span)
+        count, seconds = 0, -1.0
         first: int | None = None
-        for number, picture in enumerate(self._pictures()):
+        for number, picture in enumerate(self._pictures(start), start):
             windows.rate = self._rate
             native = native or picture.size()
             if picture.size() != native:
@@ -249,9 +260,60 @@ class _Windows:
 
 
 class VideoFrames(Frames):
-    """The chosen frames of a video file, decoded anew on every iteration."""
+    """The chosen frames of a video file, decoded anew on every iteration from the nearest keyframe
+    on."""
 
-    def _pictures(self) -> Iterator[Picture]:
+    _indexed: tuple[PacketIndex | None] | None = None  # in a tuple once it has been looked for
+
+    def count(self) -> int:
+        index = self._index()
+        return super().count() if index is None else len(index)
+
+    def _begin(self, span: Span) -> tuple[int, float]:
+        index = None if span.start is None else self._index()
+        if index is None or span.start is None:
+            return 0, 0.0
+        for number in range(len(index)):
+            if span.begun(number, index.seconds(number)):
+                return number, index.times[0] * index.tick
+        return 0, 0.0  # beyond the end, which the survey says
+
+    def _index(self) -> PacketIndex | None:
+        if self._indexed is None:
+            with self._opened() as (container, stream):
+                self._indexed = (packet_index(container, stream),)
+        return self._indexed[0]
+
+    def _pictures(self, first: int = 0) -> Iterator[Picture]:
+        index = self._index() if first else None
+        with self._opened() as (container, stream):
+            if index is not None and index.keyframe(first):
+                yield from self._sought(container, stream, index, first)
+            else:
+                yield from map(VideoPicture, islice(container.decode(stream), first, None))
+
+    def _sought(
+        self, container: Any, stream: Any, index: PacketIndex, first: int
+    ) -> Iterator[Picture]:
+        """Pictures from `first` on, by their times; decoded from the start if they are not found
+        from the keyframe."""
+        container.seek(index.times[index.keyframe(first)], stream=stream, backward=True)
+        expected = first
+        for frame in container.decode(stream):
+            number = index.number(frame.pts)
+            if expected == first and (number is None or number < first):
+                continue
+            if number != expected:
+                break
+            expected += 1
+            yield VideoPicture(frame)
+        if expected < len(index):  # times of packets and of frames differ, or frames are damaged
+            with self._opened() as (anew, video):
+                yield from map(VideoPicture, islice(anew.decode(video), expected, None))
+
+    @contextmanager
+    def _opened(self) -> Iterator[tuple[Any, Any]]:
+        """The file and its video stream; errors of the decoder are named."""
         import av
 
         try:
@@ -263,7 +325,7 @@ class VideoFrames(Frames):
                 stream = container.streams.video[0]
                 stream.thread_type = "AUTO"
                 self._rate = float(stream.average_rate or stream.guessed_rate or 30)
-                yield from map(VideoPicture, container.decode(stream))
+                yield container, stream
         except (av.error.FFmpegError, ValueError) as error:
             size = self.path.stat().st_size if self.path.exists() else 0
             raise SourceError(
@@ -279,8 +341,8 @@ def _listed(streams: Iterable[Any]) -> str:
 class FolderFrames(Frames):
     """The chosen images of a folder in the order of their names, which end in a number."""
 
-    def _pictures(self) -> Iterator[Picture]:
-        return map(FilePicture, self._paths())
+    def _pictures(self, first: int = 0) -> Iterator[Picture]:
+        return map(FilePicture, self._paths()[first:])
 
     def _chosen(self) -> Iterator[Picture]:
         paths = self._paths()

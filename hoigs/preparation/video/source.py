@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,18 +17,19 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 LANDMARKS = "pose_mediapipe.npz"
 CAMERAS = "cameras.npz"
 MEGASAM = frozenset({"images", "depths", "intrinsic", "cam_c2w"})  # arrays of its npz
+VGGT = frozenset({"extrinsic", "intrinsic", "depth", "images"})  # likewise
 FRAME_FOLDERS = ("frames", "images")  # where a folder of frames may keep them
 _COLMAP_FILES = ("cameras", "images", "points3D")
 _LAYOUT = """  FOLDER/
     video.mp4            the video (any name; one file), or frames/00000.png and so on
-    pose_mediapipe.npz   image_xyzv and world_xyzv [F, 33, 4], from MediaPipe Pose; or a body:
-                         GVHMR's hmr4d_results.pt, or WHAM's wham_output.pkl
+    pose_mediapipe.npz   image_xyzv and world_xyzv [F, 33, 4], from MediaPipe Pose; or a body of
+                         GVHMR, WHAM, TRAM, PHALP (4D-Humans) or PromptHMR
     hoi_mask/00000.png   person and object together, 0/255, one file a video frame,
                          from a video segmenter; or masks/human/ and masks/object/ apart
     depth/               depth maps as .npz, in an array named metric_depth or disparity
     sparse/              a COLMAP model, or cameras.npz (K, world_to_camera, points, in metres),
-                         or MegaSaM's npz, if you have one; else hoigs checks whether the camera
-                         moves, and then runs structure from motion itself
+                         or MegaSaM's or VGGT's npz, if you have one; else hoigs checks
+                         whether the camera moves, and then runs structure from motion itself
     ball_track.npz       xyr [F, 3] pixels, if the object is a ball: centre and radius"""
 
 
@@ -50,7 +51,7 @@ class Source:
             gives.
         masked: entities whose masks `beside` reads.
         colmap: folder of a COLMAP model, or None.
-        cameras: cameras.npz or MegaSaM's npz, or None. ball: ball_track.npz, or None.
+        cameras: cameras.npz, or MegaSaM's or VGGT's npz, or None. ball: ball_track.npz, or None.
         absent: which of "landmarks", "masks" (the person's) and "object" (the object's masks, or
             its track) are not there and given by no other estimator.
     """
@@ -68,7 +69,7 @@ class Source:
 def find_source(
     path: Path,
     *,
-    human: str = "human",
+    people: Sequence[str] = ("human",),
     object_name: str = "object",
     given: Collection[str] = (),
     own_cameras: bool = False,
@@ -77,6 +78,7 @@ def find_source(
     """The inputs in a folder, or beside a video file.
 
     Args:
+        people: names of those who are looked for; none: no landmarks are needed.
         complete: landmarks and masks have to be there; False: `Source.absent` names those that are
             not.
         given: "masks", "landmarks" or "depth" that estimators give: no files are needed for them.
@@ -95,7 +97,9 @@ def find_source(
         raise SourceError(f"{video} is empty: 0 bytes; copy it again")
     beside: dict[EstimateKind, ComponentSpec] = {}
     absent: set[str] = set()
-    if (folder / LANDMARKS).is_file():
+    if not people:
+        pass
+    elif (folder / LANDMARKS).is_file():
         beside["landmarks"] = _files("landmarks", LANDMARKS)
     elif "landmarks" not in given and not complete:
         absent.add("landmarks")
@@ -109,13 +113,13 @@ def find_source(
     ball = folder / "ball_track.npz"
     if "masks" not in given:
         lacking: list[str] = []
-        spec, masked = _find_masks(folder, human, object_name, lacking)
+        spec, masked = _find_masks(folder, people, object_name, lacking)
         if masked or complete:
             beside["masks"] = spec
         if complete:
             missing += lacking
         else:
-            absent |= {"masks"} if human not in masked else set()
+            absent |= {"masks"} if set(people) - set(masked) else set()
     if object_name not in masked and not ball.is_file():
         absent.add("object")
     if (folder / "depth").is_dir():
@@ -176,13 +180,14 @@ def _find_video(folder: Path, missing: list[str]) -> Path | None:
 
 
 def _find_masks(
-    folder: Path, human: str, object_name: str, missing: list[str]
+    folder: Path, people: Sequence[str], object_name: str, missing: list[str]
 ) -> tuple[ComponentSpec, tuple[str, ...]]:
     """The estimator that reads them, and the entities that it reads."""
-    names = (human, object_name)
+    names = (*people, object_name)
     apart = tuple(n for n in names if (folder / "masks" / n).is_dir())
     together = folder / "hoi_mask"
-    if apart != names and together.is_dir() and any(together.glob("*.png")):
+    one = len(people) == 1  # whom it can be separated from the object by
+    if one and apart != names and together.is_dir() and any(together.glob("*.png")):
         return _files("masks", "hoi_mask", holds="together", resize=True), names
     for name in names:
         # a tracked ball gives the object's mask, so the person's alone is enough
@@ -211,13 +216,14 @@ def _find_colmap(folder: Path, missing: list[str]) -> Path | None:
 
 
 def _find_cameras(folder: Path) -> Path | None:
-    """cameras.npz, or else the one file that holds MegaSaM's arrays, whatever its name."""
+    """cameras.npz, or else the one file that holds arrays of MegaSaM or VGGT, whatever its name."""
     if (folder / CAMERAS).is_file():
         return folder / CAMERAS
-    found = [path for path in sorted(folder.glob("*.npz")) if holds(path, MEGASAM)]
+    files = sorted(folder.glob("*.npz"))
+    found = [path for path in files if holds(path, MEGASAM) or holds(path, VGGT)]
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
-        raise SourceError(f"{folder} holds cameras of MegaSaM in {names}: leave one there")
+        raise SourceError(f"{folder} holds cameras of MegaSaM or VGGT in {names}: leave one there")
     return found[0] if found else None
 
 

@@ -8,14 +8,17 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+import joblib
 import numpy as np
 import pytest
 import torch
 from tiny import FRAMES, HEIGHT, WIDTH, make_source
 
+from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.bodies.as_landmarks import BodyFileEstimator
-from hoigs.preparation.bodies.body_file import SMPLX_PELVIS, body_beside, read_bodies
+from hoigs.preparation.bodies.body_file import body_beside, read_bodies
+from hoigs.preparation.bodies.programs import SMPL_PELVIS, SMPLX_PELVIS
 from hoigs.preparation.body.joint_limits import beyond
 from hoigs.preparation.body.pose_prior import PosePrior
 from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until
@@ -51,6 +54,99 @@ def wham(frames: list[int]) -> defaultdict[Any, Any]:
         people[name]["trans"] = np.full((1, len(rows), 3), 2.0)
         people[name]["frame_ids"] = np.array(rows)
     return people
+
+
+PELVIS = np.array((0.05, 0.0, 2.8))  # of everybody here, in the camera
+UPRIGHT = np.diag((1.0, -1.0, -1.0)).astype(np.float32)
+ELBOW = axis_angle_to_matrices(torch.tensor((0.0, -1.0, 0.0))).numpy()
+
+
+def tram(folder: Path, frames: list[int]) -> Path:
+    """hps/hps_track_0.npy and camera.npy, as TRAM's scripts save them."""
+    turns = np.tile(np.eye(3, dtype=np.float32), (len(frames), 24, 1, 1))
+    turns[:, 0], turns[:, 18] = UPRIGHT, ELBOW
+    place = torch.tensor(PELVIS - SMPL_PELVIS, dtype=torch.float32)
+    results = {
+        "pred_cam": torch.zeros(len(frames), 3), "pred_pose": torch.zeros(len(frames), 144),
+        "pred_shape": torch.zeros(len(frames), 10), "pred_rotmat": torch.from_numpy(turns),
+        "pred_trans": place.expand(len(frames), 1, 3), "frame": torch.tensor(frames),
+    }  # fmt: skip
+    (folder / "hps").mkdir()
+    for k in range(2):
+        np.save(folder / f"hps/hps_track_{k}.npy", np.array(results, object))
+    camera = {
+        "pred_cam_R": np.tile(np.eye(3), (len(frames), 1, 1)), "pred_cam_T": np.zeros((3, 3)),
+        "img_focal": np.float64(FOCAL), "img_center": np.array((WIDTH / 2, HEIGHT / 2)),
+    }  # fmt: skip
+    np.save(folder / "camera.npy", np.array(camera, object))
+    return folder / "hps/hps_track_0.npy"
+
+
+def phalp(folder: Path, frames: list[int]) -> Path:
+    """demo_NAME.pkl: all frames; a person who is seen in some of them, and remembered in others."""
+    smpl = {
+        "global_orient": UPRIGHT[None], "betas": np.zeros(10, np.float32),
+        "body_pose": np.tile(np.eye(3, dtype=np.float32), (23, 1, 1)),
+    }  # fmt: skip
+    smpl["body_pose"][17] = ELBOW
+    farther = 5000 / 256 * WIDTH / FOCAL  # in the same pixels by its longer focal length
+    place = (PELVIS * (1, 1, farther) - SMPL_PELVIS).astype(np.float32)
+    content: dict[str, Any] = {}
+    for i in range(max(frames) + 2):
+        name, people = f"outputs/_DEMO/my/img/{i + 1:06d}.jpg", [7] if i else [7, 9]
+        content[name] = {
+            "time": i, "shot": 0, "frame_path": name, "tid": people,
+            "tracked_time": [0 if i in frames else 3, 0][: len(people)],
+            "smpl": [smpl for _ in people], "camera": [place for _ in people],
+            "size": [[HEIGHT, WIDTH] for _ in people], "embedding": [torch.ones(4) for _ in people],
+            "mask": [[{"size": [HEIGHT, WIDTH], "counts": "ab"}] for _ in people],
+            "conf": [np.float32(0.9) for _ in people],
+        }  # fmt: skip
+    joblib.dump(content, folder / "demo_my.pkl", compress=3)
+    return folder / "demo_my.pkl"
+
+
+def prompthmr(folder: Path, frames: list[int]) -> Path:
+    """results.pkl, of a video that was made half as large."""
+    pose = np.zeros((len(frames), 75), np.float32)
+    pose[:, 0], pose[:, 55] = np.pi, -1.0
+    trans = np.tile((PELVIS - SMPLX_PELVIS).astype(np.float32), (len(frames), 1))
+    person = {
+        "track_id": 1, "frames": np.array(frames), "bboxes": np.zeros((len(frames), 4)),
+        "smplx_cam": {"pose": pose, "trans": trans, "shape": np.zeros((len(frames), 10)),
+                      "rotmat": np.zeros((len(frames), 55, 3, 3), np.float32)},
+    }  # fmt: skip
+    other = person | {"frames": np.array(frames[:1])}
+    camera = {"img_focal": np.float32(FOCAL / 2), "img_center": np.array((WIDTH, HEIGHT)) / 4}
+    content = {"camera": camera, "people": {1: other, 2: person}, "timings": {}, "has_slam": True}
+    joblib.dump(content, folder / "results.pkl")
+    return folder / "results.pkl"
+
+
+@pytest.mark.parametrize("make", [tram, phalp, prompthmr])
+def test_other_programs_say_the_same(tmp_path: Path, make: Any) -> None:
+    path = make(tmp_path, [1, 2, 4])
+    found = body_beside(tmp_path, None)
+    assert found is not None and found.program.lower() == make.__name__ and found.path == path
+    assert found.people == 2 and found.frames.tolist() == [1, 2, 4]
+    np.testing.assert_allclose(np.abs(found.turns[:, 0]), [[np.pi, 0, 0]] * 3, atol=1e-3)
+    np.testing.assert_allclose(found.turns[:, 18], [[0, -1, 0]] * 3, atol=1e-3)
+    K = found.K(WIDTH, HEIGHT)[0]
+    np.testing.assert_allclose(K[:2, 2], (WIDTH / 2, HEIGHT / 2))
+    seen, right = K @ found.pelvis[0], FOCAL * 0.05 / 2.8 + WIDTH / 2
+    np.testing.assert_allclose(seen[:2] / seen[2], (right, HEIGHT / 2), rtol=1e-4)
+    assert (found.lens(WIDTH, HEIGHT) is None) == found.weak == (make is phalp)
+    if make is not phalp:
+        np.testing.assert_allclose(K[0, 0], FOCAL)
+        with pytest.raises(SourceError, match="of a video of"):
+            found.K(WIDTH, 3 * HEIGHT)
+
+
+def test_tram_needs_its_camera(tmp_path: Path) -> None:
+    path = tram(tmp_path, [0, 1])
+    (tmp_path / "camera.npy").unlink()
+    with pytest.raises(SourceError, match=r"needs camera\.npy"):
+        read_bodies(path)
 
 
 class Evil:

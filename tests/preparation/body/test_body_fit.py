@@ -130,6 +130,21 @@ def test_landmarks_that_stand_alone_are_not_believed(seen: str, stray: str) -> N
     assert (landmarks.without(found).found == (landmarks.found & ~found)).all()
 
 
+def test_landmarks_off_the_way_are_not_believed() -> None:
+    """Shoulders that walk to the right, are lost, and are found somewhere else for a while."""
+    frames = torch.arange(40.0)
+    image, lost = torch.zeros(40, 33, 3), slice(14, 18)
+    image[:, 11, 0], image[:, 12, 0] = 50 + 3 * frames, 10 + 3 * frames
+    image[:, :, 1] = 20.0
+    image[[18, 19, 21], :, 1] += 30
+    image[32, :, 1] += 30  # no gap is near: the person may have jumped
+    image[lost] = torch.nan
+    jumps = LandmarkTrack(image, image.clone()).jumps()
+    assert jumps.nonzero()[:, 0].tolist() == [18, 19, 21]
+    image[lost] = 0.0
+    assert not LandmarkTrack(image, image.clone()).jumps().any()
+
+
 def test_frames_without_landmarks_lie_between_their_neighbours() -> None:
     cameras = [camera()] * FRAMES
     landmarks = seen_by(cameras, truth())

@@ -230,7 +230,7 @@ def test_a_shape_far_off_its_masks_is_refused(monkeypatch: pytest.MonkeyPatch) -
     """As where landmarks are wrong, and the texture is another thing's."""
     images, objects, humans, joints = filmed()
 
-    def collapsed(*arguments: object) -> object:
+    def collapsed(*arguments: object, **settings: object) -> object:
         points = 0.01 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
         rotations, places = poses(0.7)
         seen = torch.ones(FRAMES, dtype=torch.bool)

@@ -1,0 +1,84 @@
+"""Read by `mediapipe_script.py`: who is in a frame.
+
+MediaPipe follows one person; its detector finds several, by their faces. People without one are
+looked for by its model of landmarks, in squares all over the frame. It imports nothing of hoigs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from mediapipe_guided import HEAD, KEPT, SHOULDERS, landmark_graph, score, seen_in, upright
+
+GRAPH = """
+input_stream: "image"
+output_stream: "detections"
+node {
+  calculator: "PoseDetectionCpu"
+  input_stream: "IMAGE:image"
+  output_stream: "DETECTIONS:detections"
+}
+"""
+SQUARES, ROWS = (0.7, 1.1, 1.6), (0.35, 0.7)  # sides and middles of squares, in image heights
+SURE, BROAD = 0.9, 0.1  # mean visibility of shoulders and arm, without a face; their distance
+MINE = 0.35  # of the square's side from somebody's hips, along the image: it is them
+FAINT = 0.5  # of the sureness of a person without a face: others come first
+ROUND = 2.5  # side of the square about a person, in distances of the detector's two points
+
+
+class Look:
+    """Everybody whom detector and model of landmarks agree on."""
+
+    def __init__(self, complexity) -> None:
+        from google.protobuf import text_format
+        from mediapipe.framework import calculator_pb2
+        from mediapipe.python.solution_base import SolutionBase
+
+        config = text_format.Parse(GRAPH, calculator_pb2.CalculatorGraphConfig())
+        self.detector = SolutionBase(graph_config=config)
+        self.landmarks = landmark_graph(complexity)
+
+    def people(self, image):
+        """How sure, the hips' middle and the side of the square, pixels, of each."""
+        height, width = image.shape[:2]
+        found = []
+        for one in self.detector.process({"image": image}).detections or []:
+            points = one.location_data.relative_keypoints[:2]
+            hips, rim = (np.array((p.x * width, p.y * height)) for p in points)
+            side = ROUND * float(np.linalg.norm(hips - rim))
+            seen = seen_in(*self.landmarks, image, (*hips, side))
+            if seen is not None and score(seen[0][:, 3]) >= KEPT:
+                found.append((float(one.score[0]), float(hips[0]), float(hips[1]), side))
+        return found
+
+    def faceless(self, image, found):
+        """Likewise those without a face, whom two squares show, and who are none of the found."""
+        height, width = image.shape[:2]
+        seen: list[tuple[float, float, float, float]] = []
+        more: list[tuple[float, float, float, float]] = []
+        for side in (s * height for s in SQUARES):
+            for x in np.arange(side / 4, width, side / 2):
+                for y in (row * height for row in ROWS):
+                    one = self.upper_body(image, (float(x), y, side))
+                    if one is None or any(near(one, other) for other in (*found, *more)):
+                        continue
+                    if any(near(one, other) for other in seen):
+                        more.append(one)
+                    seen.append(one)
+        return more
+
+    def upper_body(self, image, square):
+        """How sure, middle and side of a square about somebody whose face need not be seen."""
+        one = seen_in(*self.landmarks, image, square)
+        if one is None or not upright(one[0]):
+            return None
+        points = one[0].copy()
+        points[HEAD, 3] = 0.0
+        sure = score(points[:, 3])
+        if sure < SURE or np.ptp(points[SHOULDERS, 0]) < BROAD * len(image):
+            return None
+        return FAINT * sure, float(points[SHOULDERS, 0].mean()), square[1], square[2]
+
+
+def near(one, other) -> bool:
+    """Whether two squares are of one person."""
+    return abs(one[1] - other[1]) < MINE * max(one[3], other[3])
