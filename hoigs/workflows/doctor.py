@@ -82,7 +82,7 @@ def training_row(device: str) -> Inspected:
         loss = rasterizer.render(gaussians, camera).color.square().mean()
         loss.backward()
         optimiser.step()
-        float(loss)  # waits for the device
+        float(loss.detach())  # waits for the device
 
     try:
         points = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) + 1
