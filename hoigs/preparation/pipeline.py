@@ -46,7 +46,7 @@ from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.person import FittedPeople
 from hoigs.preparation.place_objects import place_objects
 from hoigs.preparation.prompts import check_prompts, placed_prompts
-from hoigs.preparation.saved import from_result, to_result
+from hoigs.preparation.saved import from_result, load_cameras, save_cameras, to_result
 from hoigs.preparation.scene.depth import (
     POOR,
     DepthFit,
@@ -83,7 +83,7 @@ class Pipeline:
         stages: Stages,
         work: WorkFolder,
         bodies: FileBody | None = None,
-        announce: Callable[[str], object] = str,
+        announce: Callable[[str], object] = lambda _said: None,
     ) -> None:
         self.source, self.out, self.body = source, out, body
         self.options, self.stages, self.work = options, stages, work
@@ -550,20 +550,3 @@ class Pipeline:
             name: BodyTrack(self.options.body, person.poses, person.provenance)
             for name, person in self.people.people.items()
         }
-
-
-def save_cameras(chosen: ChosenCameras) -> Result:
-    """With a copy of the COLMAP model that the stage made itself, in a temporary folder."""
-    made, model = to_result(chosen), chosen.track.model
-    if not chosen.own_model or model is None:
-        return made
-    return Result(made.values, made.arrays, lambda to: shutil.copytree(model, to / "colmap"))
-
-
-def load_cameras(result: Result) -> ChosenCameras:
-    """With the path of that copy."""
-    chosen: ChosenCameras = from_result(result)
-    if not chosen.own_model:
-        return chosen
-    assert result.folder is not None
-    return replace(chosen, track=replace(chosen.track, model=result.folder / "colmap"))

@@ -142,17 +142,23 @@ def _people(
     return found | {"prompts": {**update.get("prompts", {}), **found["prompts"]}}
 
 
+def _by_name(named: Sequence[tuple[str | None, str]], usual: str) -> dict[str, list[str]]:
+    """Places by name, in the order of the first of each; `usual`: of those without one."""
+    places: dict[str, list[str]] = {}
+    for name, place in named:
+        places.setdefault(name or usual, []).append(place)
+    return places
+
+
 def named_people(
-    named: Sequence[tuple[str, str]], options: PrepareOptions, objects: Sequence[str] = ()
+    named: Sequence[tuple[str | None, str]], options: PrepareOptions, objects: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Names and prompts, as fields of the options, of people given by (name, place).
 
     Raises:
         SpecError: a place is wrong, or a person has an object's name.
     """
-    places: dict[str, list[str]] = {}
-    for name, place in named:
-        places.setdefault(name or options.human, []).append(place)
+    places = _by_name(named, options.human)
     for name in places:
         if name in objects:
             raise SpecError(f"--person {name}=: {name} is an object's name; give another")
@@ -173,9 +179,7 @@ def named_objects(
     Raises:
         SpecError: a place is wrong, or an object has the person's name.
     """
-    places: dict[str, list[str]] = {}
-    for name, place in named:
-        places.setdefault(name or options.object, []).append(place)
+    places = _by_name(named, options.object)
     if options.human in places:
         raise SpecError(
             f"--object {options.human}=: {options.human} is the person's name; give the object "

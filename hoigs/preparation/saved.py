@@ -6,8 +6,9 @@ Each becomes JSON that names its kind, and arrays.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -115,3 +116,20 @@ def _unpack(packed: Any, arrays: Mapping[str, np.ndarray]) -> Any:
         case {"class": name, "fields": items}:
             return CLASSES[name](**{key: _unpack(item, arrays) for key, item in items.items()})
     return packed
+
+
+def save_cameras(chosen: ChosenCameras) -> Result:
+    """With a copy of the COLMAP model that the stage made itself, in a temporary folder."""
+    made, model = to_result(chosen), chosen.track.model
+    if not chosen.own_model or model is None:
+        return made
+    return Result(made.values, made.arrays, lambda to: shutil.copytree(model, to / "colmap"))
+
+
+def load_cameras(result: Result) -> ChosenCameras:
+    """With the path of that copy."""
+    chosen: ChosenCameras = from_result(result)
+    if not chosen.own_model:
+        return chosen
+    assert result.folder is not None
+    return replace(chosen, track=replace(chosen.track, model=result.folder / "colmap"))

@@ -113,7 +113,8 @@ def _tram(content: Mapping[str, Any], path: Path) -> FileBody:
 
 def _prompthmr(content: Mapping[str, Any], path: Path) -> FileBody | None:
     people = content["people"]
-    fitted = [p for p in people.values() if _has(p, "smplx_cam")] if _has_values(people) else []
+    people = people.values() if isinstance(people, Mapping) else []
+    fitted = [p for p in people if _has(p, "smplx_cam")]
     if not fitted:
         return None
     person = max(fitted, key=lambda one: np.size(one.get("frames", ())))
@@ -167,10 +168,6 @@ def _part(smpl: Any, name: str, path: Path) -> Any:
     if not _has(smpl, name):
         raise SourceError(f"{path}, of PHALP, has no smpl.{name}; expected {EXPECTED['PHALP']}")
     return smpl[name]
-
-
-def _has_values(value: Any) -> bool:
-    return isinstance(value, Mapping) and bool(value)
 
 
 def _axes(matrices: Float[np.ndarray, "N J 3 3"]) -> Float[np.ndarray, "N J 3"]:

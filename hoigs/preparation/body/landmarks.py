@@ -76,6 +76,7 @@ class LandmarkTrack:
     def jumps(self) -> Bool[Tensor, " F"]:
         """Frames of `found` near gaps whose shoulders are far from the way on which those of most
         frames around lie: as a detector loses a person, or finds them again, it puts them anywhere.
+        The way is a line through each coordinate by the median of slopes (Theil 1950, Sen 1968).
         """
         from scipy import stats  # on use: it takes a while to import
 

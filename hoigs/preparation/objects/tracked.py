@@ -104,10 +104,8 @@ def tracked_object(
     _check(outlines)
     bones = torch.zeros(len(cameras), 0, 3)
     if joints is not None:
-        hands, bones = (
-            hand_motion(joints, masks, outlines, cameras, fps),
-            along_bones(joints, parents),
-        )
+        hands = hand_motion(joints, masks, outlines, cameras, fps)
+        bones = along_bones(joints, parents)
     else:
         assert depths is not None
         hands = no_hands(outlines, depths, cameras, fps)

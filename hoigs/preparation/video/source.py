@@ -97,13 +97,12 @@ def find_source(
         raise SourceError(f"{video} is empty: 0 bytes; copy it again")
     beside: dict[EstimateKind, ComponentSpec] = {}
     absent: set[str] = set()
-    if not people:
-        pass
-    elif (folder / LANDMARKS).is_file():
+    wanted = bool(people) and "landmarks" not in given
+    if people and (folder / LANDMARKS).is_file():
         beside["landmarks"] = _files("landmarks", LANDMARKS)
-    elif "landmarks" not in given and not complete:
+    elif wanted and not complete:
         absent.add("landmarks")
-    elif "landmarks" not in given:
+    elif wanted:
         missing.append(
             "pose_mediapipe.npz: body landmarks, from MediaPipe Pose (`pip install mediapipe` in "
             "an environment of its own), arrays image_xyzv and world_xyzv [F, 33, 4]; or let hoigs "

@@ -77,19 +77,30 @@ class BatchFolder:
         first = next(rows := iter(rows), None)  # a wrong one raises before a folder is made
         path.mkdir(parents=True, exist_ok=True)
         with in_turn(path / BATCH), written_whole(path / BATCH) as part:
-            known, count = cls.open(path) if (path / BATCH).exists() else None, 0
+            known, count = cls._known(path), 0
             with part.open("w", encoding="utf-8") as file:
                 file.write(_head(False))
                 for row in chain([first] if first else [], rows):
                     file.write(f"{row.model_dump_json()}\n")
                     count += 1
-                fan_out = known.fan_out if known else count >= many
+                fan_out = count >= many if known is None else known
                 file.seek(0)
                 file.write(_head(fan_out))
         made = cls(path, fan_out)
         for half in HALVES if fan_out else [""]:
             (path / "rows" / half).mkdir(parents=True, exist_ok=True)
         return made
+
+    @classmethod
+    def _known(cls, path: Path) -> bool | None:
+        """The `fan_out` of a batch that is there, by its folders where its list is damaged; None:
+        there is no batch."""
+        if not (path / BATCH).exists():
+            return None
+        try:
+            return cls.open(path).fan_out
+        except HoigsError:
+            return all((path / "rows" / half).is_dir() for half in HALVES)
 
     @classmethod
     def open(cls, path: Path) -> BatchFolder:

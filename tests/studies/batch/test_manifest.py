@@ -85,3 +85,12 @@ def test_folders_of_many_rows_fan_out_and_stay_where_they_are(tmp_path, many, pl
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(
         [BATCH, "rows", "summary.csv", "summary.html", "summary.json"]
     )
+
+
+@pytest.mark.parametrize("many", [1, 9])
+def test_a_damaged_list_is_written_again_where_the_rows_are(tmp_path, many):
+    (tmp_path / "m.csv").write_text("clip,name\nbuiltin:carry,a\n")
+    made = BatchFolder.begin(tmp_path / "out", each_row(tmp_path / "m.csv"), many)
+    (tmp_path / "out" / BATCH).write_text("{")
+    assert BatchFolder.begin(tmp_path / "out", each_row(tmp_path / "m.csv"), 5) == made
+    assert [row.name for row in BatchFolder.open(tmp_path / "out").rows()] == ["a"]
