@@ -34,6 +34,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.fuzz_damages import MARK, damaged
+from benchmarks.fuzz_layouts import write_layouts
 from hoigs.cli.failures import message_of
 
 SECONDS, GIB = 10.0, 1.0
@@ -149,6 +150,7 @@ def make_targets(root: Path, clip: Path) -> list[Target]:
                                        "run/spec.yaml"), _read_run),
         Target("checkpoints", root / "checkpoints", (f"{stem}.json", f"{stem}.safetensors"),
                _read_run),
+        *(Target(*layout) for layout in write_layouts(root, clip)),
     ]  # fmt: skip
 
 

@@ -45,7 +45,9 @@ def damaged(path: Path, data: bytes, rng: random.Random, mark: Path) -> bytes:
         kinds += 4 * [lambda: _npz(data, rng, mark)]
     elif path.suffix == ".safetensors":
         kinds += 4 * [lambda: _safetensors(path, rng)]
-    elif path.suffix in (".yaml", ".toml", ".ply", ".obj"):
+    elif path.suffix == ".npy":
+        kinds += 4 * [lambda: _npy(data, rng, mark)]
+    elif path.suffix in (".yaml", ".toml", ".ply", ".obj", ".txt"):
         kinds += 4 * [lambda: _words(data, rng)]
     return rng.choice(kinds)()
 
@@ -179,6 +181,24 @@ def _npz(data: bytes, rng: random.Random, mark: Path) -> bytes:
             np.lib.format.write_array(buffer, values, allow_pickle=True)
             archive.writestr(f"{key}.npy", raw if raw and key == name else buffer.getvalue())
     return out.getvalue()
+
+
+def _npy(data: bytes, rng: random.Random, mark: Path) -> bytes:
+    """An array of other values, shape or dtype; in a pickled dictionary, another value."""
+    array = np.load(io.BytesIO(data), allow_pickle=True)
+    if array.dtype == object:
+        tree = array.item()
+        holder, key = rng.choice(list(_places(tree)))
+        odd = rng.choice((_odd(rng), np.zeros((2, 3)), np.full((4, 4), np.nan), _Payload(mark)))
+        holder[key] = odd
+        array = np.array(tree, dtype=object)
+        out = io.BytesIO()
+        np.save(out, array, allow_pickle=True)
+        return out.getvalue()
+    packed = io.BytesIO()
+    np.savez(packed, a=array)
+    with zipfile.ZipFile(io.BytesIO(_npz(packed.getvalue(), rng, mark))) as archive:
+        return archive.read(archive.namelist()[0]) if archive.namelist() else b""
 
 
 def _safetensors(path: Path, rng: random.Random) -> bytes:
