@@ -44,7 +44,7 @@ class FrameFile:
             raise IndexError(f"frame {frame} of {self._count}")
         found = np.empty(self._shape, self._type)
         self._file.seek(frame * found.nbytes)
-        self._file.readinto(found.data.cast("B"))  # type: ignore[attr-defined]
+        self._file.readinto(found.data.cast("B"))
         return found
 
     def __iter__(self) -> Iterator[np.ndarray]:
