@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -89,6 +90,7 @@ def entity_masks(
     images: Images,
     silhouettes: Callable[[], MaskStack],
     fitted: Bool[np.ndarray, " F"],
+    folder: Path | None = None,
 ) -> tuple[MaskStack, MaskStack, str]:
     """Masks of person and object, disjoint, and what they were made from.
 
@@ -96,6 +98,7 @@ def entity_masks(
         images: gives the undistorted frames anew on every call.
         silhouettes: gives the fitted body's; called only if masks must be separated.
         fitted: frames whose body was fitted to landmarks.
+        folder: for temporary files; None: the system's.
     """
     if given.human is not None and given.object is not None:
         human = MaskStack(h & ~o for h, o in zip(given.human, given.object, strict=True))
@@ -107,7 +110,7 @@ def entity_masks(
     if ball is not None:
         human, objects = _disc_masks(together, ball)
         return human, objects, "ball: its disc; person: the given mask without the disc"
-    human, objects = separate(images, together, silhouettes(), fitted)
+    human, objects = separate(images, together, silhouettes(), fitted, folder=folder)
     text = (
         "one given mask of person and object, separated by the fitted body's silhouette, "
         "colour and neighbouring frames: borders between them are weak, more so where the body "

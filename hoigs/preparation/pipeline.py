@@ -378,6 +378,7 @@ class Pipeline:
             human, object_masks, text = entity_masks(
                 self._given_masks(), self.estimates.ball, self.images, self._silhouettes,
                 np.zeros(len(self.video), bool) if first is None else first.found,
+                self.work.root,
             )  # fmt: skip
             found = self.found_object
             further: dict[str, MaskStack] = {}

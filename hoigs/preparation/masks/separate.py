@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from scipy import ndimage
 
+from hoigs.preparation.masks.frame_file import FrameFile
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.video.resizing import shrink, shrink_mask
 
@@ -27,6 +29,7 @@ def separate(
     bodies: MaskStack,
     fitted: Bool[np.ndarray, " F"],
     rounds: int = 4,
+    folder: Path | None = None,
 ) -> tuple[MaskStack, MaskStack]:
     """The person's and the object's masks, which divide `together`.
 
@@ -35,7 +38,8 @@ def separate(
     the masks of the round before give over all frames, from the object's place in the frames
     before and after, and from its neighbours (a mean field with a box neighbourhood). It is
     GrabCut's idea (Rother et al. 2004) with histograms in place of mixtures and a mean field in
-    place of the cut. Large frames are worked on at a longer side of 480 pixels.
+    place of the cut. Large frames are worked on at a longer side of 480 pixels. One frame's pixels
+    are in memory at a time; small pictures and log-odds lie in files that are gone afterwards.
 
     Args:
         images: gives the frames anew on every call.
@@ -43,27 +47,32 @@ def separate(
         fitted: frames whose body was fitted to something seen; silhouettes of the others are
             guesses: they count less, and colours are not learnt from them.
         rounds: of colours and masks, after the first masks from the silhouettes alone.
+        folder: of those files; None: the system's temporary folder.
 
     Returns:
         human, object
     """
     size = _work_size(together[0].shape)
-    wholes = [shrink_mask(m, *size) for m in together]
-    pictures = [shrink(image, *size) for image in images()]
-    small_bodies = [shrink_mask(b, *size) for b in bodies]
+    wholes = MaskStack(shrink_mask(m, *size) for m in together)
+    pictures = FrameFile(folder, (shrink(image, *size) for image in images()))
+    small_bodies = MaskStack(shrink_mask(b, *size) for b in bodies)
     trust = [
         _trust(b, t) * (1.0 if seen else GUESSED)
         for b, t, seen in zip(small_bodies, wholes, fitted, strict=True)
     ]
-    odds = [w * _silhouette_odds(b) for b, w in zip(small_bodies, trust, strict=True)]
-    objects = [t & (o > 0) for t, o in zip(wholes, odds, strict=True)]
+    odds = FrameFile(
+        folder,
+        (w * _silhouette_odds(b) for b, w in zip(small_bodies, trust, strict=True)),
+    )
+    objects = MaskStack(t & (o > 0) for t, o in zip(wholes, odds, strict=True))
     for turn in range(rounds):
         colors = _learned(pictures, wholes, objects, odds, trust)
-        places = [_place(objects, i) if turn else 0.0 for i in range(len(objects))]
+        found = MaskStack()
         for i, mask in enumerate(wholes):
             color = colors(pictures[i])
-            objects[i] = _object_parts(_mean_field(odds[i] + color + places[i], mask), color)
-        objects = _without_strays(objects)
+            place = _place(objects, i) if turn else 0.0
+            found.append(_object_parts(_mean_field(odds[i] + color + place, mask), color))
+        objects = MaskStack(_without_strays(found))
     humans, separated = MaskStack(), MaskStack()
     for mask, part, whole in zip(together, _adopted(objects, wholes), wholes, strict=True):
         object_mask = mask & _enlarged(part, whole & ~part, mask.shape)
@@ -90,10 +99,10 @@ def _enlarged(
 
 
 def _learned(
-    pictures: Sequence[np.ndarray],
-    wholes: Sequence[np.ndarray],
-    objects: Sequence[np.ndarray],
-    odds: Sequence[np.ndarray],
+    pictures: FrameFile,
+    wholes: MaskStack,
+    objects: MaskStack,
+    odds: FrameFile,
     trust: Sequence[float],
 ) -> ColorOdds:
     """Colours of both, from the frames whose silhouette is to be trusted."""
@@ -123,7 +132,7 @@ def _silhouette_odds(body: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
     return (2 * np.tanh((outside - inside - scale) / scale)).astype(np.float32)
 
 
-def _place(objects: list[Bool[np.ndarray, "H W"]], frame: int) -> Float[np.ndarray, "H W"]:
+def _place(objects: MaskStack, frame: int) -> Float[np.ndarray, "H W"]:
     """Log-odds -1..1 from where the object is in the two frames before and after."""
     near = [objects[i] for i in range(frame - 2, frame + 3) if 0 <= i < len(objects) and i != frame]
     if not near:
@@ -188,49 +197,46 @@ def _object_parts(
 
 
 def _adopted(
-    objects: list[Bool[np.ndarray, "H W"]], wholes: list[Bool[np.ndarray, "H W"]]
-) -> list[Bool[np.ndarray, "H W"]]:
+    objects: Iterable[Bool[np.ndarray, "H W"]], wholes: Iterable[Bool[np.ndarray, "H W"]]
+) -> Iterator[Bool[np.ndarray, "H W"]]:
     """Objects with the crumbs of the person that touch them and nothing else of the person: a dark
     edge, a buckle."""
-    adopted = []
     for object_mask, whole in zip(objects, wholes, strict=True):
         labels, count = ndimage.label(whole & ~object_mask)
         sizes = np.bincount(labels.ravel(), minlength=count + 1)
         sizes[0] = 0
         touching = np.unique(labels[ndimage.binary_dilation(object_mask)])
         crumbs = [n for n in touching.tolist() if n and sizes[n] < CRUMB * sizes.max()]
-        adopted.append(object_mask | np.isin(labels, crumbs))
-    return adopted
+        yield object_mask | np.isin(labels, crumbs)
 
 
 def _without_strays(
-    objects: list[Bool[np.ndarray, "H W"]], reach: int = 6
-) -> list[Bool[np.ndarray, "H W"]]:
+    objects: Sequence[Bool[np.ndarray, "H W"]] | MaskStack, reach: int = 6
+) -> Iterator[Bool[np.ndarray, "H W"]]:
     """Drops parts that are far from where the object is in the frames around.
 
     Where it is: the median, over `reach` frames before and after, of the largest part's middle.
     Far: no pixel within STRAY of it.
     """
-    labelled = [ndimage.label(o) for o in objects]
     middles = np.full((len(objects), 2), np.nan)
-    for i, (labels, count) in enumerate(labelled):
+    for i, mask in enumerate(objects):
+        labels, count = ndimage.label(mask)
         if count:
             largest = 1 + np.bincount(labels.ravel())[1:].argmax()
             middles[i] = np.argwhere(labels == largest).mean(0)
-    kept = []
-    for i, (labels, count) in enumerate(labelled):
+    for i, mask in enumerate(objects):
         around = middles[max(0, i - reach) : i + reach + 1]
         around = around[np.isfinite(around[:, 0])]
+        labels, count = ndimage.label(mask)  # again: kept of all frames they would fill memory
         if not count or not len(around):
-            kept.append(objects[i])
+            yield mask
             continue
         middle = np.median(around, axis=0)
         rows, columns = np.nonzero(labels)
         away = np.hypot(rows - middle[0], columns - middle[1])
         numbers = labels[rows, columns]
         near = np.unique(numbers[away <= STRAY * max(labels.shape)])
-        kept.append(np.isin(labels, near) & (labels > 0))
-    return kept
+        yield np.isin(labels, near) & (labels > 0)
 
 
 def _mean_field(

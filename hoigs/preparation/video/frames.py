@@ -73,6 +73,7 @@ class Frames(ABC):
         indices: the source's frame number of each frame given out.
         total: frames in the source, up to the last one looked at.
         sharpness: of each frame given out.
+        notes: what went another way than it should while frames were read, a sentence each.
 
     Raises:
         SourceError: the source is no video, is empty, or is damaged.
@@ -92,6 +93,7 @@ class Frames(ABC):
         known: FrameList | None = None,
     ) -> None:
         self.path, self._rate = Path(path), rate
+        self.notes: list[str] = []
         windows = _Windows(every, fps, max_frames, pick)
         self.list = known or self._survey(windows, span or Span())
         if width and width > self.native_width:
@@ -154,6 +156,10 @@ class Frames(ABC):
                 self._reading = at, stream
                 return picture.rgb(self.native_width, self.native_height)
         raise SourceError(f"{self.path} has {self.count()} frames, none of number {number}")
+
+    def _note(self, text: str) -> None:
+        if text not in self.notes:
+            self.notes.append(text)
 
     def count(self) -> int:
         """Frames of the whole source, those beyond the last chosen one too."""
@@ -295,8 +301,8 @@ class VideoFrames(Frames):
     def _sought(
         self, container: Any, stream: Any, index: PacketIndex, first: int
     ) -> Iterator[Picture]:
-        """Pictures from `first` on, by their times; decoded from the start if they are not found
-        from the keyframe."""
+        """Pictures from `first` on, by their times; decoded from the start, with a note, if they
+        are not found from the keyframe."""
         container.seek(index.times[index.keyframe(first)], stream=stream, backward=True)
         expected = first
         for frame in container.decode(stream):
@@ -308,6 +314,12 @@ class VideoFrames(Frames):
             expected += 1
             yield VideoPicture(frame)
         if expected < len(index):  # times of packets and of frames differ, or frames are damaged
+            self._note(
+                f"frame {expected} of {self.path.name} is not where the video's index has it: "
+                "frames are decoded from the start, which takes longer and may shift them where "
+                "frames are damaged; re-encode it, such as with `ffmpeg -i VIDEO -c:v libx264 "
+                "fixed.mp4`"
+            )
             with self._opened() as (anew, video):
                 yield from map(VideoPicture, islice(anew.decode(video), expected, None))
 

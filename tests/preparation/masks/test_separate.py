@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -108,7 +110,7 @@ def test_what_strays_is_not_the_object() -> None:
             mask[60:80, 40:60] = True
         mask[2:8, 2:8] = i in (3, 4)
         frames.append(mask)
-    kept = _without_strays(frames)
+    kept = list(_without_strays(frames))
     assert not kept[4].any() and not kept[3][2:8, 2:8].any()
     assert all(kept[i][60:80, 40:60].all() for i in range(9) if i != 4)
 
@@ -122,3 +124,19 @@ def test_crumbs_of_the_person_on_the_object_are_the_objects() -> None:
     (kept,) = _adopted([thing], [whole])
     assert kept[50:80, 50:80].all()
     assert not kept[10:100, 10:48].any() and not kept[5:8, 70:73].any()
+
+
+def test_memory_does_not_grow_with_the_frames() -> None:
+    peaks = {}
+    for frames in (6, 36):
+        together = MaskStack(scene(i % F)[1] | scene(i % F)[2] for i in range(frames))
+        bodies = MaskStack(silhouettes()[i % F] for i in range(frames))
+        tracemalloc.start()
+        separate(
+            lambda count=frames: (scene(i % F)[0] for i in range(count)),
+            together, bodies, np.ones(frames, bool), rounds=2,
+        )  # fmt: skip
+        peaks[frames] = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    grown = (peaks[36] - peaks[6]) / 30
+    assert grown < WIDTH * HEIGHT  # bytes a frame: less than one mask, let alone pixels
