@@ -24,7 +24,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from itertools import product
 from multiprocessing import get_context
@@ -66,11 +66,15 @@ def main() -> int:
     rows: list[dict[str, Any]] = []
     if options.jobs > 1:
         with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
-            for row in pool.map(measure, jobs):
-                _add(rows, row, options)
+            place = {pool.submit(measure, job): i for i, job in enumerate(jobs)}
+            order: list[int] = []
+            for done in as_completed(place):  # written as they end: a run cut short leaves these
+                order.append(place[done])
+                order.sort()
+                _add(rows, done.result(), options, order.index(place[done]))
     else:
         for job in jobs:
-            _add(rows, measure(job), options)
+            _add(rows, measure(job), options, len(rows))
     return int(any("error" in row for row in rows))
 
 
@@ -178,8 +182,11 @@ def _jobs(options: argparse.Namespace) -> Iterator[Job]:
         )  # fmt: skip
 
 
-def _add(rows: list[dict[str, Any]], row: dict[str, Any], options: argparse.Namespace) -> None:
-    rows.append(row)
+def _add(
+    rows: list[dict[str, Any]], row: dict[str, Any], options: argparse.Namespace, place: int
+) -> None:
+    """Insert a row at its place, print it and write all."""
+    rows.insert(place, row)
     print(_line(row), flush=True)
     if options.json:
         given = {k: str(v) if isinstance(v, Path) else v for k, v in vars(options).items()}

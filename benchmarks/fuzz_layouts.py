@@ -59,7 +59,7 @@ def write_layouts(root: Path, clip: Path) -> list[tuple[str, Path, tuple[str, ..
 
 def _number(path: Path) -> int | None:
     digits = "".join(c for c in path.stem if c.isdigit())
-    return int(digits) if digits and path.suffix != ".txt" else None
+    return int(digits) if digits and path.suffix not in (".txt", ".bin") else None
 
 
 def _write(name: str, clip: Clip, folder: Path) -> Path:

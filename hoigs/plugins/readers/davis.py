@@ -18,7 +18,7 @@ from hoigs.core.values.clip import Clip, uniform_test_split
 from hoigs.core.values.tokens import EntityKind
 from hoigs.plugins.readers.common.config import VideoReaderConfig
 from hoigs.plugins.readers.common.frame_order import image_files, video_moments
-from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
+from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size, opened
 from hoigs.plugins.readers.common.listing import Need, require_files
 from hoigs.plugins.readers.common.start_points import points_along_rays
 
@@ -133,8 +133,7 @@ def _palettes(folder: Path, images: Sequence[Path]) -> dict[int, MaskFiles]:
     paths = [folder / f"{p.stem}.png" for p in images]
     seen: set[int] = set()
     for path in paths:
-        with Image.open(path) as image:
-            seen.update(np.unique(_indices(image)).tolist())
+        seen.update(np.unique(_indices(opened(path))).tolist())
     return {i: MaskFiles(paths, _index(i)) for i in sorted(seen - {0, VOID})}
 
 

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
 
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
@@ -20,7 +19,7 @@ from hoigs.core.values.clip import Clip, ObjectTrack, uniform_test_split
 from hoigs.core.values.tokens import EntityKind
 from hoigs.plugins.readers.common.config import VideoPointsConfig
 from hoigs.plugins.readers.common.frame_order import image_files, video_moments
-from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
+from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size, opened
 from hoigs.plugins.readers.common.listing import Need, require_files
 from hoigs.plugins.readers.common.poses import rigid
 from hoigs.plugins.readers.common.start_points import points_along_rays
@@ -72,6 +71,10 @@ class HoldReader(ClipReader):
         where = str(build / "data.npy")
         if not isinstance(data, dict) or not {"cameras", "entities"} <= set(data):
             raise ClipError(f"{where}: expected a dictionary with cameras and entities")
+        for key in ("cameras", "entities"):
+            if not isinstance(data[key], dict):
+                kind = type(data[key]).__name__
+                raise ClipError(f"{where}: {key} is a {kind}, expected a dictionary")
         paths = [build / "mask" / f"{p.stem}.png" for p in images]
         _require_values(paths[0])
         cameras = _cameras(data["cameras"], images, where)
@@ -116,7 +119,8 @@ def _cameras(table: Any, images: Sequence[Path], where: str) -> list[Camera]:
         )
     cameras = []
     for i, image in enumerate(images):
-        K, w2c = decomposed(np.asarray(table[f"world_mat_{i}"], np.float64)[:3], f"{where}: {i}")
+        name = f"world_mat_{i}"
+        K, w2c = decomposed(_numbers(table[name], (4, 4), f"{where}: {name}")[:3], f"{where}: {i}")
         width, height = image_size(image)
         lens, pose = torch.from_numpy(K).float(), torch.from_numpy(w2c).float()
         cameras.append(Camera(lens, pose, width, height))
@@ -150,14 +154,16 @@ def decomposed(
 def _object(table: Any, frames: int, where: str) -> ObjectTrack:
     """x = R s N^-1 p + t: canonical points p, their normalisation N, the object's scale s."""
     keys = {"object_poses", "obj_scale", "norm_mat", "pts.cano"}
-    if not isinstance(table, dict) or not keys <= set(table):
-        raise ClipError(f"{where}: entities.object lacks {sorted(keys - set(table or ()))}")
-    poses = np.asarray(table["object_poses"], np.float64)
-    if poses.shape != (frames, 6):
-        raise ClipError(f"{where}: object_poses is {poses.shape}, expected ({frames}, 6)")
-    cano = np.asarray(table["pts.cano"], np.float64)
-    back = np.linalg.inv(np.asarray(table["norm_mat"], np.float64))
-    scale = float(np.asarray(table["obj_scale"]).reshape(-1)[0])
+    found = set(table) if isinstance(table, dict) else set()
+    if not keys <= found:
+        raise ClipError(f"{where}: entities.object lacks {sorted(keys - found)}")
+    poses = _numbers(table["object_poses"], (frames, 6), f"{where}: object_poses")
+    cano = _numbers(table["pts.cano"], (None, 3), f"{where}: pts.cano")
+    norm = _numbers(table["norm_mat"], (4, 4), f"{where}: norm_mat")
+    if np.linalg.matrix_rank(norm) < 4:
+        raise ClipError(f"{where}: norm_mat has no inverse")
+    back = np.linalg.inv(norm)
+    scale = float(_numbers(np.reshape(table["obj_scale"], -1), (1,), f"{where}: obj_scale")[0])
     points = scale * (cano @ back[:3, :3].T + back[:3, 3])
     center = points.mean(0)
     rotations = axis_angle_to_matrices(torch.from_numpy(poses[:, :3]))
@@ -173,9 +179,24 @@ def _object(table: Any, frames: int, where: str) -> ObjectTrack:
     )
 
 
+def _numbers(value: Any, shape: tuple[int | None, ...], where: str) -> Float[np.ndarray, "..."]:
+    """Finite numbers of a shape, None for any length of at least 1; errors say what came."""
+    expected = f"expected finite numbers of shape {list(shape)}".replace("None", "any")
+    try:
+        found = np.asarray(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ClipError(f"{where} is not numbers ({error}); {expected}") from error
+    fits = found.ndim == len(shape) and all(
+        n == m or (m is None and n) for n, m in zip(found.shape, shape, strict=True)
+    )
+    if not fits or not np.isfinite(found).all():
+        what = f"has shape {list(found.shape)}" if not fits else "has numbers that are not finite"
+        raise ClipError(f"{where} {what}; {expected}")
+    return found
+
+
 def _require_values(path: Path) -> None:
-    with Image.open(path) as image:
-        values = set(np.unique(np.asarray(image.convert("L"))).tolist())
+    values = set(np.unique(np.asarray(opened(path).convert("L"))).tolist())
     if values - {0, *VALUES.values()}:
         raise ClipError(
             f"{path} has the values {sorted(values)[:8]}; HOLD's build writes 0, 50 (object), 150 "

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, FiniteFloat
 
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
@@ -64,18 +64,22 @@ class MetadataJson(BaseModel):
         return self.warp_id if self.time_id is None else self.time_id
 
 
+Pixels = Annotated[float, Field(ge=1, le=65536)]
+Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+
 class CameraJson(BaseModel):
     """camera/ID.json; orientation is world-to-camera, position the camera's centre."""
 
-    orientation: list[list[float]]
-    position: tuple[float, float, float]
-    focal_length: float = Field(gt=0)
-    principal_point: tuple[float, float]
-    image_size: tuple[float, float]
-    skew: float = 0.0
-    pixel_aspect_ratio: float = Field(default=1.0, gt=0)
-    radial_distortion: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    tangential_distortion: tuple[float, float] = (0.0, 0.0)
+    orientation: tuple[Row, Row, Row]
+    position: tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+    focal_length: FiniteFloat = Field(gt=0)
+    principal_point: tuple[FiniteFloat, FiniteFloat]
+    image_size: tuple[Pixels, Pixels]
+    skew: FiniteFloat = 0.0
+    pixel_aspect_ratio: FiniteFloat = Field(default=1.0, gt=0)
+    radial_distortion: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.0, 0.0, 0.0)
+    tangential_distortion: tuple[FiniteFloat, FiniteFloat] = (0.0, 0.0)
 
 
 class HypernerfConfig(VideoReaderConfig):
@@ -223,4 +227,7 @@ def _optional(folder: Path, pattern: str, ids: Sequence[str], suffix: str) -> li
 def _points(folder: Path, scene: SceneJson) -> tuple[*Points, str]:
     path = next(folder / name for name in POINT_FILES if (folder / name).is_file())
     points, colors = read_points(path)
-    return (points - points.new_tensor(scene.center)) * scene.scale, colors, path.name
+    points = (points - points.new_tensor(scene.center)) * scene.scale
+    if not points.isfinite().all():
+        raise ClipError(f"{path}: points are not finite at the center and scale of scene.json")
+    return points, colors, path.name

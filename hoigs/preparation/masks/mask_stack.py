@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
-LEVEL = 1  # of zlib: a mask of few outlines shrinks some fifty times, in less than a millisecond
+LEVEL = 1  # of zlib, its fastest
 
 
 class MaskStack:

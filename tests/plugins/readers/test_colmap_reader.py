@@ -134,7 +134,7 @@ def test_a_damaged_model_is_named(builtin: Clip, tmp_path: Path) -> None:
     colmap.write(builtin, tmp_path, binary=True)
     path = tmp_path / "sparse/0/images.bin"
     path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(ClipError, match="sparse/0 is not a readable COLMAP model"):
+    with pytest.raises(ClipError, match=r"sparse/0/images\.bin is not a readable COLMAP file"):
         ColmapReader().read(tmp_path)
 
 

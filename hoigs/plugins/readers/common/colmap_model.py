@@ -21,6 +21,11 @@ from hoigs.plugins.readers.common.poses import rigid
 
 MAKER = "COLMAP makes the sparse model (`colmap mapper`; mask out what moves)"
 PARTS = ("cameras", "images", "points3D")
+# of an entry in a binary file: bytes before its own count, of that count, of each that it counts
+LAYOUT = {
+    "cameras": (24, 0, 0), "images": (64, 8, 24), "points3D": (43, 8, 8),
+    "rigs": (8, 0, 0), "frames": (64, 4, 16),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -83,19 +88,24 @@ def read_sparse(folder: Path) -> SparseModel:
     """
     import pycolmap
 
+    _require_bytes(folder)
     try:
         if any((folder / f"points3D.{s}").is_file() for s in ("bin", "txt")):
             model: Any = pycolmap.Reconstruction(str(folder))
         else:
             model = _without_points(folder)
+        registered = sorted(model.images.values(), key=lambda i: natural(i.name))
     except (RuntimeError, ValueError, IndexError) as error:
         raise ClipError(f"{folder} is not a readable COLMAP model: {error}") from error
+    for number, camera in model.cameras.items():
+        if not np.isfinite(camera.params).all() or min(camera.width, camera.height) < 1:
+            raise ClipError(f"{folder}: camera {number} is {camera.todict()}; run COLMAP again")
     lenses = {
         number: Lens(c.model_name, tuple(float(p) for p in c.params), c.width, c.height)
         for number, c in model.cameras.items()
     }
     views = []
-    for image in sorted(model.images.values(), key=lambda i: natural(i.name)):
+    for image in registered:
         if image.has_pose:
             pose = np.asarray(image.cam_from_world().matrix(), np.float64)
             views.append(View(image.name, lenses[image.camera_id], rigid(pose[:, :3], pose[:, 3])))
@@ -104,13 +114,46 @@ def read_sparse(folder: Path) -> SparseModel:
             f"{folder} registers no image; run COLMAP again, with moving objects masked"
         )
     points = list(model.points3D.values())
+    places = np.array([p.xyz for p in points]).reshape(-1, 3)
+    if not np.isfinite(places).all() or not all(
+        np.isfinite(v.world_to_camera).all() for v in views
+    ):
+        raise ClipError(f"{folder}: points or poses are not finite; run COLMAP again")
     models = ", ".join(sorted({lens.model for lens in lenses.values()}))
     return SparseModel(
         views,
-        torch.tensor(np.array([p.xyz for p in points]).reshape(-1, 3)).float(),
+        torch.tensor(places).float(),
         torch.tensor(np.array([p.color for p in points]).reshape(-1, 3)).float() / 255,
         f"COLMAP {models}, {len(views)} images, {len(points)} points",
     )
+
+
+def _require_bytes(folder: Path) -> None:
+    """Counts in binary files fit the files: pycolmap believes them, and reads for minutes.
+
+    Raises:
+        ClipError: a file says that it has more than it holds.
+    """
+    for part, (head, width, each) in LAYOUT.items():
+        path = folder / f"{part}.bin"
+        if not path.is_file():
+            continue
+        data = path.read_bytes()
+        count, place = int.from_bytes(data[:8], "little"), 8
+        whole = len(data) >= 8 + count * (head + width)
+        for _ in range(count if whole and width else 0):
+            place += head
+            if part == "images":
+                place = data.find(b"\0", place) + 1 or len(data)  # the name
+            place += width + each * int.from_bytes(data[place : place + width], "little")
+            if place > len(data):
+                whole = False
+                break
+        if not whole:
+            raise ClipError(
+                f"{path} is not a readable COLMAP file: it says {count:,} entries, which do not "
+                f"fit its {len(data):,} bytes; copy it again, or run COLMAP again"
+            )
 
 
 def _without_points(folder: Path) -> Any:

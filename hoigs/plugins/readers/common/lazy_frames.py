@@ -148,7 +148,7 @@ class LazyFrames(FrameStore):
         path, camera = files.paths[position], self.cameras[position]
         if path is None:
             return torch.zeros(camera.height, camera.width, dtype=torch.bool)
-        with _opened(path) as image:
+        with opened(path) as image:
             marked = np.asarray(files.foreground(image), dtype=np.bool_)
         return torch.from_numpy(self._flat(position).mask(self._fitted(path, marked, position)))
 
@@ -162,7 +162,7 @@ class LazyFrames(FrameStore):
         return torch.from_numpy(self._flat(position).depth(self._fitted(path, values, position)))
 
     def _decode(self, path: Path) -> UInt8[Array, "H W 3"]:
-        with _opened(path) as image:
+        with opened(path) as image:
             if image.mode not in ("RGBA", "LA", "PA") and "transparency" not in image.info:
                 return np.array(image.convert("RGB"))
             pixels = np.asarray(image.convert("RGBA"), dtype=np.float32)
@@ -198,8 +198,12 @@ class LazyFrames(FrameStore):
         return values[rows[:, None], columns]
 
 
-def _opened(path: Path) -> Image.Image:
-    """A decoded image; errors name the file."""
+def opened(path: Path) -> Image.Image:
+    """A decoded image.
+
+    Raises:
+        ClipError: it cannot be read; the message names the file.
+    """
     try:
         image = Image.open(path)
         image.load()
@@ -228,6 +232,9 @@ def lens_for(lens: Lens, image: Path) -> Lens:
         ClipError: the image and the lens have different aspect ratios, or cannot be read.
     """
     width, height = image_size(image)
+    if min(lens.width, lens.height) < 1:
+        size = f"{lens.width}x{lens.height}"
+        raise ClipError(f"the camera of {image} is {size} pixels; correct its size")
     if abs(width * lens.height / (height * lens.width) - 1) > ASPECT_TOLERANCE:
         raise ClipError(
             f"{image} is {width}x{height}, its camera {lens.width}x{lens.height}: different "
@@ -248,7 +255,7 @@ def read_depth(path: Path) -> Array:
         elif path.suffix == ".npz":
             values = load_arrays(path)["depth"]
         else:
-            values = np.asarray(_opened(path))
+            values = np.asarray(opened(path))
     except (OSError, ValueError, KeyError) as error:
         raise ClipError(f"{path} cannot be read as depth ({error}); write it again") from error
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values

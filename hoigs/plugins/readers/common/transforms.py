@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, field_validator
+from pydantic import BaseModel, FiniteFloat, field_validator
 
 from hoigs.core.errors import ClipError
 from hoigs.core.values.lens import Lens
@@ -22,27 +22,27 @@ class Intrinsics(BaseModel):
     """Keys at the top of the file or in a frame; those of the frame take precedence."""
 
     camera_model: str | None = None
-    camera_angle_x: float | None = None
-    fl_x: float | None = None
-    fl_y: float | None = None
-    cx: float | None = None
-    cy: float | None = None
-    w: float | None = None
-    h: float | None = None
-    k1: float | None = None
-    k2: float | None = None
-    k3: float | None = None
-    k4: float | None = None
-    p1: float | None = None
-    p2: float | None = None
+    camera_angle_x: FiniteFloat | None = None
+    fl_x: FiniteFloat | None = None
+    fl_y: FiniteFloat | None = None
+    cx: FiniteFloat | None = None
+    cy: FiniteFloat | None = None
+    w: FiniteFloat | None = None
+    h: FiniteFloat | None = None
+    k1: FiniteFloat | None = None
+    k2: FiniteFloat | None = None
+    k3: FiniteFloat | None = None
+    k4: FiniteFloat | None = None
+    p1: FiniteFloat | None = None
+    p2: FiniteFloat | None = None
 
 
 class TransformFrame(Intrinsics):
     """One image."""
 
     file_path: str
-    transform_matrix: list[list[float]]
-    time: float | None = None
+    transform_matrix: list[list[FiniteFloat]]
+    time: FiniteFloat | None = None
     mask_path: str | None = None
     depth_file_path: str | None = None
 
@@ -62,8 +62,8 @@ class Transforms(Intrinsics):
     """The file."""
 
     frames: list[TransformFrame]
-    applied_transform: list[list[float]] | None = None
-    applied_scale: float = 1.0
+    applied_transform: list[list[FiniteFloat]] | None = None
+    applied_scale: FiniteFloat = 1.0
     ply_file_path: str | None = None
     train_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
