@@ -78,6 +78,9 @@ class LazyFrames(FrameStore):
         background: RGB, 0..255, behind images with an alpha channel.
         read_image: a file to uint8 [H, W, 3], for frames that are not image files.
         cache_mb: decoded pixels kept in memory, MiB; the least recently used go first.
+
+    Raises:
+        ClipError: a camera has numbers that are not finite.
     """
 
     root: Path
@@ -108,6 +111,9 @@ class LazyFrames(FrameStore):
             raise ValueError(
                 f"lists of different lengths: {sorted(counts)}; expected one entry for each frame"
             )
+        for path, camera in zip(self.images, self.cameras, strict=True):
+            if not (camera.K.isfinite().all() and camera.world_to_camera.isfinite().all()):
+                raise ClipError(f"{path}: its camera has numbers that are not finite")
 
     def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
         def load() -> Tensor:
