@@ -61,7 +61,7 @@ def replayed(cell: dict[str, Any], min_gain: float) -> str:
     """The candidate that successive halving chooses with a `min_gain`."""
     from hoigs.studies.needs.criterion import Score
     from hoigs.studies.needs.result import Settings
-    from hoigs.studies.needs.successive_halving import Plan, StepBudget
+    from hoigs.studies.needs.successive_halving import Plan, StepBudget, successive_halving
 
     names = list(cell["scores"])
 

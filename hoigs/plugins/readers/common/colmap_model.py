@@ -114,15 +114,13 @@ def read_sparse(folder: Path) -> SparseModel:
             f"{folder} registers no image; run COLMAP again, with moving objects masked"
         )
     points = list(model.points3D.values())
-    places = np.array([p.xyz for p in points]).reshape(-1, 3)
-    if not np.isfinite(places).all() or not all(
-        np.isfinite(v.world_to_camera).all() for v in views
-    ):
-        raise ClipError(f"{folder}: points or poses are not finite; run COLMAP again")
+    places = torch.tensor(np.array([p.xyz for p in points]).reshape(-1, 3)).float()
+    if not places.isfinite().all():
+        raise ClipError(f"{folder}: points are not finite; run COLMAP again")
     models = ", ".join(sorted({lens.model for lens in lenses.values()}))
     return SparseModel(
         views,
-        torch.tensor(places).float(),
+        places,
         torch.tensor(np.array([p.color for p in points]).reshape(-1, 3)).float() / 255,
         f"COLMAP {models}, {len(views)} images, {len(points)} points",
     )
