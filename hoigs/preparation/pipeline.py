@@ -126,6 +126,8 @@ class Pipeline:
             if stored is None:
                 warned, known = len(self.warnings), dict(self.provenance)
                 made = save(make())
+                read = self.video.notes if hasattr(self, "video") else []
+                self.warnings += [note for note in read if note not in self.warnings]
                 notes: dict[str, Any] = {
                     "warnings": self.warnings[warned:],
                     "provenance": {k: v for k, v in self.provenance.items() if k not in known},
@@ -179,6 +181,7 @@ class Pipeline:
                     f"sharpest of each few): the clip keeps their true times, {frames.fps:.4g} a "
                     "second on average"
                 )
+            self.warnings += frames.notes
             return frames.list
 
         found = self._stage("frames", make, fingerprint([path]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -79,3 +80,19 @@ def _counted(decoded: list[int]):
         return real(frame)
 
     return made
+
+
+def test_an_index_that_is_wrong_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "video.mp4"
+    write(path, bframes=0, uneven=False)
+    right = list(open_frames(path, span=Span.of("27f", "40f")))
+    index = frames_module.packet_index
+
+    def shifted(*arguments: object) -> object:
+        found = index(*arguments)  # type: ignore[arg-type]
+        return found and replace(found, times=[time + 7 for time in found.times])
+
+    monkeypatch.setattr(frames_module, "packet_index", shifted)
+    frames = open_frames(path, span=Span.of("27f", "40f"))
+    assert all((a == b).all() for a, b in zip(right, frames, strict=True))
+    assert len(frames.notes) == 1 and "decoded from the start" in frames.notes[0]
