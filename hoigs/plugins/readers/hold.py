@@ -120,7 +120,9 @@ def _cameras(table: Any, images: Sequence[Path], where: str) -> list[Camera]:
     cameras = []
     for i, image in enumerate(images):
         name = f"world_mat_{i}"
-        K, w2c = decomposed(_numbers(table[name], (4, 4), f"{where}: {name}")[:3], f"{where}: {i}")
+        K, w2c = decomposed(
+            _numbers(table[name], (None, 4), f"{where}: {name}")[:3], f"{where}: {i}"
+        )
         width, height = image_size(image)
         lens, pose = torch.from_numpy(K).float(), torch.from_numpy(w2c).float()
         cameras.append(Camera(lens, pose, width, height))
@@ -163,7 +165,7 @@ def _object(table: Any, frames: int, where: str) -> ObjectTrack:
     if np.linalg.matrix_rank(norm) < 4:
         raise ClipError(f"{where}: norm_mat has no inverse")
     back = np.linalg.inv(norm)
-    scale = float(_numbers(np.reshape(table["obj_scale"], -1), (1,), f"{where}: obj_scale")[0])
+    scale = float(_numbers(np.reshape(table["obj_scale"], -1), (None,), f"{where}: obj_scale")[0])
     points = scale * (cano @ back[:3, :3].T + back[:3, 3])
     center = points.mean(0)
     rotations = axis_angle_to_matrices(torch.from_numpy(poses[:, :3]))

@@ -22,7 +22,7 @@ from hoigs.plugins.readers.common.poses import rigid
 MAKER = "COLMAP makes the sparse model (`colmap mapper`; mask out what moves)"
 PARTS = ("cameras", "images", "points3D")
 # of an entry in a binary file: bytes before its own count, of that count, of each that it counts
-LAYOUT = {
+ENTRY_BYTES = {
     "cameras": (24, 0, 0), "images": (64, 8, 24), "points3D": (43, 8, 8),
     "rigs": (8, 0, 0), "frames": (64, 4, 16),
 }  # fmt: skip
@@ -88,7 +88,7 @@ def read_sparse(folder: Path) -> SparseModel:
     """
     import pycolmap
 
-    _require_bytes(folder)
+    _require_counts_fit(folder)
     try:
         if any((folder / f"points3D.{s}").is_file() for s in ("bin", "txt")):
             model: Any = pycolmap.Reconstruction(str(folder))
@@ -126,13 +126,13 @@ def read_sparse(folder: Path) -> SparseModel:
     )
 
 
-def _require_bytes(folder: Path) -> None:
+def _require_counts_fit(folder: Path) -> None:
     """Counts in binary files fit the files: pycolmap believes them, and reads for minutes.
 
     Raises:
         ClipError: a file says that it has more than it holds.
     """
-    for part, (head, width, each) in LAYOUT.items():
+    for part, (head, width, each) in ENTRY_BYTES.items():
         path = folder / f"{part}.bin"
         if not path.is_file():
             continue
