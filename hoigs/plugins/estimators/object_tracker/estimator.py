@@ -28,12 +28,13 @@ from hoigs.core.progress import Progress, no_progress
 from hoigs.plugins.estimators.common.subprocess import settings_key
 from hoigs.plugins.estimators.object_tracker.camera_motion import is_static
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage
+from hoigs.plugins.estimators.object_tracker.held import skeletons
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, prompted_mask
 from hoigs.plugins.estimators.object_tracker.proposal import WRISTS, proposed
 from hoigs.plugins.estimators.object_tracker.scene import Scene, moving_scene, static_scene
 from hoigs.plugins.estimators.object_tracker.tracker import Track, color_model, tracked
 
-VERSION = 5  # of what is kept in `work`; raised when masks change
+VERSION = 6  # of what is kept in `work`; raised when masks change
 WEAK = 0.6  # confidence below which a frame is named in a note
 
 
@@ -67,9 +68,12 @@ class ObjectTrackerEstimator(Estimator):
         return Estimates(_read(file, video, [e.name for e in wanted]))
 
     def _key(self, video: VideoRequest, wanted: Sequence[EntityRequest]) -> str:
-        """Of everything that masks depend on; the person's by a few frames of them."""
+        """Of everything that masks depend on; the person's masks by a few frames of them."""
         person = _person(video)
         digest = hashlib.sha256()
+        if video.known is not None:
+            for track in (video.known.landmarks or {}).values():
+                digest.update(np.ascontiguousarray(track.image_xyzv).tobytes())
         if person is not None:
             for i in video.numbers[:: max(1, len(video.numbers) // 8)]:
                 digest.update(np.packbits(person[i]).tobytes())
@@ -183,15 +187,11 @@ def _person(video: VideoRequest) -> Sequence[Any] | None:
 
 def _hands(video: VideoRequest, footage: Footage) -> np.ndarray | None:
     """x, y of the wrists [F, 2 a person, 2] in the footage; None where no landmarks are known."""
-    if video.known is None or not video.known.landmarks:
+    people = skeletons(video, footage.numbers, footage.scale)
+    if not people:
         return None
-    numbers = list(footage.numbers)
-    wrists = [
-        np.where(track.image_xyzv[numbers][:, WRISTS, 3:] > 0.3,
-                 track.image_xyzv[numbers][:, WRISTS, :2], np.nan)
-        for track in video.known.landmarks.values()
-    ]  # fmt: skip
-    return np.concatenate(wrists, 1) * footage.scale
+    wrists = [np.where(s[:, WRISTS, 3:] > 0.3, s[:, WRISTS, :2], np.nan) for s in people]
+    return np.concatenate(wrists, 1)
 
 
 def _nothing_there(entity: EntityRequest, prompt: FramePrompt, footage: Footage, i: int) -> str:

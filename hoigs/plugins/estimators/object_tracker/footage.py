@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from hoigs.core.interfaces.estimator import VideoRequest
+from hoigs.plugins.estimators.object_tracker.held import held_pixels, skeletons
 
 BUDGET = (
     400_000_000  # bytes that the frames may take; longer videos are worked on at a smaller size
@@ -25,6 +26,8 @@ class Footage:
         lab: CIE L*a*b*, as uint8: L* times 2.55, a* and b* plus 128.
         person: pixels that the person's mask covers; all False where there is none.
         blank: pixels that show nothing, such as the black corners of a stabilised video.
+        held: pixels of the person's mask that no limb of theirs reaches: rather a thing they hold,
+            or wide clothes. All False where landmarks are unknown.
     """
 
     numbers: tuple[int, ...]
@@ -32,6 +35,7 @@ class Footage:
     lab: UInt8[np.ndarray, "F h w 3"]
     person: Bool[np.ndarray, "F h w"]
     blank: Bool[np.ndarray, "F h w"]
+    held: Bool[np.ndarray, "F h w"]
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -86,7 +90,9 @@ def read_footage(
             covered[i] = _reduced(person[nearest].astype(np.uint8) * 255, size) > 127
         progress((i + 1) / len(numbers))
     blank &= _is_border(blank)
-    return Footage(numbers, size[1] / video.width, lab, covered, blank)
+    scale = size[1] / video.width
+    held = held_pixels(covered, skeletons(video, numbers, scale))
+    return Footage(numbers, scale, lab, covered, blank, held)
 
 
 def lab_of(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

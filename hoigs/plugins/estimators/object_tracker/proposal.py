@@ -1,8 +1,9 @@
-"""Where nothing was clicked: what moves, is not the person, and is nearest to the hands."""
+"""Where nothing was clicked: what moves beside the person near their hands, or what they hold."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -34,16 +35,30 @@ def proposed(
 ) -> FramePrompt | None:
     """A click on the object, in pixels of the footage and positions of its frames.
 
+    Where nothing moves beside the person, what the person's mask takes in far from their limbs is
+    the thing that they hold.
+
     Args:
         hands: x, y of both in each frame, NaN where unknown. taken: pixels of other objects.
     """
+    frames = np.unique(np.linspace(0, len(footage) - 1, SAMPLES).astype(int))
+    beside = [None if hands is None else hands[i] for i in frames]
+    others = [None if taken is None else taken[i] for i in frames]
     blobs: list[_Blob] = []
-    for i in np.unique(np.linspace(0, len(footage) - 1, SAMPLES).astype(int)):
-        beside = None if hands is None else hands[i]
-        blobs += _blobs(footage, scene, int(i), beside, None if taken is None else taken[i])
+    for i, near, other in zip(frames, beside, others, strict=True):
+        blobs += _free(footage, scene, int(i), near, other)
+    if found := _recurring(blobs):
+        return found
+    blobs = []
+    for i, near, other in zip(frames, beside, others, strict=True):
+        blobs += _held(footage, int(i), near, other)
+    return _recurring(blobs)
+
+
+def _recurring(blobs: Sequence[_Blob]) -> FramePrompt | None:
+    """Of a thing that is seen in many frames in the same colours, near the hands."""
     if not blobs:
         return None
-    # a thing that is seen in many frames in the same colours, near the hands
     alike = np.sqrt(np.stack([b.colors for b in blobs]))
     likeness = (alike @ alike.T).clip(0, 1) ** 2
     scores = np.array([b.score for b in blobs])
@@ -59,7 +74,7 @@ def proposed(
     return FramePrompt(best.frame, (PromptPoint(*best.point),))
 
 
-def _blobs(footage: Footage, scene: Scene, i: int, hands, taken) -> list[_Blob]:
+def _free(footage: Footage, scene: Scene, i: int, hands, taken) -> list[_Blob]:
     """Parts of one frame that differ from the scene and lie off the person."""
     person = footage.person[i]
     unit = max(1, round(0.004 * footage.diagonal))
@@ -67,18 +82,35 @@ def _blobs(footage: Footage, scene: Scene, i: int, hands, taken) -> list[_Blob]:
     if taken is not None:
         hidden |= ndimage.binary_dilation(taken, iterations=2 * unit)
     moving = (np.nan_to_num(scene.difference(i), nan=0.0) > 6) & ~hidden
-    moving = ndimage.binary_closing(
-        ndimage.binary_opening(moving, iterations=unit), iterations=unit
+    apart = ndimage.distance_transform_edt(~person) if person.any() else None
+    return _blobs(footage, i, moving, hands, apart)
+
+
+def _held(footage: Footage, i: int, hands, taken) -> list[_Blob]:
+    """Parts of the person's mask that no limb reaches, in other colours than the person's."""
+    held = footage.held[i] if taken is None else footage.held[i] & ~taken
+    bins = bins_of(footage.colors(i))
+    body = histogram(bins, (footage.person[i] & ~footage.held[i]) * 1.0)
+    return [
+        replace(blob, score=blob.score * (1 - float(np.sqrt(blob.colors * body).sum())))
+        for blob in _blobs(footage, i, held, hands, None)
+    ]
+
+
+def _blobs(footage: Footage, i: int, region: Bool[np.ndarray, "h w"], hands, apart) -> list[_Blob]:
+    """The largest connected parts of a region of one frame."""
+    unit = max(1, round(0.004 * footage.diagonal))
+    region = ndimage.binary_closing(
+        ndimage.binary_opening(region, iterations=unit), iterations=unit
     )
-    labels, count = ndimage.label(moving)
+    labels, count = ndimage.label(region)
     if not count:
         return []
     bins = bins_of(footage.colors(i))
-    apart = ndimage.distance_transform_edt(~person) if person.any() else None
     found = []
-    sizes = ndimage.sum_labels(moving, labels, np.arange(1, count + 1))
+    sizes = ndimage.sum_labels(region, labels, np.arange(1, count + 1))
     for k in np.argsort(-sizes)[:6]:
-        area = sizes[k] / moving.size
+        area = sizes[k] / region.size
         if not AREA[0] <= area <= AREA[1]:
             continue
         blob = labels == k + 1
