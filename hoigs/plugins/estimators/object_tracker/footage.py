@@ -49,6 +49,10 @@ class Footage:
     def diagonal(self) -> float:
         return float(np.hypot(*self.shape))
 
+    def body(self, i: int) -> Bool[np.ndarray, "h w"]:
+        """The person's mask of one frame without what they may hold."""
+        return self.person[i] & ~self.held[i]
+
     def colors(self, i: int) -> Float[np.ndarray, "h w 3"]:
         """L*a*b* of one frame as float32, with lightness at half weight, as shadows change it."""
         return to_features(self.lab[i])

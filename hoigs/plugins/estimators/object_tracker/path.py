@@ -33,7 +33,7 @@ def object_odds(
 ) -> Float[np.ndarray, "h w"]:
     """Log-odds of each pixel of a frame to be the object's, from what is known of it anywhere."""
     odds = colors.odds(bins_of(footage.colors(i)))
-    odds = odds - 0.7 * footage.person[i]
+    odds = odds - 0.7 * footage.body(i)
     if scene is not None:
         changed = np.nan_to_num(np.tanh((scene.difference(i) - 4) / 3), nan=0.0)
         odds = odds + np.maximum(changed, -0.3)  # a plain or resting thing may look unchanged

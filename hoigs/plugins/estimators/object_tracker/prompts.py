@@ -49,7 +49,7 @@ def prompted_mask(
     shown = seed if box is None else _filled(footage.shape, box)
     on_person = bool(footage.person[i][shown].mean() > 0.5) if shown.any() else False
     at_rest = not median_of(away[seed]) > 4
-    fixed = _evidence(footage.person[i], away, on_person, at_rest, box is not None)
+    fixed = _evidence(footage.body(i), away, on_person, at_rest, box is not None)
     fixed[_disc(footage.shape, outside, max(1.5, 0.008 * footage.diagonal))] = -9
     fixed[footage.blank[i]] = -9
     fixed[seed] = 6

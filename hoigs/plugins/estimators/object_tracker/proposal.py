@@ -90,7 +90,7 @@ def _held(footage: Footage, i: int, hands, taken) -> list[_Blob]:
     """Parts of the person's mask that no limb reaches, in other colours than the person's."""
     held = footage.held[i] if taken is None else footage.held[i] & ~taken
     bins = bins_of(footage.colors(i))
-    body = histogram(bins, (footage.person[i] & ~footage.held[i]) * 1.0)
+    body = histogram(bins, footage.body(i) * 1.0)
     return [
         replace(blob, score=blob.score * (1 - float(np.sqrt(blob.colors * body).sum())))
         for blob in _blobs(footage, i, held, hands, None)

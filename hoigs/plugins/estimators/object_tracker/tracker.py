@@ -234,7 +234,7 @@ class _Walk:
         near: colours around the object in this frame. prior: where other frames put it.
         """
         odds = 0.6 * self.colors.odds(bins_of(colors), near)
-        person = window.cut(self.footage.person[i] & ~self.footage.held[i])
+        person = window.cut(self.footage.body(i))
         # a person's mask that takes in most of what is known to be the object says little
         taken = 0.5 if prior is None else float((prior * person).sum() / max(prior.sum(), 1e-6))
         odds -= 2.0 * max(0.0, 1 - 1.3 * taken) * person

@@ -15,6 +15,7 @@ from hoigs.core.interfaces.estimator import (
     EntityRequest,
     Estimates,
     FramePrompt,
+    Landmarks,
     PromptPoint,
     VideoRequest,
     checked,
@@ -133,6 +134,46 @@ def test_a_held_thing_that_the_person_s_mask_takes_in(tmp_path: Path, prompt: st
     scene = frames, people, [board] * COUNT
     found = masks_of(request(tmp_path, scene, (FramePrompt(0, points, box),)))
     assert overlaps(found, scene[2])[0] > 0.9 and overlaps(found, scene[2]).mean() > 0.85
+
+
+def test_a_thing_held_away_from_the_limbs_is_proposed_from_within_the_person_s_mask(
+    tmp_path: Path,
+) -> None:
+    """A bag that never left the person's mask was no candidate, and nothing was proposed."""
+    y, x = np.mgrid[:H, :W] + 0.5
+    bag = (np.abs(x - 72) < 7) & (np.abs(y - 52) < 9)
+    arm = (np.abs(x - 62) < 12) & (np.abs(y - 40) < 3)
+    image = texture(0, (120, 130, 90))[:, :W].copy()
+    person = (np.abs(x - 50) < 8) & (y > 14)
+    image[person | arm] = (70, 80, 150)
+    image[bag] = texture(1, (200, 60, 50))[:, :W][bag]
+    scene = [image.astype(np.uint8)] * COUNT, [person | arm | bag] * COUNT, [bag] * COUNT
+    found = masks_of(with_landmarks(request(tmp_path, scene), standing(wrist=(71.0, 40.0))))
+    (prompt,) = found.chosen["object"]
+    point = prompt.points[0]
+    assert bag[int(point.y), int(point.x)]
+    assert overlaps(found, scene[2]).mean() > 0.8
+
+
+def standing(wrist: tuple[float, float]) -> np.ndarray:
+    """MediaPipe's landmarks of the upright person of `world`, one arm stretched out: [33, 4]."""
+    points = np.zeros((33, 4))
+    points[:, 3] = 1
+    points[:, :2] = 50, 18  # the head
+    for rows, at in (
+        ((11,), (54, 28)), ((12,), (46, 28)), ((23,), (53, 50)), ((24,), (47, 50)),
+        ((13,), (60, 36)), ((15, 17, 19, 21), wrist), ((14,), (46, 38)),
+        ((16, 18, 20, 22), (46, 48)),
+        ((25,), (53, 60)), ((26,), (47, 60)), ((27, 29, 31), (53, 70)), ((28, 30, 32), (47, 70)),
+    ):  # fmt: skip
+        points[list(rows), :2] = at
+    return points
+
+
+def with_landmarks(video: VideoRequest, points: np.ndarray) -> VideoRequest:
+    assert video.known is not None
+    track = Landmarks(np.repeat(points[None], COUNT, 0))
+    return replace(video, known=replace(video.known, landmarks={"human": track}))
 
 
 def test_an_object_does_not_jump_to_a_thing_of_its_colours_that_was_always_there() -> None:
