@@ -26,6 +26,7 @@ from hoigs.core.interfaces.estimator import (
 )
 from hoigs.core.progress import Progress, no_progress
 from hoigs.plugins.estimators.common.subprocess import settings_key
+from hoigs.plugins.estimators.object_tracker.alike import told_apart
 from hoigs.plugins.estimators.object_tracker.camera_motion import is_static
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage
 from hoigs.plugins.estimators.object_tracker.held import skeletons
@@ -101,6 +102,7 @@ class ObjectTrackerEstimator(Estimator):
         progress(0.35, "object")
         hands = _hands(video, footage)
         tracks: dict[str, Track | None] = {}
+        prompts: dict[str, list[PromptedMask]] = {}
         notes: list[str] = []
         chosen: dict[str, list[FramePrompt]] = {}
         for k, entity in enumerate(wanted):
@@ -108,10 +110,12 @@ class ObjectTrackerEstimator(Estimator):
             masks, proposal = self._prompted(entity, footage, scene, hands, tracks, notes)
             if proposal is not None:
                 chosen[entity.name] = [proposal]
+            prompts[entity.name] = masks
             tracks[entity.name] = (
                 tracked(footage, scene, masks, _part(progress, start, share)) if masks else None
             )
-        notes += _doubts(tracks, footage)
+        tracks, alike = told_apart(footage, scene, prompts, tracks)
+        notes += [*alike, *_doubts(tracks, footage)]
         _write(file, video, footage, tracks, chosen, notes)
 
     def _prompted(

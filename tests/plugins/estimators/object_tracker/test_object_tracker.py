@@ -155,6 +155,31 @@ def test_a_thing_held_away_from_the_limbs_is_proposed_from_within_the_person_s_m
     assert overlaps(found, scene[2]).mean() > 0.8
 
 
+def test_one_of_two_alike_does_not_become_the_other_while_it_is_away(tmp_path: Path) -> None:
+    """The second disc rests at the right until it goes behind a board; the first passes by."""
+    frames, people, discs = world()
+    ball = texture(1, (200, 60, 50))
+    y, x = np.mgrid[:H, :W] + 0.5
+    others = []
+    for i, image in enumerate(frames):
+        cx, cy = (94, 14 + 2 * i) if i < 5 else (94, 58)
+        other = np.hypot(x - cx, y - cy) < RADIUS if i < 5 or i > 9 else np.zeros((H, W), bool)
+        image[other] = np.roll(ball[:, :W], (cy, cx), (0, 1))[other].astype(np.uint8)
+        others.append(other & ~discs[i])
+    points = {"object": places()[0], "other": (94.0, 14.0)}
+    video = replace(
+        request(tmp_path, (frames, people, discs)),
+        entities=tuple(
+            EntityRequest(name, "object", further=(FramePrompt(0, (PromptPoint(*at),)),))
+            for name, at in points.items()
+        ),
+    )
+    found = masks_of(video)
+    theirs = [found.entities["other"][i] for i in range(COUNT)]
+    assert not any((theirs[i] & discs[i]).sum() > 0.5 * discs[i].sum() for i in range(COUNT))
+    assert overlaps(found, discs).mean() > 0.75
+
+
 def standing(wrist: tuple[float, float]) -> np.ndarray:
     """MediaPipe's landmarks of the upright person of `world`, one arm stretched out: [33, 4]."""
     points = np.zeros((33, 4))
