@@ -53,10 +53,8 @@ def told_apart(
 
 
 def _claimed_twice(a: Track, b: Track) -> Bool[np.ndarray, " F"]:
-    both = a.soft.any((1, 2)) & b.soft.any((1, 2))
-    for i in np.flatnonzero(both):
-        both[i] = overlap(a.soft[i] > 127, b.soft[i] > 127) > SAME
-    return both
+    pairs = zip(a.soft > 127, b.soft > 127, strict=True)
+    return np.array([bool((x & y).any()) and overlap(x, y) > SAME for x, y in pairs])
 
 
 def _runs(frames: Bool[np.ndarray, " F"]) -> list[range]:
@@ -71,14 +69,11 @@ def _comes_from_there(a: Track, b: Track, run: range) -> bool:
 
 def _jumps(track: Track, run: range) -> list[float]:
     """Pixels a frame to the nearest sightings outside of the run, before and after it."""
-    seen = (track.soft > 127).any((1, 2))
-    before, after = np.flatnonzero(seen[: run.start]), np.flatnonzero(seen[run.stop :])
-    found = [np.inf]
-    for others, last, edge in ((before[-1:], 0, run.start), (after[:1], run.stop, run.stop - 1)):
-        for i in (others + last).tolist():
-            gap = _center(track, i) - _center(track, edge)
-            found.append(float(np.hypot(*gap)) / abs(i - edge))
-    return found
+    seen = [i for i, soft in enumerate(track.soft) if (soft > 127).any()]
+    before = [(i, run.start) for i in seen if i < run.start][-1:]
+    after = [(i, run.stop - 1) for i in seen if i >= run.stop][:1]
+    ways = [(_center(track, i) - _center(track, edge), abs(i - edge)) for i, edge in before + after]
+    return [np.inf, *(float(np.hypot(*way)) / frames for way, frames in ways)]
 
 
 def _center(track: Track, i: int) -> Float[np.ndarray, "2"]:
@@ -100,7 +95,7 @@ def _without(
         closed[p.frame] &= ~(p.soft > 0.5)
     again = tracked(replace(footage, blank=closed), scene, prompts)
     soft, confidence = again.soft.copy(), again.confidence.copy()
-    for i in np.flatnonzero(_claimed_twice(again, other)):
+    for i in np.flatnonzero(_claimed_twice(again, other)).tolist():
         if i in frames and i not in {p.frame for p in prompts}:
             soft[i], confidence[i] = 0, 0.0
     return Track(soft, confidence)
