@@ -64,6 +64,7 @@ _PUBLIC = {
     "auto": "hoigs.studies.needs.auto",
     "batch": "hoigs.studies.batch.batch",
     "bug_report": "hoigs.workflows.bug_report",
+    "publish": "hoigs.core.storage.publish",
     "compress": "hoigs.studies.needs.pruning.compact_run",
     "demo": "hoigs.workflows.demo",
     "doctor": "hoigs.workflows.doctor",

@@ -19,6 +19,7 @@ from hoigs.cli import (
     needs,
     plugins,
     prepare,
+    publish,
     render,
     spec,
     stress,
@@ -45,6 +46,7 @@ app.command("eval")(evaluate.evaluate)
 app.command("render")(render.render)
 app.command("view")(view.view)
 app.command("export")(export.export)
+app.command("publish")(publish.publish)
 app.command("batch")(batch.batch)
 app.command("work")(batch.work)
 app.command("tables")(tables.tables)

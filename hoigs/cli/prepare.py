@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 def prepare(
     source: Annotated[
         Path,
-        typer.Argument(help="A video, or a folder with a video or frames and further inputs."),
+        typer.Argument(
+            help="A video, or a folder with a video or frames and further inputs; or a URL of one."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Clip folder to make.")],
     object_at: Annotated[

@@ -17,6 +17,7 @@ from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.registry.registry import default_registry
+from hoigs.core.storage.fetch import local_path
 from hoigs.preparation.bodies.as_landmarks import BodyFileEstimator
 from hoigs.preparation.bodies.body_file import body_beside
 from hoigs.preparation.clip_writing import write_clip_folder
@@ -82,7 +83,7 @@ def prepare(
 
     Args:
         source: a folder with a video or frames and their estimators (see `find_source`), or the
-            video in it.
+            video in it; or the URL of either (`hoigs.core.storage`).
         out: the clip folder to make, with report.json, report.md and overlay.mp4 in it; it
             appears when it is whole.
         width, camera, max_frames, every, fps, start, end, focal, intrinsics, calibration,
@@ -180,7 +181,7 @@ def _run(
     consent: Consent | None,
     announce: Callable[[EstimatorPlan], object] | None,
 ) -> tuple[Pipeline, PrepareReport | None]:
-    source, out = Path(source), Path(out)
+    source, out = local_path(source), Path(out)
     for name in redo:
         check_stage(name)
     _check_paths(source, out, may_replace)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from hoigs.core.errors import ClipError
 from hoigs.core.registry.registry import Registry, default_registry
+from hoigs.core.storage.fetch import local_path
 from hoigs.core.values.clip import Clip
 from hoigs.runs.reader_choice import ReaderChoice, choose_reader
 from hoigs.synthesis.named import PREFIX, is_named, named_clip
@@ -15,14 +16,15 @@ def clip_folder(clip: str | Path, registry: Registry | None = None) -> Path:
     """The folder of a clip argument; a built-in clip is generated unless it is cached.
 
     Args:
-        clip: a folder, or "builtin:NAME" (`hoigs.synthesis.named`).
+        clip: a folder, or "builtin:NAME" (`hoigs.synthesis.named`), or a URL, of which there is a
+            local copy then (`hoigs.core.storage`).
 
     Raises:
         ClipError: there is no built-in clip of that name. Whether a folder exists is not checked.
     """
     if is_named(clip):
         return named_clip(str(clip), (registry or default_registry()).get("body:anny")())
-    return Path(clip)
+    return local_path(clip)
 
 
 def clip_name(clip: str | Path) -> str:

@@ -24,6 +24,7 @@ FUNCTIONS = {
     "export": (hoigs.export,),
     "doctor": (hoigs.doctor,),
     "bug-report": (hoigs.bug_report,),
+    "publish": (hoigs.publish,),
     "demo": (hoigs.demo,),
     "work": (hoigs.work,),
 }

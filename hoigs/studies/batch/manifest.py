@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.spec.loader import load_yaml
+from hoigs.core.storage.urls import as_url
 
 NAMES = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}$"  # of rows, as they name folders
 LISTS = ("set", "prepare", "object", "export")  # in CSV, texts with ";" between
@@ -29,8 +30,10 @@ class Row(BaseModel):
     name: str = Field(
         default="", pattern=NAMES, description="folder of the row; default: the file's name"
     )
-    video: str = Field(default="", description="a video or a folder, for `hoigs prepare`")
-    clip: str = Field(default="", description="a clip folder or builtin:NAME, in place of a video")
+    video: str = Field(default="", description="a video or a folder, for `hoigs prepare`; or a URL")
+    clip: str = Field(
+        default="", description="a clip folder, its URL, or builtin:NAME, in place of a video"
+    )
     spec: str = Field(default="hoigs", description="spec to train")
     auto: bool = Field(default=False, description="reduce the spec to what the clip needs")
     set: tuple[str, ...] = Field(default=(), description="keys of the spec: train.steps=500")
@@ -41,11 +44,21 @@ class Row(BaseModel):
         default=(), description="the object, as `hoigs prepare --object`"
     )
     export: tuple[str, ...] = Field(default=("ply",), description="formats to export")
+    publish: str = Field(
+        default="", description="URL of a folder, where run and exports are written under the name"
+    )
     device: str = Field(default="auto", description="cpu, cuda or auto")
     gpus: float | None = Field(
         default=None, ge=0, le=1, description="share of a GPU; default by --jobs and the GPUs"
     )
     memory_gb: float = Field(default=0.0, ge=0, description="memory to set aside while it runs, GB")
+
+    @field_validator("publish")
+    @classmethod
+    def _is_a_url(cls, value: str) -> str:
+        if value and as_url(value) is None:
+            raise ValueError("expected a URL, such as s3://bucket/results")
+        return value
 
     @field_validator(*LISTS, mode="before")
     @classmethod
@@ -166,7 +179,7 @@ def _row(values: Mapping[str, Any], at: Mapping[str, str], folder: Path) -> Row:
         raise ManifestError(f"{place}: a row has either a video or a clip")
     key = "video" if values.get("video") else "clip"
     source = str(values[key])
-    if not source.startswith("builtin:"):
+    if not source.startswith("builtin:") and as_url(source) is None:
         path = (folder / source).absolute()
         if not path.exists():
             near = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []

@@ -51,6 +51,10 @@ def stages_of(row: Row, folder: Path) -> list[Stage]:
         target = folder / "exports" / format
         export = ("export", str(run), "--format", format, "--out", str(target), *device)
         stages.append(Stage(f"export-{format}", export, target, target, clear=True))
+    if row.publish:
+        only = _each("--only", ("run", "exports") if row.export else ("run",))
+        command = ("publish", str(folder), f"{row.publish.rstrip('/')}/{row.name}", *only)
+        stages.append(Stage("publish", command, run, run))
     return stages
 
 

@@ -1,0 +1,41 @@
+"""Which names are URLs, and the file system behind one."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from hoigs.core.errors import HoigsError, did_you_mean
+
+_URL = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]+):/+(.+)$", re.DOTALL)
+EXTRA = "pip install 'hoigs[storage]' (and s3fs for s3://, gcsfs for gs://, adlfs for az://)"
+
+
+def as_url(name: str | Path) -> str | None:
+    """The URL that a name is, or None: `Path` makes "s3:/bucket/a" of "s3://bucket/a"."""
+    found = _URL.match(str(name))
+    if found is None:
+        return None
+    scheme, rest = found.groups()
+    return f"{scheme.lower()}://{'/' if scheme.lower() == 'file' else ''}{rest}".rstrip("/")
+
+
+def file_system(url: str) -> tuple[Any, str]:
+    """fsspec's file system of a URL, and the path in it.
+
+    Raises:
+        HoigsError: there is no such scheme, or its package is not installed.
+    """
+    try:
+        import fsspec
+    except ImportError as error:
+        raise HoigsError(f"{url}: names by URL need fsspec; {EXTRA}") from error
+    try:
+        return fsspec.core.url_to_fs(url)  # type: ignore[no-any-return]
+    except ImportError as error:
+        raise HoigsError(f"{url}: {error}; {EXTRA}") from error
+    except ValueError as error:
+        scheme = url.partition(":")[0]
+        hint = did_you_mean(scheme, fsspec.available_protocols())
+        raise HoigsError(f"{url}: {error}{hint}") from error
