@@ -32,7 +32,7 @@ def file_system(url: str) -> tuple[Any, str]:
     except ImportError as error:
         raise HoigsError(f"{url}: names by URL need fsspec; {EXTRA}") from error
     try:
-        return fsspec.core.url_to_fs(url)  # type: ignore[no-any-return]
+        return fsspec.core.url_to_fs(url)
     except ImportError as error:
         raise HoigsError(f"{url}: {error}; {EXTRA}") from error
     except ValueError as error:

@@ -77,8 +77,8 @@ class BodyPose:
         }
         return replace(self, **changed)
 
-    def frame(self, index: int) -> BodyPose:
-        """One frame of a batched pose; betas without a batch are shared."""
+    def frame(self, index: int | slice) -> BodyPose:
+        """One frame of a batched pose, or some; betas without a batch are shared."""
         shared = self.betas if self.betas.dim() == 1 else self.betas[index]
         return replace(
             self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 
 import torch
@@ -19,13 +20,16 @@ from hoigs.preparation.body.landmarks import FEET, TORSO, LandmarkPoints, Landma
 from hoigs.preparation.body.mask_fit import MaskFit, Project
 from hoigs.preparation.body.motion_prior import MotionPrior
 from hoigs.preparation.body.noise import Noise, robust_weights
-from hoigs.preparation.body.normal_equations import NormalEquations
+from hoigs.preparation.body.normal_equations import REACH, NormalEquations
 from hoigs.preparation.body.pose_prior import LASTS, PosePrior
 
 GAP = 12  # frames between landmarks that smoothness carries a pose across
 CARRIED = 0.6  # of the steps, in which frames farther off begin one after another
 SURFACE = 1.7  # of a landmark on the skin against one at a joint: how uncertain its place is
 REWEIGHTINGS = 3  # for the 3D landmarks' origin
+AT_ONCE = 256  # frames whose derivatives are in memory
+ALL = slice(None)
+OF_FRAMES = ("visible", "pixels", "K", "viewmats", "in_space", "space")
 LEAST_PIXELS = 3e-3  # of the width: no landmark is known better
 
 
@@ -86,14 +90,21 @@ class FitProblem:
             start = replace(start, body=turns)
         self.begin = Unknowns.start(start, body.num_betas, pairs)
 
-    def posed(self, unknowns: Unknowns, derivatives: bool = True) -> Posed:
+    def posed(self, unknowns: Unknowns, derivatives: bool = True, frames: slice = ALL) -> Posed:
         """The points that stand for landmarks.
 
         A landmark named after a joint moves with the bone above it, a shoulder with the collar
         bone. Offsets shift the points in the rest pose, left and right as mirror images.
         """
         shift = unknowns.offsets[self.points.pairs] * self.points.mirror
-        return self.kinematics.posed(unknowns.pose, shift, derivatives)
+        return self.kinematics.posed(unknowns.pose.frame(frames), shift, derivatives)
+
+    def of(self, frames: slice) -> FitProblem:
+        """The part of the problem that some frames are, for the terms of single frames."""
+        part = copy(self)
+        for name in OF_FRAMES:
+            setattr(part, name, getattr(self, name)[frames])
+        return part
 
     def in_cameras(
         self, points: Float[Tensor, "F L 3"], scale: float
@@ -161,11 +172,12 @@ class FitProblem:
         self, unknowns: Unknowns, widen: float, equations: NormalEquations | None = None
     ) -> float:
         """Twice the negative logarithm of the posterior; its derivatives go into `equations`."""
-        at = self.posed(unknowns, derivatives=equations is not None)
-        shared = None if equations is None else self._by_shared(at)
-        total = self._landmarks(at, shared, unknowns, widen, equations)
-        total += self._in_space(at, shared, unknowns, widen, equations)
-        total += self.motion.add(at, shared, unknowns.pose, equations)
+        count, total = len(self.seen), 0.0
+        for start in range(0, count, AT_ONCE):  # derivatives take 150 KB a frame
+            total += self._part_of_energy(
+                unknowns, widen, equations, start, min(start + AT_ONCE, count)
+            )
+        total += self.motion.angles(unknowns.pose, equations)
         share = (self.spacing / LASTS).clamp_max(1.0)
         total += float(self.prior.add(unknowns.pose.body.flatten(1), share, equations))
         total += self._shared_priors(unknowns, equations)
@@ -174,6 +186,21 @@ class FitProblem:
                 unknowns.pose, self._seen_at(unknowns.scale), widen, equations
             )
         return total
+
+    def _part_of_energy(
+        self, unknowns: Unknowns, widen: float, equations: NormalEquations | None,
+        start: int, stop: int,
+    ) -> float:  # fmt: skip
+        """Of landmarks in frames `start` to `stop`, and accelerations that begin in them."""
+        own, further = slice(start, stop), slice(start, stop + REACH)
+        at = self.posed(unknowns, equations is not None, further)
+        shared = None if equations is None else self._by_shared(at)
+        inner = equations and equations.of(further)
+        total = self.motion.points(at, shared, unknowns.pose, start, inner)
+        at, part, inner = at.first(stop - start), self.of(own), equations and equations.of(own)
+        shared = None if shared is None else shared[: stop - start]
+        total += part._landmarks(at, shared, unknowns, widen, inner)
+        return total + part._in_space(at, shared, unknowns, widen, inner)
 
     def _seen_at(self, scale: float) -> Project:
         def project(points: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:

@@ -33,6 +33,11 @@ class Posed:
     by_betas: Float[Tensor, "F L 3 B"]
     by_rest: Float[Tensor, "F L 3 3"]
 
+    def first(self, frames: int) -> Posed:
+        """Of the first frames alone."""
+        parts = (self.points, self.by_frame, self.by_betas, self.by_rest)
+        return Posed(*(part[:frames] for part in parts))
+
 
 class Kinematics:
     """Points that are bound to a body, by linear blend skinning over its 22 body joints.

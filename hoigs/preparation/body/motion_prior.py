@@ -44,20 +44,22 @@ class MotionPrior:
         self.independent = torch.full((count + 1,), INDEPENDENT, dtype=torch.float64)
         self.independent[-1] = 1.0
 
-    def add(
-        self, at: Posed, shared: Tensor | None, pose: BodyPose, equations: NormalEquations | None
-    ) -> float:
-        """Cost, twice the negative logarithm of the density; adds to the equations, if any."""
+    def points(
+        self, at: Posed, shared: Tensor | None, pose: BodyPose, start: int,
+        equations: NormalEquations | None,
+    ) -> float:  # fmt: skip
+        """Cost of the points' accelerations, twice the negative logarithm of the density; adds to
+        the equations, if any.
+
+        Args:
+            at: the points of some frames from `start` on; their equations are `equations`.
+        """
         if len(at.points) < 3:
             return 0.0
-        return self._points(at, shared, pose, equations) + self._angles(pose, equations)
-
-    def _points(
-        self, at: Posed, shared: Tensor | None, pose: BodyPose, equations: NormalEquations | None
-    ) -> float:
         # a small body close by would accelerate less than a large one far off in the same images
         size, by_betas = self.kinematics.size(pose.betas)
-        factors, share = self.factors / size, self.lasts * self.independent
+        rows = slice(start, start + len(at.points) - 2)
+        factors, share = self.factors[rows] / size, self.lasts[rows] * self.independent
         points = self._about_torso(at.points)
         values = _differences(points.flatten(1), factors).unflatten(1, (-1, 3))
         squares = values.square().sum(-1) / self.smooth**2
@@ -74,7 +76,10 @@ class MotionPrior:
             )  # fmt: skip
         return float(cost.sum())
 
-    def _angles(self, pose: BodyPose, equations: NormalEquations | None) -> float:
+    def angles(self, pose: BodyPose, equations: NormalEquations | None) -> float:
+        """Cost of the joints' accelerations in all frames, likewise."""
+        if len(pose.body) < 3:
+            return 0.0
         factors = self.factors / TURNING
         turning, weight = _differences(pose.body.flatten(1), factors), INDEPENDENT * self.lasts
         if equations is not None:

@@ -3,6 +3,8 @@ ones."""
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -29,6 +31,14 @@ class NormalEquations:
         self.shared = torch.zeros(shared, shared, dtype=double)
         self.by_frame = torch.zeros(frames, width, dtype=double)
         self.by_shared = torch.zeros(shared, dtype=double)
+
+    def of(self, frames: slice) -> NormalEquations:
+        """A view of some frames' part: what is added to it is added to these."""
+        part = copy(self)
+        first, last, _ = frames.indices(len(self.by_frame))
+        part.blocks = [block[first : max(last - d, first)] for d, block in enumerate(self.blocks)]
+        part.border, part.by_frame = self.border[first:last], self.by_frame[first:last]
+        return part
 
     def add(
         self,
@@ -110,7 +120,7 @@ class NormalEquations:
         """Upper diagonals of the frames' part, as LAPACK stores them."""
         frames, width = self.by_frame.shape
         reach = (REACH + 1) * width - 1
-        band = np.zeros((reach + 1, frames * width))
+        band = np.zeros((reach + 1, frames * width), order="F")  # LAPACK's, or it is copied
         row, column = np.meshgrid(np.arange(width), np.arange(width), indexing="ij")
         for d, blocks in enumerate(self.blocks):
             upper = row <= column if d == 0 else np.ones_like(row, bool)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
-from test_body_fit import body
+from test_body_fit import FRAMES, QUICK, body, camera, seen_by, truth
 from torch import Tensor
 
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.core.values.moment import BodyPose
+from hoigs.preparation.body import fit_problem
+from hoigs.preparation.body.fit_problem import FitProblem
 from hoigs.preparation.body.kinematics import PER_FRAME, Kinematics
 from hoigs.preparation.body.landmarks import points_of
 from hoigs.preparation.body.motion_prior import MotionPrior
@@ -63,14 +66,16 @@ def test_the_motion_prior_moves_by_its_gradient() -> None:
     pose, shift = some_pose(5), torch.zeros(count, 3, dtype=torch.float64)
     equations = NormalEquations(5, PER_FRAME, len(pose.betas))
     at = kinematics.posed(pose, shift)
-    prior.add(at, at.by_betas, pose, equations)
+    prior.points(at, at.by_betas, pose, 0, equations)
+    prior.angles(pose, equations)
     draw = torch.Generator().manual_seed(1)
     by = torch.randn(5, PER_FRAME, generator=draw, dtype=torch.float64)
     betas = torch.randn(len(pose.betas), generator=draw, dtype=torch.float64)
     costs = []
     for s in (STEP, -STEP):
         changed = moved(pose, s * by, s * betas)
-        costs.append(prior.add(kinematics.posed(changed, shift, False), None, changed, None))
+        there = kinematics.posed(changed, shift, False)
+        costs.append(prior.points(there, None, changed, 0, None) + prior.angles(changed, None))
     # the cost is twice the sum that the equations are of
     expected = 2 * float((equations.by_frame * by).sum() + equations.by_shared @ betas)
     assert abs((costs[0] - costs[1]) / (2 * STEP) - expected) < 1e-4 * abs(expected)
@@ -109,3 +114,25 @@ def test_a_step_solves_the_whole_system() -> None:
     found = equations.step(0.0)
     assert found is not None
     torch.testing.assert_close(torch.cat((found[0].flatten(), found[1])), dense)
+
+
+def test_derivatives_of_a_few_frames_at_a_time_give_the_same_equations(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Accelerations reach over the borders of such parts."""
+    problem = FitProblem(
+        body(), seen_by([camera()] * FRAMES, truth()), [camera()] * FRAMES,
+        torch.arange(FRAMES) / 30, QUICK,
+    )  # fmt: skip
+    found = []
+    for at_once in (FRAMES, 4, 1):
+        monkeypatch.setattr(fit_problem, "AT_ONCE", at_once)
+        shared = problem.begin.pose.betas.numel() + problem.begin.offsets.numel() + 2
+        equations = NormalEquations(FRAMES, PER_FRAME, shared)
+        energy = problem.energy(problem.begin, 1.0, equations)
+        found.append((
+            torch.tensor(energy), *equations.blocks, equations.border, equations.by_frame,
+            equations.shared, equations.by_shared,
+        ))  # fmt: skip
+    for other in found[1:]:
+        torch.testing.assert_close(other, found[0], rtol=1e-9, atol=1e-9)
