@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.preparation.prepare import PrepareOptions, PrepareReport, prepare
 from hoigs.preparation.video.frames import VideoFrames
+from hoigs.preparation.video.pictures import Picture
 from hoigs.preparation.video.source import SourceError
 
 QUICK = {"fit_steps": 30, "overlay_width": 0}  # what is tested here is not the fit
@@ -112,6 +114,21 @@ def test_options(tiny_source: Path, tmp_path: Path, body: AnnyBody) -> None:
     assert not (tmp_path / "clip/overlay.mp4").exists()
     assert (tmp_path / "clip/images/00003.png").is_file()
     assert report.width == 48
+
+
+def test_what_is_noted_while_frames_are_read_is_a_warning_of_the_report(
+    tiny_source: Path, tmp_path: Path, body: AnnyBody, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That a video's index is wrong, say, which shows only then (`test_seeking`)."""
+    read = VideoFrames._pictures
+
+    def noting(frames: VideoFrames, first: int = 0) -> Iterator[Picture]:
+        frames._note("its index is wrong")
+        return read(frames, first)
+
+    monkeypatch.setattr(VideoFrames, "_pictures", noting)
+    _, report = prepared(tiny_source, tmp_path / "clip", body, fit_steps=2)
+    assert report.warnings.count("its index is wrong") == 1
 
 
 def test_moving_camera_and_masks_apart(tiny_source: Path, tmp_path: Path, body: AnnyBody) -> None:

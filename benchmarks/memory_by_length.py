@@ -1,0 +1,145 @@
+"""Peak memory of prepare, train, eval and render against the length of a video.
+
+    python benchmarks/memory_by_length.py --lengths 100,1000,5000 --json benchmarks/results/memory-by-length.json
+    python benchmarks/memory_by_length.py --table benchmarks/results/memory-by-length.json  # the docs' table
+
+A made-up person stands still while a ball goes to and fro; the video's landmarks and the masks of
+person and ball together lie beside it, so that no network runs. Each command is a process of its
+own, whose peak is what the system counted (`ru_maxrss`). Fits and trainings are short: memory, not
+quality, is measured. A command holds the budget if its peak at a length is at most its peak at the
+first length, and 64 MiB (training: and the 512 that frames are cached in), and 20 KiB for each
+further frame: poses, cameras, numbers and packed masks of a frame are kept in memory, pixels are
+not. Exit code 1 if one does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from hoigs.preparation.report.video_out import VideoWriter
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/preparation"))
+import tiny
+
+MARGIN, FRAME = 64 * 2**20, 20 * 2**10  # bytes: of a command, and of a frame
+CACHE = {"train": 512 * 2**20}  # of frames
+COMMANDS = ("prepare", "train", "eval", "render")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--lengths", default="100,1000,5000", help="frames")
+    parser.add_argument("--scale", type=int, default=4, help="frames are so many times 96x64")
+    parser.add_argument("--commands", default=",".join(COMMANDS))
+    parser.add_argument("--folder", type=Path, help="keep what is made here, and use it again")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--table", type=Path, metavar="JSON", help="print the docs' table, only")
+    arguments = parser.parse_args()
+    if arguments.table:
+        print(table(json.loads(arguments.table.read_text())))
+        return 0
+    lengths = [int(word) for word in arguments.lengths.split(",")]
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as temporary:
+        for frames in lengths:
+            folder = (arguments.folder or Path(temporary)) / f"{frames}"
+            make_source(folder / "source", frames, arguments.scale)
+            for name in arguments.commands.split(","):
+                rows.append({"frames": frames, "command": name, **measured(name, folder)})
+                print(json.dumps(rows[-1]), flush=True)
+    size = [tiny.WIDTH * arguments.scale, tiny.HEIGHT * arguments.scale]
+    record = {"size": size, "lengths": lengths, "rows": rows, "holds": judged(rows)}
+    print(table(record))
+    if arguments.json:
+        arguments.json.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    return int(not all(record["holds"].values()))
+
+
+def measured(name: str, folder: Path) -> dict[str, Any]:
+    """Runs a command in a process of its own.
+
+    Raises:
+        SystemExit: it fails.
+    """
+    clip, run = str(folder / "clip"), str(folder / "run")
+    words = {
+        "prepare": ["prepare", str(folder / "source"), "--out", clip, "--camera", "static",
+                    "--set", "fit_steps=5", "--set", "scene_points=500", "--overwrite"],
+        "train": ["train", clip, "--out", run, "--overwrite", "--no-eval", "--set",
+                  "train.steps=20", "--set", "model.scene.points=300",
+                  "--set", "model.human.points=200", "--set", "model.object.points=100"],
+        "eval": ["eval", run],
+        "render": ["render", run, "--out", str(folder / "film.mp4")],
+    }[name]  # fmt: skip
+    log = folder / f"{name}.log"
+    began = time.perf_counter()
+    with log.open("w") as out:
+        child = os.posix_spawn(
+            sys.executable, [sys.executable, "-m", "hoigs", *words], os.environ,
+            file_actions=[(os.POSIX_SPAWN_DUP2, out.fileno(), 1),
+                          (os.POSIX_SPAWN_DUP2, out.fileno(), 2)],
+        )  # fmt: skip
+        _, status, used = os.wait4(child, 0)
+    if status:
+        raise SystemExit(f"hoigs {' '.join(words)} failed:\n{log.read_text()[-2000:]}")
+    seconds = time.perf_counter() - began
+    return {"peak_mib": round(used.ru_maxrss / 2**10, 1), "seconds": round(seconds, 1)}
+
+
+def make_source(folder: Path, frames: int, scale: int) -> None:
+    """Video, masks of both together and landmarks; the ball goes to and fro in the tiny scene."""
+    if (folder / "pose_mediapipe.npz").is_file():
+        return
+    (folder / "hoi_mask").mkdir(parents=True, exist_ok=True)
+    way = list(chain(range(tiny.FRAMES), range(tiny.FRAMES - 2, 0, -1)))
+    big = np.ones((scale, scale, 1), np.uint8)
+    pictures = [np.kron(tiny.picture(i), big) for i in range(tiny.FRAMES)]
+    with VideoWriter(folder / "video.mp4", fps=12, crf=18) as video:
+        for i in range(frames):
+            at = way[i % len(way)]
+            video.add(pictures[at])
+            both = np.logical_or(*tiny.masks(at)).astype(np.uint8)
+            both = np.kron(both, big[..., 0]) * 255
+            Image.fromarray(both).save(folder / f"hoi_mask/{i:05d}.png", compress_level=1)
+    known = {k: np.repeat(v[:1], frames, 0) for k, v in tiny.landmarks().items()}
+    known["image_xyzv"][..., :3] *= scale
+    np.savez(folder / "pose_mediapipe.npz", **known)
+
+
+def judged(rows: list[dict[str, Any]]) -> dict[str, bool]:
+    """Whether each command holds the budget at every length."""
+    holds = {}
+    for name in {row["command"]: None for row in rows}:
+        first, *others = [row for row in rows if row["command"] == name]
+        holds[name] = all(
+            2**20 * (row["peak_mib"] - first["peak_mib"])
+            <= MARGIN + CACHE.get(name, 0) + FRAME * (row["frames"] - first["frames"])
+            for row in others
+        )
+    return holds
+
+
+def table(record: dict[str, Any]) -> str:
+    """Markdown: a row a command, peak and seconds at each length."""
+    heads = [f"{n:,} frames" for n in record["lengths"]]
+    lines = ["| | " + " | ".join(heads) + " | budget |", "|---" * (len(heads) + 2) + "|"]
+    for name, holds in record["holds"].items():
+        found = [r for r in record["rows"] if r["command"] == name]
+        cells = [f"{r['peak_mib']:,.0f} MiB, {r['seconds']:.0f} s" for r in found]
+        lines.append("| " + " | ".join([name, *cells, "held" if holds else "**not held**"]) + " |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
