@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
+from types import FrameType
 
 SLOW = 0.3  # seconds; a listing as a whole should stay below half a second
 HEAVY = ("torch", "warp", "numpy", "scipy", "matplotlib")
@@ -81,18 +82,53 @@ class TooLong(BaseException):
 
 
 @contextmanager
-def limited(what: str, block: str, seconds: float | None = None) -> Iterator[None]:
+def stops_stay() -> Iterator[None]:
+    """Raise Ctrl-C and SIGTERM again that the block caught, or turned into another exception.
+
+    A plugin with a bare `except:` around an import would go on, or be called broken.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    stops: list[KeyboardInterrupt] = []
+
+    def keep(number: int, frame: FrameType | None) -> None:
+        handler = before[signal.Signals(number)]
+        assert callable(handler)
+        try:
+            handler(number, frame)
+        except KeyboardInterrupt as stop:
+            stops.append(stop)
+            raise
+
+    for number, handler in before.items():
+        if callable(handler):
+            signal.signal(number, keep)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if signal.getsignal(number) is keep:
+                signal.signal(number, handler)
+        if stops:
+            raise stops[0]
+
+
+@contextmanager
+def limited(what: str, block: str | None, seconds: float | None = None) -> Iterator[None]:
     """Raise TooLong in an import that does not end, and name it on stderr before that.
 
     Python can end what waits or loops in the main thread. Elsewhere, and in compiled code that
     does not return, `what` is named, and the rest is left to the user.
 
     Args:
-        what: is imported. block: the value of HOIGS_BLOCK that leaves it out.
+        what: is imported. block: the value of HOIGS_BLOCK that leaves it out, if one does.
         seconds: by default $HOIGS_IMPORT_TIMEOUT, or 60.
     """
     seconds = seconds or _timeout()
-    advice = f"HOIGS_BLOCK={block} leaves it out, HOIGS_IMPORT_TIMEOUT=SECONDS waits longer"
+    advice = f"HOIGS_BLOCK={block} leaves it out, " if block else ""
+    advice += "HOIGS_IMPORT_TIMEOUT=SECONDS waits longer"
 
     def name_it() -> None:
         print(f"hoigs: still waiting for {what}; {advice}", file=sys.__stderr__, flush=True)
@@ -109,7 +145,8 @@ def limited(what: str, block: str, seconds: float | None = None) -> Iterator[Non
     if alarm:
         signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
-        yield
+        with stops_stay():
+            yield
     finally:
         notice.cancel()
         if alarm:

@@ -13,7 +13,7 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, redirect_stdout
 from dataclasses import dataclass, field
 from enum import StrEnum
 from importlib import metadata
@@ -164,7 +164,8 @@ class PluginManager(pluggy.PluginManager):
         module = importlib.util.module_from_spec(spec)
         sys.modules[name] = module  # targets are imported by this name
         try:
-            spec.loader.exec_module(module)
+            with limited(f"--plugin {path}", None), redirect_stdout(sys.stderr):
+                spec.loader.exec_module(module)
         except KeyboardInterrupt:
             raise
         except BaseException as error:

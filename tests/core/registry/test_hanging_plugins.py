@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 
 import pytest
@@ -34,6 +35,31 @@ def test_an_import_that_does_not_end(plugins, capfd, hang):
     assert "HOIGS_BLOCK=acme-hangs" in plugin.error
     assert "still waiting for plugin acme-hangs-plugin of acme-hangs" in capfd.readouterr().err
     assert Registry(manager).keys("deformation")
+
+
+def test_a_file_that_does_not_end(plugins, tmp_path):
+    file = tmp_path / "hangs.py"
+    file.write_text("import time\ntime.sleep(5)\n")
+    with pytest.raises(PluginError, match=r"hangs\.py: TooLong: its import did not end in 0\.4 s"):
+        plugins.manager().load_file(file)
+
+
+@pytest.mark.parametrize("then", ["pass", 'raise RuntimeError("wrapped")'])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopping_is_no_fault_of_the_plugin(plugins, monkeypatch, then, number):
+    """Also where the plugin catches the KeyboardInterrupt of it."""
+    monkeypatch.setenv("HOIGS_IMPORT_TIMEOUT", "60")
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    plugins.add(
+        f"acme-catches-{number}-{len(then)}",  # a module is imported once
+        f"import signal\ntry:\n    signal.raise_signal({number})\nexcept:\n    {then}",
+    )
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            plugins.manager()
+        assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_a_component_whose_module_does_not_end(plugins, tmp_path):
