@@ -1,7 +1,7 @@
 """Peak memory of prepare, train, eval and render against the length of a video.
 
-    python benchmarks/memory_by_length.py --lengths 100,1000,5000 --json benchmarks/results/memory-by-length.json
-    python benchmarks/memory_by_length.py --table benchmarks/results/memory-by-length.json  # the docs' table
+    python benchmarks/memory_by_length.py --json benchmarks/results/memory-by-length.json
+    python benchmarks/memory_by_length.py --table benchmarks/results/memory-by-length.json
 
 A made-up person stands still while a ball goes to and fro; the video's landmarks and the masks of
 person and ball together lie beside it, so that no network runs. Each command is a process of its

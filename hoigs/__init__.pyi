@@ -17,6 +17,7 @@ from hoigs.core.registry.component import Component as Component
 from hoigs.core.registry.hookspecs import hookimpl as hookimpl
 from hoigs.core.spec.schema import Spec as Spec
 from hoigs.core.spec.train_schema import TrainSpec as TrainSpec
+from hoigs.core.storage.publish import publish as publish
 from hoigs.core.values.camera import Camera as Camera
 from hoigs.core.values.clip import Clip as Clip
 from hoigs.core.values.gaussians import GaussianDelta as GaussianDelta
