@@ -9,6 +9,7 @@ import pytest
 
 from hoigs.cli.failures import message_of
 from hoigs.core.names import printable
+from hoigs.core.whole_files import written_whole
 
 SMALL = ["--device", "cpu", "--set", "train.steps=2", "--set", "train.preview_every=0", "--no-eval"]
 
@@ -65,3 +66,11 @@ def test_a_mistake_in_hoigs_keeps_its_traceback():
     assert "not enough memory" in message_of(RuntimeError("CUDA out of memory. Tried …"))
     assert "not enough memory" in message_of(MemoryError())
     assert printable("a\x1b[31mb\nc") == "a�[31mb\nc"
+
+
+def test_a_write_that_finds_the_disk_full_names_its_file(tmp_path):
+    """`write()` does not know which file it writes; the message said "a file"."""
+    with pytest.raises(OSError) as caught, written_whole(tmp_path / "scores.json"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert caught.value.filename == str(tmp_path / "scores.json")
+    assert not list(tmp_path.iterdir())
