@@ -33,9 +33,10 @@ from hoigs.plugins.estimators.object_tracker.held import skeletons
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, prompted_mask
 from hoigs.plugins.estimators.object_tracker.proposal import WRISTS, proposed
 from hoigs.plugins.estimators.object_tracker.scene import Scene, moving_scene, static_scene
-from hoigs.plugins.estimators.object_tracker.tracker import Track, color_model, tracked
+from hoigs.plugins.estimators.object_tracker.tracker import Track, at_rest, color_model, tracked
 
 VERSION = 6  # of what is kept in `work`; raised when masks change
+SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
 WEAK = 0.6  # confidence below which a frame is named in a note
 
 
@@ -141,6 +142,12 @@ class ObjectTrackerEstimator(Estimator):
                 notes.append(
                     f"{entity.name}: the click in frame {prompt.frame} lies on the person's mask; "
                     "if the person was meant, click on the object"
+                )
+            if found.quality < SET_OFF and at_rest(scene, {i: found.soft > 0.5}):
+                notes.append(
+                    f"{entity.name}: what was clicked in frame {prompt.frame} hardly differs from "
+                    "what is around it, and looks like a part of the scene: if it is none, click "
+                    "where it is seen better, or give a box"
                 )
             masks.append(found)
         return masks, None

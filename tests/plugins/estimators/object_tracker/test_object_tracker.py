@@ -136,6 +136,12 @@ def test_a_held_thing_that_the_person_s_mask_takes_in(tmp_path: Path, prompt: st
     assert overlaps(found, scene[2])[0] > 0.9 and overlaps(found, scene[2]).mean() > 0.85
 
 
+def test_a_click_on_the_wall_is_doubted_and_one_on_the_disc_is_not(tmp_path: Path) -> None:
+    for place, doubted in ((click(0, 90, 60), True), (click(3), False)):
+        found = masks_of(request(tmp_path / str(place.frame), world(), (place,)))
+        assert any("looks like a part of the scene" in note for note in found.notes) is doubted
+
+
 def test_a_thing_held_away_from_the_limbs_is_proposed_from_within_the_person_s_mask(
     tmp_path: Path,
 ) -> None:
