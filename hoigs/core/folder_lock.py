@@ -83,6 +83,7 @@ class FolderLock:
             self._create(json.dumps(record))
         except BaseException:
             _HELD.discard(token)
+            _remove_empty(self._made)
             raise
         self._token, self._ended = token, threading.Event()
         _Heartbeat(self.path, token, self._ended).start()
@@ -197,8 +198,13 @@ def _create(path: Path, text: str) -> bool:
         file = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
     except FileExistsError:
         return False
-    with os.fdopen(file, "w", encoding="utf-8") as stream:
-        stream.write(text)
+    try:
+        with os.fdopen(file, "w", encoding="utf-8") as stream:
+            stream.write(text)
+    except OSError as error:  # the disk is full, say: an empty lock would keep all others away
+        path.unlink(missing_ok=True)
+        error.filename = error.filename or str(path)
+        raise
     return True
 
 
@@ -208,8 +214,14 @@ def _release(path: Path, token: str, ended: threading.Event, made: list[Path]) -
     with contextlib.suppress(OSError):
         if _read(path).get("token") == token:
             path.unlink()
-        for parent in made:
-            parent.rmdir()  # fails where something was written
+        _remove_empty(made)
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Up to the first in which something was written."""
+    with contextlib.suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
 
 
 def _read(path: Path) -> dict[str, Any]:

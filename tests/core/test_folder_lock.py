@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import socket
@@ -47,6 +48,20 @@ def test_a_lock_is_gone_with_the_parents_that_it_made(tmp_path):
     with FolderLock(tmp_path / "a" / "run", "training"):
         (tmp_path / "a" / "run").mkdir()
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["run"]
+
+
+def test_a_lock_that_a_full_disk_does_not_take_is_gone(tmp_path, monkeypatch):
+    def full(file: int, *_: object, **__: object) -> None:
+        os.close(file)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fdopen", full)
+        with pytest.raises(OSError) as caught:
+            FolderLock(tmp_path / "new/run", "training").acquire()
+    assert caught.value.filename == str(tmp_path / "new/.run.lock")
+    assert not list(tmp_path.iterdir())
+    FolderLock(tmp_path / "new/run", "training").acquire().release()
 
 
 @pytest.mark.parametrize(
