@@ -85,6 +85,8 @@ def _reader(key: str, start: Path, options: dict[str, Any]) -> Reader:
         reader.matches(folder / start)
         clip = reader.read(folder / start)
         assert torch.isfinite(clip.points).all(), "points are not finite"
+        # a COLMAP model may have poses alone; the other layouts have points of their own
+        assert len(clip.points) or key == "reader:colmap", "no points"
         for position in (0, 2, len(clip) - 1):
             frame = clip[position % len(clip)]
             camera = frame.camera

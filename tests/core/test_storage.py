@@ -43,7 +43,7 @@ def folder(path: Path, size: int = 10) -> Path:
     [
         (Path("s3://bucket/a b.mp4"), "s3://bucket/a b.mp4"),  # a Path has one slash
         ("S3://bucket/a/", "s3://bucket/a"),
-        (Path("file:///tmp/a"), "file:///tmp/a"),
+        (Path("file:///data/a"), "file:///data/a"),
         ("builtin:carry?width=64", None),
         ("C:/clips/a", None),
         ("clips/a", None),
@@ -70,7 +70,7 @@ def test_an_upload_that_ends_early_leaves_no_sign_of_completeness(
     publish(folder(tmp_path / "row"), bucket)
     memory = fsspec.filesystem("memory")
     monkeypatch.setattr(memory, "put_file", lambda *_: (_ for _ in ()).throw(OSError("no room")))
-    with pytest.raises(HoigsError, match=r"memory://lab: cannot be written \(no room\)"):
+    with pytest.raises(HoigsError, match=r"memory://lab: cannot be written \(OSError: no room\)"):
         publish(tmp_path / "row", bucket)
     assert not memory.exists(f"/lab/{COMPLETE}")
 
@@ -81,6 +81,36 @@ def test_a_damaged_file_is_named(tmp_path: Path, bucket: str, cache: Path) -> No
     with pytest.raises(HoigsError, match=r"not whole: run/checkpoints/step is not what"):
         fetched(bucket)
     assert not list(cache.glob("*")) and not list(cache.glob(".*"))
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"../../x": {"sha256": "0"}}', '{"log": 3}'])
+def test_a_list_of_checksums_that_is_none(tmp_path: Path, bucket: str, content: str) -> None:
+    publish(folder(tmp_path / "row"), bucket)
+    fsspec.filesystem("memory").pipe_file(f"/lab/{COMPLETE}", content.encode())
+    with pytest.raises(HoigsError, match=r"complete\.json"):
+        fetched(bucket)
+
+
+def test_what_a_storage_raises_of_its_own_is_a_sentence(
+    tmp_path: Path, bucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As botocore does without keys: a class that is no OSError."""
+
+    class NoCredentialsError(Exception):
+        pass
+
+    def refused(*_: object, **__: object) -> None:
+        raise NoCredentialsError("Unable to locate credentials")
+
+    publish(folder(tmp_path / "row"), bucket)
+    for name, work in (
+        ("put_file", lambda: publish(tmp_path / "row", bucket)),
+        ("get_file", lambda: fetched(bucket)), ("isfile", lambda: fetched(bucket)),
+    ):  # fmt: skip
+        with monkeypatch.context() as patch:
+            patch.setattr(fsspec.filesystem("memory"), name, refused)
+            with pytest.raises(HoigsError, match=r"memory://lab: cannot be .*Unable to locate"):
+                work()
 
 
 def test_the_cache_keeps_to_its_bound_but_for_what_is_in_use(

@@ -82,7 +82,7 @@ class TooLong(BaseException):
 
 
 @contextmanager
-def stops_stay() -> Iterator[None]:
+def stops_raised_again() -> Iterator[None]:
     """Raise Ctrl-C and SIGTERM again that the block caught, or turned into another exception.
 
     A plugin with a bare `except:` around an import would go on, or be called broken.
@@ -145,7 +145,7 @@ def limited(what: str, block: str | None, seconds: float | None = None) -> Itera
     if alarm:
         signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
-        with stops_stay():
+        with stops_raised_again():
             yield
     finally:
         notice.cancel()

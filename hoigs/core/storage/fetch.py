@@ -15,8 +15,9 @@ from typing import Any
 
 from hoigs.core.environments.cache import cache_folder
 from hoigs.core.errors import HoigsError
+from hoigs.core.json_file import read_json
 from hoigs.core.storage.publish import COMPLETE, digest_of
-from hoigs.core.storage.urls import as_url, file_system
+from hoigs.core.storage.urls import as_url, file_system, named_failures
 
 LIMIT = "HOIGS_URL_CACHE_GB"
 DEFAULT_GB = 50.0
@@ -46,10 +47,8 @@ def fetched(url: str) -> Path:
             cache may be.
     """
     fs, path = file_system(url)
-    try:
+    with named_failures(url, "read"):
         files = _files(fs, path)
-    except (OSError, ValueError) as error:
-        raise HoigsError(f"{url}: cannot be read ({error})") from error
     if not files:
         raise HoigsError(f"{url}: there is no such file or folder, or it is empty")
     root = cache_folder() / "urls"
@@ -89,17 +88,19 @@ def _download(
             if not to.resolve().is_relative_to((part / target.name).resolve()):
                 raise HoigsError(f"{url}: a file's name leaves the folder: {name}")
             to.parent.mkdir(parents=True, exist_ok=True)
-            fs.get_file(f"{path.rstrip('/')}/{name}" if name else path, str(to))
+            with named_failures(url, "downloaded"):
+                fs.get_file(f"{path.rstrip('/')}/{name}" if name else path, str(to))
             if size and to.stat().st_size != size:
                 raise HoigsError(
                     f"{url}/{name}: {to.stat().st_size} of {size} bytes arrived; try again"
                 )
         _compare(part / target.name, url)
         (part / USED).touch()
-        with contextlib.suppress(OSError):  # another process was faster, with the same files
+        try:
             part.rename(entry)
-    except OSError as error:
-        raise HoigsError(f"{url}: cannot be downloaded ({error})") from error
+        except OSError:
+            if not (entry / USED).is_file():  # else another process was faster, with the same files
+                raise
     finally:
         shutil.rmtree(part, ignore_errors=True)
 
@@ -109,9 +110,14 @@ def _compare(folder: Path, url: str) -> None:
     listed = folder / COMPLETE
     if not listed.is_file():
         return
-    for name, about in json.loads(listed.read_text(encoding="utf-8")).items():
+    record = read_json(listed, error=HoigsError, advice=f"publish {url} again")
+    if not isinstance(record, dict) or not record:
+        raise HoigsError(f"{url}: {COMPLETE} lists no files; publish again")
+    for name, about in record.items():
         file = folder / name
-        if not file.is_file() or digest_of(file) != about["sha256"]:
+        inside = file.resolve().is_relative_to(folder.resolve())
+        known = about.get("sha256") if isinstance(about, dict) else None
+        if not inside or not file.is_file() or digest_of(file) != known:
             raise HoigsError(f"{url}: not whole: {name} is not what {COMPLETE} says; publish again")
 
 

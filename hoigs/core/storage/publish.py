@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.storage.urls import as_url, file_system
+from hoigs.core.storage.urls import as_url, file_system, named_failures
 
 COMPLETE = "complete.json"  # size and SHA-256 of each file; written last
 
@@ -40,7 +40,7 @@ def publish(folder: str | Path, url: str, *, only: Sequence[str] = ()) -> int:
     if not files:
         raise HoigsError(f"{source}: has no files to publish")
     fs, root = file_system(target)
-    try:
+    with named_failures(target, "written"):
         if fs.exists(f"{root}/{COMPLETE}"):
             fs.rm_file(f"{root}/{COMPLETE}")
         listed = {}
@@ -50,8 +50,6 @@ def publish(folder: str | Path, url: str, *, only: Sequence[str] = ()) -> int:
             fs.makedirs(f"{root}/{name}".rpartition("/")[0], exist_ok=True)
             fs.put_file(str(file), f"{root}/{name}")
         fs.pipe_file(f"{root}/{COMPLETE}", json.dumps(listed, indent=1).encode())
-    except (OSError, NotImplementedError) as error:
-        raise HoigsError(f"{target}: cannot be written ({error})") from error
     return len(files)
 
 

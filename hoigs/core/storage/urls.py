@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -39,3 +41,19 @@ def file_system(url: str) -> tuple[Any, str]:
         scheme = url.partition(":")[0]
         hint = did_you_mean(scheme, fsspec.available_protocols())
         raise HoigsError(f"{url}: {error}{hint}") from error
+
+
+@contextmanager
+def named_failures(url: str, what: str) -> Iterator[None]:
+    """Raise HoigsError, "URL: cannot be WHAT (why)", for whatever the storage raises.
+
+    Every package behind fsspec has exceptions of its own, without a common class: botocore's for
+    keys that are absent are no OSError, for instance.
+    """
+    try:
+        yield
+    except HoigsError:
+        raise
+    except Exception as error:
+        why = str(error).strip() or "no reason given"
+        raise HoigsError(f"{url}: cannot be {what} ({type(error).__name__}: {why})") from error

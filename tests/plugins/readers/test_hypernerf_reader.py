@@ -131,6 +131,14 @@ def test_a_partial_folder_is_told_in_one_message(builtin: Clip, tmp_path: Path) 
         assert part in message
 
 
+def test_points_that_are_no_real_numbers_are_refused(builtin: Clip, tmp_path: Path) -> None:
+    """Of complex ones the imaginary part was dropped, with numpy's warning alone."""
+    hypernerf.write(builtin, tmp_path)
+    np.save(tmp_path / "points.npy", np.ones((5, 3), complex))
+    with pytest.raises(ClipError, match=r"points\.npy cannot be read .*got complex128"):
+        HypernerfReader().read(tmp_path)
+
+
 def test_wrong_folders_and_files(builtin: Clip, tmp_path: Path) -> None:
     with pytest.raises(ClipError) as caught:
         HypernerfReader().read(tmp_path)

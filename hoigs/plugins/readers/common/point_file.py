@@ -36,7 +36,10 @@ def read_points(path: Path) -> Points:
 
 
 def _npy(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    points = load_array(path).astype(np.float64)
+    points = load_array(path)
+    if not np.can_cast(points.dtype, np.float64, "same_kind"):
+        raise ValueError(f"expected numbers, got {points.dtype}")
+    points = points.astype(np.float64)
     return points, np.full_like(points, GREY)
 
 
