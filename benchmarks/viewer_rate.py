@@ -10,7 +10,7 @@ over a network they are the limit.
 # ruff: noqa: E402
 from __future__ import annotations
 
-from hoigs.core.machine.cpus import share_processors
+from hoigs.core.machine.busy import share_processors
 
 share_processors()  # as the command does, before torch is imported
 

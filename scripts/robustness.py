@@ -42,14 +42,14 @@ def fuzz(record: dict[str, Any]) -> str:
 
 
 def busy(record: dict[str, Any]) -> str:
-    """CPU and wall seconds by the settings of OpenMP."""
+    """CPU and wall seconds by how threads wait."""
     rows = [
-        [" ".join(f"`{k}={v}`" for k, v in row["settings"].items()) or "none",
-         row["load average before"], row["added"], row["cpu_s"], row["wall_s"]]
-        for row in record["rows"]
-    ]  # fmt: skip
-    columns = ("settings", "load average before", "busy processes added", "CPU s", "wall s")
-    return f"{table(columns, rows)}\n\nOn {record['cpus']} processors."
+        [r["way"], r["load average before"], r["added"], r["cpu_s"], r["wall_s"]]
+        for r in record["rows"]
+    ]
+    columns = ("threads wait as", "load average before", "busy processes added", "CPU s", "wall s")
+    steps = record["steps"] - max(1, record["steps"] // 10)
+    return f"{table(columns, rows)}\n\n{steps} steps on {record['cpus']} processors."
 
 
 def long_run(record: dict[str, Any]) -> str:

@@ -28,7 +28,7 @@ from hoigs.cli import (
     view,
 )
 from hoigs.cli.failures import GuardedGroup, failures_as_messages
-from hoigs.core.machine.cpus import share_processors
+from hoigs.core.machine.busy import share_processors, short_waits_when_busy
 
 app = typer.Typer(
     name="hoigs",
@@ -79,5 +79,5 @@ def _options(
 def main() -> None:
     """Entry point: what goes wrong becomes one message on stderr and an exit code."""
     share_processors()
-    with failures_as_messages():
+    with short_waits_when_busy(), failures_as_messages():
         app()

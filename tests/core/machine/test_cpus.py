@@ -28,32 +28,3 @@ def test_processors_of_a_container(tmp_path, monkeypatch, files, count):
     monkeypatch.setattr(cpus, "CGROUP", tmp_path)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(64)), raising=False)
     assert cpus.available_cpus() == count
-
-
-@pytest.mark.parametrize(
-    ("load", "set_to"),
-    [
-        ("0.00 0.00 0.00 1/200 5", {"GOMP_SPINCOUNT": cpus.SHORT_SPIN}),
-        ("0.00 0.00 0.00 3/200 5", {"OMP_WAIT_POLICY": "PASSIVE"}),
-        ("nonsense", {"OMP_WAIT_POLICY": "PASSIVE"}),
-    ],
-)
-def test_threads_wait_as_the_machine_is_busy(hoigs, monkeypatch, tmp_path, load, set_to):
-    names = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OMP_NUM_THREADS")
-    for name in names:
-        monkeypatch.setenv(name, "")  # what the command sets ends with the test
-        monkeypatch.delenv(name)
-    (tmp_path / "loadavg").write_text(load)
-    monkeypatch.setattr(cpus, "LOAD", tmp_path / "loadavg")
-    monkeypatch.setattr(os, "cpu_count", lambda: 4)
-    assert hoigs("--version").code == 0
-    threads = {"OMP_NUM_THREADS": str(cpus.available_cpus())}
-    assert {name: os.environ[name] for name in names if name in os.environ} == set_to | threads
-
-
-def test_the_users_own_settings_of_threads_stay(hoigs, monkeypatch):
-    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
-    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
-    hoigs("--version")
-    assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"
-    assert "GOMP_SPINCOUNT" not in os.environ

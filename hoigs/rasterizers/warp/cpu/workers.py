@@ -14,12 +14,12 @@ import ctypes
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import torch
 
 from hoigs.core.errors import RenderError
+from hoigs.core.machine.busy import loaded_gomp
 from hoigs.rasterizers.warp.common.cpu_launch import prepared
 from hoigs.rasterizers.warp.common.runtime import wp
 
@@ -99,11 +99,10 @@ class OpenMPWorkers:
         from hoigs.rasterizers.warp.cpu import native_kernels
 
         self._arguments = _build_cpu_args_structs
-        folder = Path(torch.__file__).parent / "lib"
-        found = sorted(folder.glob("libgomp*.so*"))
-        if not found:
-            raise OSError(f"no libgomp in {folder}: torch was built with another OpenMP")
-        self._gomp = ctypes.CDLL(str(found[0])).GOMP_parallel
+        gomp = loaded_gomp()
+        if gomp is None:
+            raise OSError(f"no libgomp beside {torch.__file__}: it was built with another OpenMP")
+        self._gomp = gomp.GOMP_parallel
         self._gomp.restype = None
         address = wp.zeros(1, dtype=wp.uint64, device="cpu")
         wp.launch(native_kernels.queue_address, dim=1, inputs=[address], device="cpu")

@@ -1,0 +1,136 @@
+"""While other programs need the processors, threads that wait for each other sleep at once.
+
+By libgomp's documentation a waiting thread spins for GOMP_SPINCOUNT turns, but hardly at all while
+the process has more OpenMP threads than there are processors. So a group of threads without work is
+kept while this process has to queue for processors. The number of threads that work stays the
+same, and with it every result.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hoigs.core.machine.cpus import available_cpus
+
+TASKS = Path("/proc/self/task")
+SHORT_SPIN = "30000"
+"""Turns of libgomp's waiting loop before a thread sleeps; a tenth of libgomp's own default."""
+INTERVAL = 1.0  # seconds between two looks
+QUEUED = 0.1
+"""The machine is busy if threads queue for a processor for this share of their time."""
+IDLE = 100_000_000  # nanoseconds in an interval that are too few to tell
+
+
+def share_processors() -> None:
+    """Settings of OpenMP before torch is imported; those that are set already stay.
+
+    Threads sleep while they wait. Where `short_waits_when_busy` can see that the machine is busy,
+    libgomp's spin first, since on an idle machine waking them costs more.
+    """
+    os.environ.setdefault("OMP_NUM_THREADS", str(available_cpus()))
+    if {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & os.environ.keys():
+        return
+    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
+    if scheduled() is not None:
+        os.environ["GOMP_SPINCOUNT"] = SHORT_SPIN
+
+
+class Waiting:
+    """Decides how threads wait; `look` is called from time to time.
+
+    Attributes:
+        short: whether waiting threads sleep at once.
+    """
+
+    def __init__(self) -> None:
+        self.short = False
+        self._before = (0, 0)
+        self._release = threading.Event()
+
+    def look(self) -> None:
+        """Compare the times since the last call, and change how threads wait."""
+        now = scheduled() or (0, 0)
+        ran, queued = now[0] - self._before[0], now[1] - self._before[1]
+        self._before = now
+        if min(ran, queued) < 0 or ran + queued < IDLE:  # threads have ended, or hardly any work
+            return
+        self.set(queued > QUEUED * (ran + queued))
+
+    def set(self, short: bool) -> None:
+        if short and not self.short:
+            gomp = loaded_gomp()
+            if gomp is None:
+                return
+            self._release = threading.Event()
+            threading.Thread(target=_idle_threads, args=(gomp, self._release), daemon=True).start()
+        elif self.short and not short:
+            self._release.set()
+        self.short = short
+
+
+@contextmanager
+def short_waits_when_busy() -> Iterator[None]:
+    """In the block, look every second whether this process has to queue for processors.
+
+    Nothing is done under other settings than those of `share_processors`, or where torch uses
+    another library than libgomp.
+    """
+    waiting, ended = Waiting(), threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(INTERVAL):
+            waiting.look()
+        waiting.set(False)
+
+    if os.environ.get("GOMP_SPINCOUNT") == SHORT_SPIN:
+        threading.Thread(target=watch, name="hoigs-waits", daemon=True).start()
+    try:
+        yield
+    finally:
+        ended.set()
+
+
+def scheduled() -> tuple[int, int] | None:
+    """Nanoseconds that the threads of this process ran, and that they queued for a processor.
+
+    None where the system does not say so.
+    """
+    ran, queued, known = 0, 0, False
+    for path in TASKS.glob("*/schedstat"):
+        try:
+            numbers = path.read_text().split()
+            ran, queued, known = ran + int(numbers[0]), queued + int(numbers[1]), True
+        except (OSError, ValueError, IndexError):  # a thread that has just ended
+            continue
+    return (ran, queued) if known else None
+
+
+def loaded_gomp() -> Any:
+    """The libgomp that torch brought and has loaded; None without one."""
+    torch = sys.modules.get("torch")
+    if torch is None or not hasattr(os, "RTLD_NOLOAD"):
+        return None
+    for path in sorted((Path(str(torch.__file__)).parent / "lib").glob("libgomp*.so*")):
+        try:
+            return ctypes.CDLL(str(path), mode=os.RTLD_NOLOAD | os.RTLD_NOW)
+        except OSError:  # torch is just being imported
+            continue
+    return None
+
+
+def _idle_threads(gomp: Any, release: threading.Event) -> None:
+    """Keep a thread more than there are processors, all asleep, until `release`.
+
+    libgomp ends them with the thread that runs this.
+    """
+    nothing = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(lambda _: None)
+    count = ctypes.c_uint(gomp.omp_get_num_procs() + 1)
+    gomp.GOMP_parallel(nothing, None, count, ctypes.c_uint(0))
+    release.wait()
