@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
 
 from hoigs.core.errors import ClipError
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.storage.fetch import local_path
 from hoigs.core.values.clip import Clip
 from hoigs.runs.reader_choice import ReaderChoice, choose_reader
+from hoigs.synthesis.builtin import builtin_clip, generator_version
+from hoigs.synthesis.config import SceneConfig
 from hoigs.synthesis.named import PREFIX, is_named, named_clip
 
 
@@ -25,6 +31,33 @@ def clip_folder(clip: str | Path, registry: Registry | None = None) -> Path:
     if is_named(clip):
         return named_clip(str(clip), (registry or default_registry()).get("body:anny")())
     return local_path(clip)
+
+
+def recorded_folder(run: Path, provenance: Mapping[str, Any], registry: Registry) -> Path:
+    """The folder of a run's clip, by its provenance.
+
+    A built-in clip that is not where it was, as beside a copy of the run, is generated or found in
+    the cache.
+
+    Raises:
+        ClipError: it is not there, or another version of hoigs generated it.
+    """
+    folder = (run / provenance["clip"]["path"]).resolve()
+    if folder.is_dir():
+        return folder
+    missing = f"{folder}: the clip of this run is not there"
+    made = provenance.get("clip_provenance", {})
+    try:
+        config = SceneConfig.model_validate(made["config"])
+    except (KeyError, ValidationError):  # no built-in clip
+        raise ClipError(f"{missing}; name it") from None
+    other = f"{missing}, and another version of hoigs generated it; name a clip"
+    if made.get("generator") != f"hoigs.synthesis {generator_version()}":
+        raise ClipError(other)
+    again = builtin_clip(registry.get("body:anny")(), config)
+    if again.name != folder.name:
+        raise ClipError(other)
+    return again
 
 
 def clip_name(clip: str | Path) -> str:

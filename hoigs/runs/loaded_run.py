@@ -23,7 +23,7 @@ from hoigs.runs.checkpoint import (
     restore_model,
 )
 from hoigs.runs.choices import pick_device, with_rasterizer
-from hoigs.runs.clip_source import clip_folder, read_clip
+from hoigs.runs.clip_source import clip_folder, read_clip, recorded_folder
 from hoigs.runs.reader_choice import recorded_reader
 from hoigs.runs.run_folder import RunFolder
 
@@ -69,10 +69,10 @@ class LoadedRun:
         device, changes = pick_device(device), with_rasterizer((), rasterizer)
         spec = Spec.load(run.spec, overrides=changes, registry=registry)
         provenance = run.read_provenance()
-        own = path / provenance["clip"]["path"]
-        folder = own if clip is None else clip_folder(clip, registry)
-        if not folder.is_dir():
-            raise HoigsError(f"{folder}: the clip of this run is not there; give --clip FOLDER")
+        if clip is None:
+            folder = recorded_folder(path, provenance, registry)
+        else:
+            folder = clip_folder(clip, registry)
         torch.manual_seed(spec.train.seed)
         allowed = bool(provenance.get("allow_faults"))
         recorded = provenance["clip"].get("reader") if clip is None else None

@@ -47,6 +47,7 @@ class Provenance(_Record):
     components: dict[str, Any] = {}
     allow_faults: bool = False
     clip_faults: list[FaultRecord] = []
+    clip_provenance: dict[str, Any] = {}
 
 
 class SamplerRecord(_Record):

@@ -11,7 +11,7 @@ from hoigs.core.registry.registry import Registry
 from hoigs.core.spec.loader import load_yaml
 from hoigs.core.spec.older import with_present_names
 from hoigs.core.spec.schema import Spec
-from hoigs.runs.clip_source import clip_folder, clip_name, require_folder
+from hoigs.runs.clip_source import clip_folder, clip_name, recorded_folder, require_folder
 from hoigs.runs.reader_choice import ReaderChoice, choose_reader, recorded_reader
 from hoigs.runs.run_folder import RunFolder
 
@@ -81,13 +81,13 @@ def clip_and_reader(
     if clip is None and not earlier:
         raise HoigsError(f"{NO_CLIP}: `hoigs train builtin:carry`")
     record = earlier.get("clip", {})
-    own = run.path / record["path"] if earlier else None
-    folder = own if clip is None else clip_folder(clip, registry)
-    assert folder is not None
-    if clip is None and not folder.is_dir():
-        raise HoigsError(f"{folder}: the clip of this run is not there; name it: hoigs train CLIP")
+    if clip is None:
+        folder = recorded_folder(run.path, earlier, registry)
+        same = True
+    else:
+        folder = clip_folder(clip, registry)
+        same = bool(earlier) and (run.path / record["path"]).resolve() == folder.resolve()
     require_folder(folder)
-    same = own is not None and own.resolve() == folder.resolve()
     if same and record.get("reader") and reader is None and not reader_settings:
         return folder, recorded_reader(record["reader"], run.path, folder, registry)
     return folder, choose_reader(folder, registry, reader, reader_settings)

@@ -64,6 +64,7 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._lock: FolderLock | None = None
+        self._created = False
 
     def lock(self, work: str) -> None:
         """Keep other processes from writing this run, until `unlock` or the end of this process.
@@ -159,6 +160,14 @@ class RunFolder:
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
+        self._created = True
+
+    def remove_unstarted(self) -> None:
+        """Remove the run if this object created it and it has no checkpoint yet."""
+        if not self._created or any(self.checkpoints.iterdir()) or any(RUN.foreign(self.path)):
+            return
+        if self._lock is None or not self._lock.is_lost():
+            shutil.rmtree(self.path, ignore_errors=True)
 
     def update(self, spec_text: str, changed: dict[str, Any]) -> None:
         """Replace the spec of a resumed run, and the `changed` keys of its provenance."""
@@ -168,8 +177,12 @@ class RunFolder:
 
     def log(self, record: dict[str, Any]) -> None:
         """Append a line to metrics.jsonl."""
-        with self.metrics.open("a") as file:
-            file.write(json.dumps(record) + "\n")
+        try:
+            with self.metrics.open("a") as file:
+                file.write(json.dumps(record) + "\n")
+        except OSError as error:  # a full disk is noticed by write(), which knows no name
+            error.filename = error.filename or str(self.metrics)
+            raise
 
     def cut_metrics(self, step: int) -> None:
         """Drop records after `step`, which a resumed run writes again, and an unfinished line."""

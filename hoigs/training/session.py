@@ -172,9 +172,15 @@ class Session:
         return cls(spec, source, run, trainer, faults, choice.key, changes)
 
     def train(self, on_step: Callable[[StepReport], None] | None = None) -> None:
-        """`Trainer.train`; the run folder is then free for other processes."""
+        """`Trainer.train`; the run folder is then free for other processes.
+
+        A new run that fails before its first checkpoint is removed.
+        """
         try:
             self.trainer.train(on_step)
+        except Exception:
+            self.run.remove_unstarted()
+            raise
         finally:
             self.run.unlock()
 

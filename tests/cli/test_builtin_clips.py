@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 
 import pytest
 import yaml
 
+from hoigs.core.errors import ClipError
 from hoigs.runs.loaded_run import LoadedRun
 
 TINY = "builtin:carry?frames=8&width=32&held_out_views=0&test_frames=2&samples=1&edge_samples=1"
@@ -29,6 +32,29 @@ def test_a_named_clip_is_trained_on_and_read_back(hoigs, tmp_path, monkeypatch):
     assert run.name.startswith("carry-frames-8-")
     for clip in (None, TINY):
         assert len(LoadedRun.open(run, clip=clip).clip.split["test"]) == 2
+
+
+def test_a_copy_of_a_run_finds_its_built_in_clip(hoigs, tmp_path):
+    """By a path to where the run was once, it is not there."""
+    run, copy = tmp_path / "run", tmp_path / "of/another/depth/copy"
+    assert hoigs("train", TINY, "--out", run, "--set", "train.steps=2", *QUICK).code == 0
+    shutil.copytree(run, copy)
+    assert LoadedRun.open(copy).clip.name == LoadedRun.open(run).clip.name
+    done = hoigs("train", "--resume", "--out", copy, "--set", "train.steps=3", "--no-eval")
+    assert done.code == 0, done.err
+
+
+@pytest.mark.parametrize("changed", ["generator", "config"])
+def test_a_built_in_clip_of_another_version_is_not_put_in_its_place(hoigs, tmp_path, changed):
+    run = tmp_path / "there/run"
+    assert hoigs("train", TINY, "--out", run, "--set", "train.steps=2", *QUICK).code == 0
+    copy = shutil.copytree(run, tmp_path / "copy")
+    record = json.loads((copy / "provenance.json").read_text())
+    record["clip_provenance"][changed] = "another"
+    (copy / "provenance.json").write_text(json.dumps(record))
+    with pytest.raises(ClipError, match="the clip of this run is not there") as refused:
+        LoadedRun.open(copy)
+    assert "/../" not in str(refused.value)
 
 
 def test_a_wrong_name_is_answered_with_the_nearest(hoigs, tmp_path):

@@ -10,6 +10,7 @@ import pytest
 from hoigs.cli.failures import message_of
 from hoigs.core.names import printable
 from hoigs.core.whole_files import written_whole
+from hoigs.runs.run_folder import RunFolder
 
 SMALL = ["--device", "cpu", "--set", "train.steps=2", "--set", "train.preview_every=0", "--no-eval"]
 
@@ -56,8 +57,24 @@ def test_a_full_disk(hoigs, tiny_clip, tmp_path, monkeypatch, at):
         monkeypatch.setattr("hoigs.runs.run_folder.put_in_place", fail)
     outcome = hoigs("train", tiny_clip, "--spec", "static", "--out", tmp_path / "run", *SMALL)
     assert outcome.code == 2 and "the disk is full" in outcome.err, outcome.err
-    left = [p.name for p in tmp_path.rglob("*") if p.is_file() or "part" in p.name]
-    assert not [name for name in left if "part" in name or "lock" in name], left
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_is_full_after_a_checkpoint(hoigs, tiny_clip, tmp_path, monkeypatch):
+    """The run stays, at its last checkpoint."""
+    log = RunFolder.log
+
+    def fail(run: RunFolder, record: dict[str, object]) -> None:
+        if record["step"] == 2:
+            raise OSError(errno.ENOSPC, "No space left on device", str(run.metrics))
+        log(run, record)
+
+    monkeypatch.setattr(RunFolder, "log", fail)
+    every = ["--set", "train.checkpoint_every=1", "--set", "train.log_every=1"]
+    run = tmp_path / "run"
+    outcome = hoigs("train", tiny_clip, "--spec", "static", "--out", run, *SMALL, *every)
+    assert outcome.code == 2 and "metrics.jsonl: the disk is full" in outcome.err, outcome.err
+    assert [p.name for p in (run / "checkpoints").glob("*.json")] == ["step_000001.json"]
 
 
 def test_a_mistake_in_hoigs_keeps_its_traceback():

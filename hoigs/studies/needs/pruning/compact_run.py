@@ -15,6 +15,7 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.runs.checkpoint import latest_checkpoint, load_checkpoint, restore_model
 from hoigs.runs.choices import pick_device
+from hoigs.runs.clip_source import recorded_folder
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.runs.reader_choice import recorded_reader
 from hoigs.runs.run_folder import RunFolder
@@ -132,7 +133,7 @@ def moved_provenance(
 ) -> dict[str, Any]:
     """A run's provenance with paths relative to another folder."""
     clip = provenance["clip"]
-    folder = run / clip["path"]
+    folder = recorded_folder(run, provenance, registry)
     moved = {**clip, "path": target.relative(folder)}
     if clip.get("reader"):
         moved["reader"] = recorded_reader(clip["reader"], run, folder, registry).record(
