@@ -105,6 +105,19 @@ def prepare(
             help="Of the person standing, metres: the unit of the world comes from it.",
         ),
     ] = None,
+    chunk: Annotated[
+        int | None,
+        typer.Option(
+            "--chunk", help="For a long video: fit the body in windows of so many frames."
+        ),
+    ] = None,
+    overlap: Annotated[
+        int | None,
+        typer.Option(
+            "--overlap",
+            help="Frames that two windows share; default: a quarter of --chunk, 50 at most.",
+        ),
+    ] = None,
     keep_black: Annotated[
         bool | None,
         typer.Option(
@@ -150,7 +163,7 @@ def prepare(
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
         "start": start, "end": end, "focal": focal, "intrinsics": intrinsics,
         "calibration": calibration, "person_height": person_height, "keep_black": keep_black,
-        "overwrite": overwrite, "preset": estimators,
+        "overwrite": overwrite, "preset": estimators, "chunk": chunk, "overlap": overlap,
     }  # fmt: skip
     options = load_options(file, settings or (), flags)
     if stage is not None:

@@ -41,6 +41,7 @@ def fit_people(
         found.landmarks, track, body, options.fit_steps, partial(share, 0), raw.landmarks.source,
         found.masks.persons(found.ball), times,
         None if bodies is None else bodies.rotations(video.indices), options.person_height,
+        options.chunking,
     )  # fmt: skip
     if bodies is not None:
         text = f"{fitted.provenance}; {bodies.used(video.indices)}"
@@ -51,6 +52,7 @@ def fit_people(
         people[name] = fit_person(
             person.landmarks, world, body, options.fit_steps, partial(share, k + 1),
             raw.further[name].landmarks.source, person.masks, times,
+            chunking=options.chunking,
         )  # fmt: skip
     return people
 

@@ -10,6 +10,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import SpecError
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
+from hoigs.core.windows import Chunking
 from hoigs.preparation.body.fit_values import FitOptions
 from hoigs.preparation.objects.make_object import ObjectWay
 from hoigs.preparation.video.frames import Pick
@@ -119,6 +120,17 @@ class PrepareOptions(ComponentConfig):
     fit_steps: int = Field(
         default=FitOptions.steps, ge=1, description="steps of the body fit, at most"
     )
+    chunk: int | None = Field(
+        default=None,
+        ge=1,
+        description="frames of a window, for long videos: the body is fitted window by window, "
+        "with one shape for all; None: all frames at once",
+    )
+    overlap: int | None = Field(
+        default=None,
+        ge=1,
+        description="frames that neighbouring windows share; None: a quarter of them, at most 50",
+    )
     preset: Preset = Field(
         default="auto",
         description='what finds that which no file beside the video gives: "offline": MediaPipe '
@@ -205,6 +217,11 @@ class PrepareOptions(ComponentConfig):
         return self.camera in ("static", "turning", "sfm")
 
     @property
+    def chunking(self) -> Chunking | None:
+        """How the clip is cut into windows; None: it is not."""
+        return None if self.chunk is None else Chunking.of(self.chunk, self.overlap)
+
+    @property
     def people(self) -> tuple[str, ...]:
         """Names of all people, the first one's first."""
         return (self.human, *self.further_people) if self.find_person else ()
@@ -240,6 +257,13 @@ class PrepareOptions(ComponentConfig):
     def _somebody_or_something(self) -> PrepareOptions:
         if not (self.find_person or self.find_object):
             raise ValueError("neither people nor objects are looked for: nothing would be fitted")
+        return self
+
+    @model_validator(mode="after")
+    def _windows_overlap(self) -> PrepareOptions:
+        if self.chunk is None and self.overlap is not None:
+            raise ValueError("overlap is of windows: give their length, chunk, too")
+        _ = self.chunking
         return self
 
     @model_validator(mode="after")

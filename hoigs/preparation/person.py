@@ -15,8 +15,9 @@ from hoigs.core.diagnostics import ranges
 from hoigs.core.interfaces.body import PELVIS, BodyModel
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
+from hoigs.core.windows import Chunking
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_values import FitOptions
+from hoigs.preparation.body.fit_values import FitOptions, Joint
 from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.body.silhouette import posed
 from hoigs.preparation.cameras.camera_track import CameraTrack
@@ -25,6 +26,7 @@ from hoigs.preparation.nobody import Nobody
 
 SEEN, RARELY = 0.3, 0.2  # visibility; share of frames: a part seen in fewer of them is a guess
 PARTS = {"head": (0, 7, 8), "arms": (13, 14, 15, 16), "legs": (25, 26, 27, 28)}  # landmarks
+APART, APART_DEGREES = 0.01, 2.0  # metres: of the same frame in two windows, which then do not meet
 POOR_FIT = 0.02  # of the image's longer side: a fit that misses by more deserves a warning
 
 
@@ -104,6 +106,7 @@ def fit_person(
     times: Float[Tensor, " F"] | None = None,
     turns: Float[Tensor, "F 21 3"] | None = None,
     height: float | None = None,
+    chunking: Chunking | None = None,
 ) -> FittedBody:
     """Fits the body to landmarks, and masks if there are any, in at most `steps`; finds the scale
     of a world that has none.
@@ -112,6 +115,7 @@ def fit_person(
         times: of the frames, seconds.
         turns: axis-angle of the body's joints 1..21, about.
         height: of the person who stands upright, metres; None: the body model's mean.
+        chunking: fit window by window.
     """
     strays = landmarks.strays()
     jumps = landmarks.without(strays).jumps()
@@ -125,23 +129,27 @@ def fit_person(
     fit = fit_body(
         body, landmarks, track.cameras,
         options=options, points=known, masks=masks, times=times, turns=turns,
-        progress=progress,
+        chunking=chunking, progress=progress,
     )  # fmt: skip
-    frames = list(posed(body, fit.poses))
+    joints, lowest = [], []
+    for vertices, at in posed(body, fit.poses):
+        joints.append(at.clone())  # not a view, which would keep all vertices
+        lowest.append(vertices[:, 1].max())
     residual = float(fit.residual_px.nanmedian())
     found, solid = int(landmarks.found.sum()), int(landmarks.solid.sum())
     return FittedBody(
         poses=fit.poses,
-        joints=torch.stack([joints for _, joints in frames]),
+        joints=torch.stack(joints),
         scene_scale=fit.scene_scale,
         residual_px=residual,
         residuals=fit.residual_px,
-        ground=float(torch.stack([vertices[:, 1].max() for vertices, _ in frames]).median()),
+        ground=float(torch.stack(lowest).median()),
         found=landmarks.found.numpy(),
         provenance=(
             f"fitted to {source} landmarks{'' if solid else ' in the image only'} of {found} of "
             f"{len(track.cameras)} frames{'' if masks is None else ' and to masks'}, "
             f"{residual:.1f} px off (median of frames); hands are not fitted"
+            f"{'' if chunking is None else _windows(fit.joints, chunking)}"
         ),
         report=fit.report,
         warnings=[
@@ -149,8 +157,34 @@ def fit_person(
             *_unseen(landmarks),
             *_left_out(strays, "stand alone between frames without any"),
             *_left_out(jumps, "beside frames without any are off the person's way"),
+            *_open_joints(fit.joints),
         ],
     )
+
+
+def _windows(joints: Sequence[Joint], chunking: Chunking) -> str:
+    """What is said of a fit in windows."""
+    if not joints:
+        return f"; all frames are in one window of {chunking.chunk}: nothing was split"
+    return (
+        f"; in {len(joints) + 1} windows of at most {chunking.chunk} frames with one shape, which "
+        f"are {1000 * max(j.metres for j in joints):.1f} mm and "
+        f"{max(j.degrees for j in joints):.1f} degrees apart at most where they join"
+    )
+
+
+def _open_joints(joints: Sequence[Joint]) -> list[str]:
+    """A sentence for the report if windows do not meet, else nothing."""
+    apart = [j for j in joints if j.metres > APART or j.degrees > APART_DEGREES]
+    if not apart:
+        return []
+    frames = ", ".join(
+        f"{j.frame} ({100 * j.metres:.0f} cm, {j.degrees:.0f} degrees)" for j in apart
+    )
+    return [
+        f"two windows of the fit differ at frames {frames}: landmarks are rare there; use a longer "
+        "overlap or chunk"
+    ]
 
 
 def stature(body: BodyModel) -> float:

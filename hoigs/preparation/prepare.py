@@ -60,6 +60,8 @@ def prepare(
     intrinsics: str | Sequence[float] | None = None,
     calibration: str | Path | None = None,
     person_height: float | None = None,
+    chunk: int | None = None,
+    overlap: int | None = None,
     keep_black: bool | None = None,
     overwrite: bool | None = None,
     object: str | Sequence[str] = (),
@@ -87,8 +89,8 @@ def prepare(
         out: the clip folder to make, with report.json, report.md and overlay.mp4 in it; it
             appears when it is whole.
         width, camera, max_frames, every, fps, start, end, focal, intrinsics, calibration,
-            person_height, keep_black, overwrite: fields of `PrepareOptions`, laid over `options`;
-            None leaves a field as it is.
+            person_height, chunk, overlap, keep_black, overwrite: fields of `PrepareOptions`, laid
+            over `options`; None leaves a field as it is.
         object: where the object is, in place of its prompt in `options`: "640,402@0", or several
             such (`prompts.parse_prompts`); "none": there is none. Without it, the clicks that
             `annotate` stored beside the video hold.
@@ -119,7 +121,8 @@ def prepare(
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
         "start": start, "end": end, "focal": focal, "intrinsics": intrinsics,
         "calibration": None if calibration is None else str(calibration),
-        "person_height": person_height, "keep_black": keep_black, "overwrite": overwrite,
+        "person_height": person_height, "chunk": chunk, "overlap": overlap,
+        "keep_black": keep_black, "overwrite": overwrite,
     }  # fmt: skip
     options = with_prompts(load_options(options, overrides, flags), object, estimators, person)
     may_replace = options.overwrite or bool(redo)

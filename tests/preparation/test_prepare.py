@@ -14,7 +14,7 @@ from test_cameras import FOCAL, colmap_model
 from tiny import BALL, FRAMES, WIDTH, background, landmarks, make_source, masks
 
 from hoigs.core.clip_folder.check import check_clip
-from hoigs.core.errors import ClipError, HoigsError
+from hoigs.core.errors import ClipError, HoigsError, SpecError
 from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
@@ -232,3 +232,26 @@ def test_real_videos(
         mask = clip[i].masks["object"]
         column, row = column.clamp(max=mask.shape[1] - 1), row.clamp(max=mask.shape[0] - 1)
         assert float(mask[row, column].float().mean()) > (0.85 if name == "juggle" else 0.5)
+
+
+def test_a_body_fitted_in_windows_says_so(
+    tiny_source: Path, tmp_path: Path, body: AnnyBody
+) -> None:
+    _, report = prepared(tiny_source, tmp_path / "clip", body, chunk=8, overlap=4, fit_steps=3)
+    assert report.body["windows"] == 2
+    ((frame, metres, degrees),) = report.body["joints"]
+    assert (frame, metres, degrees) == (6, pytest.approx(0, abs=0.01), pytest.approx(0, abs=2))
+    assert "in 2 windows of at most 8 frames with one shape" in report.provenance["body"]
+    _, report = prepared(tiny_source, tmp_path / "whole", body, chunk=12, fit_steps=3)
+    assert report.provenance["body"].endswith("one window of 12: nothing was split")
+
+
+def test_windows_that_cannot_be_joined_are_refused(tiny_source: Path, tmp_path: Path) -> None:
+    for settings, said in (
+        ({"chunk": 8, "overlap": 6}, "may share 4, half of them"),
+        ({"chunk": 5}, "windows need 8 or more"),
+        ({"overlap": 6}, "give their length, chunk, too"),
+    ):
+        with pytest.raises(SpecError, match=said):
+            prepare(tiny_source, tmp_path / "clip", **settings)  # type: ignore[arg-type]
+        assert not (tmp_path / "clip").exists()

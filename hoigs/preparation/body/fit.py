@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.camera import Camera
+from hoigs.core.windows import Chunking
 from hoigs.preparation.body.fit_problem import FitProblem
-from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Unknowns
-from hoigs.preparation.body.kinematics import PER_FRAME
-from hoigs.preparation.body.landmarks import (
-    ENOUGH,
-    LandmarkTrack,
-)
-from hoigs.preparation.body.mask_fit import MaskFit
-from hoigs.preparation.body.normal_equations import NormalEquations
-
-DAMPING, STUCK = 1e-3, 1e4
-ESTIMATED = (6, 9, 12)  # steps before which the landmarks' noise is estimated anew
-RESCALED = (4, 8, 11)
-SETTLED = 14  # steps after which nothing but convergence is left to wait for
-ENOUGH_GAIN = 1e-3  # of the energy, below which a step is the last
+from hoigs.preparation.body.fit_values import BodyFit, FitOptions
+from hoigs.preparation.body.gauss_newton import solve
+from hoigs.preparation.body.landmarks import ENOUGH, LandmarkTrack
+from hoigs.preparation.body.mask_fit import Masks
+from hoigs.preparation.body.windowed_fit import fit_in_windows
 
 
 def fit_body(
@@ -36,9 +27,10 @@ def fit_body(
     *,
     options: FitOptions | None = None,
     points: Float[Tensor, "S 3"] | None = None,
-    masks: Iterable[Bool[np.ndarray, "H W"]] | None = None,
+    masks: Masks | None = None,
     times: Float[Tensor, " F"] | None = None,
     turns: Float[Tensor, "F 21 3"] | None = None,
+    chunking: Chunking | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> BodyFit:
     """Pose, shape and place of a body in every frame, in metres.
@@ -59,6 +51,7 @@ def fit_body(
         times: of the frames, seconds; by default 30 frames a second.
         turns: axis-angle of joints 1..21 as another program has found them: the fit starts there,
             and `PosePrior` holds it near.
+        chunking: fit window by window (`fit_in_windows`); None: all frames at once.
         progress: called with 0..1.
 
     Raises:
@@ -74,53 +67,17 @@ def fit_body(
             "body fit needs at least 2: is the person in view?"
         )
     times = torch.arange(len(seen)) / 30.0 if times is None else times
-    problem = FitProblem(body, landmarks, cameras, times, options, turns)
-    if options.scale and points is not None:
-        problem.ground = points
-    if masks is not None and options.masks and not seen.all():
-        unseen = {i: mask for i, mask in enumerate(masks) if not seen[i]}
-        problem.masks = MaskFit(body, unseen, options.mask_spread, options.masks)
+    if not options.scale:
+        points = None
     with torch.no_grad():
-        return problem.result(solve(problem, options.steps, progress))
-
-
-def solve(problem: FitProblem, steps: int, progress: Callable[[float], None] | None) -> Unknowns:
-    """Gauss-Newton with Marquardt's damping, until steps change next to nothing."""
-    unknowns, damping = problem.begin, DAMPING
-    for step in range(steps):
-        # the robust spread narrows, so that a poor start is not taken for outliers
-        widen = max(1.0, 5.0 - step)
-        if step in RESCALED:
-            unknowns = problem.rescale(unknowns)
-        if step in ESTIMATED:
-            problem.estimate_noise(unknowns)
-        unknowns = problem.carry(unknowns, step / min(steps, SETTLED))
-        better, damping, gain = _improved(problem, unknowns, widen, damping)
-        unknowns = better
-        if progress is not None:
-            progress((step + 1) / steps)
-        if step >= SETTLED and gain < ENOUGH_GAIN:
-            break
-    if progress is not None:
-        progress(1.0)
-    return unknowns
-
-
-def _improved(
-    problem: FitProblem, unknowns: Unknowns, widen: float, damping: float
-) -> tuple[Unknowns, float, float]:
-    """A step downhill, the next damping, and the share of the energy that the step gained; the
-    same unknowns and 0 if no step goes down."""
-    frames, shared = len(unknowns.pose.transl), unknowns.pose.betas.numel()
-    shared += unknowns.offsets.numel() + 2
-    equations = NormalEquations(frames, PER_FRAME, shared)
-    before = problem.energy(unknowns, widen, equations)
-    while damping < STUCK:
-        found = equations.step(damping)
-        if found is not None:
-            moved = unknowns.moved(*found)
-            after = problem.energy(moved, widen)
-            if after < before:
-                return moved, max(damping / 10, 1e-6), (before - after) / abs(before)
-        damping *= 10
-    return unknowns, DAMPING, 0.0
+        if chunking is not None and len(chunking.windows(len(seen))) > 1:
+            return fit_in_windows(
+                body, landmarks, cameras, times, options, points, masks, turns, chunking, progress
+            )
+        problem = FitProblem(body, landmarks, cameras, times, options, turns)
+        if points is not None:
+            problem.ground = points
+        if masks is not None:
+            problem.show(masks)
+        unknowns = solve(problem, options.steps, progress)
+        return problem.result(unknowns, problem.misses(unknowns))

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.camera import Camera, pinhole_pixels
-from hoigs.preparation.body.fit_start import first_guess
-from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Unknowns
+from hoigs.preparation.body.fit_start import Start, first_guess
+from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Found, Unknowns
 from hoigs.preparation.body.ground_scale import ground_scale
 from hoigs.preparation.body.kinematics import Kinematics, Posed, nearest_turn
 from hoigs.preparation.body.landmarks import FEET, TORSO, LandmarkPoints, LandmarkTrack, points_of
-from hoigs.preparation.body.mask_fit import MaskFit, Project
+from hoigs.preparation.body.mask_fit import MaskFit, Masks, Project
 from hoigs.preparation.body.motion_prior import MotionPrior
 from hoigs.preparation.body.noise import Noise, robust_weights
 from hoigs.preparation.body.normal_equations import REACH, NormalEquations
@@ -39,6 +39,8 @@ class FitProblem:
     Args:
         times: of the frames, seconds.
         turns: axis-angle of joints 1..21 where they are known, about.
+        start: where the fit begins, in place of `first_guess`.
+        found: what another fit has found, and this one keeps.
     """
 
     def __init__(
@@ -49,8 +51,10 @@ class FitProblem:
         times: Float[Tensor, " F"],
         options: FitOptions,
         turns: Float[Tensor, "F 21 3"] | None = None,
+        start: Start | None = None,
+        found: Found | None = None,
     ) -> None:
-        self.body, self.options = body, options
+        self.body, self.options, self.found = body, options, found
         self.points: LandmarkPoints = points_of(body)
         self.kinematics = Kinematics(body, self.points.joints, self.points.vertices)
         rows = list(self.points.landmarks)
@@ -85,10 +89,20 @@ class FitProblem:
             torch.full((len(rows),), options.spread * self.width, dtype=torch.float64),
             torch.full((len(rows), 3), options.space, dtype=torch.float64),
         )
-        start = first_guess(body, landmarks, cameras, options.scale)
+        start = start or first_guess(body, landmarks, cameras, options.scale)
         if turns is not None:
             start = replace(start, body=turns)
         self.begin = Unknowns.start(start, body.num_betas, pairs)
+        self.placed = self.seen.clone()  # frames that the others follow
+        if found is not None:
+            self.noise, self.begin = found.noise, found.begin(self.begin)
+            self.placed[: found.frames] = True
+
+    def show(self, masks: Masks, first: int = 0) -> None:
+        """Look at masks in the frames without landmarks; `first` is the number of frame 0."""
+        unseen = {i: masks[first + i] for i in (~self.seen).nonzero()[:, 0].tolist()}
+        if unseen and self.options.masks:
+            self.masks = MaskFit(self.body, unseen, self.options.mask_spread, self.options.masks)
 
     def posed(self, unknowns: Unknowns, derivatives: bool = True, frames: slice = ALL) -> Posed:
         """The points that stand for landmarks.
@@ -118,16 +132,18 @@ class FitProblem:
         """Frames far from landmarks begin one after another, each from its neighbour's current
         pose: masks alone do not separate an arm from what it holds, unless it starts close by. A
         short gap between landmarks is left to smoothness."""
-        if self.masks is None or progress > CARRIED or bool(self.seen.all()):
+        if self.masks is None or progress > CARRIED or bool(self.placed.all()):
             return unknowns
-        frames = torch.arange(len(self.seen))
-        found = frames[self.seen]
+        frames = torch.arange(len(self.placed))
+        found = frames[self.placed]
+        if not len(found):
+            return unknowns
         after = torch.searchsorted(found, frames)
         last, first = found[(after - 1).clamp_min(0)], found[after.clamp_max(len(found) - 1)]
         ends = (frames < found[0]) | (frames > found[-1])
         distance = torch.minimum((frames - last).abs(), (frames - first).abs())
         nearest = torch.where((frames - last).abs() < (first - frames).abs(), last, first)
-        far = ends | ((first - last > GAP) & ~self.seen)
+        far = ends | ((first - last > GAP) & ~self.placed)
         reach = int(progress / CARRIED * int(distance.max()))
         late = far & (distance > reach)
         source = torch.where(late, nearest + (frames - nearest).sign() * reach, frames)
@@ -159,6 +175,8 @@ class FitProblem:
         )
 
     def estimate_noise(self, unknowns: Unknowns) -> None:
+        if self.found is not None:
+            return
         points = self.posed(unknowns, derivatives=False).points
         pixels, _ = self.in_cameras(points, unknowns.scale)
         residuals, _, _ = self._space_residuals(points, unknowns.unit, 1.0)
@@ -180,11 +198,13 @@ class FitProblem:
         total += self.motion.angles(unknowns.pose, equations)
         share = (self.spacing / LASTS).clamp_max(1.0)
         total += float(self.prior.add(unknowns.pose.body.flatten(1), share, equations))
-        total += self._shared_priors(unknowns, equations)
+        total += self._shared_priors(unknowns, None if self.found else equations)
         if self.masks is not None:
             total += self.masks.energy(
                 unknowns.pose, self._seen_at(unknowns.scale), widen, equations
             )
+        if equations is not None and self.found is not None:
+            equations.hold(self.found.frames)
         return total
 
     def _part_of_energy(
@@ -211,7 +231,13 @@ class FitProblem:
 
         return project
 
+    def count_shared(self, unknowns: Unknowns) -> int:
+        """Number of the unknowns that all frames share: 0 if they were found before."""
+        return 0 if self.found else len(unknowns.pose.betas) + unknowns.offsets.numel() + 2
+
     def _by_shared(self, at: Posed) -> Float[Tensor, "F L 3 S"]:
+        if self.found is not None:
+            return at.points.new_zeros(*at.points.shape, 0)
         offsets = torch.einsum("flab,lpb->flapb", at.by_rest, self.onto_offsets).flatten(-2)
         scale = at.points.new_zeros(*at.points.shape, 2)
         return torch.cat((at.by_betas, offsets, scale), -1)
@@ -249,7 +275,8 @@ class FitProblem:
             total = weight.sum(1, keepdim=True).clamp_min(1e-12)
             size = 1 + unknowns.unit
             shared = size * turn @ shared
-            shared[..., -2] = (turn @ at.points[..., None])[..., 0]
+            if self.found is None:
+                shared[..., -2] = (turn @ at.points[..., None])[..., 0]
 
             def about_origin(by: Tensor) -> Tensor:
                 mean = (weight[..., None] * by).sum(1, keepdim=True) / total[..., None]
@@ -304,16 +331,19 @@ class FitProblem:
             equations.shared[: len(betas), : len(betas)] += torch.outer(by_size, by_size)
         return float(values.square().sum()) + larger**2
 
-    def result(self, unknowns: Unknowns) -> BodyFit:
+    def misses(self, unknowns: Unknowns) -> Float[Tensor, "F L"]:
+        """Distances of the visible landmarks in the image, pixels; NaN of the others."""
         points = self.posed(unknowns, derivatives=False).points
         pixels, _ = self.in_cameras(points, unknowns.scale)
         distance = (pixels - self.pixels).norm(dim=-1).float()
-        counted = self.visible > 0.5
-        residual = (distance * counted).sum(1) / counted.sum(1)
-        mean = float(distance[counted].mean())
+        return distance.masked_fill(self.visible <= 0.5, torch.nan)
+
+    def result(self, unknowns: Unknowns, misses: Float[Tensor, "F L"]) -> BodyFit:
+        """Pose and report, of the unknowns of all frames and their `misses`."""
+        mean = float(misses.nanmean())
         report = {
             "landmark_error_px": round(mean, 2),
-            "landmark_error_px_median": round(float(distance[counted].median()), 2),
+            "landmark_error_px_median": round(float(misses.nanmedian()), 2),
             "landmark_error_px_at_1280": round(mean * 1280 / self.width, 2),
             "landmark_noise_px": round(float(self.noise.pixels.median()), 2),
             "landmark_noise_m": round(float(self.noise.space.median()), 3),
@@ -321,12 +351,12 @@ class FitProblem:
             "landmark_offset_m_largest": round(float(unknowns.offsets.norm(dim=-1).max()), 3),
             "frames_with_landmarks": int(self.seen.sum()),
             "frames_with_landmarks_in_space": self.solid,
-            "frames": len(self.seen),
+            "frames": len(misses),
             "scene_scale": round(float(unknowns.scale), 5),
             "scene_scale_from": self.scale_from,
         }
         pose = unknowns.pose.map(lambda x: x.float())
-        return BodyFit(pose, residual, unknowns.scale, report)
+        return BodyFit(pose, misses.nanmean(1), unknowns.scale, report)
 
 
 def _by_place(K: Float[Tensor, "F 3 3"], cam: Float[Tensor, "F L 3"]) -> Float[Tensor, "F L 2 3"]:

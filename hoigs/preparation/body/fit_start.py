@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -35,6 +35,15 @@ class Start:
     transl: Float[Tensor, "F 3"]
     body: Float[Tensor, "F 21 3"]
     scale: float
+
+    def part(self, frames: slice) -> Start:
+        """Of some frames alone."""
+        return replace(
+            self,
+            global_orient=self.global_orient[frames],
+            transl=self.transl[frames],
+            body=self.body[frames],
+        )
 
 
 def first_guess(

@@ -13,6 +13,7 @@ from hoigs.core.maths.rotations import axis_angle_to_quats, multiply_quats, quat
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit_start import Start
 from hoigs.preparation.body.kinematics import nearest_turn
+from hoigs.preparation.body.noise import Noise
 
 
 @dataclass(frozen=True)
@@ -63,12 +64,29 @@ class BodyFit:
         residual_px: mean distance of visible landmarks per frame, pixels; NaN where unseen.
         scene_scale: metres a unit of the cameras' own world (1 unless it was requested).
         report: numbers for people.
+        joints: of a fit in windows, where one follows another.
     """
 
     poses: BodyPose
     residual_px: Float[Tensor, " F"]
     scene_scale: float
     report: dict[str, Any]
+    joints: tuple[Joint, ...] = ()
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Where a window takes over from the one before it, and how far both are apart there.
+
+    Attributes:
+        frame: the first that is the later window's own.
+        metres, degrees: largest distance of a joint's places, and angle between its orientations in
+            the world, by the two windows.
+    """
+
+    frame: int
+    metres: float
+    degrees: float
 
 
 @dataclass(frozen=True)
@@ -97,7 +115,10 @@ class Unknowns:
         return Unknowns(pose.to(torch.float64), offsets, 0.0, start.scale)
 
     def moved(self, frames: Float[Tensor, "F N"], shared: Float[Tensor, " S"]) -> Unknowns:
+        """After a step; `shared` is empty where that of shape, offsets, unit and scale is none."""
         pose, betas = self.pose, len(self.pose.betas)
+        if not len(shared):
+            shared = shared.new_zeros(betas + self.offsets.numel() + 2)
         turned = multiply_quats(
             axis_angle_to_quats(pose.global_orient), axis_angle_to_quats(frames[:, 3:6])
         )
@@ -110,3 +131,35 @@ class Unknowns:
         offsets = self.offsets + shared[betas:-2].unflatten(0, (-1, 3))
         unit = self.unit + float(shared[-2])
         return Unknowns(pose, offsets, unit, max(self.scale + float(shared[-1]), 1e-4))
+
+
+@dataclass(frozen=True)
+class Found:
+    """What one fit has found and another keeps: all that frames share, and the first frames.
+
+    Attributes:
+        pose: of the first frames; None: of none.
+    """
+
+    noise: Noise
+    betas: Float[Tensor, " B"]
+    offsets: Float[Tensor, "P 3"]
+    unit: float
+    pose: BodyPose | None = None
+
+    @property
+    def frames(self) -> int:
+        return 0 if self.pose is None else len(self.pose.transl)
+
+    def begin(self, unknowns: Unknowns) -> Unknowns:
+        """The start of a fit that keeps this."""
+        pose = unknowns.pose.replace(betas=self.betas)
+        if self.pose is not None:
+            first, rest = self.pose, pose.frame(slice(self.frames, None))
+            orient = torch.cat((first.global_orient, rest.global_orient))
+            pose = pose.replace(
+                global_orient=nearest_turn(orient),
+                body=torch.cat((first.body, rest.body)),
+                transl=torch.cat((first.transl, rest.transl)),
+            )
+        return Unknowns(pose, self.offsets, self.unit, unknowns.scale)

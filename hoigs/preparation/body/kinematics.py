@@ -77,10 +77,9 @@ class Kinematics:
         """
         betas = pose.betas.double()
         turns = torch.cat((pose.global_orient[:, None], pose.body), 1).double()
-        local = axis_angle_to_matrices(turns)
-        joints = self.joints + torch.einsum("b,bjc->jc", betas, self.joints_by_betas)
+        joints = self._at_rest(betas)
         rest = self.rest + torch.einsum("b,blc->lc", betas, self.rest_by_betas) + shift
-        world, places = self._chain(local, joints, pose.transl.double())
+        world, places = self.placed(pose)
         # every point as each of its joints alone would carry it, times that joint's weight
         arms = rest[:, None] - joints  # [L, 22, 3]
         carried = torch.einsum("fjab,ljb->flja", world, arms) + places[:, None]
@@ -103,6 +102,15 @@ class Kinematics:
         return Posed(
             points, torch.cat((still, by_turns), -1), self._by_betas(world, blended), blended
         )
+
+    def placed(self, pose: BodyPose) -> tuple[Float[Tensor, "F 22 3 3"], Float[Tensor, "F 22 3"]]:
+        """Rotation and place of each joint in the world, at a batched pose with one shape."""
+        turns = torch.cat((pose.global_orient[:, None], pose.body), 1).double()
+        joints = self._at_rest(pose.betas.double())
+        return self._chain(axis_angle_to_matrices(turns), joints, pose.transl.double())
+
+    def _at_rest(self, betas: Float[Tensor, " B"]) -> Float[Tensor, "22 3"]:
+        return self.joints + torch.einsum("b,bjc->jc", betas, self.joints_by_betas)
 
     def size(self, betas: Float[Tensor, " B"]) -> tuple[float, Float[Tensor, " B"]]:
         """Root mean square bone length in parts of the mean body's; its derivatives by betas."""

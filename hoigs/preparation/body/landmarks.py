@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -49,6 +49,10 @@ class LandmarkTrack:
         image = torch.as_tensor(image_xyzv, dtype=torch.float32)[..., [0, 1, 3]]
         world = torch.as_tensor(world_xyzv, dtype=torch.float32)[..., :3]
         return LandmarkTrack(image, world)
+
+    def rows(self, frames: slice | Int[Tensor, " T"]) -> LandmarkTrack:
+        """Of some frames alone."""
+        return replace(self, image=self.image[frames], world=self.world[frames])
 
     @property
     def known(self) -> Bool[Tensor, "F 33"]:

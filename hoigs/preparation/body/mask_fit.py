@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -20,6 +21,13 @@ Project = Callable[
     [Float[Tensor, "F V 3"], Int[Tensor, " F"]],
     tuple[Float[Tensor, "F V 2"], Float[Tensor, "F V 2 3"]],
 ]
+
+
+class Masks(Protocol):
+    """One mask a frame, read on access."""
+
+    def __getitem__(self, frame: int, /) -> Bool[np.ndarray, "H W"]: ...
+
 
 POINTS = 400  # of the body's surface
 PIXELS = 300  # of each mask

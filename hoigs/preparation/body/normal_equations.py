@@ -84,6 +84,13 @@ class NormalEquations:
         self.shared += others.shared
         self.by_shared += others.by_shared
 
+    def hold(self, frames: int) -> None:
+        """Leave the unknowns of the first frames as they are."""
+        self.by_frame[:frames], self.border[:frames] = 0, 0
+        for block in self.blocks:
+            block[:frames] = 0
+        self.blocks[0][:frames] = torch.eye(self.by_frame.shape[1]).to(self.by_frame)
+
     def _add_shared(self, residuals: Tensor, weights: Tensor, by_shared: Tensor) -> None:
         flat = by_shared.flatten(0, 1)
         weighted = flat * weights.flatten()[:, None]

@@ -35,7 +35,10 @@ PLAN = {
     "cameras": Stage(3, ("frames", "evidence"), ("camera", "focal", "intrinsics", "calibration")),
     "inputs": Stage(6, ("evidence", "cameras"), ("find_object",)),
     "body": Stage(
-        40, ("inputs",), ("body", "fit_steps", "person_height", "object_size"), slow=True
+        40,
+        ("inputs",),
+        ("body", "fit_steps", "person_height", "object_size", "chunk", "overlap"),
+        slow=True,
     ),
     "masks": Stage(10, ("inputs", "body", "object_masks"), ("keep_black",), slow=True),
     "object": Stage(40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True),

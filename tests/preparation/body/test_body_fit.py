@@ -70,7 +70,7 @@ def seen_by(cameras: list[Camera], pose: BodyPose) -> LandmarkTrack:
         1,
     )
     marks = list(points.landmarks)
-    image, world = torch.zeros(FRAMES, 33, 3), torch.zeros(FRAMES, 33, 3)
+    image, world = torch.zeros(2, len(cameras), 33, 3)
     for i, view in enumerate(cameras):
         image[i, marks, :2] = view.project(places[i])[0]
         image[i, marks, 2] = 1.0
