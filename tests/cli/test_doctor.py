@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 import torch
 
 from hoigs.core.registry.manager import PluginManager
 from hoigs.core.registry.registry import Registry, default_registry
-from hoigs.workflows.doctor import codec_rows, rasterizer_rows, training_row
+from hoigs.workflows.doctor import (
+    codec_rows,
+    cuda_rows,
+    driver_version,
+    rasterizer_rows,
+    training_row,
+)
 
 PLUGIN = """
 from hoigs import Component, hookimpl
@@ -50,7 +58,7 @@ def hoigs_components():
     for name in NAMES:
         yield Component(f"rasterizer:{name}", target=f"{__name__}:{name.title()}")
 """
-OK = "ok: drew a test splat"
+OK = "ok: draws as the oracle does"
 
 
 @pytest.fixture
@@ -63,7 +71,9 @@ def registry(tmp_path, monkeypatch):
         manager = PluginManager({})
         manager.load_file(path)
         made = Registry(manager)
-        monkeypatch.setattr("hoigs.core.registry.registry.default_registry", lambda: made)
+        for module in ("environments", "registry"):
+            name = f"hoigs.core.registry.{module}.default_registry"
+            monkeypatch.setattr(name, lambda: made)
         return made
 
     return make
@@ -88,7 +98,9 @@ def test_what_goes_wrong_is_a_row_and_not_a_traceback(hoigs, registry, no_cuda):
     names = ("bare", "black", "broken", "gone", "good")
     rows = {name: verdict for name, verdict, _ in rasterizer_rows(registry(*names))}
     assert rows.pop("rasterizer:bare").startswith("failed: AttributeError: ")
-    assert rows.pop("rasterizer:black on cpu").startswith("wrong: test splat is [0.5, ")
+    assert rows.pop("rasterizer:black on cpu").startswith(
+        "wrong: its picture differs from the oracle's by 0."
+    )
     assert rows == {
         "rasterizer:broken on cpu": "failed: IndexError: no such tile",
         "rasterizer:gone": "failed",
@@ -120,6 +132,54 @@ def test_a_training_step_and_the_codecs_of_films():
     row = training_row("cpu")
     assert row.ok and row.found == "ok" and "ms for 1000 Gaussians" in row.note
     assert {row.what: row.found for row in codec_rows()}["codec libx264"] == "ok"
+
+
+@pytest.mark.parametrize("name", ["versions", "cuda_rows", "codec_rows", "find_weights"])
+def test_a_check_that_fails_costs_only_itself(hoigs, registry, no_cuda, monkeypatch, name):
+    def fail():
+        raise OSError("broken pipe")
+
+    registry("good")
+    whole = len(json.loads(hoigs("doctor", "--json").out))
+    monkeypatch.setattr(f"hoigs.workflows.doctor.{name}", fail)
+    outcome = hoigs("doctor", "--json")
+    rows = json.loads(outcome.out)
+    assert outcome.code == 1 and len(rows) > whole / 2
+    assert [row["found"] for row in rows if not row["ok"]] == ["failed: OSError: broken pipe"]
+
+
+@pytest.mark.parametrize("kind", ["", " Open"])
+def test_the_driver_of_a_machine_whose_torch_has_no_cuda(monkeypatch, no_cuda, tmp_path, kind):
+    version = tmp_path / "version"
+    version.write_text(
+        f"NVRM version: NVIDIA UNIX{kind} Kernel Module for x86_64  560.35.03  Rel\n"
+    )
+    monkeypatch.setattr("hoigs.workflows.doctor.DRIVER", version)
+    monkeypatch.setattr(torch.version, "cuda", None)
+    driver, cuda = cuda_rows()
+    assert driver == ("NVIDIA driver", "560.35.03", "") and cuda.found == "none"
+    assert "built without CUDA" in cuda.note
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    assert not cuda_rows()[1].ok
+
+
+def test_the_driver_by_nvidia_smi(monkeypatch, tmp_path):
+    program = tmp_path / "nvidia-smi"
+    program.write_text("#!/bin/sh\necho 570.133.20\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("hoigs.workflows.doctor.DRIVER", tmp_path / "absent")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert driver_version() == "570.133.20"
+    program.unlink()
+    assert driver_version() == ""
+
+
+def test_all_that_is_checked(hoigs, no_cuda):
+    rows = {row["what"]: row for row in json.loads(hoigs("doctor", "--json").out)}
+    assert {"torch", "python", "machine", "cpu", "disk", "NVIDIA driver", "cuda",
+            "LPIPS weights", "environment mediapipe", "codec h264",
+            "rasterizer:warp on cpu", "training step on cpu"} <= set(rows)  # fmt: skip
+    assert "torch threads for" in rows["cpu"]["note"] and "GB" in rows["disk"]["note"]
 
 
 @pytest.mark.gpu
