@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from hoigs.rasterizers.warp.common.runtime import CPU_FLAGS, wp
+from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
 from hoigs.rasterizers.warp.cpu.vector_source import MAX_ROWS, PASS_CHANNELS, VECTORS
 
 F32 = wp.array(dtype=wp.float32)

@@ -307,7 +307,7 @@ for shape in ((300, 260, 3), (7, 400, 3), (2, 33, 65, 1)):
 @pytest.mark.slow
 def test_kernels_compile_for_cuda(tmp_path: Path) -> None:
     """No GPU is needed to compile; to run them see the tests on "cuda"."""
-    from hoigs.rasterizers.warp.common.runtime import wp
+    from hoigs.core.cpu_kernels.runtime import wp
     from hoigs.rasterizers.warp.ssim import tile_kernels
 
     wp.compile_aot_module(tile_kernels, arch=80, module_dir=str(tmp_path))

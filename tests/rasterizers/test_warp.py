@@ -338,7 +338,7 @@ def test_kernels_compile_for_cuda(name: str, tmp_path: Path) -> None:
     """No GPU is needed to compile; to run them see the conformance tests on "cuda"."""
     import importlib
 
-    from hoigs.rasterizers.warp.common.runtime import wp
+    from hoigs.core.cpu_kernels.runtime import wp
 
     module = importlib.import_module(f"hoigs.rasterizers.warp.{name}")
     wp.compile_aot_module(module, arch=80, module_dir=str(tmp_path))
@@ -347,7 +347,7 @@ def test_kernels_compile_for_cuda(name: str, tmp_path: Path) -> None:
 
 def test_no_render_keeps_an_autograd_graph_alive(monkeypatch: pytest.MonkeyPatch) -> None:
     """Density control gives a parameter more rows: a graph of the old size must be gone by then."""
-    from hoigs.rasterizers.warp.common import cpu_launch
+    from hoigs.core.cpu_kernels import launch as cpu_launch
 
     monkeypatch.setattr(cpu_launch, "_launches", {})  # as in a process that has drawn nothing yet
     means = torch.nn.Parameter(random_scene(8).means)

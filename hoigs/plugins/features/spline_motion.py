@@ -14,6 +14,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.cuda_graphs.device_constants import Time, filled
 from hoigs.core.interfaces.deformation import DeformationModel, ProvidesVelocity
 from hoigs.core.interfaces.features import FeatureExtractor
+from hoigs.core.maths.networks import dense
 from hoigs.core.maths.splines import (
     catmull_rom,
     hermite_weights,
@@ -140,7 +141,7 @@ class SplineMotionFeatures(FeatureExtractor):
         inputs = [velocity, filled(velocity, (len(canonical), 1), moment.time)]
         if self.config.embedding != "none":
             inputs.insert(1, self.embedded(len(canonical), moment.time))
-        features = self.mlp(torch.cat(inputs, dim=-1))
+        features = dense(self.mlp, torch.cat(inputs, dim=-1))
         with torch.no_grad():
             positions = deformation.means_at(canonical, moment)
         return Tokens(features, positions)

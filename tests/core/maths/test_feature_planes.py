@@ -1,10 +1,13 @@
-"""core/planes.py: sampling against torch's own, and the paired space-time planes."""
+"""Sampling against torch's own, the CPU kernels against float64, and planes of space and time."""
 
 from __future__ import annotations
 
+import pytest
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
+from hoigs.core.cpu_kernels.choose import native
 from hoigs.core.maths.feature_planes import PairedPlanes, ProductPlanes, roughness, sample_planes
 
 
@@ -22,6 +25,50 @@ def test_equals_grid_sample():
         (theirs[:, :, 0].permute(2, 0, 1).flatten(1) * weights).sum(), (planes, points)
     )
     torch.testing.assert_close(grads, expected)
+
+
+def everything(planes: Tensor, points: Tensor, upstream: Tensor) -> list[Tensor]:
+    """Samples, and gradients of planes and points."""
+    planes, points = planes.clone().requires_grad_(), points.clone().requires_grad_()
+    samples = sample_planes(planes, points)
+    return [samples.detach(), *torch.autograd.grad(samples, (planes, points), upstream)]
+
+
+@pytest.mark.parametrize(
+    ("shape", "count"),
+    [((3, 16, 12, 32), 3000), ((2, 9, 1, 37), 700), ((1, 1, 6, 16), 10), ((3, 4, 5, 3), 0)],
+)
+def test_the_cpu_kernel_equals_its_float64_twin(shape: tuple[int, ...], count: int) -> None:
+    torch.manual_seed(0)
+    planes, points = torch.randn(shape), torch.rand(shape[0], count, 2) * 2.6 - 1.3
+    upstream = torch.randn(count, shape[0] * shape[3])
+    assert native("planes", planes) is not None and native("planes", planes.double()) is None
+    found = everything(planes, points, upstream)
+    exact = everything(planes.double(), points.double(), upstream.double())
+    for ours, theirs in zip(found, exact, strict=True):
+        bound = 2e-6 * float(theirs.abs().amax()) if count else 0.0
+        torch.testing.assert_close(ours.double(), theirs, rtol=0, atol=bound)
+
+
+def test_the_cpu_kernel_gives_the_same_bits_on_any_number_of_cores() -> None:
+    torch.manual_seed(0)
+    values = torch.randn(3, 8, 8, 32), torch.rand(3, 2000, 2) * 2 - 1, torch.randn(2000, 96)
+    before = torch.get_num_threads()
+    try:
+        results = []
+        for threads in (1, 4):
+            torch.set_num_threads(threads)
+            results.append(everything(*values))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_a_point_that_is_not_a_number_gives_features_that_are_not() -> None:
+    points = torch.zeros(1, 2, 2)
+    points[0, 1, 0] = torch.nan
+    samples = sample_planes(torch.ones(1, 3, 3, 16), points)
+    assert (samples[0] == 1).all() and samples[1].isnan().all()
 
 
 def test_corners_edges_and_single_cells():

@@ -8,7 +8,7 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hoigs.core.maths.networks import zeroed
+from hoigs.core.maths.networks import dense, zeroed
 
 HeadKind = Literal["full", "exavatar"]
 
@@ -55,7 +55,7 @@ class CanonicalHead(nn.Module):
         )
 
     def forward(self, features: Float[Tensor, "N F"]) -> CanonicalAttributes:
-        colors, offsets, scales, *others = self.layers(features).split(self.sizes, dim=-1)
+        colors, offsets, scales, *others = dense(self.layers, features).split(self.sizes, dim=-1)
         # offsets are in units of 10 cm: at the learning rate of colours, metres would diverge
         made = CanonicalAttributes(0.1 * offsets, scales.expand(-1, 3), colors)
         if not others:

@@ -5,9 +5,9 @@
 Their C++ stands in `pixel_source`; threads are numbered 32 tile + lane.
 """
 
+from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
 from hoigs.rasterizers.warp.blend import pixel_source
 from hoigs.rasterizers.warp.common.records import F32, I32
-from hoigs.rasterizers.warp.common.runtime import CPU_FLAGS, wp
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})
 

@@ -17,7 +17,7 @@ exception, where intersections exceed the allocated memory: see `warp.cuda.inter
 
 import math
 
-from hoigs.rasterizers.warp.common.runtime import wp
+from hoigs.core.cpu_kernels.runtime import wp
 
 F32 = wp.array(dtype=wp.float32)
 I32 = wp.array(dtype=wp.int32)

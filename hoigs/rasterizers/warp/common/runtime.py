@@ -1,6 +1,5 @@
-"""Warp and its flags; the other modules take `wp` from here."""
+"""Warp and its flags, as `hoigs.core.cpu_kernels.runtime` has them."""
 
-from hoigs.core.machine.quiet_warp import wp
+from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
 
-# -ffp-contract=fast: multiply-adds in one instruction, which is not Warp's default on CPUs
-CPU_FLAGS = f"{wp.config.cpu_compiler_flags or '-march=native'} -ffp-contract=fast"
+__all__ = ["CPU_FLAGS", "wp"]

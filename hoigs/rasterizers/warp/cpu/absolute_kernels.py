@@ -2,8 +2,8 @@
 # (Warp's arrays annotate as values)
 """The native CPU backward with absolute gradients, compiled only where they are requested."""
 
+from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
 from hoigs.rasterizers.warp.common.records import F32, I32
-from hoigs.rasterizers.warp.common.runtime import CPU_FLAGS, wp
 from hoigs.rasterizers.warp.cpu import tile_source
 from hoigs.rasterizers.warp.cpu.native_kernels import TILE_WORK
 

@@ -37,7 +37,7 @@ def choose_kernels(requested: Kernels) -> tuple[Literal["native", "portable"], s
 
 def vector_lanes() -> int:
     """Floats in a vector of the native kernels: 16 with AVX-512, else 8. Compiles them."""
-    from hoigs.rasterizers.warp.common.cpu_launch import prepared
+    from hoigs.core.cpu_kernels.launch import prepared
     from hoigs.rasterizers.warp.cpu import native_kernels
 
     lanes = torch.zeros(1, dtype=torch.int32)

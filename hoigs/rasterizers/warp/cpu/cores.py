@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
-from hoigs.rasterizers.warp.common.cpu_launch import prepared
-from hoigs.rasterizers.warp.cpu.workers import SerialWorkers, Workers
+from hoigs.core.cpu_kernels.launch import prepared
+from hoigs.core.cpu_kernels.workers import SerialWorkers, Workers
 
 
 class Cores:

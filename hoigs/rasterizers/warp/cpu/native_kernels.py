@@ -7,8 +7,8 @@ Where several workers run a kernel at once, each makes the same call and takes w
 shared `counters`. What an item writes does not depend on the worker.
 """
 
+from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
 from hoigs.rasterizers.warp.common.records import F32, I32, RECORD, U64
-from hoigs.rasterizers.warp.common.runtime import CPU_FLAGS, wp
 from hoigs.rasterizers.warp.cpu import tile_source
 from hoigs.rasterizers.warp.intersect.tile_spans import span, tile_row_range
 

@@ -11,64 +11,18 @@ use more cores, with the same results bit for bit:
 from __future__ import annotations
 
 import ctypes
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 
+from hoigs.core.cpu_kernels.launch import prepared
+from hoigs.core.cpu_kernels.runtime import wp
+from hoigs.core.cpu_kernels.workers import SerialWorkers, ThreadWorkers, Workers
 from hoigs.core.errors import RenderError
 from hoigs.core.machine.busy import loaded_gomp
-from hoigs.rasterizers.warp.common.cpu_launch import prepared
-from hoigs.rasterizers.warp.common.runtime import wp
 
 Scheduler = Literal["auto", "openmp", "threads", "serial"]
-
-
-class Workers(Protocol):
-    """Runs a list of prepared launches, in any order; all are finished when `run` returns.
-
-    Attributes:
-        name: for reports.
-        worthwhile: so many Gaussians take about as long as waking another worker.
-    """
-
-    name: str
-    worthwhile: int
-
-    def run(self, launches: Sequence[Any]) -> None: ...
-
-
-class SerialWorkers:
-    name = "serial"
-    worthwhile = 2**31
-
-    def run(self, launches: Sequence[Any]) -> None:
-        for launch in launches:
-            launch.launch()
-
-
-class ThreadWorkers:
-    """A shared pool of Python threads; the caller is one of the workers."""
-
-    name = "threads"
-    worthwhile = 4096
-    _pool: ThreadPoolExecutor | None = None
-    _owner = 0
-
-    def run(self, launches: Sequence[Any]) -> None:
-        others = [self._executor().submit(launch.launch) for launch in launches[1:]]
-        launches[0].launch()
-        for future in others:
-            future.result()
-
-    @classmethod
-    def _executor(cls) -> ThreadPoolExecutor:
-        if cls._pool is None or cls._owner != os.getpid():  # threads do not survive a fork
-            cls._pool = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="hoigs-warp")
-            cls._owner = os.getpid()
-        return cls._pool
 
 
 class _Job(ctypes.Structure):

@@ -12,8 +12,8 @@ from typing import Any
 
 import torch
 
-from hoigs.rasterizers.warp.common.cpu_launch import flat, vector_sizes
-from hoigs.rasterizers.warp.common.runtime import wp
+from hoigs.core.cpu_kernels.launch import flat, vector_sizes
+from hoigs.core.cpu_kernels.runtime import wp
 
 
 class CudaStream:

@@ -5,8 +5,8 @@
 Their C++ stands in `count_place_source` and `plan_sort_source`.
 """
 
+from hoigs.core.cpu_kernels.runtime import wp
 from hoigs.rasterizers.warp.common.records import F32, I32, I64
-from hoigs.rasterizers.warp.common.runtime import wp
 from hoigs.rasterizers.warp.intersect import count_place_source, plan_sort_source
 from hoigs.rasterizers.warp.intersect.tile_spans import TILE_WIDTH
 

@@ -2,6 +2,7 @@
 # (Warp's arrays annotate as values)
 """Which tiles a splat touches, as Warp functions. All tiles are TILE_WIDTH pixels wide."""
 
+from hoigs.core.cpu_kernels.runtime import wp
 from hoigs.rasterizers.warp.common.records import (
     F32,
     HALF_HEIGHT,
@@ -12,7 +13,6 @@ from hoigs.rasterizers.warp.common.records import (
     X,
     Y,
 )
-from hoigs.rasterizers.warp.common.runtime import wp
 
 TILE_WIDTH = 16
 TILE_WIDTH_C = wp.constant(TILE_WIDTH)

@@ -4,6 +4,7 @@
 """Projection kernels for CPU and CUDA, one thread per Gaussian: raw fields to records, and the
 adjoint from partial gradients to the raw fields."""
 
+from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
 from hoigs.rasterizers.warp.common.records import (
     DEPTH,
     F32,
@@ -37,7 +38,6 @@ from hoigs.rasterizers.warp.common.records import (
     X,
     Y,
 )
-from hoigs.rasterizers.warp.common.runtime import CPU_FLAGS, wp
 from hoigs.rasterizers.warp.project.geometry import (
     is_regular,
     onto_screen,

@@ -2,8 +2,8 @@
 # (Warp's arrays annotate as values)
 """The CPU kernel of SSIM; its loops stand in `strip_source`."""
 
+from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
 from hoigs.rasterizers.warp.common.records import F32, I32
-from hoigs.rasterizers.warp.common.runtime import CPU_FLAGS, wp
 from hoigs.rasterizers.warp.ssim import strip_source
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hoigs.rasterizers.warp.common.cpu_launch import prepared
-from hoigs.rasterizers.warp.cpu.workers import SerialWorkers, ThreadWorkers
+from hoigs.core.cpu_kernels.launch import prepared
+from hoigs.core.cpu_kernels.workers import SerialWorkers, ThreadWorkers
 from hoigs.rasterizers.warp.ssim.strip_kernels import similarity_strips
 from hoigs.rasterizers.warp.ssim.strip_source import MAX_CHANNELS, STRIP
 

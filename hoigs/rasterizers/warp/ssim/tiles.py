@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.rasterizers.warp.common.cpu_launch import prepared
+from hoigs.core.cpu_kernels.launch import prepared
 from hoigs.rasterizers.warp.cuda.launch import CudaStreams
 from hoigs.rasterizers.warp.ssim.tile_kernels import backward_tiles, forward_tiles
 from hoigs.rasterizers.warp.ssim.tile_source import SIDE, THREADS

@@ -1,0 +1,73 @@
+"""Running prepared launches of Warp's CPU kernels on several cores, with public interfaces only.
+
+Warp runs a CPU launch as one loop on the calling thread and releases the GIL meanwhile.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Protocol
+
+import torch
+
+from hoigs.core.cpu_kernels.launch import prepared
+
+
+class Workers(Protocol):
+    """Runs a list of prepared launches, in any order; all are finished when `run` returns.
+
+    Attributes:
+        name: for reports.
+        worthwhile: so many Gaussians take about as long as waking another worker.
+    """
+
+    name: str
+    worthwhile: int
+
+    def run(self, launches: Sequence[Any]) -> None: ...
+
+
+class SerialWorkers:
+    name = "serial"
+    worthwhile = 2**31
+
+    def run(self, launches: Sequence[Any]) -> None:
+        for launch in launches:
+            launch.launch()
+
+
+class ThreadWorkers:
+    """A shared pool of Python threads; the caller is one of the workers."""
+
+    name = "threads"
+    worthwhile = 4096
+    _pool: ThreadPoolExecutor | None = None
+    _owner = 0
+
+    def run(self, launches: Sequence[Any]) -> None:
+        others = [self._executor().submit(launch.launch) for launch in launches[1:]]
+        launches[0].launch()
+        for future in others:
+            future.result()
+
+    @classmethod
+    def _executor(cls) -> ThreadPoolExecutor:
+        if cls._pool is None or cls._owner != os.getpid():  # threads do not survive a fork
+            cls._pool = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="hoigs-warp")
+            cls._owner = os.getpid()
+        return cls._pool
+
+
+def shared(kernel: Any, items: int, arguments: Sequence[Any]) -> None:
+    """One kernel on as many cores as are worth their waking, which share its work items.
+
+    Args:
+        kernel: its first parameter is the next item, which every core takes atomically.
+        items: in how many parts the work is cut; what they write must not depend on who writes it.
+        arguments: after the first.
+    """
+    cores = max(1, min(torch.get_num_threads(), items))
+    launches = [prepared(kernel, 1, [torch.zeros(1, dtype=torch.int32), *arguments])] * cores
+    (SerialWorkers() if cores == 1 else ThreadWorkers()).run(launches)
