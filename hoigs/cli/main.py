@@ -35,6 +35,7 @@ app = typer.Typer(
     cls=GuardedGroup,
     help="People handling things, reconstructed from one video as moving 3D Gaussians.",
     no_args_is_help=True,
+    rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     add_completion=False,
 )

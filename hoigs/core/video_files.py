@@ -45,6 +45,7 @@ def write_video(
     kind = path.suffix.lower()
     if kind not in SUFFIXES:
         raise HoigsError(f"{path}: videos end with {', '.join(SUFFIXES)}")
+    made = not path.parent.exists()
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.part")
     checked = _checked(frames, even=kind != ".gif")
@@ -58,8 +59,11 @@ def write_video(
             temporary, kind, itertools.chain((first,), checked), first, fps
         )
         temporary.replace(path)
-    finally:
+    except BaseException:
         temporary.unlink(missing_ok=True)
+        if made:
+            path.parent.rmdir()
+        raise
     return path
 
 

@@ -157,8 +157,10 @@ class RunFolder:
             (temporary / "provenance.json").write_text(json.dumps(provenance, indent=1))
             (temporary / "metrics.jsonl").touch()
             put_in_place(temporary, self.path)
-        except BaseException:
+        except BaseException as error:
             shutil.rmtree(temporary, ignore_errors=True)
+            if isinstance(error, OSError):  # a full disk is noticed by write(), which knows no name
+                error.filename = error.filename or str(self.path)
             raise
         self._created = True
 
@@ -180,8 +182,8 @@ class RunFolder:
         try:
             with self.metrics.open("a") as file:
                 file.write(json.dumps(record) + "\n")
-        except OSError as error:  # a full disk is noticed by write(), which knows no name
-            error.filename = error.filename or str(self.metrics)
+        except OSError as error:
+            error.filename = error.filename or str(self.metrics)  # as in `create`
             raise
 
     def cut_metrics(self, step: int) -> None:

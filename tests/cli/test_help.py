@@ -39,3 +39,30 @@ def test_every_public_name_exists():
 
     for name in hoigs.__all__:
         assert getattr(hoigs, name) is not None
+
+
+def commands():
+    """Every command with its words: ("chart",), ("plugins", "new") …"""
+    import typer
+
+    from hoigs.cli.main import app
+
+    def walk(command, words):
+        yield words, command
+        for name, child in getattr(command, "commands", {}).items():
+            yield from walk(child, (*words, name))
+
+    return list(walk(typer.main.get_command(app), ()))
+
+
+@pytest.mark.parametrize(
+    ("words", "command"), commands(), ids=lambda x: " ".join(x) if isinstance(x, tuple) else ""
+)
+def test_help_shows_all_that_is_written(hoigs, monkeypatch, words, command):
+    """'hoigs[ray]' and runs/*.json are no markup."""
+    monkeypatch.setenv("COLUMNS", "200")
+    shown = "".join(c for c in hoigs(*words, "--help").out if c not in "│ \n")
+    parameters = [p for p in command.params if not getattr(p, "hidden", False)]
+    for text in (command.help, *(getattr(p, "help", "") for p in parameters)):
+        for word in (text or "").replace("`", "").split():
+            assert word in shown, word

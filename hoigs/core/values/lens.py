@@ -111,7 +111,7 @@ class Lens:
 
     @property
     def _colmap(self) -> Any:
-        import pycolmap
+        from hoigs.core.machine.colmap import pycolmap
 
         known = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
         if self.model not in known:

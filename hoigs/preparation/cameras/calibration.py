@@ -137,7 +137,7 @@ def _colmap_text(lines: list[str]) -> Lenses:
 
 
 def _colmap_binary(content: bytes) -> Lenses:
-    import pycolmap
+    from hoigs.core.machine.colmap import pycolmap
 
     (count,), at = struct.unpack_from("<Q", content), 8
     found: Lenses = {}

@@ -111,7 +111,7 @@ def colmap_cameras(video: Frames, model: Path, *, partial: bool = False) -> Came
     Raises:
         SourceError: the model is unreadable, lacks frames, or has cameras of several kinds.
     """
-    import pycolmap
+    from hoigs.core.machine.colmap import pycolmap
 
     try:
         model_read = pycolmap.Reconstruction(str(model))

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
     """COLMAP logs only errors in this block."""
-    import pycolmap
+    from hoigs.core.machine.colmap import pycolmap
 
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value

@@ -94,7 +94,7 @@ def background_features(
 ) -> Iterator[Features]:
     """SIFT's of the chosen frames, outside the masks: positions, pixels at WIDTH, and unit
     descriptors."""
-    import pycolmap
+    from hoigs.core.machine.colmap import pycolmap
 
     options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1)
     options.sift.max_num_features = FEATURES

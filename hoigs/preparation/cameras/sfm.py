@@ -57,7 +57,7 @@ def structure_from_motion(
     Raises:
         SourceError: less than half of the frames were given a camera, and why that may be.
     """
-    import pycolmap
+    from hoigs.core.machine.colmap import pycolmap
 
     report = progress or (lambda _done: None)
     images, features = folder / "images", folder / "features.db"

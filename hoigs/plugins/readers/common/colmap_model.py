@@ -86,7 +86,7 @@ def read_sparse(folder: Path) -> SparseModel:
     Raises:
         ClipError: it is damaged, or registers no image.
     """
-    import pycolmap
+    from hoigs.core.machine.colmap import pycolmap
 
     _require_counts_fit(folder)
     try:
@@ -156,7 +156,7 @@ def _require_counts_fit(folder: Path) -> None:
 
 def _without_points(folder: Path) -> Any:
     """cameras.txt and images.txt alone: pycolmap needs all three files, and tracks that exist."""
-    import pycolmap
+    from hoigs.core.machine.colmap import pycolmap
 
     lines = (folder / "images.txt").read_text(encoding="utf-8").split("\n")
     rows = [line for line in lines if not line.startswith("#")]
