@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
+from hoigs.core.cuda_graphs.device_constants import constant
 from hoigs.core.interfaces.density import DensityControl
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.model.camera_refinement import CameraRefinement
@@ -19,18 +20,14 @@ from hoigs.core.values.clip import Frame
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
-from hoigs.metrics.image_loss import image_loss
 from hoigs.metrics.lpips import Lpips
 from hoigs.metrics.regions import dilate
 from hoigs.training.graphs.graphed_scene import Deformed, GraphedScene
-from hoigs.training.losses.crops import Crop, crop_around, cut, union
+from hoigs.training.losses.comparison import Comparison, image_losses
+from hoigs.training.losses.crops import Crop, union
 from hoigs.training.losses.face import FaceTexture, face_loss, visible
-from hoigs.training.losses.terms import (
-    depth_loss,
-    masked_loss,
-    scene_only_loss,
-    term_weights,
-)
+from hoigs.training.losses.terms import depth_loss, term_weights
+from hoigs.training.views import TrainingView
 
 RESIDUAL_PENALTIES = ("residual_pose", "residual_means")  # on corrections by the interaction
 CAMERA_WEIGHT = 0.1  # of camera corrections; moving all cameras and the scene changes no image
@@ -94,13 +91,19 @@ class JointObjective:
         restrained = any(spec.regularizers.get(key, 0.0) > 0 for key in RESIDUAL_PENALTIES)
         self.graphed_scene = GraphedScene(model, graphs, self.weight_of, restrained=restrained)
 
-    def __call__(self, frame: Frame, camera: Camera, generator: torch.Generator) -> ObjectiveResult:
-        """The loss of `frame`, which is on the CPU, from `camera`, which is on the model's device.
+    def __call__(
+        self, view: TrainingView | Frame, camera: Camera, generator: torch.Generator
+    ) -> ObjectiveResult:
+        """The loss of a view on the model's device, or of a frame on the CPU.
 
         Args:
-            camera: the frame's, refined where cameras are. generator: of random backgrounds, CPU.
+            camera: the frame's, refined where cameras are, on the model's device.
+            generator: of random backgrounds, CPU.
         """
         device = camera.K.device
+        if isinstance(view, Frame):
+            view = TrainingView.of(view, device)
+        frame = view.frame
         deformed = self._deform(frame.moment)
         state = deformed.state
         offsets = torch.zeros(
@@ -114,14 +117,12 @@ class JointObjective:
             camera,
             RenderRequest(screen_offsets=offsets, absolute_gradients=absolutes),
         )
-        shown = frame.to(device)
-        image = shown.rgb
-        terms: dict[str, Tensor] = {}
-        terms.update(self._scene(shown, image, camera, state, composite, offsets, absolutes))
-        if shown.depth is not None and self.weights["depth"] > 0:
-            prior = shown.depth * self.depth_scale
-            if shown.ignored is not None:
-                prior = prior.masked_fill(shown.ignored, 0.0)  # 0 = unknown
+        terms = self._composite(view, composite)
+        terms |= self._scene_alone(frame, camera, state, composite, offsets, absolutes)
+        if frame.depth is not None and self.weights["depth"] > 0:
+            prior = frame.depth * self.depth_scale
+            if frame.ignored is not None:
+                prior = prior.masked_fill(frame.ignored, 0.0)  # 0 = unknown
             depth = depth_loss(
                 composite.depth, composite.alpha, prior, self.depth_kind, self.spec.depth_fit
             )
@@ -129,15 +130,13 @@ class JointObjective:
                 terms["depth"] = depth
         for kind in ("human", "object"):
             for name in self.model.names(kind):
-                crop = None
-                if name in frame.masks:
-                    crop = crop_around(frame, camera, name, shown)
+                crop = view.crops.get(name)
                 if crop is None:  # not visible in this frame: it has no terms
                     continue
                 if kind == "object" or self.spec.human_image != "composite":
-                    terms.update(self._alone(name, kind, crop, state, generator))
+                    terms |= self._alone(name, kind, crop, camera, state, generator)
                 if kind == "human":
-                    terms.update(self._human(name, shown, crop, camera, image, state, composite))
+                    terms |= self._human(name, frame, crop, camera, state, composite)
         weights = {name: self.weights[name.partition("/")[0]] for name in terms}
         for name in self.model.entities:
             own = None if deformed.penalties is None else deformed.penalties[name]
@@ -148,8 +147,9 @@ class JointObjective:
         for name, residual in state.residuals.items():
             self._penalise_residual(name, residual, terms, weights)
         total = composite.color.new_zeros(())
-        for name, term in terms.items():
-            total = total + weights[name] * term
+        if terms:
+            factors = constant(tuple(weights[name] for name in terms), total)
+            total = torch.stack([term.reshape(()) for term in terms.values()]) @ factors
         if not total.requires_grad:  # no term applies to this frame
             total = total + 0 * composite.color.sum()
         return ObjectiveResult(terms, total, state, composite, offsets, weights, absolutes)
@@ -165,41 +165,53 @@ class JointObjective:
             weight = self.density[name].regularizer_weights.get(penalty, weight)
         return self.spec.regularizers.get(penalty, weight)
 
-    def _scene(
+    def _composite(self, view: TrainingView, composite: RenderOutput) -> dict[str, Tensor]:
+        """The image losses of the composite: of all of it (L_scene), and of each human's crop."""
+        frame, found = view.frame, {}
+        if self.weights["scene"] > 0 and self.spec.scene_loss in ("full", "both"):
+            found["scene"] = Comparison(frame.image, ignored=frame.ignored)
+        if self.spec.human_image != "alone":
+            for name in self.model.names("human"):
+                crop = view.crops.get(name)
+                if crop is not None:
+                    hidden = None if frame.ignored is None else crop.cut(frame.ignored)
+                    found[f"human/{name}/composite"] = Comparison(
+                        crop.pixels, ignored=hidden, top=crop.top, left=crop.left
+                    )
+        if not found:
+            return {}
+        losses = self._image_losses(composite.color, list(found.values()))
+        return dict(zip(found, losses, strict=True))
+
+    def _image_losses(self, render: Tensor, comparisons: list[Comparison]) -> list[Tensor]:
+        return image_losses(render, comparisons, self.spec.lambda_dssim, self.spec.ssim)
+
+    def _scene_alone(
         self,
         frame: Frame,
-        image: Tensor,
         camera: Camera,
         state: SceneState,
         composite: RenderOutput,
         offsets: Tensor,
         absolutes: Tensor | None,
     ) -> dict[str, Tensor]:
-        """L_scene (HOIGS Eq. 18): "scene" of the composite, "scene/masked" of the scene alone."""
-        terms: dict[str, Tensor] = {}
-        if self.weights["scene"] == 0:
-            return terms
-        ignored = frame.ignored
-        dssim = (self.spec.lambda_dssim, self.spec.ssim)
-        if self.spec.scene_loss in ("full", "both"):
-            drawn = composite.color
-            if ignored is not None:
-                drawn = torch.where(ignored[..., None], image, drawn)
-            terms["scene"] = image_loss(drawn, image, *dssim)
+        """L_scene of the scene drawn alone, without the pixels of people and objects."""
         scenes, kind = self.model.names("scene"), self.spec.scene_loss
+        if self.weights["scene"] == 0 or kind == "full" or not scenes:
+            return {}
         modelled = {n: m for n, m in frame.masks.items() if n in self.model.entities}
         left_out = frame.masks if kind == "background" else modelled
-        complete = not frame.unknown & {*left_out, *self.model.entities}  # no mask is missing
-        if kind in ("masked", "both", "background") and scenes and complete:
-            alone = self._scene_alone(camera, state, composite, offsets, absolutes)
-            dynamic = union(left_out.values())
-            if dynamic is not None:
-                dynamic = dilate(dynamic, self.spec.dilate)
-            hidden = union(m for m in (dynamic, ignored) if m is not None)
-            terms["scene/masked"] = scene_only_loss(alone.color, image, hidden, *dssim)
-        return terms
+        if frame.unknown & {*left_out, *self.model.entities}:  # a mask is missing
+            return {}
+        alone = self._draw_scene(camera, state, composite, offsets, absolutes)
+        dynamic = union(left_out.values())
+        if dynamic is not None:
+            dynamic = dilate(dynamic, self.spec.dilate)
+        hidden = union(m for m in (dynamic, frame.ignored) if m is not None)
+        compared = Comparison(frame.image, ignored=hidden)
+        return {"scene/masked": self._image_losses(alone.color, [compared])[0]}
 
-    def _scene_alone(
+    def _draw_scene(
         self,
         camera: Camera,
         state: SceneState,
@@ -222,22 +234,32 @@ class JointObjective:
         return self.model.rasterizer.render(state.joined(scenes), camera, request)
 
     def _alone(
-        self, name: str, kind: str, crop: Crop, state: SceneState, generator: torch.Generator
+        self,
+        name: str,
+        kind: str,
+        crop: Crop,
+        camera: Camera,
+        state: SceneState,
+        generator: torch.Generator,
     ) -> dict[str, Tensor]:
-        """The entity rendered alone over one colour: L_object (Eq. 17), or L_img of Eq. 16."""
+        """The entity rendered alone over one colour: L_object (Eq. 17), or L_img of Eq. 16.
+
+        L1 is divided by the area of the mask.
+        """
         background = torch.zeros(3)
         if self.spec.background == "random":
             background = torch.rand(3, generator=generator)
-        background = background.to(crop.image)
+        background = background.to(camera.K)
         output = self.model.rasterizer.render(
-            state.gaussians[name], crop.camera, RenderRequest(background=background)
+            state.gaussians[name], crop.seen_from(camera), RenderRequest(background=background)
         )
-        dssim = (self.spec.lambda_dssim, self.spec.ssim)
-        terms = {f"{kind}/{name}": masked_loss(output.color, crop, background, *dssim)}
+        compared = Comparison(
+            crop.pixels, crop.mask, crop.ignore, background, area=crop.area
+        )  # fmt: skip
+        terms = {f"{kind}/{name}": self._image_losses(output.color, [compared])[0]}
         if kind == "human" and self.lpips is not None and self.spec.lpips > 0:
-            target = torch.where(crop.mask[..., None], crop.image, background)
-            render = torch.where(crop.ignore[..., None], target, output.color)
-            terms[f"{kind}/{name}/lpips"] = self.spec.lpips * self.lpips(render, target)
+            perceived = self.lpips(compared.render_of(output.color), compared.target)
+            terms[f"{kind}/{name}/lpips"] = self.spec.lpips * perceived
         return terms
 
     def _human(
@@ -246,26 +268,21 @@ class JointObjective:
         frame: Frame,
         crop: Crop,
         camera: Camera,
-        image: Tensor,
         state: SceneState,
         composite: RenderOutput,
     ) -> dict[str, Tensor]:
-        """Terms of L_human (HOIGS Eq. 16) besides the human rendered alone."""
+        """LPIPS of the composite and L_face, further terms of L_human (HOIGS Eq. 16)."""
         terms = {}
-        if self.spec.human_image != "alone":
-            render = cut(composite.color, crop, camera)
+        if self.spec.human_image != "alone" and self.lpips is not None and self.spec.lpips > 0:
+            render = crop.cut(composite.color)
             if frame.ignored is not None:
-                hidden = cut(frame.ignored[..., None], crop, camera)
-                render = torch.where(hidden, crop.image, render)
-            dssim = (self.spec.lambda_dssim, self.spec.ssim)
-            terms[f"human/{name}/composite"] = image_loss(render, crop.image, *dssim)
-            if self.lpips is not None and self.spec.lpips > 0:
-                perceived = self.spec.lpips * self.lpips(render, crop.image)
-                terms[f"human/{name}/composite/lpips"] = perceived
+                render = torch.where(crop.cut(frame.ignored)[..., None], crop.image, render)
+            perceived = self.spec.lpips * self.lpips(render, crop.image)
+            terms[f"human/{name}/composite/lpips"] = perceived
         if name in self.faces and self.spec.face > 0:
             mask = visible(frame, name)
             entity, posed = self.model.entity(name), state.gaussians[name]
-            face = face_loss(self.faces[name], entity, posed, camera, image, mask)
+            face = face_loss(self.faces[name], entity, posed, camera, frame.rgb, mask)
             if face is not None:
                 terms[f"human/{name}/face"] = self.spec.face * face
         return terms

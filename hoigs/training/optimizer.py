@@ -137,8 +137,10 @@ class GroupedAdam:
             lr=1e-3, eps=1e-15, fused=True,
         )  # fmt: skip
         self.sh_rest = rates.sh_rest
+        self.progress = 0.0
 
     def set_progress(self, progress: float) -> None:
+        self.progress = progress
         for group in self.adam.param_groups:
             group["lr"] = group["schedule"].at(progress)
 
@@ -153,15 +155,13 @@ class GroupedAdam:
         That of its canonical means, or of the keyframes of a deformation that owns the means; 0 if
         neither is trained.
         """
-        prefix, rates = f"entities.{entity}.", self.learning_rates()
-        if f"{prefix}means" in rates:
-            return rates[f"{prefix}means"]
-        keyed = [
-            rates[name]
-            for name, role in zip(self.names, self.roles, strict=True)
-            if name.startswith(prefix) and role == "keyframes"
-        ]
-        return max(keyed, default=0.0)
+        prefix, keyed = f"entities.{entity}.", [0.0]
+        for name, role, schedule in zip(self.names, self.roles, self.schedules, strict=True):
+            if name == f"{prefix}means":
+                return schedule.at(self.progress)
+            if name.startswith(prefix) and role == "keyframes":
+                keyed.append(schedule.at(self.progress))
+        return max(keyed)
 
     def step(self, sh_degree: int | None = None) -> None:
         """One update of all parameters.

@@ -43,6 +43,7 @@ from hoigs.training.optimizer import GroupedAdam, entity_extent
 from hoigs.training.sampler import EpochSampler
 from hoigs.training.stop_request import StopRequest, resume_command
 from hoigs.training.unseen import fill_unseen
+from hoigs.training.views import TrainingViews
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,7 @@ class Trainer:
         self.identity = dict(identity or {"spec_name": "", "model_hash": ""})
         self.generator = torch.Generator().manual_seed(spec.seed)
         self.sampler = EpochSampler(clip.split["train"], self.generator)
+        self.views = TrainingViews(clip, model.device)
         for control in (density or {}).values():
             check_rasterizer(control, model.rasterizer)
         # before a checkpoint is restored, so that a resumed run has the same texture
@@ -124,6 +126,7 @@ class Trainer:
                 model.entity(name), control, entity_extent(model.entity(name), scene_extent)
             )
             for name, control in (density or {}).items()
+            if not control.keeps_all
         }
         self._fills = {max(1, round(share * spec.steps)) for share in spec.fill_unseen}
         self.guard = NanGuard()
@@ -166,9 +169,9 @@ class Trainer:
         self.model.train()
         started = time.perf_counter() - self.elapsed
         while self.step < end:
-            terms = self._step()
+            result = self._step()
             self.elapsed = time.perf_counter() - started
-            report = self._report(terms)
+            report = self._report(result)
             started = time.perf_counter() - self.elapsed  # previews do not count
             if report is not None:
                 if self.run is not None:
@@ -189,20 +192,21 @@ class Trainer:
         self.model.eval()
         self.model.set_progress(self.step / self.spec.steps)
 
-    def _step(self) -> dict[str, float] | None:
+    def _step(self) -> dict[str, torch.Tensor] | None:
         """One optimizer step: its loss terms and their "total"; None if the guard skipped it.
 
         No reference to the autograd graph may leave this method: a graph keeps the shapes of its
-        parameters, and density control changes them.
+        parameters, and density control changes them. The terms stay on the device, since most steps
+        report none.
         """
         progress = self.step / self.spec.steps
         self.step += 1
         self.model.interaction_enabled = progress >= self.spec.warmup.interaction
         self.optimizer.set_progress(progress)
         self.model.set_progress(progress)
-        frame = self.clip[self.sampler.next()]
-        camera = self._camera(frame)
-        result = self.objective(frame, camera, self.generator)
+        view = self.views[self.sampler.next()]
+        camera = self._camera(view.frame)
+        result = self.objective(view, camera, self.generator)
         if self.step in (1, self.spec.steps) or self.step % self.spec.log_every == 0:
             require_finite_outputs(self.model, result.state)
         self.optimizer.zero_grad()
@@ -216,14 +220,12 @@ class Trainer:
         interval = self.spec.sh_interval
         self.optimizer.step(None if interval is None else self.step // interval)
         fixed = replace(camera, world_to_camera=camera.world_to_camera.detach())
-        self._evolve(result, frame.moment, fixed)
+        self._evolve(result, view.frame.moment, fixed)
         self._refine(result, camera.width, camera.height)
         if self.step in self._fills:
             fill_unseen(self.model, self.clip, shapes=self.step < self.spec.steps)
         terms = {**result.terms, "total": result.total}
-        # one transfer from the device for all terms
-        values = torch.stack([term.detach().reshape(()) for term in terms.values()]).tolist()
-        return dict(zip(terms, values, strict=True))
+        return {name: term.detach() for name, term in terms.items()}
 
     def _camera(self, frame: Frame) -> Camera:
         """The frame's camera on the model's device, with its present corrections."""
@@ -267,17 +269,21 @@ class Trainer:
             rate = self.optimizer.position_rate(name)
             density.perturb(self.step, self.spec.steps, rate)
 
-    def _report(self, terms: dict[str, float] | None) -> StepReport | None:
+    def _report(self, terms: dict[str, torch.Tensor] | None) -> StepReport | None:
         last = self.step == self.spec.steps
         preview = self.spec.preview_every
         scored = preview > 0 and (last or self.step % preview == 0 or self.step == 1)
         if terms is None or not (scored or last or self.step % self.spec.log_every == 0):
             return None
+        # one transfer from the device for all terms
+        values = torch.stack([term.reshape(()) for term in terms.values()]).tolist()
+        losses = dict(zip(terms, values, strict=True))
+        total = losses.pop("total")
         return StepReport(
             step=self.step,
             time_s=round(self.elapsed, 3),
-            loss=terms["total"],
-            losses={name: value for name, value in terms.items() if name != "total"},
+            loss=total,
+            losses=losses,
             counts=self.model.count(),
             psnr=self._preview() if scored else {},
         )

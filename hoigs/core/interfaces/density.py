@@ -117,11 +117,13 @@ class DensityControl(Configurable, ABC):
         absolute_gradients: whether it needs absolute screen gradients, which not every rasterizer
             computes; see `check_rasterizer`.
         cap: largest count to which it grows; None declares no limit.
+        keeps_all: whether it never changes anything, so that no statistics are kept for it.
         regularizer_weights: default weight of each penalty of `regularizers`; 0 where absent.
     """
 
     absolute_gradients: bool = False
     cap: int | None = None
+    keeps_all: bool = False
     regularizer_weights: Mapping[str, float] = {}
 
     @abstractmethod

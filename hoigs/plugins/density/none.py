@@ -14,6 +14,8 @@ class NoDensityConfig(ComponentConfig):
 class NoDensity(DensityControl):
     """Never refines."""
 
+    keeps_all = True
+
     def refine(
         self,
         canonical: Gaussians,

@@ -1,17 +1,14 @@
-"""The terms of the joint objective (HOIGS Eq. 15 to 18, Sec. "Optimization")."""
+"""Weights of the joint objective's terms, and L_depth (HOIGS Eq. 15, Sec. "Optimization")."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.spec.train_schema import LossSpec
-from hoigs.metrics.image_loss import image_loss
-from hoigs.metrics.ssim import Backend, ssim
-from hoigs.training.losses.crops import Crop
 
 PIXELS_FIT = 16_384  # about as many pixels enter medians and fits of depth
 DepthFit = Literal["auto", "scale", "affine"]
@@ -31,47 +28,6 @@ def term_weights(spec: LossSpec) -> dict[str, float]:
         if override is not None:
             weights[name] = override
     return weights
-
-
-def masked_loss(
-    render: Float[Tensor, "h w 3"],
-    crop: Crop,
-    background: Float[Tensor, "3"],
-    lambda_dssim: float,
-    backend: Backend = "warp",
-) -> Float[Tensor, ""]:
-    """An entity rendered alone against its visible pixels, over `background` (HOIGS Eq. 16, 17).
-
-    Composing the target over the colour, rather than multiplying an SSIM map by a hard-edged mask,
-    trains the silhouette too: Gaussians outside the mask differ from a colour that is new at every
-    step. L1 is divided by the area of the mask; ignored pixels have no loss.
-
-    Args:
-        backend: of SSIM, here and below: `LossSpec.ssim`.
-    """
-    target = torch.where(crop.mask[..., None], crop.image, background)
-    render = torch.where(crop.ignore[..., None], target, render)
-    l1 = (render - target).abs().sum() / (3.0 * crop.mask.sum())
-    if lambda_dssim == 0:
-        return l1
-    return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim(render, target, backend))
-
-
-def scene_only_loss(
-    render: Float[Tensor, "H W 3"],
-    target: Float[Tensor, "H W 3"],
-    dynamic: Bool[Tensor, "H W"] | None,
-    lambda_dssim: float,
-    backend: Backend = "warp",
-) -> Float[Tensor, ""]:
-    """The scene rendered alone, without the pixels of people and objects (HOIGS Eq. 18).
-
-    Args:
-        dynamic: pixels to leave out.
-    """
-    if dynamic is not None:
-        render = torch.where(dynamic[..., None], target, render)
-    return image_loss(render, target, lambda_dssim, backend)
 
 
 def align_depth(

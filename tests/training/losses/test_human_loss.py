@@ -22,7 +22,7 @@ from hoigs.metrics.image_loss import image_loss
 from hoigs.metrics.lpips import STACKS
 from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.training.losses.crops import crop_around, cut
+from hoigs.training.losses.crops import crop_around
 from hoigs.training.losses.face import face_loss, lookup, unwrap_faces, visible
 from hoigs.training.objective import JointObjective
 from hoigs.training.session import lpips_term
@@ -140,11 +140,11 @@ def test_which_image_of_the_human_is_compared():
     assert of(both) == {"human/human", "human/human/composite"}
     torch.testing.assert_close(both["human/human"], alone["human/human"])
     frame = portrait()[1][1]
-    crop = crop_around(frame, frame.camera, "human")
+    crop = crop_around(frame, "human")
     with torch.no_grad():
         drawn = portrait()[0].render(frame.moment, frame.camera).color
-    part = cut(drawn, crop, frame.camera)
-    assert torch.equal(cut(frame.rgb, crop, frame.camera), crop.image)
+    part = crop.cut(drawn)
+    assert torch.equal(crop.cut(frame.rgb), crop.image)
     expected = image_loss(part, crop.image, 0.2, "torch")
     torch.testing.assert_close(composite["human/human/composite"].detach(), expected)
 

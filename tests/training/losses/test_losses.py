@@ -6,24 +6,9 @@ import pytest
 import torch
 
 from hoigs.core.spec.train_schema import LossSpec
-from hoigs.core.values.camera import Camera
 from hoigs.metrics.image_loss import image_loss
 from hoigs.metrics.ssim import ssim
-from hoigs.training.losses.crops import Crop
-from hoigs.training.losses.terms import (
-    align_depth,
-    depth_loss,
-    masked_loss,
-    scene_only_loss,
-    term_weights,
-)
-
-
-def crop(mask: torch.Tensor, ignore: torch.Tensor | None = None) -> Crop:
-    height, width = mask.shape
-    camera = Camera(torch.eye(3), torch.eye(4), width, height)
-    image = torch.full((height, width, 3), 0.5)
-    return Crop(camera, image, mask, torch.zeros_like(mask) if ignore is None else ignore)
+from hoigs.training.losses.terms import align_depth, depth_loss, term_weights
 
 
 def test_supplement_weights_and_overrides():
@@ -38,41 +23,6 @@ def test_image_loss_mixes_l1_and_dssim():
     assert float(image_loss(a, b, 0.0)) == pytest.approx(0.25)
     assert float(image_loss(a, a, 0.2)) == pytest.approx(0.0, abs=1e-6)
     assert float(image_loss(a, b, 0.2)) > 0.8 * 0.25
-
-
-def test_masked_loss_is_normalised_by_the_mask_and_blind_to_hidden_pixels():
-    mask = torch.zeros(12, 12, dtype=torch.bool)
-    mask[:3, :4] = True
-    background = torch.tensor([1.0, 0.0, 0.0])
-    target = torch.where(mask[..., None], torch.tensor(0.5), background)
-    render = target.clone()
-    render[5, 5] += 0.6  # sticks out of the mask by one pixel, 0.6 in three channels
-    assert float(masked_loss(render, crop(mask), background, 0.0)) == pytest.approx(0.6 / 12)
-    ignore = torch.zeros_like(mask)
-    ignore[5, 5] = True
-    assert float(masked_loss(render, crop(mask, ignore), background, 0.0)) == pytest.approx(0.0)
-
-
-def test_ssim_by_kernels_and_by_convolutions_teach_the_same():
-    torch.manual_seed(0)
-    target, start = torch.rand(40, 50, 3), torch.rand(40, 50, 3)
-    mask = torch.zeros(40, 50, dtype=torch.bool)
-    mask[8:30, 10:35] = True
-    entity = crop(mask, torch.roll(mask, 15, 1))
-    found = {}
-    for backend in ("warp", "torch"):
-        render = start.clone().requires_grad_()
-        terms = (
-            image_loss(render, target, 0.3, backend),
-            scene_only_loss(render, target, mask, 0.3, backend),
-            masked_loss(render, entity, torch.rand(3, generator=torch.Generator()), 0.3, backend),
-        )
-        found[backend] = [torch.autograd.grad(term, render)[0] for term in terms]
-        found[backend] += [term.detach() for term in terms]
-    for warp, plain in zip(found["warp"], found["torch"], strict=True):
-        assert float((warp - plain).norm() / plain.norm()) < 1e-5
-    assert LossSpec().ssim == "warp"
-    assert LossSpec.model_validate({"ssim": "torch"}).ssim == "torch"
 
 
 def test_depth_loss_skips_what_is_unknown():

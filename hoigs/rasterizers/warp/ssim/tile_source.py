@@ -7,7 +7,9 @@ once for four. `forward` keeps the three images of `definition.FORMULA`, `backwa
 the gradient (as fused-ssim does; Mallick et al. 2024, Taming 3DGS). There are no atomics: sums have
 the same order in every run.
 
-On a CPU one thread does the work of a block. The arguments are described in `tile_kernels`.
+On a CPU one thread does the work of a block. The arguments are described in `tile_kernels`. The
+image loss of `warp.image_loss` has the same stages, and other pieces where FETCH, PIXEL and
+GRADIENT stand.
 """
 
 from hoigs.rasterizers.warp.ssim.definition import FORMULA, WEIGHTS
@@ -36,25 +38,18 @@ _HEAD = r"""
     const int picture = tile / tiles_x / tiles_y;
     const long long first = (long long)picture * height * width;
     const long long plane = first * channels + (long long)channel * height * width;
-    const float* image_ = (const float*)image.data;
-    const float* target_ = (const float*)target.data;
     float* kept_ = (float*)kept.data;
     const long long numbers = (long long)batch * height * width * channels;  // from kept to kept
 """
 
 _FORWARD = r"""
-    float* map_ = (float*)map.data;
     HOIGS_SHARED float in[2][WIDE][WIDE];
     HOIGS_SHARED float lines[4][WIDE][SIDE];
     HOIGS_SHARED float totals[STEP];
     for (int i = me; i < WIDE * WIDE; i += STEP) {
         const int r = i / WIDE, c = i % WIDE, y = Y + r - 5, x = X + c - 5;
         float a = 0.0f, b = 0.0f;
-        if (y >= 0 && y < height && x >= 0 && x < width) {
-            const long long at = (first + (long long)y * width + x) * channels + channel;
-            a = image_[at];
-            b = target_[at];
-        }
+        if (y >= 0 && y < height && x >= 0 && x < width) { FETCH }
         in[0][r][c] = a + b;
         in[1][r][c] = a - b;
     }
@@ -98,9 +93,8 @@ _FORWARD = r"""
             float by_mean, by_sum, by_difference;
             const float value = similarity(
                 m[0][j], m[1][j], m[2][j], m[3][j], by_mean, by_sum, by_difference);
-            sum += value;
             const long long pixel = (long long)y * width + x;
-            if (with_map) map_[(first + pixel) * channels + channel] = value;
+            { PIXEL }
             if (!with_gradient) continue;
             kept_[plane + pixel] = by_mean;
             kept_[plane + pixel + numbers] = by_sum;
@@ -139,7 +133,7 @@ _BACKWARD = r"""
         }
     }
     HOIGS_SYNC;
-    const float scale = ((const float*)upstream.data)[0] / (float)numbers;
+    const float scale = ((const float*)upstream.data)[0];
     for (int i = me; i < SIDE * SIDE / R; i += STEP) {
         const int c = i % SIDE, top = i / SIDE * R;
         float g[3][R] = {};
@@ -158,9 +152,10 @@ _BACKWARD = r"""
         for (int j = 0; j < R; ++j) {
             const int y = Y + top + j, x = X + c;
             if (y >= height || x >= width) continue;
-            const long long at = (first + (long long)y * width + x) * channels + channel;
-            const float a = image_[at], b = target_[at];
-            ((float*)gradient.data)[at] = scale * (g[0][j] + (a + b) * g[1][j] + (a - b) * g[2][j]);
+            float a = 0.0f, b = 0.0f;
+            FETCH
+            const float slope = g[0][j] + (a + b) * g[1][j] + (a - b) * g[2][j];
+            GRADIENT
         }
     }
 """
@@ -172,5 +167,41 @@ _TAIL = r"""
 """
 
 _SIZES = {"SIDE": SIDE, "THREADS": THREADS, "WEIGHTS": WEIGHTS}
-FORWARD = _HEAD % _SIZES + FORMULA + _FORWARD + _TAIL
-BACKWARD = _HEAD % _SIZES + _BACKWARD + _TAIL
+
+
+def forward(fetch: str, pixel: str) -> str:
+    """Body of a forward kernel.
+
+    Args:
+        fetch: sets `a`, of the image, and `b`, of the target, at (x, y) of `channel`.
+        pixel: adds to `sum` of the tile, from `value`, the pixel's SSIM.
+    """
+    body = _FORWARD.replace("FETCH", fetch).replace("PIXEL", pixel)
+    return _HEAD % _SIZES + FORMULA + body + _TAIL
+
+
+def backward(fetch: str, gradient: str) -> str:
+    """Body of a backward kernel.
+
+    Args:
+        fetch: as in `forward`.
+        gradient: writes a gradient at (x, y), from `slope`, the derivative of the sum of SSIM over
+            all pixels by `a`, and `scale`, the upstream gradient. It sees the variables of `fetch`.
+    """
+    body = _BACKWARD.replace("FETCH", fetch).replace("GRADIENT", gradient)
+    return _HEAD % _SIZES + body + _TAIL
+
+
+_FETCH = """
+            const long long at = (first + (long long)y * width + x) * channels + channel;
+            a = ((const float*)image.data)[at];
+            b = ((const float*)target.data)[at];
+"""
+_PIXEL = """
+            sum += value;
+            if (with_map) ((float*)map.data)[(first + pixel) * channels + channel] = value;
+"""
+_GRADIENT = "((float*)gradient.data)[at] = scale / (float)numbers * slope;"
+
+FORWARD = forward(_FETCH, _PIXEL)
+BACKWARD = backward(_FETCH, _GRADIENT)

@@ -1,0 +1,117 @@
+"""Image losses by Warp kernels as one differentiable function of torch tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from hoigs.rasterizers.warp.common.cpu_launch import prepared
+from hoigs.rasterizers.warp.cuda.launch import CudaStreams
+from hoigs.rasterizers.warp.image_loss.kernels import backward_tiles, forward_tiles
+from hoigs.rasterizers.warp.ssim.tile_source import SIDE, THREADS
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a box of a render is compared with, and how.
+
+    All tensors may be views of larger images, on the render's device.
+
+    Attributes:
+        pixels: of the frame. shown: pixels that show what is compared; elsewhere the target is the
+            background; None where all do. ignored: pixels without a loss, or None.
+        background: RGB in [0, 1]; needed where `shown` is not None.
+        top, left: of the box in the render, pixels.
+        l1: weight of the sum of absolute differences over the box.
+        dssim: weight of 1 - SSIM, which is a mean over the box.
+    """
+
+    pixels: UInt8[Tensor, "h w 3"]
+    l1: float
+    dssim: float
+    shown: Bool[Tensor, "h w"] | None = None
+    ignored: Bool[Tensor, "h w"] | None = None
+    background: Float[Tensor, "3"] | None = None
+    top: int = 0
+    left: int = 0
+
+
+def image_losses(
+    render: Float[Tensor, "H W 3"], targets: Sequence[Target]
+) -> Float[Tensor, " targets"]:
+    """The loss of a float32 render against each target, by the kernels of CUDA.
+
+    Differentiable once, in the render. Two runs agree bit for bit. On a CPU the kernels run as
+    scalar code, which serves tests.
+    """
+    losses: Tensor = _ImageLosses.apply(render.contiguous(), tuple(targets))
+    return losses
+
+
+class _ImageLosses(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, render: Tensor, targets: tuple[Target, ...]) -> Tensor:
+        tracked = ctx.needs_input_grad[0]
+        most = max(_tiles(t.pixels) for t in targets)
+        sums = render.new_zeros(len(targets), most)
+        kept = []
+        with torch.cuda.device_of(render):
+            for target, row in zip(targets, sums):
+                own = render.new_empty(3 * target.pixels.numel() if tracked else 0)
+                _launch(forward_tiles, target, render, [int(tracked), row, own])
+                kept.append(own)
+        ctx.targets = targets
+        ctx.save_for_backward(render, *kept)
+        return sums.sum(1)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        render, *kept = ctx.saved_tensors
+        whole = ctx.targets[0].pixels.shape == render.shape
+        gradient = torch.empty_like(render) if whole else torch.zeros_like(render)
+        given = upstream[0].contiguous()
+        with torch.cuda.device_of(render):
+            for index, target in enumerate(ctx.targets):
+                box = gradient[target.top :, target.left :]
+                rest = [kept[index], given[index:], box, gradient.stride(0), int(index > 0)]
+                _launch(backward_tiles, target, render, rest)
+        return gradient, None
+
+
+_STREAMS = CudaStreams()
+
+
+def _launch(kernel: Any, target: Target, render: Tensor, rest: list[Any]) -> None:
+    pixels = target.pixels
+    height, width = pixels.shape[:2]
+    masks = [m for m in (target.shown, target.ignored) if m is not None]
+    strides = {mask.stride() for mask in masks}
+    if len(strides) > 1 or any(stride[1] != 1 for stride in strides):
+        raise ValueError(f"masks are boxes of images of one width, got strides {sorted(strides)}")
+    shown, ignored = (
+        # not read where there is none
+        pixels if mask is None else mask.view(torch.uint8)
+        for mask in (target.shown, target.ignored)
+    )
+    arguments = [
+        height, width, render[target.top :, target.left :], render.stride(0),
+        pixels, pixels.stride(0), shown, ignored, masks[0].stride(0) if masks else 0,
+        int(target.shown is not None), int(target.ignored is not None),
+        render if target.background is None else target.background,
+        target.l1, target.dssim, *rest,
+    ]  # fmt: skip
+    if render.is_cuda:
+        _STREAMS.current().blocks(kernel, _tiles(pixels), THREADS, arguments)
+    else:
+        prepared(kernel, _tiles(pixels), arguments).launch()
+
+
+def _tiles(pixels: Tensor) -> int:
+    height, width, channels = pixels.shape
+    return channels * -(-height // SIDE) * -(-width // SIDE)
