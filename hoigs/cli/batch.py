@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -125,19 +124,12 @@ def _shown() -> Iterator[dict[str, Any]]:
     from rich.console import Console
     from rich.live import Live
 
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt  # so that SIGTERM ends the stages too
-
     console, table = Console(), _LiveTable()
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        if not console.is_terminal:
-            yield {"report": lambda work, word: typer.echo(printable(f"{work.row.name}: {word}"))}
-            return
-        with Live(console=console, get_renderable=table.draw, refresh_per_second=4):
-            yield {"report": table.report, "tick": table.tick}
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    if not console.is_terminal:
+        yield {"report": lambda work, word: typer.echo(printable(f"{work.row.name}: {word}"))}
+        return
+    with Live(console=console, get_renderable=table.draw, refresh_per_second=4):
+        yield {"report": table.report, "tick": table.tick}
 
 
 class _LiveTable:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -85,57 +84,49 @@ def chart(
 
     each = threads or max(1, available_cpus() // jobs)
     where = make_executor(executor, jobs, each, address)
-    before = signal.signal(signal.SIGTERM, _stop)  # so that SIGTERM ends the runs too
-    try:
-        if rerun is not None:
-            _rerun(out, rerun, where)
-            return
-        from hoigs.core.errors import HoigsError
-        from hoigs.studies.chart.data import load_chart
-        from hoigs.studies.chart.interactive import require_plotly
-        from hoigs.studies.chart.plan import ChartStudy
-        from hoigs.studies.chart.run import run_chart
-        from hoigs.studies.chart.write import write_chart
-        from hoigs.studies.jobs.job import Job
-        from hoigs.studies.jobs.variants import parse_variants
+    if rerun is not None:
+        _rerun(out, rerun, where)
+        return
+    from hoigs.core.errors import HoigsError
+    from hoigs.studies.chart.data import load_chart
+    from hoigs.studies.chart.interactive import require_plotly
+    from hoigs.studies.chart.plan import ChartStudy
+    from hoigs.studies.chart.run import run_chart
+    from hoigs.studies.chart.write import write_chart
+    from hoigs.studies.jobs.job import Job
+    from hoigs.studies.jobs.variants import parse_variants
 
-        if not clips and not add:
-            raise HoigsError("name a clip: `hoigs chart builtin:carry --specs hoigs,static`")
-        require_plotly()
-        loaded = {path: load_chart(path) for path in add or ()}
-        others = [cell for added, _ in loaded.values() for cell in added]
-        study = ChartStudy(
-            clips=clips or [],
-            variants=parse_variants(specs),
-            out=out.resolve(),
-            rasterizers=[r.strip() for r in rasterizers.split(",") if r.strip()],
-            budgets=_steps(budgets),
-            seeds=seeds,
-            settings=tuple(settings or ()),
-            device=study_device(device, executor),
-            lpips_weights=lpips_weights.resolve() if lpips_weights else None,
-            plugins=tuple(p.resolve() for p in plugin or ()),
-        )
+    if not clips and not add:
+        raise HoigsError("name a clip: `hoigs chart builtin:carry --specs hoigs,static`")
+    require_plotly()
+    loaded = {path: load_chart(path) for path in add or ()}
+    others = [cell for added, _ in loaded.values() for cell in added]
+    study = ChartStudy(
+        clips=clips or [],
+        variants=parse_variants(specs),
+        out=out.resolve(),
+        rasterizers=[r.strip() for r in rasterizers.split(",") if r.strip()],
+        budgets=_steps(budgets),
+        seeds=seeds,
+        settings=tuple(settings or ()),
+        device=study_device(device, executor),
+        lpips_weights=lpips_weights.resolve() if lpips_weights else None,
+        plugins=tuple(p.resolve() for p in plugin or ()),
+    )
 
-        def report(job: Job, word: str) -> None:
-            typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
+    def report(job: Job, word: str) -> None:
+        typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
 
-        limit = None if minutes is None else 60 * minutes
-        cells = run_chart(study, executor=where, limit_s=limit, report=report)
-        about = _about(study.settings, study.device, jobs, each)
-        if not clips:  # nothing was run
-            about = {k if len(loaded) == 1 else f"{k} ({path})": v
-                     for path, (_, made) in loaded.items() for k, v in made.items()}  # fmt: skip
-        for path in write_chart([*cells, *others], study.out, about, mix_machines=mix_machines):
-            typer.echo(f"wrote {path}")
-        if any(cell.missing for cell in cells):
-            typer.echo("some trainings are not done; chart.md gives the reason")
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def _stop(*_: object) -> None:
-    raise KeyboardInterrupt
+    limit = None if minutes is None else 60 * minutes
+    cells = run_chart(study, executor=where, limit_s=limit, report=report)
+    about = _about(study.settings, study.device, jobs, each)
+    if not clips:  # nothing was run
+        about = {k if len(loaded) == 1 else f"{k} ({path})": v
+                 for path, (_, made) in loaded.items() for k, v in made.items()}  # fmt: skip
+    for path in write_chart([*cells, *others], study.out, about, mix_machines=mix_machines):
+        typer.echo(f"wrote {path}")
+    if any(cell.missing for cell in cells):
+        typer.echo("some trainings are not done; chart.md gives the reason")
 
 
 def _steps(text: str) -> list[int]:

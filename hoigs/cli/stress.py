@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -90,12 +89,8 @@ def stress(
     def report(job: Job, word: str) -> None:
         typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
 
-    before = signal.signal(signal.SIGTERM, _stop)  # so that SIGTERM ends the runs too
-    try:
-        limit = None if minutes is None else 60 * minutes
-        verdicts = run_stress(study, executor=where, limit_s=limit, report=report, log=typer.echo)
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    limit = None if minutes is None else 60 * minutes
+    verdicts = run_stress(study, executor=where, limit_s=limit, report=report, log=typer.echo)
     definitions = {row.label: definition(row) for row in study.specs}
     table = make_table(study.cases, definitions, verdicts, _about(study, jobs, each))
     for path in write_stress(table, study.out):
@@ -106,10 +101,6 @@ def stress(
     if broken:
         typer.echo(f"checks of hoigs' own code fail: {', '.join(broken)}")
         raise typer.Exit(1)
-
-
-def _stop(*_: object) -> None:
-    raise KeyboardInterrupt
 
 
 def _about(study: object, jobs: int, threads: int) -> dict[str, object]:

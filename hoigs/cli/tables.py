@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -87,15 +86,8 @@ def tables(
         ended += word not in ("started", "stopped")
         typer.echo(printable(f"[{ended:>3}] {job.clip_label}/{job.folder.name}: {word}"))
 
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt  # so that SIGTERM ends the runs too
-
     limit = None if minutes is None else 60 * minutes
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        results = run_study(study, executor=where, limit_s=limit, report=report)
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    results = run_study(study, executor=where, limit_s=limit, report=report)
     about: dict[str, object] = {
         "clips": ", ".join(study.clips),
         "seeds": seeds,

@@ -51,6 +51,26 @@ def test_a_second_signal_stops_within_the_step(hoigs, clip, tmp_path, monkeypatc
     assert not list((run / "checkpoints").iterdir())
 
 
+@pytest.mark.parametrize(
+    ("command", "work"),
+    [
+        (["batch", "rows.csv", "--out", "out"], "batch.batch.batch"),
+        (["tables", "--clips", "x", "--specs", "static", "--out", "out"], "tables.run.run_study"),
+        (["chart", "x", "--specs", "static", "--out", "out"], "chart.run.run_chart"),
+        (["stress", "--specs", "static", "--out", "out"], "stress.run.run_stress"),
+    ],
+    ids=lambda x: x[0] if isinstance(x, list) else "",
+)
+def test_a_study_that_is_stopped_says_by_what(hoigs, tmp_path, monkeypatch, command, work):
+    def stop(*_: object, **__: object) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(f"hoigs.studies.{work}", stop)
+    stopped = hoigs(*command)
+    assert (stopped.code, stopped.err) == (143, "stopped\n")
+
+
 def test_a_trained_run_that_is_not_yet_scored(hoigs, clip, tmp_path, monkeypatch):
     def stop(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGINT)
