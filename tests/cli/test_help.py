@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 
@@ -66,3 +67,12 @@ def test_help_shows_all_that_is_written(hoigs, monkeypatch, words, command):
     for text in (command.help, *(getattr(p, "help", "") for p in parameters)):
         for word in (text or "").replace("`", "").split():
             assert word in shown, word
+
+
+def test_help_names_commands_that_exist():
+    known = {words[0] for words, _ in commands() if words}
+    for words, command in commands():
+        parameters = [getattr(p, "help", "") for p in command.params]
+        for text in (command.help, *parameters):
+            for named in re.findall(r"`hoigs ([a-z-]+)", text or ""):
+                assert named in known, (words, named)

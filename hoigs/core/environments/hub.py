@@ -72,6 +72,7 @@ def fetched(name: str) -> Path:
             "are complete are kept, and the same command goes on from there; or use --estimators "
             "offline"
         ) from error
+    _remove_abandoned(folder)
     damaged = _damaged(folder)
     _remove(damaged)
     if damaged:
@@ -86,6 +87,14 @@ def fetched(name: str) -> Path:
             "code when they are read)"
         )
     return folder
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Remove what killed downloads left of files that are whole by now: huggingface_hub neither
+    continues it nor removes it."""
+    for part in (folder.parents[1] / "blobs").glob("*.incomplete"):
+        if part.with_name(part.name.partition(".")[0]).is_file():
+            part.unlink(missing_ok=True)
 
 
 def _has_weights(folder: Path) -> bool:

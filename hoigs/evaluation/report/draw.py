@@ -17,6 +17,9 @@ from hoigs.core.values.moment import Moment
 ERROR_FULL = 0.25  # absolute error, of colours in [0, 1], that is drawn white
 
 
+DEPTH_DARKEST = 0.1  # of depth's colour map: what is darker is left for transparent pixels
+
+
 @torch.no_grad()
 def draw(
     model: SceneModel, moment: Moment, camera: Camera, only: Iterable[str] | None = None
@@ -59,9 +62,23 @@ def depth_picture(output: RenderOutput, span: tuple[float, float]) -> UInt8[np.n
     """Depth in false colour, near is bright, darkened by transparency."""
     near, far = span
     closeness = (far - output.expected_depth) / (far - near)
-    # the darkest tenth of the colour map is left for transparent pixels
-    shown = false_color(0.1 + 0.9 * closeness.clamp(0, 1), "magma").astype(np.float32)
+    bright = DEPTH_DARKEST + (1 - DEPTH_DARKEST) * closeness.clamp(0, 1)
+    shown = false_color(bright, "magma").astype(np.float32)
     return (shown * output.alpha.clamp(0, 1)[..., None].cpu().numpy()).round().astype(np.uint8)
+
+
+def error_colors(count: int = 9) -> list[str]:
+    """The colours of errors from 0 to ERROR_FULL, as #rrggbb."""
+    return _hex(torch.linspace(0, 1, count), "inferno")
+
+
+def depth_colors(count: int = 9) -> list[str]:
+    """The colours of depths from near to far, as #rrggbb."""
+    return _hex(torch.linspace(1, DEPTH_DARKEST, count), "magma")
+
+
+def _hex(values: Float[Tensor, " N"], name: str) -> list[str]:
+    return [f"#{bytes(color).hex()}" for color in false_color(values[None], name)[0]]
 
 
 def false_color(values: Float[Tensor, "H W"], name: str) -> UInt8[np.ndarray, "H W 3"]:

@@ -1,4 +1,4 @@
-"""Pictures and animations of a run, encoded as data URIs for a page without other files."""
+"""Pictures of a run, encoded as data URIs for a page without other files."""
 
 from __future__ import annotations
 
@@ -38,6 +38,15 @@ PLAYBACK_BYTES, ORBIT_BYTES = 2_000_000, 1_200_000
 
 
 @dataclass(frozen=True)
+class Moving:
+    """Pictures that are played one after the other, as data URIs, each with a label."""
+
+    pictures: list[str]
+    labels: list[str]
+    interval_ms: float
+
+
+@dataclass(frozen=True)
 class Comparison:
     """One scored frame as data URIs: the video, the render, where they differ."""
 
@@ -59,21 +68,24 @@ class Cutout:
     image: str
 
 
-def playback(model: SceneModel, clip: Clip) -> str:
+def playback(model: SceneModel, clip: Clip) -> Moving:
     """The video beside its reconstruction, over the whole clip, from the clip's cameras."""
     count = min(PLAYBACK_FRAMES, len(clip))
     positions = [round(i * (len(clip) - 1) / max(1, count - 1)) for i in range(count)]
     seconds = len(clip) / clip.fps
-    panels = []
+    panels, labels = [], []
     for position in positions:
         frame = clip[position]
         render = picture(draw(model, frame.moment, frame.camera).color)
         panels.append(beside(frame.image.numpy(), render))
-    return animation(panels, 1000 * seconds / count, PLAYBACK_BYTES)
+        labels.append(f"frame {frame.moment.index}")
+    return Moving(within(panels, PLAYBACK_BYTES), labels, 1000 * seconds / count)
 
 
-def frozen_orbit(model: SceneModel, clip: Clip, position: int) -> str:
-    """One moment seen from a swinging camera: colour beside depth."""
+def frozen_orbit(
+    model: SceneModel, clip: Clip, position: int
+) -> tuple[Moving, tuple[float, float]]:
+    """One moment seen from a swinging camera: colour beside depth; and the range of depths."""
     moment = clip.moments[position]
     cameras = orbit_cameras(clip, model, ORBIT_FRAMES, position=position)
     span = depth_range(draw(model, moment, cameras[0]))
@@ -81,7 +93,8 @@ def frozen_orbit(model: SceneModel, clip: Clip, position: int) -> str:
     for camera in cameras:
         output = draw(model, moment, camera)
         panels.append(beside(picture(output.color), depth_picture(output, span)))
-    return animation(panels, 90, ORBIT_BYTES)
+    labels = [f"view {i + 1}" for i in range(len(panels))]
+    return Moving(within(panels, ORBIT_BYTES), labels, 90), span
 
 
 def cutouts(model: SceneModel, clip: Clip, position: int) -> list[Cutout]:
@@ -131,19 +144,19 @@ def _compare(model: SceneModel, frame: Frame, scored: FrameScores, name: str) ->
     )
 
 
-def scored_sequence(model: SceneModel, clip: Clip, evaluation: Evaluation) -> list[tuple[str, str]]:
-    """The scored frames of the video in order: label, and video | render | error as a data URI."""
+def scored_sequence(model: SceneModel, clip: Clip, evaluation: Evaluation) -> Moving:
+    """The scored frames of the video in order: video | render | error."""
     frames = [
         f for view in evaluation.views if view.name != "held-out cameras" for f in view.frames
     ]
-    made = []
+    pictures, labels = [], []
     for scored in evenly(sorted(frames, key=lambda f: f.index), SEQUENCE):
         frame = clip[scored.position]
         color = draw(model, frame.moment, frame.camera).color
         panels = (frame.image.numpy(), picture(color), error_picture(color, frame.rgb))
-        row = np.concatenate(panels, 1)
-        made.append((f"frame {scored.index}", still(row, 3 * SEQUENCE_WIDTH, 70)))
-    return made
+        pictures.append(still(np.concatenate(panels, 1), 3 * SEQUENCE_WIDTH, 70))
+        labels.append(f"frame {scored.index}")
+    return Moving(pictures, labels, 250)
 
 
 def key_position(clip: Clip, samples: int = 24) -> int:
@@ -174,27 +187,26 @@ def beside(left: np.ndarray, right: np.ndarray) -> Image.Image:
     return pair
 
 
-def animation(frames: Sequence[Image.Image], duration_ms: float, limit: int) -> str:
-    """A looping WebP as a data URI, at the best quality that stays under `limit` bytes."""
-    data = b""
+def within(images: Sequence[Image.Image], limit: int) -> list[str]:
+    """Images as data URIs, at the best quality at which all together stay under `limit` bytes."""
+    data: list[bytes] = []
     for quality in (84, 70, 55, 40, 25):
-        buffer = io.BytesIO()
-        frames[0].save(
-            buffer, "WEBP", save_all=True, append_images=list(frames[1:]), loop=0,
-            duration=max(20, round(duration_ms)), quality=quality, method=2,
-        )  # fmt: skip
-        data = buffer.getvalue()
-        if len(data) <= limit:
+        data = [_webp(image, quality, method=2) for image in images]
+        if sum(map(len, data)) <= limit:
             break
-    return _uri(data, "webp")
+    return [_uri(one, "webp") for one in data]
 
 
 def still(image: np.ndarray, width: int, quality: int) -> str:
     """A WebP as a data URI, at most `width` wide; four channels keep their transparency."""
-    buffer = io.BytesIO()
     shown = _fit(Image.fromarray(image), min(width, image.shape[1]))
-    shown.save(buffer, "WEBP", quality=quality, method=4)
-    return _uri(buffer.getvalue(), "webp")
+    return _uri(_webp(shown, quality, method=4), "webp")
+
+
+def _webp(image: Image.Image, quality: int, method: int) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, "WEBP", quality=quality, method=method)
+    return buffer.getvalue()
 
 
 def _fit(image: Image.Image, width: int) -> Image.Image:

@@ -32,10 +32,13 @@ for (const player of document.querySelectorAll(".player")) {
   button.addEventListener("click", () => {
     if (timer) return stop();
     button.textContent = "Pause";
-    timer = setInterval(() => show((Number(slider.value) + 1) % images.length), 250);
+    const next = () => show((Number(slider.value) + 1) % images.length);
+    timer = setInterval(next, Number(player.dataset.interval));
   });
   slider.addEventListener("input", () => {
     stop();
     show(Number(slider.value));
   });
+  const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+  if (player.classList.contains("playing") && !still) button.click();
 }

@@ -6,9 +6,10 @@ import json
 from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any
+from urllib.parse import quote
 
 from hoigs.evaluation.protocol import NotComputed, Value
-from hoigs.evaluation.report.media import Comparison, Cutout
+from hoigs.evaluation.report.media import Comparison, Cutout, Moving
 from hoigs.evaluation.scores import Evaluation, Table, Timing
 from hoigs.metrics.regions import MEANING
 
@@ -52,27 +53,41 @@ def _decibels(value: Value, what: str, view: str) -> list[tuple[str, str, str]]:
     return [(f"{value:.2f} dB", f"PSNR, {what}", view)]
 
 
-def pair(image: str, left: str, right: str, alt: str) -> str:
-    """One picture with a caption for each half."""
-    return (
-        f"<figure class='pair'><img src='{image}' alt='{escape(alt, quote=True)}'>"
-        f"<figcaption><span>{escape(left)}</span><span>{escape(right)}</span></figcaption></figure>"
-    )
+def player(moving: Moving, captions: Sequence[str], *, playing: bool = False) -> str:
+    """Pictures with a play button and a slider.
 
-
-def player(frames: Sequence[tuple[str, str]]) -> str:
-    """Pictures of a sequence with a play button and a slider; each is labelled."""
+    Args:
+        captions: HTML below the parts of each picture, from left to right.
+        playing: from the start, except for readers whose system asks for less motion.
+    """
     pictures = "".join(
         f"<img class='{'on' if i == 0 else ''}' src='{image}' alt='{escape(label, quote=True)}'>"
-        for i, (label, image) in enumerate(frames)
+        for i, (label, image) in enumerate(zip(moving.labels, moving.pictures, strict=True))
     )
+    words = "".join(f"<span>{caption}</span>" for caption in captions)
     return (
-        f"<div class='player'><figure>{pictures}<figcaption><span>The video</span>"
-        "<span>The reconstruction</span><span>Error</span></figcaption></figure>"
+        f"<div class='player{' playing' if playing else ''}' "
+        f"data-interval='{max(20, round(moving.interval_ms))}'>"
+        f"<figure>{pictures}<figcaption>{words}</figcaption></figure>"
         "<p><button type='button'>Play</button>"
-        f"<input type='range' min='0' max='{len(frames) - 1}' value='0' aria-label='frame'>"
-        f"<output>{escape(frames[0][0])}</output></p></div>"
+        f"<input type='range' min='0' max='{len(moving.pictures) - 1}' value='0' "
+        f"aria-label='frame'><output>{escape(moving.labels[0])}</output></p></div>"
     )
+
+
+def color_bar(what: str, colors: Sequence[str], low: str, high: str) -> str:
+    """What false colours mean."""
+    return (
+        f"{escape(what)} <span class='colors'>{escape(low)} "
+        f"<i style='background:linear-gradient(to right,{','.join(colors)})'></i> "
+        f"{escape(high)}</span>"
+    )
+
+
+def files(paths: Sequence[str]) -> str:
+    """Links to files beside the page."""
+    links = (f"<a href='{quote(path)}'>{escape(path)}</a>" for path in paths)
+    return f"<p class='files'>{' '.join(links)}</p>"
 
 
 def commands(lines: Sequence[tuple[str, str]]) -> str:
@@ -83,8 +98,12 @@ def commands(lines: Sequence[tuple[str, str]]) -> str:
     return f"<dl class='commands'>{rows}</dl>"
 
 
-def comparer(comparisons: Sequence[Comparison]) -> str:
-    """Video and render under a slider, the error beside them, and thumbnails to choose a frame."""
+def comparer(comparisons: Sequence[Comparison], error: str) -> str:
+    """Video and render under a slider, the error beside them, and thumbnails to choose a frame.
+
+    Args:
+        error: the colour bar of errors.
+    """
     stages, thumbs = [], []
     for i, c in enumerate(comparisons):
         on = " on" if i == 0 else ""
@@ -97,8 +116,9 @@ def comparer(comparisons: Sequence[Comparison]) -> str:
             "<input type='range' min='0' max='100' value='50' step='0.1' "
             "aria-label='how much of the video to show'></div>"
             f"<div class='error'><img src='{c.error}' alt='error'>"
-            "<span class='tag left'>absolute error, white at 0.25</span></div>"
-            f"<p class='caption'><b>{escape(c.label)}</b> {escape(c.score)}</p></div>"
+            "</div>"
+            f"<p class='caption'><b>{escape(c.label)}</b> {escape(c.score)}</p>"
+            f"<p class='caption'>{error}</p></div>"
         )
         thumbs.append(
             f"<button class='{on.strip()}' aria-label='{escape(c.label, quote=True)}'>"
@@ -119,8 +139,8 @@ def apart(cutouts: Sequence[Cutout]) -> str:
     return f"<div class='apart'>{''.join(cells)}</div>"
 
 
-def table(source: Table) -> str:
-    """A table with its notes."""
+def table(source: Table, *, words: bool = False) -> str:
+    """A table with its notes; of `words`, lines are broken."""
     head = "".join(f"<th>{escape(c)}</th>" for c in source.columns)
     body = "".join(
         "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>"
@@ -128,8 +148,9 @@ def table(source: Table) -> str:
     )
     notes = "".join(f"<li>{escape(note)}</li>" for note in source.notes)
     return (
-        f"<div class='table'><h3>{escape(source.title)}</h3><table><thead><tr>{head}</tr></thead>"
-        f"<tbody>{body}</tbody></table><ul class='notes'>{notes}</ul></div>"
+        f"<div class='table{' words' if words else ''}'><h3>{escape(source.title)}</h3>"
+        f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        f"<ul class='notes'>{notes}</ul></div>"
     )
 
 

@@ -18,8 +18,11 @@ from hoigs.core.spec.loader import load_yaml
 from hoigs.core.values.clip import Clip
 from hoigs.core.whole_files import write_whole
 from hoigs.evaluation.report import curves, media, sections
+from hoigs.evaluation.report.draw import ERROR_FULL, depth_colors, error_colors
 from hoigs.evaluation.scores import Evaluation, Table, score_table, size_table, timing_table
 from hoigs.runs.run_folder import RunFolder
+
+BESIDE = ("*.yaml", "*.json", "*.jsonl", "renders/*", "exports/*/export.json")  # what is linked
 
 
 def write_report(
@@ -33,7 +36,7 @@ def write_report(
     """Write `report.html` into a run folder, and return its path.
 
     The page is self-contained and loads nothing from the network. It includes the run's
-    metrics.jsonl, spec.yaml and provenance.json where they exist.
+    metrics.jsonl, spec.yaml and provenance.json where they exist, and links to the run's files.
 
     Raises:
         HoigsError: metrics.jsonl is damaged.
@@ -109,36 +112,41 @@ def without_home(text: str) -> str:
 
 
 def _hero(model: SceneModel, clip: Clip) -> str:
-    image = media.playback(model, clip)
-    return "<div class='hero'>" + sections.pair(
-        image, "The video", "The reconstruction, from the same camera", "video beside render"
-    ) + "</div>"  # fmt: skip
+    captions = ("The video", "The reconstruction, from the same camera")
+    moving = media.playback(model, clip)
+    return f"<div class='hero'>{sections.player(moving, captions, playing=True)}</div>"
 
 
 def _compared(model: SceneModel, clip: Clip, evaluation: Evaluation) -> str:
     comparisons = media.comparisons(model, clip, evaluation)
     if not comparisons:
         return _section("Frames outside training", "The clip has none.", "")
+    error = sections.color_bar("Absolute error", error_colors(), "0", f"{ERROR_FULL:g}")
     unseen = all(view.protocol.split == "test" for view in evaluation.views)
     return _section(
         "Frames outside training" if unseen else "Frame by frame",
         ("None of these images took part in training. " if unseen else "")
         + "Drag the line between them; choose a frame below.",
-        sections.comparer(comparisons),
+        sections.comparer(comparisons, error),
     ) + _section(
         "In a row",
         "The frames that were scored, in their order.",
-        sections.player(media.scored_sequence(model, clip, evaluation)),
+        sections.player(
+            media.scored_sequence(model, clip, evaluation),
+            ("The video", "The reconstruction", error),
+        ),
     )
 
 
 def _further(folder: Path) -> str:
     given = folder.is_absolute() or ".." in folder.parts
     run = shlex.quote(folder.resolve().name if given else str(folder))
+    there = [path.relative_to(folder).as_posix() for kind in BESIDE for path in folder.glob(kind)]
     return _section(
         "Look further",
         "",
-        sections.commands(
+        (sections.files(sorted(there)) if there else "")
+        + sections.commands(
             (
                 (f"hoigs view {run}", "from any side, in the browser"),
                 (f"hoigs view {run} --html run.html", "the same as one file to send"),
@@ -163,11 +171,12 @@ def _further(folder: Path) -> str:
 def _space(model: SceneModel, clip: Clip) -> str:
     position = media.key_position(clip)
     index = clip.moments[position].index
-    orbit = media.frozen_orbit(model, clip, position)
+    orbit, (near, far) = media.frozen_orbit(model, clip, position)
+    depth = sections.color_bar("Depth", depth_colors(), f"{near:.2f} m", f"{far:.2f} m")
     return _section(
         "One moment from other views",
         f"Frame {index} is stopped while the camera swings 20° to each side of where it was.",
-        sections.pair(orbit, "Colour", "Depth, near is bright", "orbit around a frozen moment"),
+        sections.player(orbit, ("Colour", depth), playing=True),
     ) + _section(
         "Entities on their own",
         "Every entity is a model of its own and can be drawn alone, moved or left out.",
@@ -215,7 +224,7 @@ def _faults(folder: Path) -> str:
     return _section(
         "What is wrong with the clip",
         "Training tolerated these defects.",
-        sections.table(Table("", ("found", "what to do, and what was done"), rows, ())),
+        sections.table(Table("", ("found", "what to do, and what was done"), rows, ()), words=True),
     )
 
 

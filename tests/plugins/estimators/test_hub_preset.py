@@ -227,6 +227,20 @@ def test_a_download_that_fails_is_not_taken_for_a_network(loopback: Hub, cache: 
     assert hub.fetched(SAM2) == hub.cached(SAM2)
 
 
+def test_what_a_killed_download_left_goes_when_the_file_is_whole(
+    loopback: Hub, cache: Path
+) -> None:
+    blobs = cache / f"models--{SAM2.replace('/', '--')}" / "blobs"
+    digest = hashlib.sha256(loopback.files[SAM2][hub.WEIGHTS]).hexdigest()
+    left = blobs / f"{digest}.0123abcd.incomplete"
+    other = blobs / f"{'0' * 64}.0123abcd.incomplete"
+    blobs.mkdir(parents=True)
+    left.write_bytes(b"half")
+    other.write_bytes(b"of a file that is not whole, which another process may be writing")
+    hub.fetched(SAM2)
+    assert list(blobs.glob("*.incomplete")) == [other]
+
+
 def test_another_checksum_is_refused_and_not_kept(loopback: Hub, cache: Path) -> None:
     loopback.damage = True
     with pytest.raises(HoigsError, match=r"model\.safetensors from http.* has another checksum"):
