@@ -77,6 +77,14 @@ def train(
             help="A time, 90s, 20m or 2h: width and steps that fit it on this machine.",
         ),
     ] = None,
+    chunk: Annotated[
+        int | None,
+        typer.Option(
+            "--chunk",
+            help="For a long clip: train in windows of so many frames, of which one at a time is "
+            "in memory.",
+        ),
+    ] = None,
     evaluate: Annotated[
         bool, typer.Option("--eval/--no-eval", help="Score the run and write its report.")
     ] = True,
@@ -102,11 +110,19 @@ def train(
         }  # fmt: skip
         if auto:
             named = _clip_for_auto(clip, reader, reader_set, budget)
+            if chunk is not None:
+                given["overrides"] = [*given["overrides"], f"train.chunk={chunk}"]
             made = train_auto(named, spec, on_found=print_needs, **given)
             run = made.run
         else:
             run = train_spec(
-                clip, spec, reader=reader, reader_settings=reader_set or (), budget=budget, **given
+                clip,
+                spec,
+                reader=reader,
+                reader_settings=reader_set or (),
+                budget=budget,
+                chunk=chunk,
+                **given,
             )
     if auto:
         _print_after(made.after)

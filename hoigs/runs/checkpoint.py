@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import nn
 
 from hoigs.compression.compact import COMPOSED, read_compact
@@ -18,6 +18,7 @@ from hoigs.compression.compact import FORMAT as COMPACT
 from hoigs.core.errors import CheckpointError
 from hoigs.core.json_file import read_json, short, validated
 from hoigs.core.model.scene import SceneModel
+from hoigs.core.storage.tensor_files import TensorFile, save_tensors
 from hoigs.core.whole_files import write_whole, written_whole
 from hoigs.runs.records import CheckpointRecord, CompactRecord
 
@@ -36,11 +37,14 @@ class Checkpoint:
 
     Attributes:
         tensors: "model.*", "optimizer.*", "density.*", "cameras.*", "rng.*".
-        meta: format, version, step, time_s, counts, sampler, skipped, spec_name, model_hash.
+        meta: format, version, step, time_s, counts, sampler, skipped, spec_name, model_hash; of a
+            training in windows, windows.
+        files: of a training in windows, tensors that lie in files, in place of those in `tensors`.
     """
 
     tensors: dict[str, torch.Tensor]
     meta: dict[str, Any]
+    files: Mapping[str, TensorFile] = field(default_factory=dict)
 
     def part(self, prefix: str) -> dict[str, torch.Tensor]:
         """The tensors whose names start with `prefix.`, under the rest of their names."""
@@ -56,10 +60,13 @@ class Checkpoint:
         folder.mkdir(parents=True, exist_ok=True)
         stem = f"step_{self.meta['step']:06d}"
         weights, meta = folder / f"{stem}.safetensors", folder / f"{stem}.json"
-        tensors = {k: v.detach().cpu().contiguous() for k, v in self.tensors.items()}
         try:
             with written_whole(weights, weights.with_suffix(".safetensors.part")) as part:
-                save_file(tensors, part)
+                if self.files:
+                    save_tensors({**self.tensors, **self.files}, part)
+                else:
+                    tensors = {k: v.detach().cpu().contiguous() for k, v in self.tensors.items()}
+                    save_file(tensors, part)
         except SafetensorError as error:
             raise CheckpointError(f"{weights} cannot be written: {error}") from error
         write_whole(meta, json.dumps(self.meta, indent=1), meta.with_suffix(".json.part"))
@@ -108,8 +115,11 @@ def latest_checkpoint(folder: Path) -> Path:
     return found[-1]
 
 
-def load_newest(folder: Path) -> Checkpoint:
+def load_newest(folder: Path, parts: Collection[str] | None = None) -> Checkpoint:
     """The newest complete checkpoint in a run's `checkpoints/` folder.
+
+    Args:
+        parts: as of `load_checkpoint`.
 
     Raises:
         CheckpointError: there is none, or it is damaged; the message then names the newest one that
@@ -117,7 +127,7 @@ def load_newest(folder: Path) -> Checkpoint:
     """
     newest = latest_checkpoint(folder)
     try:
-        return load_checkpoint(newest)
+        return load_checkpoint(newest, parts)
     except CheckpointError as error:
         broken = [newest.stem]
         for older in reversed(_complete(folder)[:-1]):
@@ -134,8 +144,12 @@ def load_newest(folder: Path) -> Checkpoint:
         raise
 
 
-def load_checkpoint(meta_path: Path) -> Checkpoint:
+def load_checkpoint(meta_path: Path, parts: Collection[str] | None = None) -> Checkpoint:
     """Read one checkpoint; `meta_path` is its JSON file.
+
+    Args:
+        parts: of the tensors, "model" or "optimizer"; None: all. A compact checkpoint is read
+            whole.
 
     Raises:
         CheckpointError: a file is damaged or absent, or of another format, or holds values that
@@ -155,7 +169,7 @@ def load_checkpoint(meta_path: Path) -> Checkpoint:
     validated(meta, record, meta_path, error=CheckpointError, advice=ADVICE)
     weights = meta_path.with_suffix(".safetensors")
     try:
-        tensors = load_file(weights)
+        tensors = _read(weights, None if compact else parts)
     except (OSError, SafetensorError, ValueError, KeyError) as error:
         raise CheckpointError(f"{weights}: damaged or absent: {error}; {ADVICE}") from error
     if compact:
@@ -166,6 +180,12 @@ def load_checkpoint(meta_path: Path) -> Checkpoint:
     _check_values(weights, tensors)
     _check_counts(meta_path, meta["counts"], tensors)
     return Checkpoint(tensors, meta)
+
+
+def _read(path: Path, parts: Collection[str] | None) -> dict[str, torch.Tensor]:
+    with safe_open(path, framework="pt") as file:
+        names = [n for n in file.keys() if parts is None or n.partition(".")[0] in parts]  # noqa: SIM118
+        return {name: file.get_tensor(name) for name in names}
 
 
 def _check_values(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:

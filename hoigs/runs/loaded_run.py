@@ -27,6 +27,8 @@ from hoigs.runs.clip_source import clip_folder, read_clip, recorded_folder
 from hoigs.runs.reader_choice import recorded_reader
 from hoigs.runs.run_folder import RunFolder
 
+DRAWN = ("model", "cameras")  # what is read of a checkpoint: moments are three times as large
+
 
 @dataclass(frozen=True)
 class LoadedRun:
@@ -78,7 +80,7 @@ class LoadedRun:
         recorded = provenance["clip"].get("reader") if clip is None else None
         choice = recorded_reader(recorded, path, folder, registry) if recorded else None
         source = read_clip(folder, registry, spec.train.width, allow_faults=allowed, reader=choice)
-        checkpoint = load_newest(run.checkpoints)
+        checkpoint = load_newest(run.checkpoints, DRAWN)
         model = compose(spec, source, registry)
         restore_model(model, checkpoint, spec.model_hash())
         _try(model, source, run.checkpoints)
@@ -97,7 +99,7 @@ class LoadedRun:
         Raises:
             HoigsError: the checkpoint is damaged, belongs to another spec or refines cameras.
         """
-        checkpoint = load_newest(RunFolder(path).checkpoints)
+        checkpoint = load_newest(RunFolder(path).checkpoints, DRAWN)
         if checkpoint.part("cameras"):
             raise HoigsError(f"{path}: with refined cameras the clip has to be read again")
         model = copy.deepcopy(self.model)

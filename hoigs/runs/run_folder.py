@@ -49,8 +49,9 @@ RUN = Layout(
         r"checkpoints/step_\d+\.((safetensors|json)(\.part)?|\d+\.part)",
         r"renders/[^/]+\.(mp4|webm|mov|gif)(\.part)?",
         r"exports/.+",
+        r"windows/\d+\.(values|exp_avg|exp_avg_sq)",  # of a training that was killed
     ),
-    folders=one_of("checkpoints", "renders", "exports(/.+)?"),
+    folders=one_of("checkpoints", "renders", "windows", "exports(/.+)?"),
 )
 
 
@@ -95,6 +96,11 @@ class RunFolder:
     @property
     def checkpoints(self) -> Path:
         return self.path / "checkpoints"
+
+    @property
+    def windows(self) -> Path:
+        """Files of a training in windows, while it runs."""
+        return self.path / "windows"
 
     @property
     def provenance(self) -> Path:

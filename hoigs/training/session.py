@@ -150,6 +150,7 @@ class Session:
             },
             "allow_faults": allow_faults,
             "clip_faults": [fault.to_dict() for fault in faults],
+            "windows": None if trainer.windows is None else trainer.windows.sentence(),
         }
         changes = changes_of(run.spec, spec) if resume else []
         if resume:

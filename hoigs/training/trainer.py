@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -42,6 +43,7 @@ from hoigs.training.objective import JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
 from hoigs.training.sampler import EpochSampler
 from hoigs.training.stop_request import StopRequest, resume_command
+from hoigs.training.time_windows import TimeWindows, WindowSampler
 from hoigs.training.unseen import fill_unseen
 from hoigs.training.views import TrainingViews
 
@@ -104,7 +106,6 @@ class Trainer:
         self.model, self.clip, self.spec, self.run = model, clip, spec, run
         self.identity = dict(identity or {"spec_name": "", "model_hash": ""})
         self.generator = torch.Generator().manual_seed(spec.seed)
-        self.sampler = EpochSampler(clip.split["train"], self.generator)
         self.views = TrainingViews(clip, model.device)
         for control in (density or {}).values():
             check_rasterizer(control, model.rasterizer)
@@ -117,10 +118,12 @@ class Trainer:
         scale = 1 / depth_factor(clip) if spec.loss.depth_fit == "auto" else 1.0
         self.objective = JointObjective(
             model, spec.loss, clip.depth_kind, lpips, density, faces, self.cameras, scale,
-            spec.graphs,
+            spec.graphs if spec.chunk is None else "off",
         )  # fmt: skip
         scene_extent = clip.extent()
         self.optimizer = GroupedAdam(model, spec.rates, spec.warmup, scene_extent, self.cameras)
+        self.windows = self._windows({n for n, c in (density or {}).items() if not c.keeps_all})
+        self.sampler = self._sampler()
         self.density = {
             name: EntityDensity(
                 model.entity(name), control, entity_extent(model.entity(name), scene_extent)
@@ -133,6 +136,22 @@ class Trainer:
         self.viewed = False
         self.step = 0
         self.elapsed = 0.0
+
+    def _windows(self, fixed: set[str]) -> TimeWindows | None:
+        if self.spec.chunk is None:
+            return None
+        folder = None if self.run is None else self.run.windows
+        frames = self.clip.num_frames
+        return TimeWindows(self.model, self.optimizer, frames, self.spec.chunk, fixed, folder)
+
+    def _sampler(self) -> EpochSampler | WindowSampler:
+        positions = self.clip.split["train"]
+        if self.windows is None or not self.windows.names:
+            return EpochSampler(positions, self.generator)
+        by_window: list[list[int]] = [[] for _ in range(self.windows.count)]
+        for position in positions:
+            by_window[self.windows.of(float(self.clip.moments[position].time))].append(position)
+        return WindowSampler(by_window, self.spec.steps, self.generator)
 
     def train(
         self, on_step: Callable[[StepReport], object] | None = None, *, until: int | None = None
@@ -150,10 +169,12 @@ class Trainer:
             NotFiniteError: see `NanGuard`.
             Interrupted: stopped by a signal; the message has the command that continues.
         """
+        whole = nullcontext() if self.windows is None else self.windows.opened(self.spec.steps)
         if self.run is None:
-            self._steps(on_step, until, None)
+            with whole:
+                self._steps(on_step, until, None)
             return
-        with StopRequest() as stop:
+        with StopRequest() as stop, whole:
             self._steps(on_step, until, stop)
 
     def _steps(
@@ -219,6 +240,8 @@ class Trainer:
         self.guard.passed()
         interval = self.spec.sh_interval
         self.optimizer.step(None if interval is None else self.step // interval)
+        if self.windows is not None:
+            self.windows.stepped()
         fixed = replace(camera, world_to_camera=camera.world_to_camera.detach())
         self._evolve(result, view.frame.moment, fixed)
         self._refine(result, camera.width, camera.height)
@@ -310,6 +333,7 @@ class Trainer:
 
     def checkpoint(self) -> Checkpoint:
         """The complete state of training; see Checkpoint."""
+        files = {} if self.windows is None else self.windows.files()
         tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
         tensors |= {f"optimizer.{k}": v for k, v in self.optimizer.tensors().items()}
         for name, density in self.density.items():
@@ -328,7 +352,9 @@ class Trainer:
             "skipped": self.guard.skipped,
             **self.identity,
         }
-        return Checkpoint(tensors, meta)
+        if self.windows is not None and self.windows.names:
+            meta["windows"] = self.windows.state()
+        return Checkpoint(tensors, meta, files)
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Restore a checkpoint; the rest of the run then equals an unbroken one.
@@ -362,5 +388,7 @@ class Trainer:
         self.generator.set_state(checkpoint.tensors["rng.generator"])
         torch.set_rng_state(checkpoint.tensors["rng.torch"])
         self.sampler.load(checkpoint.meta["sampler"])
+        if self.windows is not None:
+            self.windows.load(checkpoint.meta.get("windows"), checkpoint.meta["step"])
         self.step = checkpoint.meta["step"]
         self.elapsed = checkpoint.meta["time_s"]

@@ -59,6 +59,7 @@ def train(
     reader_settings: Sequence[str] = (),
     evaluate: bool = True,
     budget: str | float | None = None,
+    chunk: int | None = None,
     plugins: Sequence[Path | str] = (),
     view: bool = False,
     port: int = 8090,
@@ -84,6 +85,8 @@ def train(
         evaluate: score the run and write its report.
         budget: a time, "90s", "20m", "2h": image width and steps are chosen so that training and
             scores take about that long here. Not with `resume`.
+        chunk: frames of a window, for a long clip (`train.chunk`): of what grows with the clip, one
+            window's part is in memory, and training visits the windows in turn.
         plugins: Python files to load (and run) first.
         view: show the training in the browser while it lasts, by a process of its own that reads
             checkpoints, of which one is then written about every 10 seconds. port: of its address
@@ -98,6 +101,8 @@ def train(
         Interrupted: Ctrl-C or SIGTERM; the message has the command that continues.
     """
     began, plan = time.perf_counter(), None
+    if chunk is not None:
+        overrides = [*overrides, f"train.chunk={chunk}"]
     if budget is not None:
         if resume:
             raise HoigsError("--budget plans a new run; a resumed one keeps its width and steps")
@@ -139,6 +144,8 @@ def _trained(
     """The rest of `train`: the steps and the scores."""
     if on_start is not None:
         on_start(session)
+    if session.trainer.windows is not None:
+        report(session.trainer.windows.sentence())
     session.train(on_step)
     for step, culprit in session.trainer.guard.skipped[:5]:
         report(f"skipped step {step}: {culprit} was not finite")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import ClassVar, Literal, Protocol, TypeGuard, runtime_checkable
 
 from jaxtyping import Float
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.maths.knots import Knots
+from hoigs.core.time_rows import TimeRows
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
@@ -65,6 +67,8 @@ class DeformationModel(Configurable, nn.Module, ABC):
         input_space: space of the canonical Gaussians: "canonical" (a body in its zero pose, an
             object about its centre) where the model knows the body or the track that places them,
             else "world". May be set on the instance.
+        time_rows: parameters of this module that have rows for times of the clip (TimeRows); those
+            of modules in it are declared there.
         cuda_graph_safe: whether a CUDA graph may capture it; the conditions are in
             `hoigs.core.cuda_graphs.eligibility`.
         progress: done share of the training run, in [0, 1]; see `set_progress`.
@@ -79,6 +83,7 @@ class DeformationModel(Configurable, nn.Module, ABC):
     moves: bool = True
     continuous: bool = True
     cut_gradients: frozenset[str] = frozenset()
+    time_rows: Mapping[str, TimeRows] = MappingProxyType({})
     input_space: Literal["canonical", "world"] = "canonical"
     cuda_graph_safe: bool = False
     progress: float = 1.0

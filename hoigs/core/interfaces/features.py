@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from torch import Tensor, nn
 
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.interfaces.deformation import DeformationModel
+from hoigs.core.time_rows import TimeRows
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Tokens
@@ -26,12 +28,13 @@ class FeatureExtractor(Configurable, nn.Module, ABC):
         per_gaussian: names of this module's parameters whose first axis is the Gaussian.
         rates: as DeformationModel.rates.
         width: D, the width of the tokens; known after `bind`.
-        cuda_graph_safe: as DeformationModel.cuda_graph_safe.
+        time_rows, cuda_graph_safe: as those of DeformationModel.
     """
 
     requires: frozenset[str] = frozenset()
     per_gaussian: tuple[str, ...] = ()
     rates: ClassVar[Mapping[str, str]] = {}
+    time_rows: Mapping[str, TimeRows] = MappingProxyType({})
     cuda_graph_safe: bool = False
     width: int
 

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from hoigs.core.cpu_kernels.choose import native
 from hoigs.core.cuda_graphs.device_constants import Time, constant, filled
+from hoigs.core.time_rows import TimeRows
 
 # Axes (0 x, 1 y, 2 z) of the space planes xy, xz, yz, and the axis that each time plane pairs
 # with time so that the product of the two sees all four coordinates: xy*zt, xz*yt, yz*xt
@@ -120,6 +121,8 @@ class PairedPlanes(nn.Module):
         self.space = nn.Parameter(torch.randn(3, resolution, resolution, channels) * spread)
         timed = torch.ones(3, time_resolution, resolution, channels)
         self.register_parameter("time", nn.Parameter(timed) if time_resolution else None)
+        self.rows = TimeRows(time_resolution)
+        self.time_rows = {"time": self.rows} if time_resolution else {}
 
     def forward(
         self, points: Float[Tensor, "N 3"], time: Time | None = None
@@ -128,6 +131,7 @@ class PairedPlanes(nn.Module):
         features = sample_planes(self.space, axis_pairs(points))
         if time is None or self.time is None:
             return features
+        time = self.rows.local(time, self.time.shape[1])
         return features * sample_planes(self.time, timed_pairs(points, time, TIME_AXES))
 
     def time_smoothness(self) -> Float[Tensor, ""]:
@@ -169,6 +173,8 @@ class ProductPlanes(nn.Module):
             for size in resolutions
             if time_resolution
         )
+        self.rows = TimeRows(time_resolution)
+        self.time_rows = {f"time.{i}": self.rows for i in range(len(self.time))}
 
     def forward(
         self, points: Float[Tensor, "N 3"], time: Time | None = None
@@ -177,6 +183,7 @@ class ProductPlanes(nn.Module):
         pairs = axis_pairs(points)
         features = [_product(planes, pairs) for planes in self.space]
         if time is not None and len(self.time):
+            time = self.rows.local(time, self.time[0].shape[1])
             pairs = timed_pairs(points, time, (0, 1, 2))
             timed = [_product(planes, pairs) for planes in self.time]
             features = [f * t for f, t in zip(features, timed, strict=True)]

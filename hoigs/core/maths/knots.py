@@ -15,6 +15,7 @@ from hoigs.core.maths import splines
 from hoigs.core.maths.rotations import slerp
 from hoigs.core.maths.splines import Interval
 from hoigs.core.resizing import Resizing
+from hoigs.core.time_rows import TimeRows
 
 Times = Sequence[float] | Float[Tensor, " T"]
 
@@ -54,6 +55,7 @@ class Knots(Resizing):
         times = uniform_times(count)
         self.register_buffer("times", torch.tensor(times, dtype=torch.float64), persistent=movable)
         self._times = times
+        self.rows = TimeRows(count)  # of values kept at uniform knots
 
     def __len__(self) -> int:
         return len(self._times)
@@ -83,7 +85,7 @@ class Knots(Resizing):
     def at(self, time: Time) -> Interval:
         """The interval of one time."""
         if not self.movable:
-            return splines.keyframe_position(time, len(self))
+            return self.rows_about(time, self.rows)
         if isinstance(time, Tensor):
             time = time.clamp(0.0, 1.0)
             first = torch.searchsorted(self.times, time, right=True) - 1
@@ -94,6 +96,12 @@ class Knots(Resizing):
         k = min(max(bisect_right(self._times, time) - 1, 0), len(self) - 2)
         length = self._times[k + 1] - self._times[k]
         return Interval(k, (time - self._times[k]) / length, length / self.reference)
+
+    @staticmethod
+    def rows_about(time: Time, rows: TimeRows) -> Interval:
+        """The interval of one time among uniform knots, whose number counts from `rows.first`."""
+        at = splines.keyframe_position(time, rows.count)
+        return at._replace(k=at.k - rows.first)
 
     def at_times(self, times: Times, like: Tensor) -> Interval:
         """The intervals of T times; positions and lengths in the data type of `like`."""

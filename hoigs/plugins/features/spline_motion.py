@@ -14,15 +14,16 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.cuda_graphs.device_constants import Time, filled
 from hoigs.core.interfaces.deformation import DeformationModel, ProvidesVelocity
 from hoigs.core.interfaces.features import FeatureExtractor
+from hoigs.core.maths.knots import Knots
 from hoigs.core.maths.networks import dense
 from hoigs.core.maths.splines import (
     catmull_rom,
     hermite_weights,
-    keyframe_position,
     knot_pair,
     lerp,
     linear,
 )
+from hoigs.core.time_rows import TimeRows
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Tokens
@@ -103,20 +104,23 @@ class SplineMotionFeatures(FeatureExtractor):
         counts = {"per-gaussian": len(canonical), "shared": 1, "low-rank": config.rank}
         shape = (counts[config.embedding], keyframes, config.embedding_width)
         self.embedding = nn.Parameter(0.1 * torch.randn(shape).to(canonical.means))
+        self.time_rows = {"embedding": TimeRows(keyframes)}
         if config.embedding == "low-rank":
             mixture = torch.randn(len(canonical), config.rank).to(canonical.means)
             self.mixture = nn.Parameter(mixture)
 
     def embedded(self, count: int, time: Time) -> Float[Tensor, "N E"]:
         """e(t) of each of `count` Gaussians."""
-        codes = self._between(self.embedding, time)
+        codes = self._between(self.embedding, time, self.time_rows["embedding"])
         if self.config.embedding == "low-rank":
             return self.mixture @ codes / self.config.rank**0.5
         return codes.expand(count, -1)
 
-    def _between(self, values: Float[Tensor, "N K D"], time: Time) -> Float[Tensor, "N D"]:
+    def _between(
+        self, values: Float[Tensor, "N K D"], time: Time, rows: TimeRows
+    ) -> Float[Tensor, "N D"]:
         """Values of the keyframes at `time`."""
-        at = keyframe_position(time, values.shape[1])
+        at = Knots.rows_about(time, rows)
         if self.config.interpolation == "linear":
             return linear(values, at)
         if self.config.interpolation == "zero-tangent":
@@ -128,9 +132,10 @@ class SplineMotionFeatures(FeatureExtractor):
     ) -> Float[Tensor, "N 3"]:
         """tau(t)."""
         if self.config.velocity == "keyframes":
-            tangents = deformation.tangents
+            tangents, rows = deformation.tangents, getattr(deformation, "time_rows", {})
             assert isinstance(tangents, Tensor)
-            return self._between(tangents, moment.time)
+            every = TimeRows(tangents.shape[1])
+            return self._between(tangents, moment.time, rows.get("tangents", every))
         assert isinstance(deformation, ProvidesVelocity)
         return deformation.velocity(canonical, moment)
 

@@ -88,6 +88,8 @@ class HexPlaneField(DeformationModel):
             time_resolution = half_the_frames(num_frames)
         sizes = [config.resolution * scale for scale in config.multires]
         self.planes = ProductPlanes(config.channels, sizes, time_resolution)
+        if config.time_span == "half":  # rows are then not where the times of the clip are
+            self.planes.time_rows = {}
         self.box = UnitBox()
 
     @classmethod

@@ -72,6 +72,7 @@ class CubicHermite(Keyframed):
         names += ["opacity_logits"] if self.keyed else []
         self.per_gaussian = tuple(names)
         self.knot_axes = dict.fromkeys(names, 1)
+        self.time_rows = {} if self.knots.movable else dict.fromkeys(names, self.knots.rows)
         self.owns = frozenset({"means", "quats"} | ({"opacity_logits"} if self.keyed else set()))
 
     def bind(self, canonical: Gaussians) -> None:

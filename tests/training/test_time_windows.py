@@ -1,0 +1,166 @@
+"""Training in windows: the same model, of which one window's rows are in memory."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from hoigs.core.errors import SpecError
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.spec.schema import Spec
+from hoigs.core.time_rows import TimeRows
+from hoigs.core.values.clip import Clip
+from hoigs.runs.loaded_run import LoadedRun
+from hoigs.training.session import Session
+from hoigs.training.time_windows import WindowSampler
+from hoigs.workflows.train import train
+
+CLIP = (
+    "builtin:lift-and-swing?frames=24&width=32&fps=8&samples=1&edge_samples=1&held_out_views=0"
+    "&test_frames=3"
+)
+SMALL = [
+    "model.scene.points=60", "model.human.points=40", "model.object.points=20",
+    "model.human.deformation.resolution=8", "model.human.deformation.channels=2",
+    "model.object.deformation.keyframe_step=1", "train.log_every=1", "train.preview_every=0",
+    "train.fill_unseen=[]", "train.steps=30", "train.checkpoint_every=100",
+]  # fmt: skip
+PAGED = {
+    "entities.human.deformation.planes.time",
+    "entities.object.deformation.keyframe_means",
+    "entities.object.deformation.keyframe_quats",
+    "entities.object.deformation.opacity_logits",
+    "entities.object.deformation.tangents",
+    "entities.object.features.embedding",
+}
+
+
+def opened(out: Path, *settings: str, **options: bool) -> Session:
+    return Session.open(
+        None if options else CLIP, None if options else "hoigs", out=out,
+        overrides=[*SMALL, *settings], **options,
+    )  # fmt: skip
+
+
+def drawn(model: SceneModel, clip: Clip) -> list[Tensor]:
+    """All numbers of the scene's Gaussians in every frame."""
+    found = []
+    with torch.no_grad():
+        for moment in clip.moments:
+            g = model(moment).joined()
+            found.append(torch.cat([g.means, g.quats, g.opacity_logits[:, None], g.sh[:, 0]], 1))
+    return found
+
+
+def test_rows_about_a_time_are_those_that_are_read() -> None:
+    rows = TimeRows(11)
+    assert rows.about(0.0, 0.5) == slice(0, 8)
+    assert rows.about(0.5, 1.0) == slice(3, 11)
+    assert rows.about(0.0, 1.0) == slice(0, 11)
+    assert rows.local(0.3, 11) == 0.3
+    rows.first = 3
+    assert rows.local(0.3, 8) == pytest.approx(0)
+    assert rows.local(1.0, 8) == pytest.approx(1)
+
+
+def test_a_window_draws_what_the_whole_model_draws(tmp_path: Path) -> None:
+    session = opened(tmp_path / "run", "train.chunk=6")
+    trainer, clip, model = session.trainer, session.clip, session.trainer.model
+    windows = trainer.windows
+    assert windows is not None
+    assert set(windows.names) == PAGED
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for name in windows.names:
+            values = trainer.optimizer.names[name]
+            values += 0.05 * torch.randn(values.shape, generator=generator)
+    model.eval()
+    whole = drawn(model, clip)
+    size = {n: p.numel() for n, p in trainer.optimizer.names.items() if n in PAGED}
+    with windows.opened(1):
+        assert windows.count == 4
+        for frame, numbers in zip(drawn(model, clip), whole, strict=True):
+            torch.testing.assert_close(frame, numbers)
+        for name, parameter in trainer.optimizer.names.items():
+            if name in PAGED:
+                assert parameter.numel() < 0.7 * size[name], name
+    for frame, numbers in zip(drawn(model, clip), whole, strict=True):
+        assert torch.equal(frame, numbers)
+    assert not (tmp_path / "run" / "windows").exists()
+
+
+def test_training_in_windows_gives_an_ordinary_run(tmp_path: Path) -> None:
+    said: list[str] = []
+    trained = train(
+        CLIP, out=tmp_path / "run", overrides=SMALL, chunk=6, device="cpu", report=said.append
+    )
+    assert any("trained in 4 windows of at most 6 frames" in line for line in said)
+    record = json.loads((tmp_path / "run" / "provenance.json").read_text())
+    assert record["windows"] in said
+    assert trained.evaluated is not None
+    whole = opened(tmp_path / "whole")
+    whole.train()
+    loaded = LoadedRun.open(tmp_path / "run")
+    shapes = {n: v.shape for n, v in loaded.model.state_dict().items()}
+    assert shapes == {n: v.shape for n, v in whole.trainer.model.state_dict().items()}
+    model = trained.session.trainer.model
+    model.eval()
+    for frame, numbers in zip(drawn(model, loaded.clip), drawn(loaded.model, loaded.clip),
+                              strict=True):  # fmt: skip
+        torch.testing.assert_close(frame, numbers)
+    moved = loaded.model.state_dict()["entities.human.deformation.planes.time"]
+    assert (moved != 1).any(dim=(0, 2, 3)).all(), "every row was trained"
+
+
+def test_a_resumed_training_in_windows_equals_an_unbroken_one(tmp_path: Path) -> None:
+    unbroken, broken = (opened(tmp_path / n, "train.chunk=6") for n in ("one", "two"))
+    unbroken.train()
+    broken.trainer.train(until=13)
+    broken.trainer.checkpoint().save(broken.run.checkpoints)
+    broken.run.unlock()
+    again = opened(tmp_path / "two", "train.chunk=6", resume=True)
+    assert again.trainer.step == 13
+    again.train()
+    one, two = unbroken.trainer.model.state_dict(), again.trainer.model.state_dict()
+    for name, values in one.items():
+        assert torch.equal(values, two[name]), name
+
+
+def test_what_does_not_grow_with_the_clip_is_trained_at_once(tmp_path: Path) -> None:
+    short = opened(tmp_path / "short", "train.chunk=24")
+    assert short.trainer.windows is not None
+    assert short.trainer.windows.sentence() == (
+        "trained at once: all frames fit in one window of 24"
+    )
+    still = Session.open(CLIP, "static", out=tmp_path / "still", overrides=["train.chunk=6"])
+    assert still.trainer.windows is not None
+    assert "no parameter of this model grows with the clip" in still.trainer.windows.sentence()
+    with pytest.raises(SpecError, match="chunk"):
+        Spec.load("hoigs", overrides=["train.chunk=1"])
+
+
+def test_rows_of_gaussians_whose_number_changes_stay_whole(tmp_path: Path) -> None:
+    session = opened(tmp_path / "run", "train.chunk=6", "model.object.density.use=density:adc")
+    assert session.trainer.windows is not None
+    assert session.trainer.windows.names == ["entities.human.deformation.planes.time"]
+
+
+def test_windows_are_visited_in_turn_and_every_frame_equally() -> None:
+    sampler = WindowSampler([[0, 1, 2], [3, 4, 5], [6, 7, 8]], 90, torch.Generator().manual_seed(0))
+    assert sampler.visit == 3
+    drawn = [sampler.next() for _ in range(90)]
+    assert set(Counter(drawn).values()) == {10}
+    visits = [{p // 3 for p in drawn[i : i + 3]} for i in range(0, 90, 3)]
+    assert all(len(v) == 1 for v in visits), "three frames of one window, then of another"
+    state = sampler.state()
+    ahead = [sampler.next() for _ in range(5)]
+    sampler.load(state)
+    assert sampler.state() == state
+    assert len(ahead) == 5
+    with pytest.raises(ValueError, match="not among those that are trained on"):
+        sampler.load({"queue": [9], "windows": []})
