@@ -12,9 +12,9 @@ from torch import Tensor
 
 
 def native(name: str, *tensors: Tensor) -> ModuleType | None:
-    """The module `name` of this folder, for float32 tensors on a CPU; else None.
+    """The functions of `name`, a package beside this, for float32 tensors on a CPU; else None.
 
-    It has its Warp module as `kernels`.
+    They have their Warp module as `kernels`.
 
     None, too, with a warning, where its kernels do not compile: torch operations then do the same
     more slowly.
@@ -29,7 +29,7 @@ def _compiled(name: str) -> ModuleType | None:
     try:
         from hoigs.core.cpu_kernels.runtime import wp
 
-        module = importlib.import_module(f"hoigs.core.cpu_kernels.{name}")
+        module = importlib.import_module(f"hoigs.core.cpu_kernels.{name}.function")
         wp.load_module(module.kernels, device="cpu")
     except Exception as error:  # Warp raises nothing narrower when a build fails
         warnings.warn(f"the CPU kernels of {name} do not compile here: {error}", stacklevel=3)

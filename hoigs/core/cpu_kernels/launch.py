@@ -17,6 +17,7 @@ from hoigs.core.cpu_kernels.runtime import wp
 
 _TYPES = {
     torch.float32: wp.float32,
+    torch.float64: wp.float64,
     torch.int32: wp.int32,
     torch.int64: wp.int64,
     torch.uint8: wp.uint8,

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.cpu_kernels.choose import native
 from hoigs.core.cuda_graphs.device_constants import constant
 
 # Products of quaternions, and the matrices of their rotations, are sums of a few products a_i b_j.
@@ -78,6 +79,16 @@ def multiply_quats(
 ) -> Float[Tensor, "*batch 4"]:
     """Hamilton product a*b: rotate by b first, then by a."""
     return _pairs(a, b) @ constant(HAMILTON, a)
+
+
+def turned_quats(change: Float[Tensor, "N 4"], quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
+    """Unit quaternions of rotations by `quats` and then by normalise((1, 0, 0, 0) + change)."""
+    kernels = native("skin", change, quats)
+    if kernels is not None:
+        composed: Tensor = kernels.ComposedQuats.apply(change, quats, 1.0)
+        return composed
+    turn = normalize_quats(change + constant((1.0, 0.0, 0.0, 0.0), change))
+    return multiply_quats(turn, normalize_quats(quats))
 
 
 def conjugate_quats(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:

@@ -9,10 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.cpu_kernels.choose import native
 from hoigs.core.cuda_graphs.device_constants import constant
 from hoigs.core.maths.rotations import (
     axis_angle_to_matrices,
     matrices_to_quats,
+    multiply_quats,
     normalize_quats,
 )
 
@@ -110,17 +112,13 @@ def ancestor_table(parents: Sequence[int]) -> Float[Tensor, "J J"]:
     return table
 
 
-def skin_quats(
-    transforms: Float[Tensor, "J 4 4"],
-    weights: Float[Tensor, "N J"],
-    parents: Sequence[int],
-    ancestors: Float[Tensor, "J J"],
-) -> Float[Tensor, "N 4"]:
-    """Unit quaternions by which points turn: the weighted mean of the joints' quaternions.
+def joint_turns(
+    transforms: Float[Tensor, "J 4 4"], parents: Sequence[int], ancestors: Float[Tensor, "J J"]
+) -> Float[Tensor, "J 4"]:
+    """Unit quaternions of joints, of signs with which they may be averaged.
 
-    The weighted mean of rotation matrices shrinks and may flip where a limb is twisted (the "candy
-    wrapper" artefact); the mean of quaternions remains a rotation. q and -q are the same rotation,
-    so each joint's sign is first chosen to agree with its parent's, from the root on.
+    q and -q are the same rotation, so each joint's sign is chosen to agree with its parent's, from
+    the root on.
 
     Args:
         ancestors: `ancestor_table(parents)`.
@@ -131,4 +129,42 @@ def skin_quats(
         above = quats.index_select(0, above)
         flipped = ((quats * above).sum(-1) < 0).to(quats)
         signs = 1 - 2 * torch.remainder(ancestors @ flipped, 2)
-    return normalize_quats(weights @ (quats * signs[:, None]))
+    return quats * signs[:, None]
+
+
+def skin_quats(
+    transforms: Float[Tensor, "J 4 4"],
+    weights: Float[Tensor, "N J"],
+    parents: Sequence[int],
+    ancestors: Float[Tensor, "J J"],
+) -> Float[Tensor, "N 4"]:
+    """Unit quaternions by which points turn: the weighted mean of the joints' quaternions.
+
+    The weighted mean of rotation matrices shrinks and may flip where a limb is twisted (the "candy
+    wrapper" artefact); the mean of quaternions remains a rotation.
+
+    Args:
+        ancestors: `ancestor_table(parents)`.
+    """
+    return normalize_quats(weights @ joint_turns(transforms, parents, ancestors))
+
+
+def skin_gaussians(
+    points: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    weights: Float[Tensor, "N J"],
+    transforms: Float[Tensor, "J 4 4"],
+    turns: Float[Tensor, "J 4"],
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
+    """Points moved as `skin` does, and rotations turned further as `skin_quats` says.
+
+    Args:
+        turns: `joint_turns` of the transforms, or of ones that differ in scale and translation.
+    """
+    kernels = native("skin", points, quats, weights, transforms, turns)
+    if kernels is not None and kernels.fits(len(turns)):
+        table = torch.cat((transforms[:, :3].flatten(1), turns), 1)
+        means, turned = kernels.SkinnedGaussians.apply(points, quats, weights, table)
+        return means, turned
+    turned = multiply_quats(normalize_quats(weights @ turns), quats)
+    return skin(points, transforms, weights), turned

@@ -11,10 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.cuda_graphs.device_constants import constant
 from hoigs.core.errors import NotFiniteError
 from hoigs.core.maths.nearest import nearest, surface_normals
-from hoigs.core.maths.rotations import multiply_quats, normalize_quats, quats_to_matrices
+from hoigs.core.maths.rotations import quats_to_matrices, turned_quats
 
 SH_C0 = 0.28209479177387814  # Y_00, so that color = 0.5 + SH_C0 * sh[:, 0]
 
@@ -110,8 +109,7 @@ class Gaussians:
         """These Gaussians with a delta applied (see GaussianDelta for the rule of each field)."""
         quats = self.quats
         if delta.quats is not None:
-            turn = normalize_quats(delta.quats + constant((1.0, 0.0, 0.0, 0.0), delta.quats))
-            quats = multiply_quats(turn, normalize_quats(quats))
+            quats = turned_quats(delta.quats, quats)
         plus = lambda raw, change: raw if change is None else raw + change  # noqa: E731
         return Gaussians(
             means=plus(self.means, delta.means),

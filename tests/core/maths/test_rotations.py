@@ -9,6 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from hoigs.core.cpu_kernels.choose import native
 from hoigs.core.maths import rotations as R
 
 AXIS = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.81]).double(), dim=0)
@@ -164,3 +165,24 @@ def test_exp_se3_has_gradients_at_rest():
     assert torch.autograd.gradcheck(R.exp_se3, (turns, shifts))
     big = torch.randn(3, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(R.exp_se3, (big, shifts))
+
+
+def test_turned_quats_by_kernel_and_in_float64() -> None:
+    torch.manual_seed(0)
+    change, quats, upstream = torch.randn(3, 600, 4).unbind()
+    quats[0] = 0  # stays zero
+    assert native("skin", change) is not None
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        a, b = change.to(dtype).requires_grad_(), quats.to(dtype).requires_grad_()
+        turned = R.turned_quats(a, b)
+        results.append([turned.detach(), *torch.autograd.grad(turned, (a, b), upstream.to(dtype))])
+    (turned, to_change, to_quats), exact = results
+    assert (turned[0] == 0).all()
+    for ours, theirs in zip((turned, to_change, to_quats[1:]), (*exact[:2], exact[2][1:])):
+        bound = 2e-6 * float(theirs.abs().amax())
+        torch.testing.assert_close(ours.double(), theirs, rtol=0, atol=bound)
+    identity = torch.tensor((1.0, 0.0, 0.0, 0.0)).double()
+    turn = R.normalize_quats(change.double() + identity)
+    plain = R.multiply_quats(turn, R.normalize_quats(quats.double()))
+    torch.testing.assert_close(exact[0], plain)

@@ -8,8 +8,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from hoigs.core.maths.rotations import axis_angle_to_matrices, quats_to_matrices
-from hoigs.core.maths.skinning import ancestor_table, joint_transforms, skin, skin_quats
+from hoigs.core.cpu_kernels.choose import native
+from hoigs.core.maths.rotations import axis_angle_to_matrices, multiply_quats, quats_to_matrices
+from hoigs.core.maths.skinning import (
+    ancestor_table,
+    joint_transforms,
+    joint_turns,
+    skin,
+    skin_gaussians,
+    skin_quats,
+)
 
 CHAIN = tuple(range(-1, 11))
 FORK = (-1, 0, 0, 1, 1, 2, 5, 6, 7, 0)
@@ -106,3 +114,54 @@ def test_skin_by_hand():
         torch.tensor([[1.0, 1, 1], [0, 0, 0]]), transforms, torch.tensor([[0.5, 0.5], [0, 1]])
     )
     torch.testing.assert_close(points, torch.tensor([[2.0, 1, 1], [2, 0, 0]]))
+
+
+def skinned(dtype: torch.dtype, joints: int, frozen: bool) -> list[Tensor]:
+    """Points and rotations after skinning, and the gradients of all that is not frozen."""
+    generator = torch.Generator().manual_seed(joints)
+    shapes = (700, 3), (700, 4), (700, joints), (joints, 3, 4), (joints, 4)
+    values = [torch.randn(shape, generator=generator) for shape in shapes]
+    values[2] = values[2].softmax(-1)
+    values[4] = torch.nn.functional.normalize(values[4] + torch.tensor([3.0, 0, 0, 0]), dim=-1)
+    sources = [x.to(dtype).requires_grad_(not frozen or i < 2) for i, x in enumerate(values)]
+    points, quats, weights, top, turns = sources
+    last = torch.tensor((0.0, 0.0, 0.0, 1.0)).to(top).expand(joints, 1, 4)
+    out = skin_gaussians(points, quats, weights, torch.cat((top, last), 1), turns)
+    upstream = [torch.randn(x.shape, generator=generator).to(dtype) for x in out]
+    wanted = [x for x in sources if x.requires_grad]
+    return [*(x.detach() for x in out), *torch.autograd.grad(out, wanted, upstream)]
+
+
+@pytest.mark.parametrize(("joints", "frozen"), [(52, False), (5, False), (16, False), (55, True)])
+def test_the_cpu_kernel_equals_its_float64_twin(joints: int, frozen: bool) -> None:
+    assert native("skin", torch.zeros(1)) is not None
+    found, exact = skinned(torch.float32, joints, frozen), skinned(torch.float64, joints, frozen)
+    assert len(found) == (4 if frozen else 7)
+    for ours, theirs in zip(found, exact, strict=True):
+        bound = 2e-6 * float(theirs.abs().amax())
+        torch.testing.assert_close(ours.double(), theirs, rtol=0, atol=bound)
+
+
+def test_the_cpu_kernel_gives_the_same_bits_on_any_number_of_cores() -> None:
+    before = torch.get_num_threads()
+    try:
+        results = []
+        for threads in (1, 4):
+            torch.set_num_threads(threads)
+            results.append(skinned(torch.float32, 52, frozen=False))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_gaussians_are_skinned_as_points_and_rotations_are() -> None:
+    rotations, joints, transl = inputs(FORK, (), torch.float64)
+    transforms = joint_transforms(rotations, joints, FORK, transl)
+    table = ancestor_table(FORK).double()
+    weights = torch.rand(9, len(FORK), dtype=torch.float64).softmax(-1)
+    points, quats = torch.randn(9, 3).double(), torch.randn(9, 4).double()
+    turns = joint_turns(transforms, FORK, table)
+    means, turned = skin_gaussians(points, quats, weights, transforms, turns)
+    torch.testing.assert_close(means, skin(points, transforms, weights))
+    expected = multiply_quats(skin_quats(transforms, weights, FORK, table), quats)
+    torch.testing.assert_close(turned, expected)

@@ -149,6 +149,7 @@ class HexPlaneSkinning(SurfaceBody):
         field = field_subset(body.vertex_parts, config.field_points)
         self.register_buffer("field_vertices", field, persistent=False)
         self._cached: tuple[object, CanonicalAttributes, Tensor] | None = None
+        self._own: tuple[object, Tensor] | None = None
         self._last: tuple[CanonicalAttributes, Tensor] | None = None
         self._held: tuple[Gaussians, Tensor] | None = None
 
@@ -229,6 +230,16 @@ class HexPlaneSkinning(SurfaceBody):
             self._cached = (state, attributes, weights)
         return attributes, weights
 
+    def _own_weights(self) -> Float[Tensor, "N J"]:
+        """The body's own skinning weights of every point; cached, except where graphs are captured
+        and memory of one capture must not be read by another."""
+        if self.log_weights.is_cuda:
+            return self.log_weights.softmax(-1)
+        state = (self.log_weights.data_ptr(), self.log_weights._version)
+        if self._own is None or self._own[0] != state:
+            self._own = (state, self.log_weights.softmax(-1))
+        return self._own[1]
+
     def _predicted(self, points: Float[Tensor, "N 3"]) -> CanonicalAttributes:
         """psi_h(f) at points of the zero pose, metres."""
         attributes: CanonicalAttributes = self.head(
@@ -307,7 +318,7 @@ class HexPlaneSkinning(SurfaceBody):
 
     def on_topology(self, change: TopologyChange) -> None:
         super().on_topology(change)
-        self.neighbours = self._cached = self._last = self._held = None
+        self.neighbours = self._cached = self._own = self._last = self._held = None
 
     def regularizers(self) -> dict[str, Tensor]:
         """Means over points (or cells) of squares, except the sparsity.
@@ -328,8 +339,8 @@ class HexPlaneSkinning(SurfaceBody):
             penalties["offset"] = attributes.offsets.square().sum(-1).mean()
             penalties["scale"] = attributes.log_scales.square().mean()
             if attributes.weights is not None:
-                drift = weights - self.log_weights.softmax(-1)
-                penalties["skinning"] = drift.square().sum(-1).mean()
+                drift = nn.functional.mse_loss(weights, self._own_weights(), reduction="sum")
+                penalties["skinning"] = drift / len(weights)
             if self.edges is not None:
                 attributes = self._predicted(self.rest_vertices)
             smoothed = self.config.laplacian_of

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Self
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.cuda_graphs.device_constants import Time, constant
@@ -245,6 +246,14 @@ class SkinnedBody(DeformationModel):
         """World points scaled by alpha."""
         center = self.scale_center(pelvis, moment)
         return center + self.log_alpha.exp() * (points - center)
+
+    def scaled_transforms(
+        self, transforms: Float[Tensor, "J 4 4"], pelvis: Float[Tensor, " 3"], moment: Moment
+    ) -> Float[Tensor, "J 4 4"]:
+        """Transforms that also scale by alpha, as `scaled` does."""
+        alpha = self.log_alpha.exp()
+        rest = (1 - alpha) * self.scale_center(pelvis, moment)
+        return alpha * transforms + pad(rest[:, None], (3, 0, 0, 1))
 
     def scale_center(self, pelvis: Float[Tensor, " 3"], moment: Moment) -> Float[Tensor, " 3"]:
         """The fixed point of alpha in the world."""

@@ -13,8 +13,7 @@ from torch.nn.functional import normalize
 
 from hoigs.core.interfaces.body import PELVIS, BodySurface
 from hoigs.core.interfaces.deformation import Template
-from hoigs.core.maths.rotations import multiply_quats
-from hoigs.core.maths.skinning import skin, skin_quats
+from hoigs.core.maths.skinning import joint_turns, skin_gaussians
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment, ResidualRule
 from hoigs.core.values.tokens import Residual
@@ -113,16 +112,17 @@ class SurfaceBody(SkinnedBody):
                 metres.
         """
         transforms = self.body.skinning_transforms(pose)
-        means = skin(canonical.means, transforms, weights)
+        turns = joint_turns(transforms, self.body.parents, self.ancestors)
         pelvis = self.posed_joints(joints, transforms, (PELVIS,))[0]
-        means = self.scaled(means, pelvis, moment)
+        # scaling the joints' transforms scales every point, as its weights sum to one
+        scaled = self.scaled_transforms(transforms, pelvis, moment)
+        means, quats = skin_gaussians(canonical.means, canonical.quats, weights, scaled, turns)
         if residual is not None and residual.means is not None:
             means = means + residual.means
-        turns = skin_quats(transforms, weights, self.body.parents, self.ancestors)
         return replace(
             canonical,
             means=means,
-            quats=multiply_quats(turns, canonical.quats),
+            quats=quats,
             log_scales=canonical.log_scales + self.log_alpha,
         )
 

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from hoigs.core.cpu_kernels.choose import native
 from hoigs.core.maths.nearest import nearest
 from hoigs.plugins.deformation.avatars.canonical_head import CanonicalAttributes
 
@@ -25,6 +26,10 @@ def point_roughness(
     values: Float[Tensor, "N D"], neighbours: Int[Tensor, "N k"]
 ) -> Float[Tensor, ""]:
     """Mean over points of |x_i - mean of its neighbours' x|^2."""
+    kernels = native("roughness", values)
+    if kernels is not None:
+        fast: Tensor = kernels.Roughness.apply(values, neighbours)
+        return fast
     return (values - values[neighbours].mean(1)).square().sum(-1).mean()
 
 

@@ -184,6 +184,13 @@ def test_point_laplacian_equals_its_definition():
         order = (points - points[i]).norm(dim=1).argsort()[1:5]
         total += float((values[i] - values[order].mean(0)).square().sum())
     assert float(point_roughness(values, neighbours_of(points))) == pytest.approx(total / 30)
+    # the CPU kernel and its gradient against float64
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        leaf = values.to(dtype).requires_grad_()
+        rough = point_roughness(leaf, neighbours_of(points))
+        found.append([rough.detach().double(), torch.autograd.grad(3 * rough, leaf)[0].double()])
+    torch.testing.assert_close(found[0], found[1], rtol=1e-5, atol=1e-7)
     assert neighbours_of(points[:4]) is None
 
 

@@ -5,7 +5,7 @@ The backward pass takes BLOCK rows at a time: the masked upstream gradient and x
 all tiles of the block find them in the cache. Gradients of W and b are summed apart for every CHUNK
 rows, and these sums added up by torch, so that results do not depend on the number of cores. Casts
 are written (float)(x), since `float(x)` is a macro of Warp. The arguments are described in
-`dense_kernels`.
+`kernels`.
 """
 
 CHUNK = 768  # rows of a work item of the backward pass

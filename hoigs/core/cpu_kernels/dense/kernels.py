@@ -1,8 +1,8 @@
 # mypy: ignore-errors
 # (Warp's arrays annotate as values)
-"""A layer of a network on CPUs; the loops stand in `dense_source`."""
+"""A layer of a network on CPUs; the loops stand in `source`."""
 
-from hoigs.core.cpu_kernels import dense_source
+from hoigs.core.cpu_kernels.dense import source
 from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})
@@ -11,7 +11,7 @@ F32 = wp.array(dtype=wp.float32)
 I32 = wp.array(dtype=wp.int32)
 
 
-@wp.func_native(dense_source.FORWARD)
+@wp.func_native(source.FORWARD)
 def forward_native(
     counter: I32, count: int, entry: int, width: int, padded: int, stride: int, relu: int,
     rows: F32, weight: F32, bias: F32, out: F32,
@@ -21,7 +21,7 @@ def forward_native(
 @wp.kernel
 def layer(
     counter: I32,  # [1], zero: the next work item, for workers that make this same call
-    count: int,  # rows, at least dense_source.HIGH
+    count: int,  # rows, at least source.HIGH
     entry: int, width: int,  # columns of `rows` and of `out`
     padded: int,  # `width`, up to whole vectors
     stride: int,  # of the rows of `weight`, at least `padded`
@@ -34,7 +34,7 @@ def layer(
     forward_native(counter, count, entry, width, padded, stride, relu, rows, weight, bias, out)
 
 
-@wp.func_native(dense_source.BACKWARD)
+@wp.func_native(source.BACKWARD)
 def backward_native(
     counter: I32, count: int, entry: int, width: int, padded: int, stride: int, relu: int,
     rows: F32, weight: F32, result: F32, upstream: F32, with_rows: int, with_weight: int,

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from hoigs.core.cpu_kernels import dense_kernels as kernels
-from hoigs.core.cpu_kernels.dense_source import CHUNK, FORWARD_CHUNK, HIGH, LANES, MAX_WIDTH
+from hoigs.core.cpu_kernels.dense import kernels
+from hoigs.core.cpu_kernels.dense.source import CHUNK, FORWARD_CHUNK, HIGH, LANES, MAX_WIDTH
 from hoigs.core.cpu_kernels.workers import shared
 
 

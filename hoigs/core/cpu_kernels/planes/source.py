@@ -4,7 +4,7 @@ A work item is taken by one core, and no two items write the same memory: a chun
 forward pass; in the backward pass LANES channels of one plane, to which all points add one after
 the other, or a chunk of points, whose own gradient is summed over channels. So results do not
 depend on the number of cores. Casts are written (float)(x), since `float(x)` is a macro of Warp.
-The arguments are described in `plane_kernels`.
+The arguments are described in `kernels`.
 """
 
 LANES = 16
@@ -80,13 +80,19 @@ _BACKWARD = r"""
             const int plane = item / blocks, c = item % blocks * LANES;
             float* gradient = (float*)to_planes.data + c;
             const float* up = upstream_ + plane * channels + c;
+            const int deep = channels - c < LANES ? channels - c : LANES;
+            float* cell_gradient = gradient + plane * height * width * channels;
+            for (int i = 0; i < height * width; ++i, cell_gradient += channels) {
+                if (deep == LANES) *(loose*)cell_gradient = (vec){};
+                else for (int k = 0; k < deep; ++k) cell_gradient[k] = 0.0f;
+            }
             for (int point = 0; point < count; ++point, up += many * channels) {
                 const Cell cell = cell_of(plane, point);
                 float* row = gradient + cell.first;
                 const float w00 = (1.0f - cell.fy) * (1.0f - cell.fx);
                 const float w01 = (1.0f - cell.fy) * cell.fx;
                 const float w10 = cell.fy * (1.0f - cell.fx), w11 = cell.fy * cell.fx;
-                if (c + LANES <= channels) {
+                if (deep == LANES) {
                     // one after the other: on narrow planes these may be the same row
                     const vec v = load(up);
                     *(loose*)row += v * w00;
@@ -94,7 +100,7 @@ _BACKWARD = r"""
                     *(loose*)(row + below) += v * w10;
                     *(loose*)(row + below + right) += v * w11;
                 } else {
-                    for (int i = 0; c + i < channels; ++i) {
+                    for (int i = 0; i < deep; ++i) {
                         row[i] += up[i] * w00;
                         row[right + i] += up[i] * w01;
                         row[below + i] += up[i] * w10;

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.core.cpu_kernels import plane_kernels as kernels
-from hoigs.core.cpu_kernels.plane_source import CHUNK
+from hoigs.core.cpu_kernels.planes import kernels
+from hoigs.core.cpu_kernels.planes.source import CHUNK
 from hoigs.core.cpu_kernels.workers import shared
 
 
@@ -31,7 +31,7 @@ class SampledPlanes(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
         planes, points = ctx.saved_tensors
         with_planes, with_points = ctx.needs_input_grad
-        to_planes = torch.zeros_like(planes) if with_planes else planes.new_empty(0)
+        to_planes = torch.empty_like(planes) if with_planes else planes.new_empty(0)
         to_points = torch.empty_like(points) if with_points else planes.new_empty(0)
         shared(
             kernels.sample_adjoint,

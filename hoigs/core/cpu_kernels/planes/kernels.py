@@ -1,8 +1,8 @@
 # mypy: ignore-errors
 # (Warp's arrays annotate as values)
-"""Bilinear samples of feature planes on CPUs; the loops stand in `plane_source`."""
+"""Bilinear samples of feature planes on CPUs; the loops stand in `source`."""
 
-from hoigs.core.cpu_kernels import plane_source
+from hoigs.core.cpu_kernels.planes import source
 from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})
@@ -11,7 +11,7 @@ F32 = wp.array(dtype=wp.float32)
 I32 = wp.array(dtype=wp.int32)
 
 
-@wp.func_native(plane_source.FORWARD)
+@wp.func_native(source.FORWARD)
 def forward_native(
     counter: I32, count: int, many: int, height: int, width: int, channels: int, planes: F32,
     points: F32, out: F32,
@@ -31,7 +31,7 @@ def sample(
     forward_native(counter, count, many, height, width, channels, planes, points, out)
 
 
-@wp.func_native(plane_source.BACKWARD)
+@wp.func_native(source.BACKWARD)
 def backward_native(
     counter: I32, count: int, many: int, height: int, width: int, channels: int, planes: F32,
     points: F32, upstream: F32, with_planes: int, with_points: int, to_planes: F32, to_points: F32,
@@ -44,7 +44,7 @@ def sample_adjoint(
     planes: F32, points: F32,  # as of `sample`
     upstream: F32,  # [count, many, channels]
     with_planes: int, with_points: int,
-    to_planes: F32,  # [many, height, width, channels], zero: added to; or empty
+    to_planes: F32,  # [many, height, width, channels], or empty
     to_points: F32,  # [many, count, 2], or empty
 ):  # fmt: skip
     backward_native(

@@ -1,0 +1,1 @@
+"""Bilinear samples of feature planes, and their gradients: `function`."""

@@ -1,0 +1,1 @@
+"""How far values are from the mean of their neighbours', and its gradient: `function`."""

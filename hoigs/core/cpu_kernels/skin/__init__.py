@@ -1,0 +1,1 @@
+"""Skinning of points and rotations, products of quaternions, and their gradients: `function`."""
