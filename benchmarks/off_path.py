@@ -1,13 +1,13 @@
 """Quality on views nobody filmed: PSNR of person + object by the angle between camera and path.
 
-    python benchmarks/off_path.py lift-and-swing carry --device cuda --steps 3000 --json off-path.json
+    python benchmarks/off_path.py lift-and-swing carry --device cuda --json off-path.json
     python benchmarks/off_path.py lift-and-swing --variant "more=hoigs;model.human.points=30000"
     python benchmarks/off_path.py --table off-path.json
 
-Each variant, a spec with settings, is trained on built-in clips with every pose given, and scored on
-test frames of the path, on the clip's own held-out cameras (which stay near the path), and on cameras
-turned about the target by each angle, to the left and to the right of the training camera of their
-moment. These see sides that no training frame shows.
+Each variant, a spec with settings, is trained on built-in clips with every pose given, and scored
+on test frames of the path, on the clip's own held-out cameras (which stay near the path), and on
+cameras turned about the target by each angle, to the left and to the right of the training camera
+of their moment. These see sides that no training frame shows.
 """
 
 from __future__ import annotations

@@ -80,8 +80,11 @@ def registry(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def no_cuda(monkeypatch):
+def no_cuda(monkeypatch, tmp_path):
+    """A machine without NVIDIA's driver."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr("hoigs.workflows.doctor.DRIVER", tmp_path / "none")
+    monkeypatch.setattr("hoigs.workflows.doctor.shutil.which", lambda program: None)
 
 
 def test_a_backend_without_a_device_here_is_no_failure(hoigs, registry, no_cuda):
