@@ -254,7 +254,7 @@ def _shown(name: str, options: PrepareOptions) -> str:
         return f'"{prompt.text}"'
     where = prompt.places() if prompt else []
     if not where:
-        return "proposed: moves, near the hands"
+        return "proposed: what hands move or hold"
     what = name if options.further_objects else "--object"
     frames = ", ".join("first" if at.frame is None else str(at.frame) for at in where)
     return f"{what} in frame {frames}"

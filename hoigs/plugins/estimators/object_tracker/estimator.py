@@ -31,11 +31,11 @@ from hoigs.plugins.estimators.object_tracker.camera_motion import is_static
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage
 from hoigs.plugins.estimators.object_tracker.held import skeletons
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, prompted_mask
-from hoigs.plugins.estimators.object_tracker.proposal import WRISTS, proposed
+from hoigs.plugins.estimators.object_tracker.proposal import proposed
 from hoigs.plugins.estimators.object_tracker.scene import Scene, moving_scene, static_scene
 from hoigs.plugins.estimators.object_tracker.tracker import Track, at_rest, color_model, tracked
 
-VERSION = 6  # of what is kept in `work`; raised when masks change
+VERSION = 7  # of what is kept in `work`; raised when masks change
 SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
 WEAK = 0.6  # confidence below which a frame is named in a note
 
@@ -52,8 +52,8 @@ class ObjectTrackerEstimator(Estimator):
     """Masks of objects through a video from one click, box or a few of them, without a network.
 
     It needs the person's masks (`VideoRequest.known`) to tell the object from the person, and does
-    what it can without. An object without a prompt is proposed: what moves, is not the person
-    and is nearest to the hands.
+    what it can without. An object without a prompt is proposed: what is around the hands in many
+    frames, and is neither the scene nor the person by motion, landmarks and colours.
     """
 
     Config: ClassVar = ObjectTrackerConfig
@@ -101,16 +101,19 @@ class ObjectTrackerEstimator(Estimator):
         still = video.static_camera or is_static(footage)
         scene: Scene = static_scene(footage) if still else moving_scene(footage)
         progress(0.35, "object")
-        hands = _hands(video, footage)
+        people = skeletons(video, footage.numbers, footage.scale)
         tracks: dict[str, Track | None] = {}
         prompts: dict[str, list[PromptedMask]] = {}
         notes: list[str] = []
         chosen: dict[str, list[FramePrompt]] = {}
         for k, entity in enumerate(wanted):
             start, share = 0.35 + 0.65 * k / len(wanted), 0.65 / len(wanted)
-            masks, proposal = self._prompted(entity, footage, scene, hands, tracks, notes)
-            if proposal is not None:
-                chosen[entity.name] = [proposal]
+            if entity.prompts:
+                masks = self._prompted(entity, footage, scene, notes)
+            else:
+                masks, chosen[entity.name] = _proposed(
+                    entity, footage, scene, people, tracks, notes
+                )
             prompts[entity.name] = masks
             tracks[entity.name] = (
                 tracked(footage, scene, masks, _part(progress, start, share)) if masks else None
@@ -120,17 +123,9 @@ class ObjectTrackerEstimator(Estimator):
         _write(file, video, footage, tracks, chosen, notes)
 
     def _prompted(
-        self,
-        entity: EntityRequest,
-        footage: Footage,
-        scene: Scene,
-        hands: np.ndarray | None,
-        others: dict[str, Track | None],
-        notes: list[str],
-    ) -> tuple[list[PromptedMask], FramePrompt | None]:
-        """Masks of the entity's prompts, or of a proposal, which is returned too."""
-        if not entity.prompts:
-            return self._proposed(entity, footage, scene, hands, others, notes)
+        self, entity: EntityRequest, footage: Footage, scene: Scene, notes: list[str]
+    ) -> list[PromptedMask]:
+        """Masks of the entity's prompts."""
         masks: list[PromptedMask] = []
         for prompt in entity.prompts:
             i = footage.numbers.index(prompt.frame)
@@ -150,34 +145,26 @@ class ObjectTrackerEstimator(Estimator):
                     "where it is seen better, or give a box"
                 )
             masks.append(found)
-        return masks, None
+        return masks
 
-    def _proposed(
-        self,
-        entity: EntityRequest,
-        footage: Footage,
-        scene: Scene,
-        hands: np.ndarray | None,
-        others: dict[str, Track | None],
-        notes: list[str],
-    ) -> tuple[list[PromptedMask], FramePrompt | None]:
-        taken = [t.soft > 127 for t in others.values() if t is not None]
-        click = proposed(footage, scene, hands, np.any(taken, axis=0) if taken else None)
-        if click is None:
-            notes.append(
-                f"{entity.name}: nothing was found that moves and is not the person; click on it, "
-                "such as --object 640,402@0"
-            )
-            return [], None
-        s = 1 / footage.scale
-        native = FramePrompt(
-            footage.numbers[click.frame],
-            tuple(PromptPoint(round(p.x * s), round(p.y * s)) for p in click.points),
+
+def _proposed(
+    entity: EntityRequest,
+    footage: Footage,
+    scene: Scene,
+    people: Sequence[np.ndarray],
+    others: dict[str, Track | None],
+    notes: list[str],
+) -> tuple[list[PromptedMask], list[FramePrompt]]:
+    """Masks in a few frames, and the clicks that give them; none, with a note, where nothing is."""
+    taken = [t.soft > 127 for t in others.values() if t is not None]
+    found = proposed(footage, scene, people, np.any(taken, axis=0) if taken else None)
+    if not found:
+        notes.append(
+            f"{entity.name}: nothing was found that moves or is held and is not the person; click "
+            "on it, such as --object 640,402@0"
         )
-        found = prompted_mask(footage, scene, click.frame, native)
-        y, x = np.nonzero(found.soft > 0.5)
-        box = tuple(round(float(v) * s) for v in (x.min(), y.min(), x.max() + 1, y.max() + 1))
-        return [found], FramePrompt(native.frame, native.points, box)  # type: ignore[arg-type]
+    return [p.mask for p in found], [p.prompt for p in found]
 
 
 def _part(progress: Progress, start: float, share: float) -> Callable[[float], None]:
@@ -194,15 +181,6 @@ def _person(video: VideoRequest) -> Sequence[Any] | None:
     if len(each) == 1:
         return each[0]
     return LazyFrames(video.frames, lambda i: np.any([m[i] for m in each], axis=0))
-
-
-def _hands(video: VideoRequest, footage: Footage) -> np.ndarray | None:
-    """x, y of the wrists [F, 2 a person, 2] in the footage; None where no landmarks are known."""
-    people = skeletons(video, footage.numbers, footage.scale)
-    if not people:
-        return None
-    wrists = [np.where(s[:, WRISTS, 3:] > 0.3, s[:, WRISTS, :2], np.nan) for s in people]
-    return np.concatenate(wrists, 1)
 
 
 def _nothing_there(entity: EntityRequest, prompt: FramePrompt, footage: Footage, i: int) -> str:
@@ -280,6 +258,7 @@ def _write(
         "chosen": {
             n: [[p.frame, [[q.x, q.y, q.inside] for q in p.points], p.box] for p in prompts]
             for n, prompts in chosen.items()
+            if prompts
         },
     }
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -49,6 +49,11 @@ class Footage:
     def diagonal(self) -> float:
         return float(np.hypot(*self.shape))
 
+    @property
+    def unit(self) -> int:
+        """A few pixels, by which masks are wrong."""
+        return max(1, round(0.004 * self.diagonal))
+
     def body(self, i: int) -> Bool[np.ndarray, "h w"]:
         """The person's mask of one frame without what they may hold."""
         return self.person[i] & ~self.held[i]

@@ -1,4 +1,4 @@
-"""Where nothing was clicked: what moves beside the person near their hands, or what they hold."""
+"""Where nothing was clicked: what people handle, by all that speaks for it, in a few frames."""
 
 from __future__ import annotations
 
@@ -10,127 +10,197 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from hoigs.core.interfaces.estimator import FramePrompt, PromptPoint
-from hoigs.plugins.estimators.object_tracker.colors import bins_of, histogram
+from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram
 from hoigs.plugins.estimators.object_tracker.footage import Footage
-from hoigs.plugins.estimators.object_tracker.scene import Scene
+from hoigs.plugins.estimators.object_tracker.likeness import Likeness
+from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, prompted_mask
+from hoigs.plugins.estimators.object_tracker.scene import Scene, carried
 
 SAMPLES = 24  # frames that are searched
 AREA = (0.0003, 0.12)  # of the image, least and largest
-WRISTS = (15, 16)  # among MediaPipe's landmarks
+PARTS = 6  # of a frame that are looked at
+OFTEN = 0.1  # mean over frames of likeness times score from which something is there again
+AROUND, ALIKE = 4, 0.7  # samples before and after in which a thing of these colours is looked for
+TOUCHED = 0.97  # nearness of what a hand may touch
+TRIED = 12  # frames in which masks are grown
+GOOD, SAME = 0.5, 0.55  # of the best mask: least value, least likeness of colours
+APART = 8  # masks are at least this part of the video from each other
 
 
 @dataclass(frozen=True)
-class _Blob:
+class Candidate:
+    """A part of one frame that may be the thing.
+
+    Attributes:
+        point: its innermost pixel, x and y. score: what speaks for it in this frame, 0 to 1.
+        colors: their histogram. radius: of a disc of its area. near: how near a hand is, 0 to 1.
+    """
+
     frame: int
     point: tuple[float, float]
     score: float
-    colors: np.ndarray
+    colors: Float[np.ndarray, "B"]
+    radius: float
+    near: float
+
+    def alike(self, other: Candidate) -> float:
+        return float(np.sqrt(self.colors * other.colors).sum())
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A mask in one frame, and the click that it was grown from, in pixels of the video."""
+
+    mask: PromptedMask
+    prompt: FramePrompt
 
 
 def proposed(
     footage: Footage,
     scene: Scene,
-    hands: Float[np.ndarray, "F 2 2"] | None = None,
+    people: Sequence[Float[np.ndarray, "F 33 4"]] = (),
     taken: Bool[np.ndarray, "F h w"] | None = None,
-) -> FramePrompt | None:
-    """A click on the object, in pixels of the footage and positions of its frames.
-
-    Where nothing moves beside the person, what the person's mask takes in far from their limbs is
-    the thing that they hold.
+) -> list[Proposal]:
+    """The object in a few frames across the video, the best first; empty where there is none.
 
     Args:
-        hands: x, y of both in each frame, NaN where unknown. taken: pixels of other objects.
+        people: landmarks of each in the footage. taken: pixels of other objects.
     """
-    frames = np.unique(np.linspace(0, len(footage) - 1, SAMPLES).astype(int))
-    beside = [None if hands is None else hands[i] for i in frames]
-    others = [None if taken is None else taken[i] for i in frames]
-    blobs: list[_Blob] = []
-    for i, near, other in zip(frames, beside, others, strict=True):
-        blobs += _free(footage, scene, int(i), near, other)
-    if found := _recurring(blobs):
-        return found
-    blobs = []
-    for i, near, other in zip(frames, beside, others, strict=True):
-        blobs += _held(footage, int(i), near, other)
-    return _recurring(blobs)
-
-
-def _recurring(blobs: Sequence[_Blob]) -> FramePrompt | None:
-    """Of a thing that is seen in many frames in the same colours, near the hands."""
-    if not blobs:
-        return None
-    alike = np.sqrt(np.stack([b.colors for b in blobs]))
-    likeness = (alike @ alike.T).clip(0, 1) ** 2
-    scores = np.array([b.score for b in blobs])
-    frames = np.array([b.frame for b in blobs])
-    support = np.zeros(len(blobs))
-    for i in np.unique(frames):
-        rows = frames == i
-        support += (likeness[:, rows] * scores[rows]).max(1)
-    enough = support > 0.12 * SAMPLES * 0.5
-    if not enough.any():
-        return None
-    best = blobs[int(np.argmax(support * np.sqrt(scores) * enough))]
-    return FramePrompt(best.frame, (PromptPoint(*best.point),))
-
-
-def _free(footage: Footage, scene: Scene, i: int, hands, taken) -> list[_Blob]:
-    """Parts of one frame that differ from the scene and lie off the person."""
-    person = footage.person[i]
-    unit = max(1, round(0.004 * footage.diagonal))
-    hidden = ndimage.binary_dilation(person, iterations=unit) | footage.blank[i]
-    if taken is not None:
-        hidden |= ndimage.binary_dilation(taken, iterations=2 * unit)
-    moving = (np.nan_to_num(scene.difference(i), nan=0.0) > 6) & ~hidden
-    apart = ndimage.distance_transform_edt(~person) if person.any() else None
-    return _blobs(footage, i, moving, hands, apart)
-
-
-def _held(footage: Footage, i: int, hands, taken) -> list[_Blob]:
-    """Parts of the person's mask that no limb reaches, in other colours than the person's."""
-    held = footage.held[i] if taken is None else footage.held[i] & ~taken
-    bins = bins_of(footage.colors(i))
-    body = histogram(bins, footage.body(i) * 1.0)
-    return [
-        replace(blob, score=blob.score * (1 - float(np.sqrt(blob.colors * body).sum())))
-        for blob in _blobs(footage, i, held, hands, None)
-    ]
-
-
-def _blobs(footage: Footage, i: int, region: Bool[np.ndarray, "h w"], hands, apart) -> list[_Blob]:
-    """The largest connected parts of a region of one frame."""
-    unit = max(1, round(0.004 * footage.diagonal))
-    region = ndimage.binary_closing(
-        ndimage.binary_opening(region, iterations=unit), iterations=unit
-    )
-    labels, count = ndimage.label(region)
-    if not count:
+    frames = np.unique(np.linspace(0, len(footage) - 1, SAMPLES).astype(int)).tolist()
+    likeness = Likeness.of(footage, scene, people, frames)
+    found: list[Candidate] = []
+    for i in frames:
+        odds = likeness.odds(i)
+        if taken is not None:
+            odds[ndimage.binary_dilation(taken[i], iterations=2 * footage.unit)] = -9
+        found += _parts(footage, i, odds, likeness.nearness(i))
+    order = ranked(without_scenery(found, scene, 0.02 * footage.diagonal), len(frames))
+    if not order:
         return []
+    first = {c.frame: c for c in reversed(order)}  # the best of each frame
+    tried = [c for c in order if first[c.frame] is c][:TRIED]
+    known = _colors_of(footage, found, order[0], frames)
+    grown = [_grown(likeness, c, known) for c in tried]
+    return _spread(footage, grown)
+
+
+def _parts(
+    footage: Footage, i: int, odds: Float[np.ndarray, "h w"], near: Float[np.ndarray, "h w"]
+) -> list[Candidate]:
+    """The largest connected parts of one frame that look like a thing."""
+    region = ndimage.gaussian_filter(odds, footage.unit) > 0.5
+    region = ndimage.binary_opening(region, iterations=footage.unit)
+    region = ndimage.binary_closing(region, iterations=footage.unit)
+    labels, _ = ndimage.label(region)
     bins = bins_of(footage.colors(i))
+    sizes = np.bincount(labels.ravel())[1:]
     found = []
-    sizes = ndimage.sum_labels(region, labels, np.arange(1, count + 1))
-    for k in np.argsort(-sizes)[:6]:
+    for k in np.argsort(-sizes)[:PARTS]:
         area = sizes[k] / region.size
         if not AREA[0] <= area <= AREA[1]:
             continue
-        blob = labels == k + 1
-        depth = ndimage.distance_transform_edt(np.pad(blob, 1))[1:-1, 1:-1]
+        part = ndimage.binary_fill_holes(labels == k + 1)
+        depth = ndimage.distance_transform_edt(np.pad(part, 1))[1:-1, 1:-1]
         y, x = np.unravel_index(depth.argmax(), depth.shape)
-        round_ = float(np.pi * depth.max() ** 2 / sizes[k])  # 1 for a disc
-        near = _nearness(blob, hands, apart, footage.diagonal)
-        score = float(near * min(1.0, 1.6 * round_**0.5) * min(1.0, (area / 0.002) ** 0.5))
-        found.append(_Blob(i, (float(x) + 0.5, float(y) + 0.5), score, histogram(bins, blob * 1.0)))
+        round_ = float(np.pi * depth.max() ** 2 / part.sum())  # 1 for a disc
+        score = float(near[part].max() * np.tanh(odds[part].mean().clip(0)))
+        score *= min(1.0, 1.6 * round_**0.5) * min(1.0, (area / 0.002) ** 0.5)
+        point = (float(x) + 0.5, float(y) + 0.5)
+        colors, radius = histogram(bins, part * 1.0), float(np.sqrt(part.sum() / np.pi))
+        found.append(Candidate(i, point, score, colors, radius, float(near[part].max())))
     return found
 
 
-def _nearness(blob: np.ndarray, hands, apart, diagonal: float) -> float:
-    """From 1 at the hands, or at the person where hands are unknown, falling with distance."""
-    if hands is not None and np.isfinite(hands).all(-1).any():
-        y, x = np.nonzero(blob)
-        known = hands[np.isfinite(hands).all(-1)]
-        gap = min(float(np.hypot(x - hx, y - hy).min()) for hx, hy in known)
-    elif apart is not None:
-        gap = float(apart[blob].min())
-    else:
-        gap = 0.0
-    return 1 / (1 + (gap / (0.12 * diagonal)) ** 2)
+def without_scenery(found: Sequence[Candidate], scene: Scene, slack: float) -> list[Candidate]:
+    """Less for what no hand touches and what stays where it is in the scene: its edges, before a
+    camera that moves."""
+    frames = sorted({c.frame for c in found})
+    by_frame = {i: [c for c in found if c.frame == i] for i in frames}
+
+    def stays(c: Candidate) -> float:
+        row = frames.index(c.frame)
+        around = [i for i in frames[max(0, row - AROUND) : row + AROUND + 1] if i != c.frame]
+        there = []
+        for i in around:
+            x, y = carried(scene, c.point, c.frame, i)
+            there.append(
+                any(
+                    np.hypot(o.point[0] - x, o.point[1] - y) < c.radius + slack
+                    and c.alike(o) > ALIKE
+                    for o in by_frame[i]
+                )
+            )
+        return float(np.mean(there)) if there else 0.0
+
+    return [c if c.near > TOUCHED else replace(c, score=c.score * (1 - stays(c))) for c in found]
+
+
+def ranked(found: Sequence[Candidate], frames: int) -> list[Candidate]:
+    """Those of things that are seen in many of the frames in the same colours, the best first."""
+    if not found:
+        return []
+    roots = np.sqrt(np.stack([c.colors for c in found]))
+    likeness = (roots @ roots.T).clip(0, 1) ** 2
+    scores = np.array([c.score for c in found])
+    seen_in = np.array([c.frame for c in found])
+    support = np.zeros(len(found))
+    for i in np.unique(seen_in):
+        rows = seen_in == i
+        support += (likeness[:, rows] * scores[rows]).max(1)
+    order = np.argsort(-support * np.sqrt(scores))
+    return [found[k] for k in order if support[k] > OFTEN * frames]
+
+
+def _colors_of(
+    footage: Footage, found: Sequence[Candidate], best: Candidate, frames: Sequence[int]
+) -> ColorModel:
+    """Colours of the best candidate and of those like it, and of the whole frames."""
+    inside = np.sum([c.score * best.alike(c) ** 2 * c.colors for c in found], axis=0)
+    small = [bins_of(footage.colors(i)[::3, ::3]) for i in frames]
+    return ColorModel(inside / inside.sum(), histogram(np.stack(small), np.ones_like(small) * 1.0))
+
+
+def _grown(
+    likeness: Likeness, c: Candidate, known: ColorModel
+) -> tuple[float, Proposal, Float[np.ndarray, "B"]]:
+    """The mask about a candidate, how good it is, and its colours.
+
+    It is good where it is well set off, takes in all that looks like a thing around the hands, and
+    consists of that.
+    """
+    footage = likeness.footage
+    x, y = (round(v / footage.scale) for v in c.point)
+    prompt = FramePrompt(footage.numbers[c.frame], (PromptPoint(x, y),))
+    found = prompted_mask(footage, likeness.scene, c.frame, prompt, known)
+    mask = found.soft > 0.5
+    colors = histogram(bins_of(footage.colors(c.frame)), mask * 1.0)
+    if not mask.any():
+        return 0.0, Proposal(found, prompt), colors
+    odds = ndimage.gaussian_filter(likeness.odds(c.frame), footage.unit).clip(-2, 2)
+    near = likeness.nearness(c.frame)
+    speaks = odds.clip(0) * near
+    takes_in = speaks[mask].sum() / max(float(speaks[mask | (near > 0.5)].sum()), 1e-6)
+    consists = 1 / (1 + np.exp(-3 * odds[mask].mean()))
+    rows, columns = np.nonzero(mask)
+    box = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+    drawn = tuple(round(float(v) / footage.scale) for v in box)
+    prompt = FramePrompt(prompt.frame, prompt.points, drawn)  # type: ignore[arg-type]
+    return float(found.quality * takes_in * consists), Proposal(found, prompt), colors
+
+
+def _spread(
+    footage: Footage, grown: Sequence[tuple[float, Proposal, Float[np.ndarray, "B"]]]
+) -> list[Proposal]:
+    """The best, and further ones that are nearly as good, look like it, and lie apart in time: a
+    thing that turns or is hidden is then known on both sides."""
+    ordered = sorted(grown, key=lambda g: -g[0])
+    value, best, colors = ordered[0]
+    if value <= 0:
+        return []
+    kept = [best]
+    for other, proposal, theirs in ordered[1:]:
+        gaps = [abs(proposal.mask.frame - p.mask.frame) for p in kept]
+        alike = float(np.sqrt(colors * theirs).sum())
+        if other > GOOD * value and alike > SAME and min(gaps) >= len(footage) / APART:
+            kept.append(proposal)
+    return kept

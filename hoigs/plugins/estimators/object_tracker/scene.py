@@ -9,7 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
-from hoigs.plugins.estimators.object_tracker.camera_motion import chained, homographies
+from hoigs.plugins.estimators.object_tracker.camera_motion import (
+    chained,
+    homographies,
+    moved_points,
+)
 from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
 
 SAMPLES = 48  # frames of which the median is taken
@@ -136,6 +140,13 @@ class MovingScene:
 
 def moving_scene(footage: Footage) -> MovingScene:
     return MovingScene(footage, homographies(footage))
+
+
+def carried(scene: Scene, point: tuple[float, float], i: int, j: int) -> Float[np.ndarray, "2"]:
+    """Where a point x, y of frame i that is a part of the scene lies in frame j."""
+    if isinstance(scene, MovingScene):
+        return moved_points(chained(scene.steps, i, j), np.array(point))
+    return np.array(point)
 
 
 def median_of(differences: np.ndarray) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -21,8 +22,10 @@ from hoigs.core.interfaces.estimator import (
     checked,
 )
 from hoigs.plugins.estimators.object_tracker.estimator import ObjectTrackerEstimator
-from hoigs.plugins.estimators.object_tracker.footage import lab_of
+from hoigs.plugins.estimators.object_tracker.footage import Footage, lab_of
 from hoigs.plugins.estimators.object_tracker.path import _cheapest
+from hoigs.plugins.estimators.object_tracker.proposal import Candidate, ranked, without_scenery
+from hoigs.plugins.estimators.object_tracker.scene import MovingScene
 
 H, W, RADIUS, COUNT = 72, 108, 8, 14
 
@@ -96,9 +99,7 @@ def test_one_click_follows_a_disc_past_a_person(tmp_path: Path, pan: float) -> N
 def test_without_a_prompt_the_moving_disc_is_proposed(tmp_path: Path) -> None:
     scene = world()
     found = masks_of(request(tmp_path, scene))
-    (prompt,) = found.chosen["object"]
-    point = prompt.points[0]
-    assert scene[2][prompt.frame][int(point.y), int(point.x)]
+    on_thing(found, scene[2])
     assert overlaps(found, scene[2]).mean() > 0.8
 
 
@@ -155,10 +156,82 @@ def test_a_thing_held_away_from_the_limbs_is_proposed_from_within_the_person_s_m
     image[bag] = texture(1, (200, 60, 50))[:, :W][bag]
     scene = [image.astype(np.uint8)] * COUNT, [person | arm | bag] * COUNT, [bag] * COUNT
     found = masks_of(with_landmarks(request(tmp_path, scene), standing(wrist=(71.0, 40.0))))
-    (prompt,) = found.chosen["object"]
-    point = prompt.points[0]
-    assert bag[int(point.y), int(point.x)]
+    on_thing(found, scene[2])
     assert overlaps(found, scene[2]).mean() > 0.8
+
+
+def on_thing(found: EntityMasks, things: list[np.ndarray]) -> None:
+    """Every proposed click lies on it."""
+    assert found.chosen["object"]
+    for prompt in found.chosen["object"]:
+        (point,) = prompt.points
+        assert things[prompt.frame][int(point.y), int(point.x)]
+
+
+def before_the_body(flag: bool = False, away: range = range(0)):
+    """A yellow box before a person's belly, in their mask; `flag`: something waves far from them;
+    `away`: frames in which their back is seen."""
+    wall = texture(0, (120, 130, 90))[:, :W]
+    y, x = np.mgrid[:H, :W] + 0.5
+    body = ((np.abs(x - 50) < 10) & (y > 24)) | (np.hypot(x - 50, y - 18) < 5)
+    frames, boxes = [], []
+    for i in range(COUNT):
+        image, shift = wall.copy(), 2 * np.sin(i)
+        image[body] = texture(2, (70, 80, 150))[:, :W][body]
+        box = (np.abs(x - 50 - shift) < 8) & (np.abs(y - 45) < 6) & (i not in away)
+        image[box] = texture(1, (220, 190, 40))[:, :W][box]
+        if flag:
+            waves = np.hypot(x - 98, y - 14 - 4 * (i % 3)) < 6
+            image[waves] = texture(3, (200, 60, 50))[:, :W][waves]
+        frames.append(image.astype(np.uint8))
+        boxes.append(box)
+    return frames, [body] * COUNT, boxes
+
+
+def with_hands_before_the_belly(video: VideoRequest) -> VideoRequest:
+    points = standing(wrist=(57.0, 45.0))
+    points[[16, 18, 20, 22], :2] = 43, 45
+    return with_landmarks(video, points)
+
+
+@pytest.mark.parametrize("flag", [False, True])
+def test_a_thing_before_the_body_is_proposed_by_its_colours(tmp_path: Path, flag: bool) -> None:
+    """It lies within the person's mask and within their limbs, and was no candidate. What waves
+    far from the hands is not it."""
+    scene = before_the_body(flag)
+    found = masks_of(with_hands_before_the_belly(request(tmp_path, scene)))
+    on_thing(found, scene[2])
+    assert overlaps(found, scene[2]).mean() > 0.75
+
+
+def test_a_thing_that_the_body_hides_is_proposed_before_and_after(tmp_path: Path) -> None:
+    """One click left it to the tracker to find it again."""
+    scene = before_the_body(away=range(5, 9))
+    found = masks_of(with_hands_before_the_belly(request(tmp_path, scene)))
+    on_thing(found, scene[2])
+    asked = [prompt.frame for prompt in found.chosen["object"]]
+    assert min(asked) < 5 and max(asked) > 8
+    masks = found.entities["object"]
+    assert not any(masks[i].any() for i in range(5, 9))
+    assert overlaps(found, scene[2])[[*range(5), *range(9, COUNT)]].mean() > 0.7
+
+
+def test_what_no_hand_touches_and_stays_in_place_counts_less() -> None:
+    """Edges of the scene that a moving camera's parallax sets off, beside a ball that is kicked."""
+
+    steps = np.tile(np.eye(3), (10, 1, 1))
+    steps[:, 0, 2] = 3
+    panned = MovingScene(cast(Footage, None), steps)
+
+    def seen(x: float, i: int, color: int, near: float) -> Candidate:
+        return Candidate(i, (x, 40.0), 0.5, np.eye(4)[color], radius=2.0, near=near)
+
+    edges = [seen(10 + 3 * i, i, 0, near=0.3) for i in range(10)]
+    kicked = [seen(90 - 9 * i, i, 1, near=0.3) for i in range(10)]
+    touched = [seen(60 + 3 * i, i, 2, near=1.0) for i in range(10)]
+    found = without_scenery([*edges, *kicked, *touched], panned, slack=1.0)
+    assert [c.score for c in found] == [0.0] * 10 + [0.5] * 20
+    assert not [c for c in ranked(found, 10) if c.colors[0]]
 
 
 def test_one_of_two_alike_does_not_become_the_other_while_it_is_away(tmp_path: Path) -> None:

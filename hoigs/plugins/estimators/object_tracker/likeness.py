@@ -1,0 +1,138 @@
+"""How much each pixel speaks for a thing that people handle: place, motion and colours together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from hoigs.plugins.estimators.object_tracker.colors import bins_of, histogram, odds_of
+from hoigs.plugins.estimators.object_tracker.footage import Footage
+from hoigs.plugins.estimators.object_tracker.held import HIPS, SEEN, SHOULDERS, torso_length
+from hoigs.plugins.estimators.object_tracker.scene import Scene
+
+WRISTS = (15, 16)  # among MediaPipe's landmarks
+# Pairs of landmarks between which the body itself is seen, if anything of it is: what lies farther
+# in front of the body than its limbs hides the middle of the torso first.
+BARE = (
+    (11, 12), (11, 13), (13, 15), (12, 14), (14, 16), (15, 19), (16, 20), (23, 25), (25, 27),
+    (24, 26), (26, 28), (7, 8),
+)  # fmt: skip
+THIN = 0.07  # radius of these, in torsos
+REACH = 0.8  # torsos around the hands in which colours of things are learnt
+CHANGED = 6.0  # units of noise by which a pixel differs from the scene
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """What is known of one video.
+
+    Attributes:
+        people: landmarks of each.
+        colors: log-odds of each bin of colours: around the hands against on the body and in the
+            scene; None where no hands are known.
+        torso: its usual length in pixels; NaN where it is never seen.
+    """
+
+    footage: Footage
+    scene: Scene
+    people: Sequence[Float[np.ndarray, "F 33 4"]]
+    colors: Float[np.ndarray, "B"] | None
+    torso: float
+
+    @classmethod
+    def of(
+        cls,
+        footage: Footage,
+        scene: Scene,
+        people: Sequence[Float[np.ndarray, "F 33 4"]],
+        frames: Sequence[int],
+    ) -> Likeness:
+        """Learnt from some frames."""
+        lengths = [v for p in people for v in torso_length(p) if np.isfinite(v)]
+        torso = float(np.median(lengths)) if lengths else np.nan
+        first = cls(footage, scene, people, None, torso)
+        body: list[np.ndarray] = []
+        around: list[np.ndarray] = []
+        scenery: list[np.ndarray] = []
+        for i in frames if lengths else ():
+            if not first._hands(i):
+                continue
+            bins = bins_of(footage.colors(i))
+            bare = first._bare(i) & footage.person[i]
+            shown = footage.person[i] | (first._standing_out(i) > 0)
+            near = (first._gap(i) < REACH * torso) & shown
+            far = (first._gap(i) > 2 * REACH * torso) & ~footage.person[i]
+            for found, region in ((body, bare), (around, near), (scenery, far)):
+                found += [histogram(bins, region * 1.0)] if region.any() else []
+        if not body or not around:
+            return first
+        others = np.maximum(np.mean(body, 0), np.mean(scenery, 0) if scenery else 0)
+        colors = odds_of(np.mean(around, 0), others).clip(-2, 2)
+        return cls(footage, scene, people, colors, torso)
+
+    def odds(self, i: int) -> Float[np.ndarray, "h w"]:
+        """Log-odds of each pixel of a frame."""
+        odds = self._standing_out(i)
+        if self.colors is not None:
+            odds += self.colors[bins_of(self.footage.colors(i))]
+        odds[self.footage.blank[i]] = -9
+        return odds
+
+    def _standing_out(self, i: int) -> Float[np.ndarray, "h w"]:
+        """Log-odds by what differs from the scene and is no limb."""
+        person, held = self.footage.person[i], self.footage.held[i]
+        away = self.scene.difference(i)
+        known = np.isfinite(away)
+        moving = np.nan_to_num(away, nan=0.0) > CHANGED
+        odds = np.where(moving, 1.5, np.where(known, -3.0, -1.0))
+        rim = ndimage.binary_dilation(person, iterations=self.footage.unit) & ~person
+        odds[rim] -= 1.5  # masks end a little too early
+        within = np.where(held, 1.0, -0.7)
+        return np.where(person, within, odds)
+
+    def _hands(self, i: int) -> list[Float[np.ndarray, "2"]]:
+        """x, y of everybody's wrists that are seen."""
+        return [p[i, k, :2] for p in self.people for k in WRISTS if p[i, k, 3] > 0.3]
+
+    def _gap(self, i: int) -> Float[np.ndarray, "h w"]:
+        """Pixels to the nearest hand, or to the person where no hand is seen."""
+        height, width = self.footage.shape
+        y, x = np.mgrid[:height, :width] + 0.5
+        if hands := self._hands(i):
+            return np.min([np.hypot(x - at[0], y - at[1]) for at in hands], axis=0)
+        person = self.footage.person[i]
+        return (
+            ndimage.distance_transform_edt(~person) if person.any() else np.zeros((height, width))
+        )
+
+    def nearness(self, i: int) -> Float[np.ndarray, "h w"]:
+        """From 1 at the hands, falling with distance: a half at the length of a torso."""
+        near = self.torso if np.isfinite(self.torso) else 0.12 * self.footage.diagonal
+        return 1 / (1 + (self._gap(i) / near) ** 4)
+
+    def _bare(self, i: int) -> Bool[np.ndarray, "h w"]:
+        """Pixels on the thin middles of limbs that are seen."""
+        height, width = self.footage.shape
+        y, x = np.mgrid[:height, :width] + 0.5
+        found = np.zeros((height, width), bool)
+        for a, b in self._lines(i):
+            along = b - a
+            share = ((x - a[0]) * along[0] + (y - a[1]) * along[1]) / max(along @ along, 1e-9)
+            share = share.clip(0, 1)
+            gap = np.hypot(x - a[0] - share * along[0], y - a[1] - share * along[1])
+            found |= gap < THIN * self.torso
+        return found
+
+    def _lines(self, i: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for person in self.people:
+            points = person[i]
+            for a, b in BARE:
+                if min(points[a, 3], points[b, 3]) > SEEN:
+                    yield points[a, :2], points[b, :2]
+            if points[list(SHOULDERS), 3].min() > SEEN:  # and of the torso its upper third
+                top, bottom = (points[list(pair), :2].mean(0) for pair in (SHOULDERS, HIPS))
+                yield top, top + (bottom - top) / 3
