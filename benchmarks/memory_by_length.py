@@ -1,6 +1,7 @@
 """Peak memory of prepare, train, eval and render against the length of a video.
 
     python benchmarks/memory_by_length.py --json benchmarks/results/memory-by-length.json
+    python benchmarks/memory_by_length.py --chunk 500 --json benchmarks/results/memory-chunked.json
     python benchmarks/memory_by_length.py --table benchmarks/results/memory-by-length.json
 
 A made-up person stands still while a ball goes to and fro; the video's landmarks and the masks of
@@ -42,6 +43,7 @@ def main() -> int:
     parser.add_argument("--lengths", default="100,1000,5000", help="frames")
     parser.add_argument("--scale", type=int, default=4, help="frames are so many times 96x64")
     parser.add_argument("--commands", default=",".join(COMMANDS))
+    parser.add_argument("--chunk", type=int, help="prepare and train in windows of so many frames")
     parser.add_argument("--folder", type=Path, help="keep what is made here, and use it again")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--table", type=Path, metavar="JSON", help="print the docs' table, only")
@@ -56,18 +58,20 @@ def main() -> int:
             folder = (arguments.folder or Path(temporary)) / f"{frames}"
             make_source(folder / "source", frames, arguments.scale)
             for name in arguments.commands.split(","):
-                rows.append({"frames": frames, "command": name, **measured(name, folder)})
+                took = measured(name, folder, arguments.chunk)
+                rows.append({"frames": frames, "command": name, **took})
                 print(json.dumps(rows[-1]), flush=True)
     size = [tiny.WIDTH * arguments.scale, tiny.HEIGHT * arguments.scale]
-    record = {"size": size, "lengths": lengths, "rows": rows, "holds": judged(rows)}
+    record = {"size": size, "lengths": lengths, "chunk": arguments.chunk, "rows": rows,
+              "holds": judged(rows)}  # fmt: skip
     print(table(record))
     if arguments.json:
         arguments.json.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     return int(not all(record["holds"].values()))
 
 
-def measured(name: str, folder: Path) -> dict[str, Any]:
-    """Runs a command in a process of its own.
+def measured(name: str, folder: Path, chunk: int | None) -> dict[str, Any]:
+    """Runs a command in a process of its own, and reads where windows of the body fit meet.
 
     Raises:
         SystemExit: it fails.
@@ -82,6 +86,8 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
         "eval": ["eval", run],
         "render": ["render", run, "--out", str(folder / "film.mp4")],
     }[name]  # fmt: skip
+    if chunk is not None and name in ("prepare", "train"):
+        words += ["--chunk", str(chunk)]
     log = folder / f"{name}.log"
     began = time.perf_counter()
     with log.open("w") as out:
@@ -94,7 +100,11 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
     if status:
         raise SystemExit(f"hoigs {' '.join(words)} failed:\n{log.read_text()[-2000:]}")
     seconds = time.perf_counter() - began
-    return {"peak_mib": round(used.ru_maxrss / 2**10, 1), "seconds": round(seconds, 1)}
+    found = {"peak_mib": round(used.ru_maxrss / 2**10, 1), "seconds": round(seconds, 1)}
+    if name == "prepare":
+        joints = json.loads((folder / "clip/report.json").read_text())["body"].get("joints", [])
+        found["joints"] = [[frame, 1000 * metres, degrees] for frame, metres, degrees in joints]
+    return found
 
 
 def make_source(folder: Path, frames: int, scale: int) -> None:

@@ -65,7 +65,7 @@ from hoigs.preparation.video.header import missing_frames
 from hoigs.preparation.video.source import NobodyFoundError, Source, SourceError
 from hoigs.preparation.video.span import Span
 
-FORMAT = 10  # of what the stages keep; another number makes older results unread
+FORMAT = 11  # of what the stages keep; another number makes older results unread
 LARGEST, REDUCED = 1920, 1280  # longer sides, pixels: of frames that are kept, and of smaller ones
 T = TypeVar("T")
 

@@ -74,8 +74,8 @@ def _pack(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
         arrays[name] = value
         return {"array": name}
     if isinstance(value, MaskStack):
-        arrays[name] = value.bits
-        return {"masks": name, "width": value.width}
+        arrays[name], arrays[f"{name}.lengths"] = value.deflated()
+        return {"masks": name, "size": list(value.shape)}
     if isinstance(value, Path):
         return {"path": str(value)}
     if isinstance(value, list) and value and isinstance(value[0], Camera):
@@ -100,8 +100,10 @@ def _unpack(packed: Any, arrays: Mapping[str, np.ndarray]) -> Any:
             return torch.from_numpy(arrays[name])
         case {"array": name}:
             return arrays[name]
-        case {"masks": name, "width": width}:
-            return MaskStack.from_bits(arrays[name], width)
+        case {"masks": name, "size": [height, width]}:
+            return MaskStack.from_deflated(
+                arrays[name], arrays[f"{name}.lengths"], (height, width)
+            )
         case {"path": path}:
             return Path(path)
         case {"cameras": name, "size": size}:

@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 
 LEVEL = 1  # of zlib, its fastest
@@ -22,12 +22,20 @@ class MaskStack:
             self.append(mask)
 
     @staticmethod
-    def from_bits(bits: UInt8[np.ndarray, "F H B"], width: int) -> MaskStack:
-        """From what `bits` and `width` give."""
-        stack = MaskStack()
-        stack._shape = (bits.shape[1], width)
-        stack._packed = [zlib.compress(np.ascontiguousarray(rows).data, LEVEL) for rows in bits]
+    def from_deflated(
+        deflated: UInt8[np.ndarray, " B"], lengths: Int[np.ndarray, " F"], shape: tuple[int, int]
+    ) -> MaskStack:
+        """From what `deflated` and `shape` give."""
+        stack, ends = MaskStack(), np.cumsum(lengths)
+        stack._shape = shape
+        spans = zip(ends - lengths, ends, strict=True)
+        stack._packed = [deflated[start:end].tobytes() for start, end in spans]
         return stack
+
+    def deflated(self) -> tuple[UInt8[np.ndarray, " B"], Int[np.ndarray, " F"]]:
+        """The masks as they are kept, one after another, and the bytes of each."""
+        lengths = np.array([len(packed) for packed in self._packed], np.int64)
+        return np.frombuffer(b"".join(self._packed), np.uint8), lengths
 
     @property
     def bits(self) -> UInt8[np.ndarray, "F H B"]:
@@ -38,8 +46,9 @@ class MaskStack:
         return found
 
     @property
-    def width(self) -> int:
-        return self._shape[1]
+    def shape(self) -> tuple[int, int]:
+        """Height and width."""
+        return self._shape
 
     def append(self, mask: Bool[np.ndarray, "H W"]) -> None:
         self._shape = mask.shape
