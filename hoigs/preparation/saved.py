@@ -101,9 +101,7 @@ def _unpack(packed: Any, arrays: Mapping[str, np.ndarray]) -> Any:
         case {"array": name}:
             return arrays[name]
         case {"masks": name, "size": [height, width]}:
-            return MaskStack.from_deflated(
-                arrays[name], arrays[f"{name}.lengths"], (height, width)
-            )
+            return MaskStack.from_deflated(arrays[name], arrays[f"{name}.lengths"], (height, width))
         case {"path": path}:
             return Path(path)
         case {"cameras": name, "size": size}:

@@ -142,10 +142,10 @@ def _trained(
     report: Report,
 ) -> TrainedRun:
     """The rest of `train`: the steps and the scores."""
-    if on_start is not None:
-        on_start(session)
     if session.trainer.windows is not None:
         report(session.trainer.windows.sentence())
+    if on_start is not None:
+        on_start(session)
     session.train(on_step)
     for step, culprit in session.trainer.guard.skipped[:5]:
         report(f"skipped step {step}: {culprit} was not finite")

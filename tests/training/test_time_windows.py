@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -18,7 +20,6 @@ from hoigs.core.values.clip import Clip
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.training.session import Session
 from hoigs.training.time_windows import WindowSampler
-from hoigs.workflows.train import train
 
 CLIP = (
     "builtin:lift-and-swing?frames=24&width=32&fps=8&samples=1&edge_samples=1&held_out_views=0"
@@ -94,27 +95,34 @@ def test_a_window_draws_what_the_whole_model_draws(tmp_path: Path) -> None:
     assert not (tmp_path / "run" / "windows").exists()
 
 
-def test_training_in_windows_gives_an_ordinary_run(tmp_path: Path) -> None:
-    said: list[str] = []
-    trained = train(
-        CLIP, out=tmp_path / "run", overrides=SMALL, chunk=6, device="cpu", report=said.append
-    )
-    assert any("trained in 4 windows of at most 6 frames" in line for line in said)
-    record = json.loads((tmp_path / "run" / "provenance.json").read_text())
-    assert record["windows"] in said
-    assert trained.evaluated is not None
-    whole = opened(tmp_path / "whole")
-    whole.train()
+def test_training_in_windows_gives_an_ordinary_run(
+    hoigs: Callable[..., Any], tmp_path: Path
+) -> None:
+    settings = [word for setting in SMALL for word in ("--set", setting)]
+    run = tmp_path / "run"
+    trained = hoigs("train", CLIP, "--out", run, "--chunk", "6", "--device", "cpu", *settings)
+    assert trained.code == 0, trained.err
+    said = "trained in 4 windows of at most 6 frames"
+    assert said in " ".join(trained.out.split())
+    assert json.loads((run / "provenance.json").read_text())["windows"].startswith(said)
+    assert not (run / "windows").exists()
+    assert (run / "evaluation.json").is_file()
+    stored = LoadedRun.open(run).model.state_dict()
+    whole = opened(tmp_path / "whole").trainer.model.state_dict()
+    assert {n: v.shape for n, v in stored.items()} == {n: v.shape for n, v in whole.items()}
+    planes = stored["entities.human.deformation.planes.time"]
+    assert (planes != 1).any(0).any(-1).any(-1).all(), "every row was trained"
+
+
+def test_a_finished_training_leaves_the_model_that_its_checkpoint_has(tmp_path: Path) -> None:
+    session = opened(tmp_path / "run", "train.chunk=6")
+    session.train()
     loaded = LoadedRun.open(tmp_path / "run")
-    shapes = {n: v.shape for n, v in loaded.model.state_dict().items()}
-    assert shapes == {n: v.shape for n, v in whole.trainer.model.state_dict().items()}
-    model = trained.session.trainer.model
-    model.eval()
-    for frame, numbers in zip(drawn(model, loaded.clip), drawn(loaded.model, loaded.clip),
-                              strict=True):  # fmt: skip
+    session.trainer.model.eval()
+    pairs = zip(drawn(session.trainer.model, session.clip), drawn(loaded.model, loaded.clip),
+                strict=True)  # fmt: skip
+    for frame, numbers in pairs:
         torch.testing.assert_close(frame, numbers)
-    moved = loaded.model.state_dict()["entities.human.deformation.planes.time"]
-    assert (moved != 1).any(dim=(0, 2, 3)).all(), "every row was trained"
 
 
 def test_a_resumed_training_in_windows_equals_an_unbroken_one(tmp_path: Path) -> None:
