@@ -16,10 +16,12 @@ from torch import Tensor
 
 from hoigs.core.diagnostics import Diagnostic
 from hoigs.core.maths.frame_times import FrameTimes
+from hoigs.core.pixel_cache import PixelCache
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind
 
+CACHE_MB = 512  # of resized images kept in memory
 EVEN = 1e-5  # of the clip: times this near to even ones are even
 # keys of Clip.provenance
 CAMERAS_REFINED = "cameras_refined_in_training"
@@ -256,15 +258,16 @@ class ResizedStore(FrameStore):
     def __init__(self, base: FrameStore, sizes: Sequence[tuple[int, int]]) -> None:
         self.base, self.sizes = base, sizes
         self.root = base.root
-        self._images: dict[int, Tensor] = {}
+        self._images = PixelCache(CACHE_MB)
 
     def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
-        if position not in self._images:
-            width, height = self.sizes[position]
-            image = self.base.image(position).permute(2, 0, 1)[None].float()
-            small = torch.nn.functional.interpolate(image, (height, width), mode="area")
-            self._images[position] = small[0].permute(1, 2, 0).round().to(torch.uint8)
-        return self._images[position]
+        return self._images.get(position, lambda: self._resized(position))
+
+    def _resized(self, position: int) -> UInt8[Tensor, "H W 3"]:
+        width, height = self.sizes[position]
+        image = self.base.image(position).permute(2, 0, 1)[None].float()
+        small = torch.nn.functional.interpolate(image, (height, width), mode="area")
+        return small[0].permute(1, 2, 0).round().to(torch.uint8)
 
     def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
         return self._nearest(self.base.mask(entity, position).float(), position) > 0.5

@@ -29,12 +29,12 @@ from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.frame_times import FrameTimes, time_of
 from hoigs.core.npz import load_arrays
+from hoigs.core.pixel_cache import PixelCache
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind
 from hoigs.plugins.readers.common.config import ReaderConfig
-from hoigs.plugins.readers.common.pixel_cache import PixelCache
 
 
 class ClipFolderReaderConfig(ReaderConfig):

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from hoigs.core.errors import ClipError
 from hoigs.core.npz import load_array, load_arrays
+from hoigs.core.pixel_cache import PixelCache
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import FrameStore
 from hoigs.core.values.lens import Lens
 from hoigs.core.values.undistortion import Undistortion
-from hoigs.plugins.readers.common.pixel_cache import PixelCache
 
 Array = np.ndarray
 ASPECT_TOLERANCE = 0.02  # a mask of half an odd size has a slightly different aspect ratio
