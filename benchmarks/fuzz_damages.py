@@ -47,6 +47,8 @@ def damaged(path: Path, data: bytes, rng: random.Random, mark: Path) -> bytes:
         kinds += 4 * [lambda: _safetensors(path, rng)]
     elif path.suffix == ".npy":
         kinds += 4 * [lambda: _npy(data, rng, mark)]
+    elif path.suffix == ".pkl":
+        kinds += 4 * [lambda: _pickle(data, rng, mark)]
     elif path.suffix in (".yaml", ".toml", ".ply", ".obj", ".txt"):
         kinds += 4 * [lambda: _words(data, rng)]
     return rng.choice(kinds)()
@@ -188,17 +190,43 @@ def _npy(data: bytes, rng: random.Random, mark: Path) -> bytes:
     array = np.load(io.BytesIO(data), allow_pickle=True)
     if array.dtype == object:
         tree = array.item()
-        holder, key = rng.choice(list(_places(tree)))
-        odd = rng.choice((_odd(rng), np.zeros((2, 3)), np.full((4, 4), np.nan), _Payload(mark)))
-        holder[key] = odd
-        array = np.array(tree, dtype=object)
+        _tree(tree, rng, mark)
         out = io.BytesIO()
-        np.save(out, array, allow_pickle=True)
+        np.save(out, np.array(tree, dtype=object), allow_pickle=True)
         return out.getvalue()
     packed = io.BytesIO()
     np.savez(packed, a=array)
     with zipfile.ZipFile(io.BytesIO(_npz(packed.getvalue(), rng, mark))) as archive:
         return archive.read(archive.namelist()[0]) if archive.namelist() else b""
+
+
+def _pickle(data: bytes, rng: random.Random, mark: Path) -> bytes:
+    """A pickled dictionary, or joblib's, with another value, in the same form."""
+    try:
+        tree, dump = pickle.loads(data), pickle.dumps
+    except (pickle.UnpicklingError, KeyError, EOFError, ValueError, IndexError):
+        import joblib
+
+        def dump(tree: Any) -> bytes:
+            out = io.BytesIO()
+            joblib.dump(tree, out)
+            return out.getvalue()
+
+        tree = joblib.load(io.BytesIO(data))
+    _tree(tree, rng, mark)
+    return dump(tree)
+
+
+def _tree(tree: Any, rng: random.Random, mark: Path) -> None:
+    """Replace a value of nested dictionaries, lists and arrays."""
+    holder, key = rng.choice(_places(tree))
+    value = holder[key]
+    odds = [_odd(rng), np.zeros((2, 3)), np.full((4, 4), np.nan), _Payload(mark)]
+    if isinstance(value, np.ndarray) and value.size:
+        broken = value.astype(float) if value.dtype.kind in "iuf" else value
+        broken.flat[rng.randrange(value.size)] = rng.choice(ODD_NUMBERS)
+        odds += [broken, value[None], value.astype(str)]
+    holder[key] = rng.choice(odds)
 
 
 def _safetensors(path: Path, rng: random.Random) -> bytes:

@@ -36,7 +36,7 @@ def fuzz(record: dict[str, Any]) -> str:
         for name, t in record["targets"].items()
     ]  # fmt: skip
     columns = ("files", "cases", "read", "refused", "wrong", "slowest, s")
-    minutes = f"{record['seconds'] / 60:.0f} minutes"
+    minutes = f"{record['seconds'] / 60:.1f} minutes"
     note = f"`{record['command']}`: {record['cases']:,} cases in {minutes}"
     return f"{table(columns, rows)}\n\n{note}, at most {record['peak_gib']} GiB."
 
@@ -119,6 +119,7 @@ TABLES = (
     ("many-rows", "many-rows.json", many_rows),
     ("kill-batch", "kill-batch.json", kill_batch),
     ("fuzz", "fuzz.json", fuzz),
+    ("layouts", "fuzz-layouts.json", fuzz),
     ("busy", "busy-machine.json", busy),
     ("long", "long-run.json", long_run),
     ("long-cuda", "long-run-h100.json", long_run),

@@ -84,7 +84,7 @@ def load_pickled_npy(path: Path) -> Any:
             if not dtype.hasobject:
                 file.seek(0)
                 return np.load(file, allow_pickle=False)
-        except (ValueError, KeyError, EOFError) as error:
+        except (ValueError, KeyError, EOFError, OverflowError) as error:
             raise ClipError(f"{path} is not a readable .npy file ({error})") from error
         array = _load(file, path)
     return array.item() if shape == () else array

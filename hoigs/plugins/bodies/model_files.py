@@ -18,6 +18,7 @@ from hoigs.core.npz import plain_reason
 from hoigs.core.values.clip import BodyTrack
 
 Layout = Mapping[str, tuple[int | str, ...]]
+HANDS = ("hands_meanl", "hands_meanr")  # where a file has them
 GENDERS = ("female", "male", "neutral")
 
 
@@ -45,13 +46,14 @@ def read_model(key: str, path: Path, layout: Layout, where: str) -> dict[str, np
                     f"{path} is not a complete {name} model: it lacks {', '.join(missing)} (found "
                     f"{', '.join(sorted(file.files)) or 'nothing'}); {where}"
                 )
-            optional = ("hands_meanl", "hands_meanr")
-            arrays = {k: file[k] for k in (*layout, *optional) if k in file.files}
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+            hands = [k for k in HANDS if k in file.files]
+            arrays = {k: file[k] for k in (*layout, *hands)}
+    except (ValueError, EOFError, OSError, OverflowError, zipfile.BadZipFile) as error:
         # pickles are refused with a ValueError
         reason = plain_reason(error)
         raise HoigsError(f"{path} is not an {name} .npz file ({reason}); {where}") from error
-    _check_shapes(path, arrays, layout, name, where)
+    own = {**layout, **dict.fromkeys(HANDS, (45,))} if hands else layout
+    _check_shapes(path, arrays, own, name, where)
     return arrays
 
 
@@ -60,6 +62,10 @@ def _check_shapes(
 ) -> None:
     sizes: dict[str, int] = {}
     for key, form in layout.items():
+        if key not in arrays:
+            raise HoigsError(f"{path}: it has one mean hand, but no {key}; {where}")
+        if arrays[key].dtype.kind not in "biuf":
+            raise HoigsError(f"{path}: {key} holds {arrays[key].dtype}, expected numbers; {where}")
         shape = arrays[key].shape
         expected = [sizes.get(n, n) if isinstance(n, str) else n for n in form]
         fits = len(shape) == len(form) and all(

@@ -26,6 +26,7 @@ from hoigs.plugins.readers.common.frame_order import image_files, video_moments
 from hoigs.plugins.readers.common.json_file import load_json, parse_json_map
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
 from hoigs.plugins.readers.common.listing import Need, require_files
+from hoigs.plugins.readers.common.numbers import entry, numbers
 from hoigs.plugins.readers.common.poses import checked_rotation, rigid
 from hoigs.plugins.readers.common.start_points import points_along_rays
 from hoigs.plugins.readers.common.template_mesh import load_mesh
@@ -38,6 +39,7 @@ MASKS = (
     "or `--reader-set masks=false`"
 )
 SMPLX = ("global_orient", "body_pose", "left_hand_pose", "right_hand_pose", "transl")
+EGO = ("R_k_cam_np", "T_k_cam_np", "dist8", "intrinsics")
 HINGE = (0.0, 0.0, -1.0)  # the top turns about it (common/object_tensors.py)
 FPS = 30.0
 BEHIND = (1.0, 4.0)  # scene points start within these times the object's distance
@@ -82,9 +84,7 @@ class ArcticReader(ClipReader):
             near = did_you_mean(place.subject, misc)
             raise ClipError(f"{place.root}/meta/misc.json has no subject {place.subject}{near}")
         subject = misc[place.subject]
-        truth = np.asarray(load_pickled_npy(place.raw("object")), np.float64)
-        if truth.ndim != 2 or truth.shape[1] != 7 or not np.isfinite(truth).all():
-            raise ClipError(f"{place.raw('object')}: expected [T, 7] numbers, got {truth.shape}")
+        truth = numbers(load_pickled_npy(place.raw("object")), str(place.raw("object")), -1, 7)
         frames = self._frames(place, subject, len(truth))
         images = [place.image(f + subject.ioi_offset) for f in frames]
         masks = {n: [place.mask(n, p) for p in images] for n in ("human", "object")}
@@ -225,22 +225,28 @@ def _cameras(
     with the head and is distorted."""
     where, size = f"{place.root}/meta/misc.json: {place.subject}", subject.image_size[place.view]
     if place.view > 0:
-        pose = np.asarray(subject.world2cam[place.view - 1], np.float64)
+        pose = numbers(subject.world2cam[place.view - 1], f"{where} world2cam", 4, 4)
         pose = rigid(checked_rotation(pose[:3, :3], f"{where} world2cam"), pose[:3, 3])
-        K = np.asarray(subject.intris_mat[place.view - 1], np.float64)
+        K = numbers(subject.intris_mat[place.view - 1], f"{where} intris_mat", 3, 3)
         return Lens.opencv(K, [], *size), [pose] * len(frames)
     ego: Any = load_pickled_npy(place.raw("egocam.dist"))
     where = str(place.raw("egocam.dist"))
-    turns = np.asarray(ego["R_k_cam_np"], np.float64)
-    shifts = np.asarray(ego["T_k_cam_np"], np.float64).reshape(-1, 3)
-    bent = np.asarray(ego["dist8"], np.float64).reshape(-1).tolist()
-    lens = Lens.opencv(np.asarray(ego["intrinsics"], np.float64), bent, *size)
+    read = {key: numbers(entry(ego, key, where), f"{where}: {key}") for key in EGO}
+    turns = numbers(read["R_k_cam_np"], f"{where}: R_k_cam_np", -1, 3, 3)
+    shifts = numbers(read["T_k_cam_np"].reshape(len(turns), -1), f"{where}: T_k_cam_np", -1, 3)
+    if len(turns) <= max(frames):
+        raise ClipError(f"{where} ends before frame {max(frames)}")
+    K = numbers(read["intrinsics"], f"{where}: intrinsics", 3, 3)
+    lens = Lens.opencv(K, read["dist8"].reshape(-1).tolist(), *size)
     return lens, [rigid(checked_rotation(turns[f], f"{where}: {f}"), shifts[f]) for f in frames]
 
 
 def _body(place: _Place, subject: Subject, frames: Sequence[int]) -> BodyTrack:
     table: Any = load_pickled_npy(place.raw("smplx"))
-    values = {k: torch.from_numpy(np.asarray(table[k], np.float64)) for k in SMPLX if k in table}
+    where = str(place.raw("smplx"))
+    values = {
+        k: torch.from_numpy(numbers(entry(table, k, where), f"{where}: {k}", -1, -1)) for k in SMPLX
+    }
     short = {k: len(v) for k, v in values.items() if len(v) <= max(frames)}
     if short:
         raise ClipError(f"{place.raw('smplx')} ends before frame {max(frames)}: {short}")
@@ -263,7 +269,7 @@ def _object(
     """The track of the mesh's centre, and the angles of its top, radians."""
     folder = place.root / "meta/object_vtemplates" / place.object_name
     vertices = np.asarray(load_mesh(folder / "mesh.obj").vertices, np.float64) / 1000
-    parts = np.asarray(load_json(folder / "parts.json"), bool)
+    parts = numbers(load_json(folder / "parts.json"), f"{folder / 'parts.json'}", -1) > 0
     if len(parts) != len(vertices):
         raise ClipError(
             f"{folder}: parts.json has {len(parts)} entries, mesh.obj {len(vertices)} vertices"

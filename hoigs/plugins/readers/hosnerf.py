@@ -28,6 +28,7 @@ from hoigs.plugins.readers.common.frame_order import image_files, video_moments
 from hoigs.plugins.readers.common.json_file import load_json
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size
 from hoigs.plugins.readers.common.listing import Need, require_files
+from hoigs.plugins.readers.common.numbers import entry, numbers
 from hoigs.plugins.readers.common.poses import body_model, checked_rotation, rigid
 from hoigs.plugins.readers.common.start_points import points_along_rays
 
@@ -112,13 +113,20 @@ class HosnerfReader(ClipReader):
             provenance["poses of human"] = NO_POSES
         states = folder / "transitions_times.json"
         if states.is_file():
-            provenance["transitions"] = [float(s["time"]) for s in load_json(states).values()]
+            provenance["transitions"] = _transitions(states)
         return Clip(
             name=folder.resolve().name, store=store, cameras=cameras,
             moments=video_moments(range(len(images)), len(images), bodies), kinds=kinds,
             bodies=bodies, points=points, point_colors=colors, split=published_split(len(images)),
             fps=self.config.fps, provenance=provenance,
         )  # fmt: skip
+
+
+def _transitions(path: Path) -> list[float]:
+    content = load_json(path)
+    rows = content.values() if isinstance(content, dict) else [content]
+    times = [entry(row, "time", str(path)) for row in rows]
+    return [float(numbers(time, f"{path}: time", 1, flat=True)[0]) for time in times]
 
 
 def published_split(count: int) -> dict[str, list[int]]:
@@ -147,11 +155,8 @@ class _Rig:
 
 def _read_rig(folder: Path, images: Sequence[Path]) -> _Rig:
     table = _by_name(folder / "cameras.pkl", images)
-    for name, entry in table.items():
-        lacking = {"intrinsics", "smpl_to_camera", "smpl_to_world"} - set(entry)
-        if lacking:
-            raise ClipError(f"{folder / 'cameras.pkl'}: frame {name} has no {sorted(lacking)}")
-    to_world = np.stack([_matrix(e["smpl_to_world"]) for e in table.values()])
+    path = folder / "cameras.pkl"
+    to_world = np.stack([_matrix(e, "smpl_to_world", f"{path}: {n}") for n, e in table.items()])
     scales = np.cbrt(np.linalg.det(to_world[:, :3, :3]))
     scale = float(np.median(scales))
     if not (scales > 0).all() or np.abs(scales / scale - 1).max() > SAME_SCALE:
@@ -160,17 +165,18 @@ def _read_rig(folder: Path, images: Sequence[Path]) -> _Rig:
             f"{scales.max():.3g}; one scene has one scale"
         )
     lenses, poses = [], []
-    for (name, entry), similar, own, path in zip(table.items(), to_world, scales, images):
-        where = f"{folder / 'cameras.pkl'}: frame {name}"
-        to_camera = _matrix(entry["smpl_to_camera"])
+    for (name, row), similar, own, image in zip(table.items(), to_world, scales, images):
+        where = f"{path}: {name}"
+        to_camera = _matrix(row, "smpl_to_camera", where)
         turn = checked_rotation(to_camera[:3, :3], f"{where}: smpl_to_camera")
         from_smpl = checked_rotation(similar[:3, :3] / own, f"{where}: smpl_to_world")
         center = (similar[:3, :3] @ (-turn.T @ to_camera[:3, 3]) + similar[:3, 3]) / scale
         rotation = turn @ from_smpl.T
         poses.append(rigid(rotation, -rotation @ center))
-        K = np.asarray(entry["intrinsics"], np.float64)[:3, :3]
-        bent = np.asarray(entry.get("distortions", ()), np.float64).reshape(-1)
-        lenses.append(Lens.opencv(K, bent.tolist(), *image_size(path)))
+        K = numbers(entry(row, "intrinsics", where), f"{where}: intrinsics", -1, -1)
+        bent = numbers(row.get("distortions", ()), f"{where}: distortions", flat=True)
+        K = numbers(K[:3, :3], f"{where}: intrinsics", 3, 3)
+        lenses.append(Lens.opencv(K, bent.tolist(), *image_size(image)))
     bounds = _bounds(folder / "poses_bounds.npy", images, poses)
     span = (float(np.quantile(bounds[:, 0], 0.05)), float(np.quantile(bounds[:, 1], 0.95)))
     return _Rig(lenses, poses, to_world, scale, (span[0] / scale, span[1] / scale))
@@ -201,16 +207,12 @@ def _bounds(
             as they are if rows and images are paired wrongly.
     """
     try:
-        rows = load_array(path)
-    except (OSError, ValueError) as error:
+        found = load_array(path)
+    except (OSError, ValueError, OverflowError) as error:
         raise ClipError(f"{path} cannot be read ({error}); write it again") from error
-    if rows.shape != (len(images), 17):
-        raise ClipError(
-            f"{path} has shape {list(rows.shape)}, expected [{len(images)}, 17], "
-            "one row for each image"
-        )
+    rows = numbers(found, f"{path}, one row for each image", len(images), 17)
     order = np.argsort(np.argsort([p.name for p in images]))  # the image's place by plain sorting
-    rows = rows[order].astype(np.float64)
+    rows = rows[order]
     # columns of LLFF are down, right, back; OpenCV's are right, down, forward
     llff = rows[:, :15].reshape(-1, 3, 5)[:, :, :3]
     turns = np.stack((llff[:, :, 1], llff[:, :, 0], -llff[:, :, 2]), -1)
@@ -232,12 +234,10 @@ def _body(folder: Path, images: Sequence[Path], rig: _Rig, smpl: Path) -> BodyTr
     keys = {"poses": 72, "tpose_joints": 72, "Rh": 3, "Th": 3}
     columns = {}
     for key, width in keys.items():
-        rows = [np.asarray(e.get(key, ()), np.float64).reshape(-1) for e in table.values()]
-        bad = [n for n, row in zip(table, rows) if len(row) != width]
-        if bad:
-            raise ClipError(
-                f"{folder / 'mesh_infos.pkl'}: frame {bad[0]} has no {key} of {width} numbers"
-            )
+        rows = []
+        for name, row in table.items():
+            where = f"{folder / 'mesh_infos.pkl'}: {name}"
+            rows.append(numbers(entry(row, key, where), f"{where}: {key}", width, flat=True))
         columns[key] = torch.from_numpy(np.stack(rows))
     rest = columns["tpose_joints"].unflatten(-1, (24, 3))
     shapes = rest - rest[:, :1]
@@ -292,5 +292,5 @@ def _any(image: Image.Image) -> Array:
     return np.asarray(image.convert("L")) > 0
 
 
-def _matrix(value: Any) -> Float[Array, "4 4"]:
-    return np.asarray(value, np.float64).reshape(4, 4)
+def _matrix(row: Any, key: str, where: str) -> Float[Array, "4 4"]:
+    return numbers(entry(row, key, where), f"{where}: {key}", 16, flat=True).reshape(4, 4)

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
+from hoigs.core.json_file import short
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.core.model.smpl_params import pose_from_smpl
 from hoigs.core.unpickling.joblib_file import load_joblib
@@ -30,6 +31,7 @@ from hoigs.plugins.readers.common.lazy_frames import (
     lens_for,
 )
 from hoigs.plugins.readers.common.listing import Need, require_files
+from hoigs.plugins.readers.common.numbers import entry, numbers, read_lines
 from hoigs.plugins.readers.common.poses import body_model
 
 LAYOUT = "a NeuMan scene"
@@ -155,9 +157,7 @@ def _alignments(path: Path, names: Sequence[str]) -> _Alignments:
             f"{path} has no entry for {len(absent)} of {len(names)} images "
             f"({', '.join(absent[:4])}); {MAKERS['alignments']}"
         )
-    rows = np.stack([np.asarray(table[name], np.float64) for name in names])
-    if rows.shape[1:] != (4, 3):
-        raise ClipError(f"{path}: entries have shape {list(rows.shape[1:])}, expected [4, 3]")
+    rows = np.stack([numbers(table[name], f"{path}: {name}", 4, 3) for name in names])
     matrices = rows[:, :3].transpose(0, 2, 1)  # written for row vectors
     determinants = np.linalg.det(matrices)
     if (determinants <= 0).any():
@@ -206,29 +206,30 @@ def _smpl_rows(path: Path, names: Sequence[str]) -> tuple[torch.Tensor, torch.Te
     """pose [F, 72] and betas [F, 10]; rows are numbered as the images are named."""
     content = load_joblib(path)
     people = list(content.values()) if isinstance(content, dict) else []
-    if len(people) != 1 or not {"pose", "betas"} <= set(people[0]):
+    if len(people) != 1:
         raise ClipError(f"{path}: expected one person with pose and betas")
     columns = []
     for key, width in (("pose", 72), ("betas", 10)):
-        rows = np.asarray(people[0][key], np.float64)
-        rows = rows.reshape(len(rows), -1)[:, :width]
-        numbers = [int(Path(name).stem) for name in names]
-        if rows.shape[1] != width or max(numbers) >= len(rows):
+        rows = numbers(entry(people[0], key, str(path)), f"{path}: {key}")
+        rows = rows.reshape(len(rows), -1)[:, :width] if rows.size else rows.reshape(0, width)
+        frames = [int(Path(name).stem) for name in names]
+        if rows.shape[1] != width or max(frames) >= len(rows):
             raise ClipError(
                 f"{path}: {key} has shape {list(rows.shape)}; expected rows up to "
-                f"{max(numbers)}, the last image's number, of {width}"
+                f"{max(frames)}, the last image's number, of {width}"
             )
-        columns.append(torch.from_numpy(rows[numbers]))
+        columns.append(torch.from_numpy(rows[frames]))
     return columns[0], columns[1]
 
 
 def _listed(folder: Path, use: str, names: Sequence[str]) -> list[int]:
     path = folder / f"{use}_split.txt"
-    wanted = [line.strip() for line in path.read_text().splitlines() if line.strip()]
+    wanted = read_lines(path)
     unknown = [name for name in wanted if name not in names]
     if unknown:
         raise ClipError(
-            f"{path} names {', '.join(unknown[:4])}: not among the images that sparse/ registers"
+            f"{path} names {', '.join(map(short, unknown[:4]))}: not among the images that sparse/ "
+            "registers"
         )
     return sorted(names.index(name) for name in wanted)
 

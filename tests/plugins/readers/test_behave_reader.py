@@ -204,7 +204,7 @@ def test_damaged_fits_are_told(still: Clip, pelvis: Tensor, tmp_path: Path) -> N
     path = folder / "t0003.033/person/fit02/person_fit.pkl"
     content = load_pickle(path)
     path.write_bytes(pickle.dumps({**content, "pose": content["pose"][:72]}))
-    with pytest.raises(ClipError, match="expected 156 finite numbers as 'pose', got 72"):
+    with pytest.raises(ClipError, match=r"pose: expected numbers of shape \[156\], got \[72\]"):
         BehaveReader().read(folder)
     path.write_bytes(pickle.dumps({**content, "betas": content["betas"] + 4}))
     with pytest.raises(ClipError, match="betas of frame 1 differ"):

@@ -159,5 +159,5 @@ def test_broken_files_are_named(builtin: Clip, body: AnnyBody, smplx: Path, tmp_
     with pytest.raises(ClipError, match=r"4\.json does not have .*\n  trans: Field required"):
         reader_of(smplx).read(tmp_path)
     (tmp_path / "frame_list_train.txt").write_text("0\nframe7.png\n")
-    with pytest.raises(ClipError, match=r'frame_list_train\.txt has the line "frame7\.png"'):
+    with pytest.raises(ClipError, match=r"frame_list_train\.txt has the line 'frame7\.png'"):
         reader_of(smplx).read(tmp_path)

@@ -155,7 +155,7 @@ def test_inconsistent_files(source: Clip, body: AnnyBody, smpl: Path, tmp_path: 
     with pytest.raises(ClipError, match=r"pose has shape \[5, 72\]; expected rows up to 7"):
         NeumanReader(NeumanReader.Config(smpl=smpl)).read(tmp_path)
     (tmp_path / "train_split.txt").write_text("00099.png\n")
-    with pytest.raises(ClipError, match=r"train_split\.txt names 00099\.png: not among"):
+    with pytest.raises(ClipError, match=r"train_split\.txt names '00099\.png': not among"):
         NeumanReader().read(tmp_path)
 
 

@@ -16,6 +16,7 @@ from hoigs.core.errors import ClipError
 from hoigs.core.npz import load_arrays
 from hoigs.core.unpickling.pickles import load_pickle
 from hoigs.plugins.readers.common.listing import Need
+from hoigs.plugins.readers.common.numbers import entry, numbers
 
 SITE = "https://virtualhumans.mpi-inf.mpg.de/behave"
 MAKER = (
@@ -137,12 +138,14 @@ def _of_arrays(frames: Sequence[Path], body_path: Path, object_path: Path) -> Fi
 
 
 def _seconds(times: np.ndarray) -> np.ndarray:
-    """Seconds of "t0003.033", or of numbers."""
-    return np.array([float(str(t).removeprefix("t")) for t in times])
+    """Seconds of "t0003.033", or of numbers.
+
+    Raises:
+        ClipError: they are something else.
+    """
+    texts = [str(t).removeprefix("t") for t in times]
+    return numbers(np.array(texts, object), "frame_times", -1)
 
 
 def _numbers(table: Any, key: str, width: int, path: Path) -> np.ndarray:
-    values = np.asarray(table.get(key, ()) if isinstance(table, dict) else (), np.float64)
-    if values.size != width or not np.isfinite(values).all():
-        raise ClipError(f"{path}: expected {width} finite numbers as {key!r}, got {values.size}")
-    return values.reshape(-1)
+    return numbers(entry(table, key, str(path)), f"{path}: {key}", width, flat=True)

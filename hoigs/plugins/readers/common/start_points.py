@@ -9,11 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.errors import ClipError
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import FrameStore
 
 Points = tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]
 SOURCES = 8  # frames that are read
+FARTHEST = 1e7  # metres, as in clip folders
 
 
 def points_in_box(count: int, reach: float) -> Points:
@@ -60,7 +62,15 @@ def points_along_rays(
 
     Args:
         span: nearest and farthest depth, metres; inverse depth is uniform between them.
+
+    Raises:
+        ClipError: the span makes no sense, since the cameras or what they look at do not.
     """
+    if not 1 / FARTHEST < span[0] <= span[1] < FARTHEST:
+        raise ClipError(
+            f"the scene would begin {span[0]:.3g} to {span[1]:.3g} m away from the cameras: their "
+            "poses, or what places the scene, are wrong"
+        )
     rng = np.random.default_rng(seed)
     sources = _sources(len(cameras))
     parts = []

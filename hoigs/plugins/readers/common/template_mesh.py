@@ -28,8 +28,13 @@ def load_mesh(path: Path) -> Any:
         vertices = np.asarray(loaded.vertices, np.float64)
     except Exception as error:  # its readers raise anything on a damaged file
         raise ClipError(f"{path} is not a mesh ({type(error).__name__}: {error})") from error
-    if vertices.ndim != 2 or not len(vertices) or not np.isfinite(vertices).all():
-        raise ClipError(f"{path} is not a mesh: it has no vertices, or some that are not finite")
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices):
+        raise ClipError(f"{path} is not a mesh: it has no vertices of three coordinates")
+    if not np.isfinite(vertices).all():
+        raise ClipError(f"{path} is not a mesh: some of its vertices are not finite")
+    faces = np.asarray(loaded.faces)
+    if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise ClipError(f"{path} is not a mesh: some of its faces name a vertex that it lacks")
     return loaded
 
 

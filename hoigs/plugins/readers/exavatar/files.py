@@ -12,12 +12,14 @@ import torch
 from pydantic import BaseModel, Field
 
 from hoigs.core.errors import ClipError
+from hoigs.core.json_file import short
 from hoigs.core.values.lens import Lens
 from hoigs.plugins.readers.common.colmap_model import View, model_folder, read_sparse, sparse_needs
 from hoigs.plugins.readers.common.frame_order import IMAGE_SUFFIXES
 from hoigs.plugins.readers.common.json_file import parse_json
 from hoigs.plugins.readers.common.lazy_frames import image_size
 from hoigs.plugins.readers.common.listing import Need
+from hoigs.plugins.readers.common.numbers import numbers, read_lines
 from hoigs.plugins.readers.common.point_file import Points
 from hoigs.plugins.readers.common.poses import checked_rotation, rigid
 
@@ -27,6 +29,7 @@ BACKGROUND = "COLMAP makes it; ExAvatar's bkg_point_cloud.txt serves a fixed cam
 CAMERAS = "COLMAP makes it; ExAvatar's make_virtual_cam_params.py for a camera that stands still"
 FRAMES = "the video's frames, I.png"
 OPTIMIZED, POINTS = "smplx_optimized", "bkg_point_cloud.txt"
+LONGEST = 9  # digits of a frame's number
 USES = ("train", "test")
 POSE_FOLDERS = ("smplx_params_smoothed", "smplx_params")
 Array = np.ndarray
@@ -60,7 +63,7 @@ class FrameFiles:
 
 def _numbered(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     found = sorted(folder.glob("*"))
-    return {int(p.stem): p for p in found if p.suffix.lower() in suffixes and p.stem.isdigit()}
+    return {int(p.stem): p for p in found if p.suffix.lower() in suffixes and p.stem.isdecimal()}
 
 
 def _image_folder(folder: Path) -> str:
@@ -111,11 +114,11 @@ def read_split(folder: Path) -> dict[str, list[int]]:
     """
     split = {}
     for use, name in _lists(folder).items():
-        lines = (folder / name).read_text().split()
+        lines = read_lines(folder / name)
         stems = [Path(line).stem for line in lines]
-        wrong = [line for line, stem in zip(lines, stems) if not stem.isdigit()]
+        wrong = [x for x, stem in zip(lines, stems) if not stem.isdecimal() or len(stem) > LONGEST]
         if wrong or not lines:
-            what = f'has the line "{wrong[0]}"' if wrong else "is empty"
+            what = f"has the line {short(wrong[0])}" if wrong else "is empty"
             raise ClipError(f"{folder / name} {what}; expected one frame number on each line")
         split[use] = sorted({int(stem) for stem in stems})
     return split
@@ -137,7 +140,7 @@ def colmap_views(folder: Path) -> dict[int, View] | None:
 def virtual_view(folder: Path, number: int, image: Path) -> View:
     path = folder / "cam_params" / f"{number}.json"
     camera = parse_json(path, CameraJson)
-    rotation = checked_rotation(np.array(camera.R, np.float64), str(path))
+    rotation = checked_rotation(numbers(camera.R, f"{path}: R", 3, 3), str(path))
     lens = Lens("PINHOLE", (*camera.focal, *camera.princpt), *image_size(image))
     return View(image.name, lens, rigid(rotation, np.array(camera.t, np.float64)))
 

@@ -21,6 +21,7 @@ from hoigs.plugins.readers.common.frame_order import video_moments
 from hoigs.plugins.readers.common.json_file import load_json, parse_json
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, lens_for
 from hoigs.plugins.readers.common.listing import require_files
+from hoigs.plugins.readers.common.numbers import numbers
 from hoigs.plugins.readers.common.poses import body_model
 from hoigs.plugins.readers.exavatar.files import (
     OPTIMIZED,
@@ -137,8 +138,10 @@ class ExavatarReader(ClipReader):
         still = bool(np.abs(world_to_camera - np.eye(4)).max() == 0)
         if self.config.smplx is None and not still:
             return {}
-        shape = np.asarray(load_json(folder / OPTIMIZED / "shape_param.json"), np.float64)
-        betas = torch.from_numpy(shape.reshape(-1)[: self.config.num_betas])
+        path = folder / OPTIMIZED / "shape_param.json"
+        betas = torch.from_numpy(
+            numbers(load_json(path), str(path), flat=True)[: self.config.num_betas]
+        )
         pelvis = torch.zeros(3, dtype=torch.float64)
         if self.config.smplx is not None:
             body = body_model("body:smplx", self.config.smplx, num_betas=len(betas))
@@ -160,7 +163,10 @@ class ExavatarReader(ClipReader):
 
 def _stacked(paths: Sequence[Path], rows: Sequence[Any], key: str) -> torch.Tensor:
     """[F, N] float64 of one key of all files."""
-    flat = [np.concatenate([np.ravel(part) for part in row]) for row in rows]
+    flat = [
+        numbers([x for part in row for x in np.ravel(part)], f"{path}: {key}")
+        for path, row in zip(paths, rows)
+    ]
     for path, row in zip(paths, flat):
         if len(row) != len(flat[0]):
             raise ClipError(f"{path}: {key} has {len(row)} numbers, others have {len(flat[0])}")
