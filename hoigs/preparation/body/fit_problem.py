@@ -97,6 +97,7 @@ class FitProblem:
         if found is not None:
             self.noise, self.begin = found.noise, found.begin(self.begin)
             self.placed[: found.frames] = True
+            self.motion.suppose(found.ordinary)
 
     def show(self, masks: Masks, first: int = 0) -> None:
         """Look at masks in the frames without landmarks; `first` is the number of frame 0."""
@@ -175,16 +176,22 @@ class FitProblem:
         )
 
     def estimate_noise(self, unknowns: Unknowns) -> None:
+        """Of the landmarks; and how strongly what they stand for accelerates."""
         if self.found is not None:
             return
         points = self.posed(unknowns, derivatives=False).points
-        pixels, _ = self.in_cameras(points, unknowns.scale)
+        pixels, cam = self.in_cameras(points, unknowns.scale)
         residuals, _, _ = self._space_residuals(points, unknowns.unit, 1.0)
         self.noise = self.noise.seen(
             (pixels - self.pixels, self.visible),
             (residuals, self.in_space),
             LEAST_PIXELS * self.width,
         )
+        # where the landmarks lie at the fit's depths, along the mean camera's two image axes
+        metres = cam[..., 2:] / self.K[:, None, [0, 1], [0, 1]]
+        axes = self.viewmats[:, :2, :3]
+        places = points + (self.pixels - pixels) * metres @ axes
+        self.motion.seen(places @ axes.mean(0).mT, self.visible > 0.5)
 
     def energy(
         self, unknowns: Unknowns, widen: float, equations: NormalEquations | None = None

@@ -138,10 +138,11 @@ class Found:
     """What one fit has found and another keeps: all that frames share, and the first frames.
 
     Attributes:
-        pose: of the first frames; None: of none.
+        ordinary: accelerations of `MotionPrior`. pose: of the first frames; None: of none.
     """
 
     noise: Noise
+    ordinary: Float[Tensor, " K"]
     betas: Float[Tensor, " B"]
     offsets: Float[Tensor, "P 3"]
     unit: float

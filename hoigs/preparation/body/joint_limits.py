@@ -10,7 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 # body joint (1..21) -> limits of the x, y, z components, degrees. Knees bend about +x, the left
-# elbow about -y and the right one about +y; generous values of ordinary anatomy.
+# elbow about -y and the right one about +y; generous values of ordinary anatomy. A forearm that
+# twists while the elbow is bent has a z component there, and a y component at the wrist.
 LIMITS: dict[int, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     1: ((-120, 50), (-50, 50), (-30, 60)),
     2: ((-120, 50), (-50, 50), (-60, 30)),
@@ -29,10 +30,10 @@ LIMITS: dict[int, tuple[tuple[float, float], tuple[float, float], tuple[float, f
     15: ((-30, 30), (-40, 40), (-20, 20)),
     16: ((-90, 90), (-130, 60), (-110, 100)),
     17: ((-90, 90), (-60, 130), (-100, 110)),
-    18: ((-80, 80), (-150, 2), (-8, 8)),
-    19: ((-80, 80), (-2, 150), (-8, 8)),
-    20: ((-40, 40), (-30, 30), (-70, 70)),
-    21: ((-40, 40), (-30, 30), (-70, 70)),
+    18: ((-80, 80), (-150, 2), (-30, 30)),
+    19: ((-80, 80), (-2, 150), (-30, 30)),
+    20: ((-40, 40), (-45, 45), (-70, 70)),
+    21: ((-40, 40), (-45, 45), (-70, 70)),
 }
 
 

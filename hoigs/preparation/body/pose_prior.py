@@ -13,7 +13,7 @@ from hoigs.preparation.body.normal_equations import NormalEquations
 # joint -> standard deviation from rest, radians; of the others FREE
 SPREADS = {
     3: 0.25, 6: 0.2, 9: 0.2, 12: 0.3, 15: 0.3, 13: 0.2, 14: 0.2, 7: 0.35, 8: 0.35,
-    10: 0.1, 11: 0.1, 20: 0.35, 21: 0.35,
+    10: 0.1, 11: 0.1, 20: 0.6, 21: 0.6,
 }  # fmt: skip
 FREE = 1.2
 FOUND = 0.3  # radians that a pose by another program is off, of every joint

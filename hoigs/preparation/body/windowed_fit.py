@@ -41,9 +41,9 @@ def fit_in_windows(
 ) -> BodyFit:
     """As `fit_body`, with memory for one window.
 
-    What all frames share (shape, places of the landmarks, noise, the world's scale) is fitted to as
-    many frames as a window has, in stretches from all over the clip, and then kept. Each window
-    keeps the first poses of its overlap as the window before has found them, so that accelerations
+    What all frames share (shape, places of the landmarks, noise, ordinary motion, the world's
+    scale) is fitted to as many frames as a window has, in stretches from all over the clip, and
+    then kept. Each window keeps the first poses of its overlap as the window before has found them, so that accelerations
     are priced across the joint, and replaces the later ones, of which that had not seen what
     follows (a fixed-lag smoother).
     """
@@ -58,7 +58,9 @@ def fit_in_windows(
     if points is not None:
         known.ground = points
     shared = solve(known, options.steps, partial(share, 0))
-    found = Found(known.noise, shared.pose.betas, shared.offsets, shared.unit)
+    found = Found(
+        known.noise, known.motion.ordinary, shared.pose.betas, shared.offsets, shared.unit
+    )
     metric, cameras = replace(options, scale=False), [c.scaled(shared.scale) for c in cameras]
     start = first_guess(body, landmarks, cameras, False)
     parts: list[BodyPose] = []

@@ -11,7 +11,12 @@ import torch
 from torch import Tensor
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.maths.rotations import (
+    axis_angle_to_matrices,
+    axis_angle_to_quats,
+    multiply_quats,
+    quats_to_axis_angle,
+)
 from hoigs.core.maths.skinning import skin, transform_points
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
@@ -381,3 +386,12 @@ def test_offsets_are_as_likely_on_a_small_body_as_on_a_large_one() -> None:
         for s in (1, -1)
     ]
     assert (costs[0] - costs[1]) / 4 == pytest.approx(float(equations.by_shared @ by), rel=1e-5)
+
+
+def test_a_bent_elbow_may_twist() -> None:
+    """The axis-angle of both turns together has a z component, which is no bend of its own."""
+    bend, twist = torch.tensor([0.0, -1.4, 0.0]), torch.tensor([-0.6, 0.0, 0.0])
+    quats = multiply_quats(axis_angle_to_quats(bend), axis_angle_to_quats(twist))
+    turns = torch.zeros(1, 21, 3)
+    turns[:, 17] = quats_to_axis_angle(quats)
+    assert turns[0, 17, 2].abs() > 0.3 and limit_penalty(turns) == 0
