@@ -43,9 +43,9 @@ def fit_in_windows(
 
     What all frames share (shape, places of the landmarks, noise, ordinary motion, the world's
     scale) is fitted to as many frames as a window has, in stretches from all over the clip, and
-    then kept. Each window keeps the first poses of its overlap as the window before has found them, so that accelerations
-    are priced across the joint, and replaces the later ones, of which that had not seen what
-    follows (a fixed-lag smoother).
+    then kept. Each window keeps the first poses of its overlap as the window before has found them,
+    so that accelerations are priced across the joint, and replaces the later ones, of which that
+    had not seen what follows (a fixed-lag smoother).
     """
     windows = chunking.windows(len(cameras))
     share = partial(_share, progress, len(windows) + 1)
