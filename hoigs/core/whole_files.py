@@ -8,6 +8,18 @@ from pathlib import Path
 
 
 @contextmanager
+def failures_named(path: Path) -> Iterator[None]:
+    """Errors of the system in the block that name no file name this one: a full disk is noticed by
+    write(), which knows no name."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
 def written_whole(path: Path, temporary: Path | None = None) -> Iterator[Path]:
     """A temporary name to write to, renamed to `path` after the block and removed if it fails.
 
@@ -16,12 +28,11 @@ def written_whole(path: Path, temporary: Path | None = None) -> Iterator[Path]:
     """
     temporary = temporary or path.with_name(f".{path.name}.part")
     try:
-        yield temporary
-        temporary.replace(path)
-    except BaseException as error:
+        with failures_named(path):
+            yield temporary
+            temporary.replace(path)
+    except BaseException:
         temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno and error.filename is None:
-            error.filename = str(path)  # a full disk is noticed by write(), which knows no name
         raise
 
 

@@ -26,7 +26,7 @@ from hoigs.core.safe_replace import (
     refuse_unwritable,
     require_replaceable,
 )
-from hoigs.core.whole_files import write_whole
+from hoigs.core.whole_files import failures_named, write_whole
 from hoigs.runs.records import MetricsRecord, Provenance, StepRecord
 
 PACKAGES = ("hoigs", "torch", "warp-lang", "kornia", "pluggy", "numpy")
@@ -158,15 +158,14 @@ class RunFolder:
         temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
         shutil.rmtree(temporary, ignore_errors=True)
         try:
-            (temporary / "checkpoints").mkdir(parents=True)
-            (temporary / "spec.yaml").write_text(spec_text)
-            (temporary / "provenance.json").write_text(json.dumps(provenance, indent=1))
-            (temporary / "metrics.jsonl").touch()
-            put_in_place(temporary, self.path)
-        except BaseException as error:
+            with failures_named(self.path):
+                (temporary / "checkpoints").mkdir(parents=True)
+                (temporary / "spec.yaml").write_text(spec_text)
+                (temporary / "provenance.json").write_text(json.dumps(provenance, indent=1))
+                (temporary / "metrics.jsonl").touch()
+                put_in_place(temporary, self.path)
+        except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
-            if isinstance(error, OSError):  # a full disk is noticed by write(), which knows no name
-                error.filename = error.filename or str(self.path)
             raise
         self._created = True
 
@@ -185,12 +184,8 @@ class RunFolder:
 
     def log(self, record: dict[str, Any]) -> None:
         """Append a line to metrics.jsonl."""
-        try:
-            with self.metrics.open("a") as file:
-                file.write(json.dumps(record) + "\n")
-        except OSError as error:
-            error.filename = error.filename or str(self.metrics)  # as in `create`
-            raise
+        with failures_named(self.metrics), self.metrics.open("a") as file:
+            file.write(json.dumps(record) + "\n")
 
     def cut_metrics(self, step: int) -> None:
         """Drop records after `step`, which a resumed run writes again, and an unfinished line."""

@@ -36,6 +36,7 @@ from hoigs.core.errors import ClipError
 from hoigs.core.safe_replace import refuse_unwritable, require_replaceable
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, ObjectTrack, uniform_test_split
+from hoigs.core.whole_files import failures_named
 
 Image8 = UInt8[Tensor, "H W 3"] | UInt8[np.ndarray, "H W 3"]
 Mask = Bool[Tensor, "H W"] | Bool[np.ndarray, "H W"]
@@ -174,8 +175,11 @@ class ClipWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
     ) -> None:
         try:
-            if kind is None:
-                self._finish()
+            with failures_named(self.folder):
+                if isinstance(error, OSError):
+                    raise error
+                if kind is None:
+                    self._finish()
         finally:
             if self._root.exists():
                 shutil.rmtree(self._root)

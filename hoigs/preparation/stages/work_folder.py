@@ -23,6 +23,7 @@ import numpy as np
 from hoigs.core.errors import ClipError
 from hoigs.core.folder_lock import FolderLock
 from hoigs.core.npz import load_arrays
+from hoigs.core.whole_files import failures_named
 
 TEMPORARY = "."  # names that begin with it are not read, and are removed at the start
 UNFINISHED = "unfinished-"
@@ -73,19 +74,32 @@ class WorkFolder:
         self._lock.release()
 
     def load(self, stage: str, key: str) -> Result | None:
-        """The stage's result, if there is one for this key."""
+        """The stage's result, if there is a whole one for this key; others are made again."""
         folder = self.root / stage
         try:
             content = json.loads((folder / RESULT).read_text(encoding="utf-8"))
-        except FileNotFoundError:
+            if content["key"] != key:
+                return None
+            return Result(content["values"], load_arrays(folder / ARRAYS), None, folder)
+        except (FileNotFoundError, ValueError, KeyError, TypeError, RecursionError):
             return None
-        if content["key"] != key:
-            return None
-        return Result(content["values"], load_arrays(folder / ARRAYS), None, folder)
 
     def save(self, stage: str, key: str, result: Result) -> Result:
         """Keeps a stage's result in place of an older one; returns it as `load` does."""
         fresh = self.temporary()
+        try:
+            with failures_named(self.root / stage):
+                self._write(fresh, key, result)
+        except BaseException:
+            shutil.rmtree(fresh, ignore_errors=True)
+            raise
+        self.forget(stage)
+        fresh.rename(self.root / stage)
+        kept = self.load(stage, key)
+        assert kept is not None
+        return kept
+
+    def _write(self, fresh: Path, key: str, result: Result) -> None:
         if result.files is not None:
             result.files(fresh)
         np.savez_compressed(fresh / ARRAYS, **result.arrays)  # type: ignore[arg-type]
@@ -94,11 +108,6 @@ class WorkFolder:
         (fresh / RESULT).write_text(text, encoding="utf-8")
         for path in (fresh / ARRAYS, fresh / RESULT):
             _to_disk(path)
-        self.forget(stage)
-        fresh.rename(self.root / stage)
-        kept = self.load(stage, key)
-        assert kept is not None
-        return kept
 
     def forget(self, stage: str) -> None:
         """Removes a stage's result, all at once."""

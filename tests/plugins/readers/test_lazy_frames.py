@@ -89,6 +89,13 @@ def test_depth_is_scaled_and_cleaned(tmp_path: Path, image: Path) -> None:
     assert depth is not None and depth[0, :4].tolist() == [0, 0, 0, 2]
 
 
+def test_a_depth_map_without_pixels_is_refused(tmp_path: Path, image: Path) -> None:
+    np.save(tmp_path / "d.npy", np.zeros((0, W), np.float32))
+    store = LazyFrames(tmp_path, [image], [CAMERA], depth=DepthFiles([tmp_path / "d.npy"]))
+    with pytest.raises(ClipError, match=r"d\.npy is 24x0, the frame 24x16"):
+        store.depth(0)
+
+
 def test_one_map_bends_images_masks_and_depth(tmp_path: Path) -> None:
     """A blob lands in the same pixels in all three, and elsewhere than in the file."""
     blob = np.zeros((H, W), np.uint8)

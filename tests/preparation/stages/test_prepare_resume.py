@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 import subprocess
@@ -111,6 +112,41 @@ def test_results_survive_exactly_and_only_for_their_key(tmp_path: Path) -> None:
         assert work.load("a", "key") is None and not (found.folder / "note").exists()
         work.forget("a")
         assert work.load("a", "other") is None
+
+
+@pytest.mark.parametrize("damage", [b"", b"[1]", b"{}", b'{"key": 1', b"\xff"])
+def test_a_damaged_result_is_made_again(tmp_path: Path, damage: bytes) -> None:
+    with WorkFolder(tmp_path / "clip.prepare") as work:
+        work.save("depth", "k", Result({"a": 1}, {"x": np.zeros(3)}))
+        for name in ("result.json", "arrays.npz"):
+            path = tmp_path / "clip.prepare/depth" / name
+            whole = path.read_bytes()
+            path.write_bytes(damage)
+            assert work.load("depth", "k") is None
+            path.write_bytes(whole)
+        assert work.load("depth", "k") is not None
+
+
+@pytest.mark.parametrize("where", ["stage", "clip"])
+def test_a_full_disk_is_named_and_leaves_nothing_half(
+    tiny_source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    out = tmp_path / "clip"
+    if where == "stage":
+        monkeypatch.setattr(np, "savez_compressed", full)
+        with WorkFolder(tmp_path / "clip.prepare") as work, pytest.raises(OSError) as caught:
+            work.save("depth", "k", Result({}, {}))
+        assert not list((tmp_path / "clip.prepare").iterdir())
+        assert caught.value.filename == str(tmp_path / "clip.prepare/depth")
+    else:
+        monkeypatch.setattr("hoigs.core.clip_folder.write.check_clip", full)
+        with pytest.raises(OSError) as caught:
+            prepare(tiny_source, out, body=AnnyBody(), options=OPTIONS)
+        assert caught.value.filename == str(out)
+        assert sorted(p.name for p in tmp_path.iterdir()) == ["clip.prepare", "source"]
 
 
 def test_leavings_of_a_killed_process_are_swept_away(tmp_path: Path) -> None:

@@ -194,7 +194,9 @@ class LazyFrames(FrameStore):
         height, width = values.shape[:2]
         if (width, height) == (camera.width, camera.height):
             return values
-        if abs(width * camera.height / (height * camera.width) - 1) > ASPECT_TOLERANCE:
+        if not values.size or (
+            abs(width * camera.height / (height * camera.width) - 1) > ASPECT_TOLERANCE
+        ):
             raise ClipError(
                 f"{path} is {width}x{height}, the frame {camera.width}x{camera.height}: "
                 "different aspect ratios"
