@@ -81,8 +81,8 @@ def train(
         int | None,
         typer.Option(
             "--chunk",
-            help="For a long clip: train in windows of so many frames, of which one at a time is "
-            "in memory.",
+            help="For a long clip: of what grows with it, keep so many frames' part in memory "
+            "(16: short windows cost less time).",
         ),
     ] = None,
     evaluate: Annotated[

@@ -36,9 +36,9 @@ class Checkpoint:
     A pruned or compressed checkpoint holds the model alone, which can be drawn but not resumed.
 
     Attributes:
-        tensors: "model.*", "optimizer.*", "density.*", "cameras.*", "rng.*".
-        meta: format, version, step, time_s, counts, sampler, skipped, spec_name, model_hash; of a
-            training in windows, windows.
+        tensors: "model.*", "optimizer.*", "density.*", "cameras.*", "rng.*"; of a training in
+            windows "windows.*".
+        meta: format, version, step, time_s, counts, sampler, skipped, spec_name, model_hash.
         files: of a training in windows, tensors that lie in files, in place of those in `tensors`.
     """
 

@@ -2,23 +2,31 @@
 
 A parameter that has rows for times (`hoigs.core.time_rows.TimeRows`) grows with the clip, and with
 it its gradient and two moments of Adam. A step reads the rows about one time. So the clip's time is
-cut into windows, training visits one after the other (`WindowSampler`), and the rows of the others,
-with their moments, lie in files. Neighbouring windows share the rows about the time where they
-meet, so that nothing has to be joined: the model is one function of time, as without windows.
+cut into windows; before a step the rows of its frame's window, with their moments, are read from
+files, and after it they are written there. Frames come in the order in which they would come
+without windows, as several in a row from one part of the clip would pull the scene towards it.
+
+Without windows Adam would go on to move the rows of the other windows, by their moments. Those
+moves, of gradients that are zero, are made up for when rows are read again (`_caught_up`). What is
+left are penalties of these parameters, which see one window at a time. Neighbouring windows share
+the rows about the time where they meet, so nothing has to be joined: the model is one function of
+time, and a checkpoint is that of an ordinary training.
 """
 
 from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from torch import nn
+from jaxtyping import Float, Int
+from torch import Tensor, nn
 
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.storage.tensor_files import TensorFile
@@ -27,17 +35,22 @@ from hoigs.core.values.moment import Moment
 from hoigs.training.optimizer import GroupedAdam
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
-ROUNDS = 10  # in which training visits all windows, at least, where it has the steps
+FADED = 120  # steps without a gradient after which a moment moves nothing any more
 
 
 @dataclass(frozen=True)
 class _Paged:
-    """A parameter, its rows, and the files of its values and moments."""
+    """A parameter, its rows, and the files of its values and moments.
+
+    Attributes:
+        last: of each row, the number of optimizer steps that its values and moments have seen.
+    """
 
     parameter: nn.Parameter
     rows: TimeRows
     values: TensorFile
     moments: dict[str, TensorFile]
+    last: Int[np.ndarray, " T"]
 
 
 class TimeWindows:
@@ -50,7 +63,7 @@ class TimeWindows:
         folder: for the files, made and removed by `opened`; None: the system's temporary one.
 
     Attributes:
-        names: of the parameters that are cut. steps: that each window has had.
+        names: of the parameters that are cut. done: optimizer steps.
     """
 
     def __init__(
@@ -63,10 +76,10 @@ class TimeWindows:
         folder: Path | None = None,
     ) -> None:
         self.model, self.optimizer, self.folder = model, optimizer, folder
-        self.chunk, self.count = chunk, max(1, -(-frames // chunk))
-        self.steps = [0] * self.count
+        self.chunk, self.count, self.done = chunk, max(1, -(-frames // chunk)), 0
         self._rows = dict(_rows_of(model, fixed)) if self.count > 1 else {}
         self.names = [name for name in self._rows if name in optimizer.names]
+        self._last: dict[str, np.ndarray] = {}
         self._paged: dict[str, _Paged] = {}
         self._present: int | None = None
 
@@ -74,7 +87,7 @@ class TimeWindows:
         """How the clip is trained, for people."""
         if self.names:
             return (
-                f"trained in {self.count} windows of at most {self.chunk} frames, by turns: of "
+                f"trained in {self.count} windows of at most {self.chunk} frames: of "
                 f"{len(self.names)} parameters that grow with the clip, one window's rows are in "
                 "memory"
             )
@@ -82,10 +95,6 @@ class TimeWindows:
         if self.count == 1:
             why = f"all frames fit in one window of {self.chunk}"
         return f"trained at once: {why}"
-
-    def of(self, time: float) -> int:
-        """The window of a time in [0, 1]."""
-        return min(max(int(time * self.count), 0), self.count - 1)
 
     @contextmanager
     def opened(self, end: int) -> Iterator[None]:
@@ -104,53 +113,29 @@ class TimeWindows:
             folder = self.folder
             shutil.rmtree(folder, ignore_errors=True)  # of a killed training
             folder.mkdir()
-        hook = self.model.register_forward_pre_hook(
-            lambda _, given, named: self.enter(
-                float((given[0] if given else named["moment"]).time)
-            ),
-            with_kwargs=True,
-        )
+        hook = self.model.register_forward_pre_hook(self._before_forward, with_kwargs=True)
         try:
             self._write(folder)
             yield
-            self._whole(sum(self.steps) < end)
+            self._catch_up()
         finally:
             hook.remove()
-            self._paged, self._present = {}, None
+            self._whole(self.done < end)
+            self._paged = {}
             shutil.rmtree(folder, ignore_errors=True)
 
-    def _before_forward(self, _: nn.Module, given: tuple[Any, ...], named: dict[str, Any]) -> None:
-        moment: Moment = given[0] if given else named["moment"]
-        self.enter(float(moment.time))
-
-    def enter(self, time: float) -> None:
-        """Take the rows about a time into memory, in place of others."""
-        window = self.of(time)
-        if window == self._present:
-            return
-        self._leave()
-        for paged in self._paged.values():
-            rows = self._about(paged.rows, window)
-            paged.rows.first = rows.start
-            parameter, steps = paged.parameter, self.steps[window]
-            parameter.grad, device = None, parameter.device
-            parameter.data = paged.values.read(rows).to(device)
-            self.optimizer.adam.state[parameter] = {
-                "step": torch.tensor(float(steps), device=device),
-                **{
-                    key: file.read(rows).to(device) if steps else torch.zeros_like(parameter)
-                    for key, file in paged.moments.items()
-                },
-            }
-        self._present = window
-
     def stepped(self) -> None:
-        """Count an optimizer step of the present window."""
-        if self._present is not None:
-            self.steps[self._present] += 1
+        """Count an optimizer step."""
+        self.done += 1
 
-    def files(self) -> dict[str, TensorFile]:
-        """What a checkpoint holds of these parameters: their whole values and moments."""
+    def files(self, finished: bool) -> dict[str, TensorFile]:
+        """What a checkpoint holds of these parameters: their whole values and moments.
+
+        Args:
+            finished: after the last step, whose model is used: all windows are brought up to it.
+        """
+        if finished:
+            self._catch_up()
         self._leave()
         found: dict[str, TensorFile] = {}
         for name, paged in self._paged.items():
@@ -158,13 +143,19 @@ class TimeWindows:
             found |= {f"optimizer.{name}.{key}": file for key, file in paged.moments.items()}
         return found
 
-    def state(self) -> dict[str, Any]:
-        return {"chunk": self.chunk, "steps": list(self.steps)}
+    def state(self) -> dict[str, Tensor]:
+        """Of each parameter, the steps that its rows have seen; to be called after `files`."""
+        return {name: torch.from_numpy(p.last.copy()) for name, p in self._paged.items()}
 
-    def load(self, state: dict[str, Any] | None, step: int) -> None:
-        """Of a checkpoint of `step` steps, which may be of a training with other windows."""
-        same = state is not None and len(state["steps"]) == self.count
-        self.steps = [int(n) for n in state["steps"]] if state and same else [step] * self.count
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Of a checkpoint; empty of a training without windows."""
+        self._last = {name: last.numpy().copy() for name, last in state.items()}
+
+    def _before_forward(self, _: nn.Module, given: tuple[Any, ...], named: dict[str, Any]) -> None:
+        moment: Moment = given[0] if given else named["moment"]
+        window = min(max(int(float(moment.time) * self.count), 0), self.count - 1)
+        if self._paged:
+            self._enter(window)
 
     def _about(self, rows: TimeRows, window: int) -> slice:
         return rows.about(window / self.count, (window + 1) / self.count)
@@ -172,7 +163,7 @@ class TimeWindows:
     @torch.no_grad()
     def _write(self, folder: Path) -> None:
         for number, name in enumerate(self.names):
-            parameter = self.optimizer.names[name]
+            parameter, rows = self.optimizer.names[name], self._rows[name]
             shape, state = tuple(parameter.shape), self.optimizer.adam.state.pop(parameter, {})
             files = {
                 key: TensorFile(folder / f"{number}.{key}", shape) for key in ("values", *MOMENTS)
@@ -181,35 +172,99 @@ class TimeWindows:
             values.write(parameter)
             for key, file in files.items():
                 file.write(state[key]) if key in state else file.zero()
-            self._paged[name] = _Paged(parameter, self._rows[name], values, files)
-        self.enter(0.0)
+            self.done = max(self.done, int(state.get("step", 0)))
+            last = self._last.get(name)
+            if last is None:
+                last = np.full(rows.count, self.done, np.int64)
+            self._paged[name] = _Paged(parameter, rows, values, files, last)
+        self._last = {}
+
+    @torch.no_grad()
+    def _enter(self, window: int) -> None:
+        """Take the rows of a window into memory, in place of others."""
+        if window == self._present:
+            return
+        self._leave()
+        rates = self.optimizer.learning_rates()
+        for name, paged in self._paged.items():
+            parameter, rows = paged.parameter, self._about(paged.rows, window)
+            paged.rows.first, parameter.grad = rows.start, None
+            device = parameter.device
+            values, mean, square = (
+                file.read(rows).to(device) for file in (paged.values, *paged.moments.values())
+            )
+            parameter.data, mean, square = _caught_up(
+                values, mean, square, paged.last[rows], self.done, rates[name]
+            )
+            self.optimizer.adam.state[parameter] = {
+                "step": torch.tensor(float(self.done), device=device),
+                "exp_avg": mean,
+                "exp_avg_sq": square,
+            }
+        self._present = window
 
     @torch.no_grad()
     def _leave(self) -> None:
         """Write the present rows to their files; they stay in memory, too."""
-        if self._present is None or not self.steps[self._present]:
+        if self._present is None:
             return
         for paged in self._paged.values():
             rows = self._about(paged.rows, self._present)
             paged.values.write(paged.parameter, rows)
-            state = self.optimizer.adam.state.get(paged.parameter, {})
             for key, file in paged.moments.items():
-                if key in state:
-                    file.write(state[key], rows)
+                file.write(self.optimizer.adam.state[paged.parameter][key], rows)
+            paged.last[rows] = self.done
+
+    def _catch_up(self) -> None:
+        for window in range(self.count):
+            self._enter(window)
 
     @torch.no_grad()
     def _whole(self, moments: bool) -> None:
         self._leave()
-        for paged in self._paged.values():
-            parameter = paged.parameter
-            parameter.grad, paged.rows.first = None, 0
-            parameter.data = paged.values.read().to(parameter.device)
+        for name, paged in self._paged.items():
+            parameter, paged.rows.first = paged.parameter, 0
+            parameter.grad, device = None, parameter.device
+            parameter.data = paged.values.read().to(device)
             self.optimizer.adam.state.pop(parameter, None)
-            if moments and any(self.steps):
+            if moments and self.done:
                 self.optimizer.adam.state[parameter] = {
-                    "step": torch.tensor(float(sum(self.steps)), device=parameter.device),
-                    **{k: file.read().to(parameter.device) for k, file in paged.moments.items()},
+                    "step": torch.tensor(float(self.done), device=device),
+                    **{k: file.read().to(device) for k, file in paged.moments.items()},
                 }
+                self._last[name] = paged.last
+        self._present = None
+
+
+def _caught_up(
+    values: Float[Tensor, "A R *rest"],
+    mean: Float[Tensor, "A R *rest"],
+    square: Float[Tensor, "A R *rest"],
+    last: Int[np.ndarray, " R"],
+    done: int,
+    rate: float,
+    betas: tuple[float, float] = (0.9, 0.999),
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows and their moments after steps of Adam without a gradient.
+
+    Args:
+        last: steps that each row has seen. done: steps to be seen. rate: learning rate of the steps
+            between, which changes little while moments fade.
+    """
+    missed = (done - last).astype(np.float64)
+    if not missed.any():
+        return values, mean, square
+    first, second = betas
+    step = np.arange(1, FADED + 1)[:, None]
+    at = np.maximum(last, 1) + step
+    moves = first**step / second ** (step / 2) * np.sqrt(1 - second**at) / (1 - first**at)
+    moved = np.where(step <= missed, moves, 0).sum(0)
+
+    def by_row(factors: Float[np.ndarray, " R"]) -> Tensor:
+        return torch.from_numpy(factors).to(values).reshape(1, -1, *[1] * (values.dim() - 2))
+
+    values = values - rate * by_row(moved) * mean / (square.sqrt() + 1e-15)
+    return values, mean * by_row(first**missed), square * by_row(second**missed)
 
 
 def _rows_of(model: SceneModel, fixed: Collection[str]) -> Iterator[tuple[str, TimeRows]]:
@@ -224,60 +279,3 @@ def _rows_of(model: SceneModel, fixed: Collection[str]) -> Iterator[tuple[str, T
             full = f"{path}.{name}"
             if full not in whole and rows.count > 1:
                 yield full, rows
-
-
-class WindowSampler:
-    """Every window a round, in a new order; in a visit several of its frames, in an order of its
-    own, which goes on where the visit before it ended. A checkpoint holds its state.
-
-    Args:
-        positions: of the frames to train on, by window.
-        steps: of the training.
-
-    Raises:
-        ValueError: there are no positions.
-    """
-
-    def __init__(
-        self, positions: Sequence[Sequence[int]], steps: int, generator: torch.Generator
-    ) -> None:
-        self.positions = [list(some) for some in positions if some]
-        if not self.positions:
-            raise ValueError("no frames to train on: the clip's split has no 'train' positions")
-        self.generator = generator
-        self.visit = max(1, steps // (ROUNDS * len(self.positions)))
-        self.queue: list[int] = []
-        self.waiting: list[list[int]] = [[] for _ in self.positions]
-
-    def next(self) -> int:
-        if not self.queue:
-            for window in self._shuffled(range(len(self.positions))):
-                self.queue += [self._of(window) for _ in range(self._length(window))]
-            self.queue.reverse()
-        return self.queue.pop()
-
-    def _length(self, window: int) -> int:
-        """Frames of a visit: as many as the window has of all."""
-        share = len(self.positions[window]) * len(self.positions) / sum(map(len, self.positions))
-        return max(1, round(self.visit * share))
-
-    def _of(self, window: int) -> int:
-        if not self.waiting[window]:
-            self.waiting[window] = self._shuffled(self.positions[window])
-        return self.waiting[window].pop()
-
-    def _shuffled(self, values: Sequence[int]) -> list[int]:
-        order = torch.randperm(len(values), generator=self.generator).tolist()
-        return [values[i] for i in order]
-
-    def state(self) -> dict[str, Any]:
-        return {"queue": list(self.queue), "windows": [list(some) for some in self.waiting]}
-
-    def load(self, state: dict[str, Any]) -> None:
-        windows = state.get("windows", [])
-        known = {p for some in self.positions for p in some}
-        unknown = sorted({*state["queue"], *(p for some in windows for p in some)} - known)
-        if unknown:
-            raise ValueError(f"frames {unknown[:5]} are not among those that are trained on")
-        if len(windows) == len(self.positions):
-            self.queue, self.waiting = list(state["queue"]), [list(some) for some in windows]

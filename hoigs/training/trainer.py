@@ -43,7 +43,7 @@ from hoigs.training.objective import JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
 from hoigs.training.sampler import EpochSampler
 from hoigs.training.stop_request import StopRequest, resume_command
-from hoigs.training.time_windows import TimeWindows, WindowSampler
+from hoigs.training.time_windows import TimeWindows
 from hoigs.training.unseen import fill_unseen
 from hoigs.training.views import TrainingViews
 
@@ -123,7 +123,7 @@ class Trainer:
         scene_extent = clip.extent()
         self.optimizer = GroupedAdam(model, spec.rates, spec.warmup, scene_extent, self.cameras)
         self.windows = self._windows({n for n, c in (density or {}).items() if not c.keeps_all})
-        self.sampler = self._sampler()
+        self.sampler = EpochSampler(clip.split["train"], self.generator)
         self.density = {
             name: EntityDensity(
                 model.entity(name), control, entity_extent(model.entity(name), scene_extent)
@@ -143,15 +143,6 @@ class Trainer:
         folder = None if self.run is None else self.run.windows
         frames = self.clip.num_frames
         return TimeWindows(self.model, self.optimizer, frames, self.spec.chunk, fixed, folder)
-
-    def _sampler(self) -> EpochSampler | WindowSampler:
-        positions = self.clip.split["train"]
-        if self.windows is None or not self.windows.names:
-            return EpochSampler(positions, self.generator)
-        by_window: list[list[int]] = [[] for _ in range(self.windows.count)]
-        for position in positions:
-            by_window[self.windows.of(float(self.clip.moments[position].time))].append(position)
-        return WindowSampler(by_window, self.spec.steps, self.generator)
 
     def train(
         self, on_step: Callable[[StepReport], object] | None = None, *, until: int | None = None
@@ -333,13 +324,16 @@ class Trainer:
 
     def checkpoint(self) -> Checkpoint:
         """The complete state of training; see Checkpoint."""
-        files = {} if self.windows is None else self.windows.files()
+        finished = self.step == self.spec.steps
+        files = {} if self.windows is None else self.windows.files(finished)
         tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
         tensors |= {f"optimizer.{k}": v for k, v in self.optimizer.tensors().items()}
         for name, density in self.density.items():
             tensors |= {f"density.{name}.{k}": v for k, v in vars(density.statistics).items()}
         if self.cameras is not None:
             tensors |= {f"cameras.{k}": v for k, v in self.cameras.state_dict().items()}
+        if self.windows is not None:
+            tensors |= {f"windows.{k}": v for k, v in self.windows.state().items()}
         tensors["rng.generator"] = self.generator.get_state()
         tensors["rng.torch"] = torch.get_rng_state()
         meta = {
@@ -352,8 +346,6 @@ class Trainer:
             "skipped": self.guard.skipped,
             **self.identity,
         }
-        if self.windows is not None and self.windows.names:
-            meta["windows"] = self.windows.state()
         return Checkpoint(tensors, meta, files)
 
     def resume(self, checkpoint: Checkpoint) -> None:
@@ -389,6 +381,6 @@ class Trainer:
         torch.set_rng_state(checkpoint.tensors["rng.torch"])
         self.sampler.load(checkpoint.meta["sampler"])
         if self.windows is not None:
-            self.windows.load(checkpoint.meta.get("windows"), checkpoint.meta["step"])
+            self.windows.load(checkpoint.part("windows"))
         self.step = checkpoint.meta["step"]
         self.elapsed = checkpoint.meta["time_s"]

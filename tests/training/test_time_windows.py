@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hoigs.core.errors import SpecError
 from hoigs.core.model.scene import SceneModel
@@ -19,7 +19,7 @@ from hoigs.core.time_rows import TimeRows
 from hoigs.core.values.clip import Clip
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.training.session import Session
-from hoigs.training.time_windows import WindowSampler
+from hoigs.training.time_windows import _caught_up
 
 CLIP = (
     "builtin:lift-and-swing?frames=24&width=32&fps=8&samples=1&edge_samples=1&held_out_views=0"
@@ -126,12 +126,12 @@ def test_a_finished_training_leaves_the_model_that_its_checkpoint_has(tmp_path: 
 
 
 def test_a_resumed_training_in_windows_equals_an_unbroken_one(tmp_path: Path) -> None:
-    unbroken, broken = (opened(tmp_path / n, "train.chunk=6") for n in ("one", "two"))
+    settings = ("train.chunk=6", "train.checkpoint_every=13")
+    unbroken, broken = (opened(tmp_path / n, *settings) for n in ("one", "two"))
     unbroken.train()
     broken.trainer.train(until=13)
-    broken.trainer.checkpoint().save(broken.run.checkpoints)
     broken.run.unlock()
-    again = opened(tmp_path / "two", "train.chunk=6", resume=True)
+    again = opened(tmp_path / "two", *settings, resume=True)
     assert again.trainer.step == 13
     again.train()
     one, two = unbroken.trainer.model.state_dict(), again.trainer.model.state_dict()
@@ -158,17 +158,35 @@ def test_rows_of_gaussians_whose_number_changes_stay_whole(tmp_path: Path) -> No
     assert session.trainer.windows.names == ["entities.human.deformation.planes.time"]
 
 
-def test_windows_are_visited_in_turn_and_every_frame_equally() -> None:
-    sampler = WindowSampler([[0, 1, 2], [3, 4, 5], [6, 7, 8]], 90, torch.Generator().manual_seed(0))
-    assert sampler.visit == 3
-    drawn = [sampler.next() for _ in range(90)]
-    assert set(Counter(drawn).values()) == {10}
-    visits = [{p // 3 for p in drawn[i : i + 3]} for i in range(0, 90, 3)]
-    assert all(len(v) == 1 for v in visits), "three frames of one window, then of another"
-    state = sampler.state()
-    ahead = [sampler.next() for _ in range(5)]
-    sampler.load(state)
-    assert sampler.state() == state
-    assert len(ahead) == 5
-    with pytest.raises(ValueError, match="not among those that are trained on"):
-        sampler.load({"queue": [9], "windows": []})
+def test_rows_move_as_adam_would_have_moved_them_without_gradients() -> None:
+    generator = torch.Generator().manual_seed(0)
+    parameter = nn.Parameter(torch.rand(2, 6, 3, generator=generator))
+    adam = torch.optim.Adam([parameter], lr=0.01, eps=1e-15)
+    kept: list[tuple[Tensor, ...]] = []
+    for step in range(12):
+        parameter.grad = torch.zeros_like(parameter)
+        if step < 5:  # the later a row, the longer has it had no gradient
+            parameter.grad[:, : 5 - step] = torch.rand(2, 5 - step, 3, generator=generator)
+        adam.step()
+        state = adam.state[parameter]
+        now = (parameter.detach(), state["exp_avg"], state["exp_avg_sq"])
+        kept.append(tuple(values.clone() for values in now))
+    last = np.array([5, 7, 5, 9, 12, 5])
+    old = [torch.stack([kept[n - 1][i][:, r] for r, n in enumerate(last)], 1) for i in range(3)]
+    found = _caught_up(old[0], old[1], old[2], last, 12, 0.01)
+    for values, expected in zip(found, kept[-1], strict=True):
+        torch.testing.assert_close(values, expected)
+
+
+def test_windows_train_as_the_whole_does(tmp_path: Path) -> None:
+    """But for penalties along time, which see one window at a time."""
+    without = ["train.loss.regularizers={tangent: 0, acceleration: 0, time_smoothness: 0, "
+               "time_sparsity: 0}", "train.warmup.motion=0"]  # fmt: skip
+    models = []
+    for name, settings in (("whole", []), ("windows", ["train.chunk=3"])):
+        session = opened(tmp_path / name, *without, *settings)
+        session.train()
+        models.append(session.trainer.model.eval())
+    whole, windows = (drawn(model, session.clip) for model in models)
+    for frame, numbers in zip(windows, whole, strict=True):
+        torch.testing.assert_close(frame, numbers, atol=2e-3, rtol=2e-3)

@@ -154,9 +154,9 @@ class TrainSpec(_Strict):
     """Train and score at this image width, at most: frames are never enlarged. None is the clip's
     own."""
     chunk: int | None = Field(default=None, ge=2)
-    """Frames of a window, for long clips: of parameters that grow with the clip, those of one
-    window are in memory, with their gradients and moments, and training visits the windows in turn
-    (hoigs/training/time_windows.py). None trains all at once."""
+    """Frames of a window, for long clips: of parameters that grow with the clip, the rows of one
+    window are in memory, with their gradients and moments (hoigs/training/time_windows.py). Each
+    step copies a window's rows: few frames cost less. None trains all at once."""
     sh_interval: int | None = Field(default=None, ge=1)
     """Steps after which one more degree of harmonics is trained (3DGS: 1000); None trains all from
     the start."""
