@@ -93,8 +93,10 @@ def print_table(
     console = Console()
     table = Table(title=escape(printable(title)), title_justify="left")
     for i, column in enumerate(columns):
+        cells = [str(row[i]) for row in rows if str(row[i])]
+        numbers = i > 0 and all(cell.lstrip("+-")[:1].isdigit() for cell in cells)
         table.add_column(
-            escape(printable(column)), justify="left" if i == 0 else "right", overflow="fold"
+            escape(printable(column)), justify="right" if numbers else "left", overflow="fold"
         )
     for row in rows:
         table.add_row(

@@ -50,3 +50,11 @@ def test_warp_starts_without_a_word() -> None:
     code = "import hoigs.synthesis.generate, hoigs.rasterizers.warp"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "" and done.stderr == ""
+
+
+def test_texts_start_at_the_left_and_numbers_end_at_the_right(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    print_table("t", ["what", "why", "time"], [["a", "short", "9 s"], ["b", "rather long", "10 s"]])
+    row = next(line for line in capsys.readouterr().out.splitlines() if "short" in line)
+    assert [cell[1:-1] for cell in row[1:-1].split("│")] == ["a   ", "short      ", " 9 s"]

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import FRAMES, HEIGHT, WIDTH, landmarks, masks
+from tiny import FRAMES, HEIGHT, WIDTH, landmarks, masks, picture
 from tiny_mediapipe import FAKE, FAKE_CV2, FAKE_LOOK
 
 from hoigs.core.clip_folder.check import check_clip
@@ -28,7 +29,7 @@ from hoigs.plugins.estimators.common.environments import MEDIAPIPE
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.preparation.estimator_plan import EstimatorPlan, plan_estimators
 from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.prepare import prepare, prepare_until, work_folder
+from hoigs.preparation.prepare import prepare, work_folder
 from hoigs.preparation.prompts import with_prompts
 from hoigs.preparation.stages.plan import PLAN
 from hoigs.preparation.video.source import SourceError, find_source
@@ -271,15 +272,67 @@ def test_files_come_first(tiny_source: Path, alone: Path) -> None:
         chosen(alone, with_prompts(PrepareOptions(), ["1,2", "3,4@5"], "hub"))
 
 
-def test_a_black_video_is_named(alone: Path, environment: None, tmp_path: Path) -> None:
+def rewrite(path: Path, pictures: list[np.ndarray], ticks: list[int]) -> None:
+    """A video of pictures that are shown at multiples of 1/300 s."""
     import av
 
-    with av.open(str(alone), "w") as container:
+    with av.open(str(path), "w") as container:
         stream = container.add_stream("h264", rate=30)
-        stream.width, stream.height = 64, 48
-        for _ in range(10):
-            frame = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 300)
+        for image, tick in zip(pictures, ticks, strict=True):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame.pts, frame.time_base = tick, Fraction(1, 300)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
+
+
+def nothing_is_left(folder: Path) -> bool:
+    return not any(p.name.startswith("clip") for p in folder.iterdir())
+
+
+def test_a_black_video_is_named(alone: Path, environment: None, tmp_path: Path) -> None:
+    black = np.zeros((48, 64, 3), np.uint8)
+    rewrite(alone, [black] * 10, [10 * i for i in range(10)])
     with pytest.raises(HoigsError, match="is black: in 5 frames"):
-        prepare_until("evidence", alone, tmp_path / "clip", options=OPTIONS)
+        prepare(alone, tmp_path / "clip", options=OPTIONS)
+    assert nothing_is_left(tmp_path)
+
+
+def test_nobody_in_the_video_is_a_sentence(alone: Path, tmp_path: Path) -> None:
+    class Nobody(Two):
+        def people(self, video) -> tuple[FramePrompt, ...]:
+            return ()
+
+        def estimate(self, video, progress=None) -> Estimates:
+            unknown = Landmarks(np.full((video.frames, 33, 4), np.nan, np.float32))
+            empty = [np.zeros((HEIGHT, WIDTH), bool)] * video.frames
+            return Estimates(EntityMasks({"human": empty}), {"human": unknown})
+
+    two = Nobody()
+    with pytest.raises(SourceError, match=f"no person was found in the {FRAMES} chosen frames"):
+        prepare(
+            alone, tmp_path / "clip", options=OPTIONS, body=AnnyBody(),
+            estimators={"landmarks": two, "masks": two},
+        )  # fmt: skip
+    assert nothing_is_left(tmp_path)
+
+
+def test_a_click_on_nothing_is_a_sentence(alone: Path, environment: None, tmp_path: Path) -> None:
+    bordered = [picture(i) for i in range(FRAMES)]
+    for image in bordered:
+        image[:, -16:] = 0
+    rewrite(alone, bordered, [25 * i for i in range(FRAMES)])
+    x = WIDTH - 5
+    with pytest.raises(HoigsError, match=rf"no object was found at {x},30 in frame 0: .* black"):
+        prepare(alone, tmp_path / "clip", object=f"{x},30", options=OPTIONS, body=AnnyBody())
+    assert not (tmp_path / "clip").exists()
+
+
+def test_a_variable_rate_is_noted(alone: Path, environment: None, tmp_path: Path) -> None:
+    uneven = [10 * i + 25 * (i // 3) for i in range(FRAMES)]
+    rewrite(alone, [picture(i) for i in range(FRAMES)], uneven)
+    report = prepare(alone, tmp_path / "clip", object="none", options=OPTIONS, body=AnnyBody())
+    assert any("not evenly spaced" in text for text in report.warnings)
+    clip = ClipFolderReader().read(tmp_path / "clip")
+    assert list(clip.frame_times) == pytest.approx([tick / uneven[-1] for tick in uneven], abs=1e-3)

@@ -34,3 +34,4 @@ def test_large_frames_are_stored_smaller(size: tuple[int, int], width: int | Non
     found = FrameList(*size, 60.0, 60.0, 3, [0, 1, 2], [1.0] * 3)
     assert Pipeline._smaller_width(run, found) == width
     assert bool(run.warnings) == (width is not None)
+    assert all(f"frames of {size[0]}x{size[1]} are stored at a width of" in w for w in run.warnings)
