@@ -20,7 +20,7 @@ from hoigs.workflows.doctor import doctor
 
 OF_A_RUN = ("spec.yaml", "provenance.json", "metrics.jsonl", "evaluation.json")
 MOST_BYTES = 20 * 2**20  # of one file; a longer one is cut at its beginning
-PATH = re.compile(r"(?<![\w.<])(?:[A-Za-z]:\\|~?/)(?:[^\s\"',:;<>|*?]+[/\\])+")
+PATH = re.compile(r"(?<![\w.<])(?:[A-Za-z]:\\|~?/|(?:\.\./)+)(?:[^\s\"',:;<>|*?]+[/\\])+")
 
 
 def bug_report(
@@ -80,7 +80,7 @@ def _of_run(path: Path) -> dict[str, str]:
 
 
 def without_names(text: str) -> str:
-    """`text` with FOLDER/ for every absolute folder, and without the user's and machine's names."""
+    """`text` with FOLDER/ for folders outside of the run, and without the user's and machine's names."""
     text = PATH.sub("FOLDER/", text)
     private = {_user(): "USER", socket.gethostname(): "MACHINE", Path.home().name: "USER"}
     for name, word in private.items():

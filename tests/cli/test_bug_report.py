@@ -38,4 +38,5 @@ def test_names_are_replaced(monkeypatch):
         'in "/home/janedoe/my clips/a.png" on janes-laptop by janedoe; C:\\Users\\jane\\x, 3/4, a/b'
     )
     assert without_names(text).count("jane") == 0
+    assert without_names('"path": "../../secret/clips/x"') == '"path": "FOLDER/x"'
     assert "3/4, a/b" in without_names(text)
