@@ -80,7 +80,7 @@ def _of_run(path: Path) -> dict[str, str]:
 
 
 def without_names(text: str) -> str:
-    """`text` with FOLDER/ for folders outside of the run, and without the user's and machine's names."""
+    """`text` with FOLDER/ for folders, and without the names of user and machine."""
     text = PATH.sub("FOLDER/", text)
     private = {_user(): "USER", socket.gethostname(): "MACHINE", Path.home().name: "USER"}
     for name, word in private.items():
