@@ -10,7 +10,7 @@ are written (float)(x), since `float(x)` is a macro of Warp. The arguments are d
 
 CHUNK = 768  # rows of a work item of the backward pass
 FORWARD_CHUNK = 64
-BLOCK = 48
+BLOCK = 96
 MAX_WIDTH = 256
 LANES, HIGH = 16, 8  # of a tile: columns of one vector, rows
 
