@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test lint lint-types lint-rest docs charts stress changelog format wheel sbom clean
+.PHONY: demo test lint lint-types lint-rest docs charts stress bench changelog format wheel sbom clean
 
 demo: $(INSTALLED)
 	$(BIN)/hoigs demo --out runs/demo --overwrite
@@ -57,6 +57,11 @@ stress: $(INSTALLED)
 	mkdir -p docs/results/stress
 	cp $(addprefix $(STRESS_OUT)/,stress.md stress.json stress-matrix.png stress-curves.png) \
 		docs/results/stress/
+
+# times of this tree against the last release's, or another commit's, in turns on this CPU
+BENCH_COMMIT ?= $(shell git describe --tags --abbrev=0 2>/dev/null || echo main)
+bench: $(INSTALLED)
+	$(BIN)/python benchmarks/against_commit.py --commit $(BENCH_COMMIT)
 
 # fragments of changelog.d, collected into CHANGELOG.md
 changelog: $(INSTALLED)

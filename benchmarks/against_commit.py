@@ -1,7 +1,7 @@
 """How long this tree takes against another commit's, on a CPU, in turns.
 
     python benchmarks/against_commit.py --commit 8e71855 --json against-commit.json
-    make bench BENCH_COMMIT=v0.1.0
+    make bench BENCH_COMMIT=8e71855
 
 The commit is checked out beside this tree for as long as it takes. Two processes, one of each tree,
 open the same run of the demo and train it past its first steps. Then they take turns: one works

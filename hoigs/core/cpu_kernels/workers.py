@@ -47,10 +47,13 @@ class ThreadWorkers:
     _owner = 0
 
     def run(self, launches: Sequence[Any]) -> None:
-        others = [self._executor().submit(launch.launch) for launch in launches[1:]]
+        others = [(self._executor().submit(launch.launch), launch) for launch in launches[1:]]
         launches[0].launch()
-        for future in others:
-            future.result()
+        for future, launch in reversed(others):
+            if future.cancel():  # its worker has not begun, as on a busy machine
+                launch.launch()
+            else:
+                future.result()
 
     @classmethod
     def _executor(cls) -> ThreadPoolExecutor:

@@ -1,0 +1,47 @@
+"""Launches on several cores, also where other programs keep these busy."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from hoigs.core.cpu_kernels.workers import SerialWorkers, ThreadWorkers
+
+
+class Launch:
+    def __init__(self) -> None:
+        self.threads: list[str] = []
+
+    def launch(self) -> None:
+        self.threads.append(threading.current_thread().name)
+
+
+def test_every_launch_runs_once() -> None:
+    for workers in (SerialWorkers(), ThreadWorkers()):
+        launches = [Launch() for _ in range(5)]
+        workers.run(launches)
+        assert [len(launch.threads) for launch in launches] == [1] * 5
+
+
+def test_the_caller_does_what_no_worker_has_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    free = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(free.wait, 10.0)  # the worker has no time
+        monkeypatch.setattr(ThreadWorkers, "_executor", lambda _: pool)
+        launches = [Launch() for _ in range(3)]
+        ThreadWorkers().run(launches)
+        assert not free.is_set()
+        free.set()
+    caller = threading.current_thread().name
+    assert [launch.threads for launch in launches] == [[caller]] * 3
+
+
+def test_an_error_of_a_worker_reaches_the_caller() -> None:
+    class Broken(Launch):
+        def launch(self) -> None:
+            raise RuntimeError("no memory")
+
+    with pytest.raises(RuntimeError, match="no memory"):
+        ThreadWorkers().run([Launch(), Broken()])
