@@ -130,6 +130,18 @@ class RunFolder:
             )
         require_replaceable(self.path, RUN, inputs=map(Path, inputs))
 
+    def require_room(self, needed: int) -> None:
+        """Raise HoigsError if the disk has no room for a first checkpoint of `needed` bytes."""
+        parent = self.path.absolute().parent
+        while not parent.exists():
+            parent = parent.parent
+        free = shutil.disk_usage(parent).free
+        if free < needed:
+            raise HoigsError(
+                f"{self.path}: a checkpoint takes {needed / 1e6:.1f} MB and more, and {parent} has "
+                f"{free / 1e6:.1f} MB left; make room, or name a folder on another disk"
+            )
+
     def replace_by(
         self, new: RunFolder, overwrite: bool, inputs: Iterable[Path | str] = ()
     ) -> None:

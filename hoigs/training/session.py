@@ -153,6 +153,8 @@ class Session:
             "windows": None if trainer.windows is None else trainer.windows.sentence(),
         }
         changes = changes_of(run.spec, spec) if resume else []
+        # Adam keeps two numbers for each parameter
+        run.require_room(3 * sum(p.numel() * p.element_size() for p in model.parameters()))
         if resume:
             if has_checkpoint(run.checkpoints):
                 trainer.resume(load_newest(run.checkpoints))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import shutil
 import sys
 
 import pytest
@@ -58,6 +59,16 @@ def test_a_full_disk(hoigs, tiny_clip, tmp_path, monkeypatch, at):
     outcome = hoigs("train", tiny_clip, "--spec", "static", "--out", tmp_path / "run", *SMALL)
     assert outcome.code == 2 and "the disk is full" in outcome.err, outcome.err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_without_room_for_a_checkpoint(hoigs, tiny_clip, tmp_path, monkeypatch):
+    """It is found out before the work."""
+    usage = shutil.disk_usage
+    small = usage(tmp_path)._replace(free=10_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: small)
+    outcome = hoigs("train", tiny_clip, "--spec", "static", "--out", tmp_path / "a/run", *SMALL)
+    assert outcome.code == 2 and "has 0.0 MB left; make room" in outcome.err, outcome.err
+    assert "training static" not in outcome.out and not list(tmp_path.iterdir())
 
 
 def test_a_disk_that_is_full_after_a_checkpoint(hoigs, tiny_clip, tmp_path, monkeypatch):
