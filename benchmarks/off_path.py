@@ -21,6 +21,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+import torch
+from PIL import Image
+
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.at_size import machine, write
@@ -44,6 +47,9 @@ def main() -> int:
     parser.add_argument("--size", default="", help="of the clips: width=96&height=96&frames=24")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--json", type=Path, help="written after each training")
+    parser.add_argument(
+        "--pictures", type=Path, help="folder: a view of each angle, drawn below it"
+    )
     parser.add_argument("--table", type=Path, help="print the table of such a file")
     options = parser.parse_args()
     if options.table:
@@ -79,7 +85,10 @@ def trained(clip: str, variant: str, seed: int, options: argparse.Namespace) -> 
         seconds = time.perf_counter() - trained_from
         model, registry = session.trainer.model, default_registry()
         own = evaluate(model, session.clip, timing_frames=0)
-        turned = evaluate(model, read_clip(wide, registry, None), timing_frames=0)
+        around = read_clip(wide, registry, None)
+        turned = evaluate(model, around, timing_frames=0)
+        if options.pictures:
+            draw(model, around.held_out, options.pictures / f"{clip}-{name}-{seed}.png")
     row = {
         "clip": clip, "variant": name, "settings": [spec, *settings], "seed": seed,
         "steps": options.steps, "train_s": round(seconds, 1),
@@ -92,6 +101,18 @@ def trained(clip: str, variant: str, seed: int, options: argparse.Namespace) -> 
         row[f"{angle:g}"] = _mean(turned.view("held-out cameras"), members)
     print(json.dumps(row), flush=True)
     return row
+
+
+def draw(model: Any, views: Any, file: Path) -> None:
+    """One view of each angle, above, and the same drawn by the model, below."""
+    columns = []
+    for frame in (views[2 * i] for i in range(len(ANGLES))):
+        with torch.no_grad():
+            camera, moment = frame.camera.to(model.device), frame.moment.to(model.device)
+            drawn = model.render(moment, camera).color.clamp(0, 1)
+        columns.append(torch.cat((frame.rgb, drawn.cpu())))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray((255 * torch.cat(columns, 1)).byte().numpy()).save(file)
 
 
 def _mean(view: ViewScores, members: Any) -> float:

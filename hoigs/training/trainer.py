@@ -237,7 +237,10 @@ class Trainer:
         self._evolve(result, view.frame.moment, fixed)
         self._refine(result, camera.width, camera.height)
         if self.step in self._fills:
-            fill_unseen(self.model, self.clip, shapes=self.step < self.spec.steps)
+            fill_unseen(
+                self.model, self.clip, shapes=self.step < self.spec.steps,
+                opposite=self.spec.unseen_sides == "opposite",
+            )  # fmt: skip
         terms = {**result.terms, "total": result.total}
         return {name: term.detach() for name, term in terms.items()}
 

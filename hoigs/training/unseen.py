@@ -4,7 +4,10 @@ A Gaussian there has no image to follow. The few pixels in which it shines throu
 through half-transparent neighbours, make it a spike or a blotch of somebody else's colour. Here it
 takes its values from the Gaussians beside it on the surface that were seen, and from its mirror
 image on a body: the solution of a screened Laplace equation over the graph of neighbours (as in
-gradient-domain inpainting, Perez et al. 2003), which keeps what was seen.
+gradient-domain inpainting, Perez et al. 2003), which keeps what was seen. Patterns do not continue
+that way: far from all that was seen, stripes become their mean. So a person's back may take the
+colours of the front at the same height, as avatars from one picture do (e.g. Natsume et al. 2019,
+SiCloPe).
 """
 
 from __future__ import annotations
@@ -14,10 +17,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from hoigs.core.interfaces.deformation import ProvidesTemplate
+from hoigs.core.interfaces.body import HEAD_PART
+from hoigs.core.interfaces.deformation import ProvidesTemplate, Template
 from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.maths.nearest import nearest
 from hoigs.core.model.entity import Entity
@@ -30,12 +34,17 @@ FRAMES = 16  # training frames in which weights are summed
 NEIGHBOURS = 8
 HALF_SEEN = 0.1  # confidence is 1/2 at this share of a well seen Gaussian's weight
 WELL_SEEN = 0.9  # quantile, among Gaussians with any weight, of a well seen one
+OPPOSITE = 8.0  # weight of the opposite side's colours; that of all neighbours together is about 1
+ASIDE = 0.03  # metres by which a point and its opposite may be apart across the line of sight
 
 
-def fill_unseen(model: SceneModel, clip: Clip, *, shapes: bool = True) -> None:
+def fill_unseen(
+    model: SceneModel, clip: Clip, *, shapes: bool = True, opposite: bool = False
+) -> None:
     """Fill in, in place, the Gaussians of people and objects by how little was seen of them.
 
     Args:
+        opposite: people take patterns from the opposite side of their body (`opposite_points`).
         shapes: also opacity, size and, on a body's template, the distance from its surface; else
             colours alone.
     """
@@ -45,7 +54,7 @@ def fill_unseen(model: SceneModel, clip: Clip, *, shapes: bool = True) -> None:
     for name in (*model.names("human"), *model.names("object")):
         seen = confidence(*weights[name])
         if seen is not None:
-            _fill(model.entity(name), seen, shapes)
+            _fill(model.entity(name), seen, shapes, opposite)
     model.train(training)
 
 
@@ -108,19 +117,23 @@ def confidence(
 
 
 @torch.no_grad()
-def _fill(entity: Entity, seen: Float[Tensor, " N"], shapes: bool) -> None:
+def _fill(entity: Entity, seen: Float[Tensor, " N"], shapes: bool, opposite: bool) -> None:
     deformation, canonical = entity.deformation, entity.canonical
+    other = None
     if isinstance(deformation, ProvidesTemplate):
         template = deformation.template(canonical)
         drawn, points, normals = template.gaussians, template.points, template.normals
         mirror = nearest(template.mirrored, 1, points)[0][:, 0]
         height = ((drawn.means - points) * normals).sum(-1, keepdim=True)
+        other = opposite_points(template) if opposite else None
     else:
         drawn, points, mirror = canonical, canonical.means, None
         height = torch.zeros_like(points[:, :1])
     size = drawn.log_scales.mean(-1, keepdim=True)
     known = torch.cat((drawn.sh[:, 0], drawn.opacity_logits[:, None], size, height), -1)
     color, logit, size, height = spread(known, seen, points, mirror).split((3, 1, 1, 1), -1)
+    if other is not None:
+        color = spread(drawn.sh[:, 0], seen, points, mirror, other)
     sh = torch.zeros_like(drawn.sh)
     sh[:, 0] = color
     target = {"sh": sh}
@@ -141,19 +154,46 @@ def _blend(
             parameter.add_(share.reshape(-1, *[1] * (value.ndim - 1)) * (value - now))
 
 
+def opposite_points(template: Template) -> Int[Tensor, " N"]:
+    """Index of the point on the other side of the body, front or back, -1 where there is none.
+
+    That is the nearest one of the same part, seen along z, whose normal points the other way.
+    Bodies face +z in their zero pose, their limbs lie across it. The head has none: hair is not a
+    face.
+    """
+    found = torch.full_like(template.parts, -1)
+    flat, front = (
+        template.points * template.points.new_tensor([1, 1, 0]),
+        template.normals[:, 2] > 0,
+    )
+    for part in template.parts.unique().tolist():
+        for side in (True, False):
+            own = ((template.parts == part) & (front == side)).nonzero()[:, 0]
+            others = ((template.parts == part) & (front != side)).nonzero()[:, 0]
+            if part == HEAD_PART or not len(own) or not len(others):
+                continue
+            index, apart = nearest(flat[own], 1, flat[others])
+            close = apart[:, 0] < ASIDE
+            found[own[close]] = others[index[:, 0]][close]
+    return found
+
+
 def spread(
     values: Float[Tensor, "N D"],
     seen: Float[Tensor, " N"],
     points: Float[Tensor, "N 3"],
     mirror: Tensor | None = None,
+    opposite: Int[Tensor, " N"] | None = None,
 ) -> Float[Tensor, "N D"]:
     """Values of what was seen, continued smoothly over what was not.
 
     Minimises sum_i s_i / (1 - s_i) |y_i - x_i|^2 + sum_ij w_ij |y_i - y_j|^2 over the graph that
     joins each point with its nearest neighbours, of weight 1 together, and with its mirror image.
+    With opposite points o, OPPOSITE (1 - s_i) s_o(i) |y_i - x_o(i)|^2 are added.
 
     Args:
         seen: s, in [0, 1]. mirror: index of each point's mirror image, int64 [N].
+        opposite: index of each point's opposite one, -1 without one.
     """
     from scipy import sparse  # on use: scipy takes a while to import
     from scipy.sparse.linalg import splu
@@ -171,6 +211,12 @@ def spread(
     graph = (graph + graph.T) / 2
     laplacian = sparse.diags(np.asarray(graph.sum(1)).ravel()) - graph
     s = seen.double().cpu().numpy()
-    data = sparse.diags(s / (1.0001 - s) + 1e-6)  # what is cut off from all that was seen stays
-    found = splu((data + laplacian).tocsc()).solve(data @ values.double().cpu().numpy())
+    data = s / (1.0001 - s) + 1e-6  # what is cut off from all that was seen stays
+    given = values.double().cpu().numpy()
+    known = data[:, None] * given
+    if opposite is not None:
+        other = opposite.cpu().numpy()
+        weight = np.where(other >= 0, OPPOSITE * (1 - s) ** 4 * s[other], 0.0)
+        data, known = data + weight, known + weight[:, None] * given[other]
+    found = splu((sparse.diags(data) + laplacian).tocsc()).solve(known)
     return torch.from_numpy(found).to(values)

@@ -7,12 +7,22 @@ from pathlib import Path
 import pytest
 import torch
 
+from hoigs.core.interfaces.body import HEAD_PART
+from hoigs.core.interfaces.deformation import Template
 from hoigs.core.model.compose import compose
 from hoigs.core.spec.schema import Spec
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.synthesis import SceneConfig, builtin_clip
-from hoigs.training.unseen import _weights, confidence, fill_unseen, seen_weights, spread
+from hoigs.training.unseen import (
+    _weights,
+    confidence,
+    fill_unseen,
+    opposite_points,
+    seen_weights,
+    spread,
+)
 
 
 def ring(count: int) -> torch.Tensor:
@@ -40,6 +50,36 @@ def test_a_side_has_the_colours_of_its_mirror_image() -> None:
     seen = torch.cat((torch.ones(40), torch.zeros(40)))
     filled = spread(values, seen, points, mirror)
     assert (filled[40:] - points[40:].abs()).abs().mean() < 0.1
+
+
+def tube(head: bool) -> Template:
+    """A body part along y: half of its points face +z, the others -z."""
+    angle, y = torch.rand(2, 3000, generator=torch.Generator().manual_seed(1))
+    around = 2 * torch.pi * angle
+    normals = torch.stack((around.cos(), torch.zeros_like(y), around.sin()), -1)
+    points = 0.1 * normals + y[:, None] * torch.tensor([0.0, 1.0, 0.0])
+    gaussians = Gaussians.from_points(points, torch.rand(3000, 3))
+    parts = torch.full((3000,), HEAD_PART if head else HEAD_PART + 1)
+    return Template(gaussians, points, normals, points * torch.tensor([-1.0, 1, 1]), parts)
+
+
+def test_a_back_takes_the_stripes_of_the_front() -> None:
+    template = tube(head=False)
+    other = opposite_points(template)
+    front, has = template.normals[:, 2] > 0, other >= 0
+    assert has.float().mean() > 0.95 and (front[other[has]] != front[has]).all()
+    stripes = (40 * template.points[:, 1:2]).sin()
+    values, seen = torch.where(front[:, None], stripes, 99.0), front.float()
+    smooth = spread(values, seen, template.points)
+    patterned = spread(values, seen, template.points, opposite=other)
+    deep = template.normals[:, 2] < -0.7
+    assert (smooth - stripes)[deep].abs().mean() > 0.4
+    assert (patterned - stripes)[deep].abs().mean() < 0.2
+    torch.testing.assert_close(patterned[front], stripes[front], atol=1e-2, rtol=0)
+
+
+def test_the_back_of_a_head_takes_no_face() -> None:
+    assert (opposite_points(tube(head=True)) == -1).all()
 
 
 def test_weight_outside_the_mask_is_no_sight_of_it() -> None:

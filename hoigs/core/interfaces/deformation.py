@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar, Literal, Protocol, TypeGuard, runtime_checkable
 
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from hoigs.core.interfaces.configurable import Configurable
@@ -227,12 +227,14 @@ class Template:
         gaussians: raw, as they are drawn but for the pose.
         points: of the surface, one a Gaussian, metres. normals: there, outward, of unit length.
         mirrored: `points` reflected in the body's plane of symmetry.
+        parts: body part of each point (`hoigs.core.interfaces.body`).
     """
 
     gaussians: Gaussians
     points: Float[Tensor, "N 3"]
     normals: Float[Tensor, "N 3"]
     mirrored: Float[Tensor, "N 3"]
+    parts: Int[Tensor, " N"]
 
 
 @runtime_checkable

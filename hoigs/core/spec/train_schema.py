@@ -164,6 +164,10 @@ class TrainSpec(_Strict):
     """Shares of the steps after which sides of people and objects that no training frame shows take
     their colour, and people their shape too, from what lies beside them (hoigs/training/unseen.py);
     with 1.0 the colours are filled again at the end. Empty: they stay as they are."""
+    unseen_sides: Literal["neighbours", "opposite"] = "neighbours"
+    """Where these colours come from. "neighbours" continues what was seen beside them, and on the
+    other half of the body, which leaves no pattern; "opposite" also takes the pattern of the other
+    side of the same part of the body: of the front for the back, but not for the head."""
     warmup: WarmupSpec = WarmupSpec()
     loss: LossSpec = LossSpec()
     rates: RatesSpec = RatesSpec()

@@ -133,7 +133,8 @@ class SurfaceBody(SkinnedBody):
         normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         middle = torch.zeros_like(points)
         middle[:, 0] = 2 * (self.rest_joints[PELVIS, 0] - points[:, 0])
-        return Template(canonical, points, normalize(normals, dim=-1), points + middle)
+        normals = normalize(normals, dim=-1)
+        return Template(canonical, points, normals, points + middle, self.parts)
 
     def point_parts(self) -> Int[Tensor, " N"]:
         return self.parts
