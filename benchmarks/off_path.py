@@ -47,9 +47,7 @@ def main() -> int:
     parser.add_argument("--size", default="", help="of the clips: width=96&height=96&frames=24")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--json", type=Path, help="written after each training")
-    parser.add_argument(
-        "--pictures", type=Path, help="folder: a view of each angle, drawn below it"
-    )
+    parser.add_argument("--pictures", type=Path, help="folder of views, drawn below")
     parser.add_argument("--table", type=Path, help="print the table of such a file")
     options = parser.parse_args()
     if options.table:

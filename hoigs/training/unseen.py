@@ -162,10 +162,8 @@ def opposite_points(template: Template) -> Int[Tensor, " N"]:
     face.
     """
     found = torch.full_like(template.parts, -1)
-    flat, front = (
-        template.points * template.points.new_tensor([1, 1, 0]),
-        template.normals[:, 2] > 0,
-    )
+    flat = template.points * template.points.new_tensor([1, 1, 0])
+    front = template.normals[:, 2] > 0
     for part in template.parts.unique().tolist():
         for side in (True, False):
             own = ((template.parts == part) & (front == side)).nonzero()[:, 0]
