@@ -26,6 +26,7 @@ from hoigs.runs.run_folder import versions
 
 DRIVER = Path("/proc/driver/nvidia/version")
 LEFT_OUT = 0.02  # what a picture may differ by, since splats are not drawn where they are faint
+NEEDS_EXTRA = "not run: needs an extra"
 DECODERS = ("h264", "hevc", "vp9", "av1", "mjpeg")
 
 
@@ -204,7 +205,7 @@ def _rows_of(offer: Offer, registry: Registry) -> list[Inspected]:
         declared = sorted(backend.capabilities.devices)
     except PluginError:
         absent = offer.status is Status.NEEDS_EXTRA
-        found = "not run: needs an extra" if absent else "failed"
+        found = NEEDS_EXTRA if absent else "failed"
         return [Inspected(offer.key, found, offer.error)]
     except Exception as error:  # a plugin's class may raise anything here
         return [Inspected(offer.key, _failed(error), "capabilities.devices could not be read")]
@@ -234,6 +235,8 @@ def _draw(backend: type[Rasterizer], device: str) -> tuple[str, str]:
         report: dict[str, str] = getattr(rasterizer, "backend_report", dict)()
         error = float((color - truth).abs().max())
     except Exception as problem:  # reported as the backend's state
+        if isinstance(problem.__cause__, ImportError):  # imported on use: gsplat's
+            return NEEDS_EXTRA, str(problem)
         return _failed(problem), ""
     note = ", ".join(f"{name.replace('_', ' ')}: {value}" for name, value in report.items())
     if error < LEFT_OUT:

@@ -7,9 +7,12 @@ import json
 import pytest
 import torch
 
+from hoigs.core.errors import RenderError
 from hoigs.core.registry.manager import PluginManager
 from hoigs.core.registry.registry import Registry, default_registry
+from hoigs.rasterizers.oracle import OracleRasterizer
 from hoigs.workflows.doctor import (
+    _draw,
     codec_rows,
     cuda_rows,
     driver_version,
@@ -195,3 +198,13 @@ def test_on_cuda_all_that_declare_it_draw_there(hoigs):
     gsplat = rows.get("rasterizer:gsplat", rows.get("rasterizer:gsplat on cuda"))
     assert gsplat in (OK, "not run: needs an extra")
     assert hoigs("doctor").code == 0
+
+
+class ImportsOnUse(OracleRasterizer):
+    def render(self, *arguments, **named):
+        raise RenderError("pip install 'hoigs[absent]'") from ImportError("no module")
+
+
+def test_an_extra_that_is_imported_on_use_is_no_failure():
+    found, note = _draw(ImportsOnUse, "cpu")
+    assert found == "not run: needs an extra" and "hoigs[absent]" in note
