@@ -28,6 +28,14 @@ def hull(
         radius: metres within which the object lies. samples: points on the surface.
     """
     directions, faces = _sphere(DIVISIONS)
+    reach = reaches(crops, poses, directions, radius, carved)
+    return with_samples(directions * reach[:, None], faces, samples)
+
+
+def reaches(
+    crops: Crops, poses: Poses, directions: Float[Tensor, "V 3"], radius: float, carved: float
+) -> Float[Tensor, " V"]:
+    """Metres from the object's middle along unit rays to the hull."""
     steps = torch.linspace(0.05, 1.0, SHELLS) * radius
     places = directions[:, None] * steps[:, None]  # V, S, 3
     flat = places.flatten(0, 1)
@@ -50,8 +58,7 @@ def hull(
     rows = torch.arange(len(directions))
     low, high = empty[rows, index - 1], empty[rows, index]
     part = ((carved - low) / (high - low).clamp_min(1e-6)).clamp(0, 1)
-    reach = steps[index - 1] + part * (steps[index] - steps[index - 1])
-    return with_samples(directions * reach[:, None], faces, samples)
+    return steps[index - 1] + part * (steps[index] - steps[index - 1])
 
 
 def with_samples(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "T 3"], count: int) -> Surface:

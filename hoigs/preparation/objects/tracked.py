@@ -30,6 +30,7 @@ from hoigs.preparation.objects.flights import flights_by_texture
 from hoigs.preparation.objects.hands import HandMotion, along_bones, hand_motion, no_hands
 from hoigs.preparation.objects.search import grasps_by_texture
 from hoigs.preparation.objects.surface import hull, with_samples
+from hoigs.preparation.objects.unseen_side import completed
 
 FEWEST = 8  # frames that show the object whole
 SMALLEST = 10  # pixels across, median
@@ -129,7 +130,9 @@ def tracked_object(
             f"what the frames show of its texture agrees by {typical:.2f} only (correlation; "
             f"{AGREES} is needed): it has hardly any texture, is not rigid, or its masks are off"
         )
-    return _result(found, surface, hands, outlines, agreement, count)
+    vertices, depth = completed(crops, surface, found.poses, found.vertices, radius)
+    found = replace(found, vertices=vertices)
+    return _result(found, surface, hands, outlines, agreement, count, depth)
 
 
 def _aligned(
@@ -241,7 +244,17 @@ def _result(
     outlines: Outlines,
     agreement: Float[np.ndarray, " F"],
     count: int,
+    depth: float | None,
 ) -> tuple[ObjectTrack, Float[Tensor, "P 3"], ObjectConfidence]:
+    """Args:
+    depth: metres, of an object whose back was never seen; None: it was.
+    """
+    back = "as small and smooth as the outlines allow"
+    if depth is not None:
+        back = (
+            "filled as far as the outlines allow: all frames show one side, and it is taken to be "
+            f"{1000 * depth:.0f} mm deep, by the size of its outlines"
+        )
     shown = outlines.observed
     dense = with_samples(found.vertices, surface.faces, count)
     points, normals = dense.points(found.vertices), dense.normals(found.vertices)
@@ -266,7 +279,7 @@ def _result(
                 f"{int(known.sum())} of {len(shown)} frames, the others follow their neighbours; "
                 f"distance from the hands that hold it ({int(hands.held.sum())} frames); shape "
                 f"from outlines and texture, {1000 * off:.0f} mm off the masks' outlines, sides "
-                "never seen as small and smooth as the outlines allow"
+                f"never seen {back}"
             ),
         ),
         normals,

@@ -20,13 +20,14 @@ from hoigs.preparation.objects.crops import make_crops
 from hoigs.preparation.objects.flights import ballistic, flights_by_texture
 from hoigs.preparation.objects.hands import hand_motion, upward
 from hoigs.preparation.objects.make_object import make_object
-from hoigs.preparation.objects.surface import hull
+from hoigs.preparation.objects.surface import hull, with_samples
 from hoigs.preparation.objects.tracked import (
     ObjectConfidence,
     UntrackableError,
     between,
     tracked_object,
 )
+from hoigs.preparation.objects.unseen_side import completed
 
 FRAMES, SIZE, FPS = 12, 96, 12.0
 PARENTS = (-1, *range(51))
@@ -171,6 +172,32 @@ def test_a_person_behind_the_object_hides_nothing_of_it_but_other_objects_do() -
             np.full(FRAMES, 2.2),
         )  # fmt: skip
         assert float(crops.hidden[crops.masks == 0].mean()) == share
+
+
+@pytest.mark.parametrize(("angle", "one_sided"), [(0.3, True), (2.5, False)])
+def test_a_back_that_no_frame_shows_is_filled(angle: float, one_sided: bool) -> None:
+    """A fit leaves a dome behind the front; the box is 0.34 broad, 0.24 high and 0.26 deep."""
+    rotations, places = poses(angle)
+    images, objects, humans, _ = filmed(motion=(rotations, places))
+    crops = make_crops(
+        lambda: iter(images), objects, humans, humans, [CAMERA] * FRAMES, np.ones(FRAMES, bool),
+        96, torch.zeros(FRAMES, 0, 3), np.full(FRAMES, 2.5),
+    )  # fmt: skip
+    known = Poses(rotations, places)
+    surface = hull(crops, known, 0.35, 800)
+    rays = torch.nn.functional.normalize(surface.rest, dim=-1)
+    box = rays * (HALF / rays.abs()).amin(-1, keepdim=True)
+    dome = torch.where(rays[:, 2:] > 0, 0.13 * rays, box)  # z points away from the camera
+    found, depth = completed(crops, with_samples(dome, surface.faces, 800), known, dome, 0.35)
+    if not one_sided:
+        assert depth is None and torch.equal(found, dome)
+        return
+    assert depth is not None and 0.22 < depth < 0.3
+    front = rays[:, 2] < -0.9
+    assert torch.equal(found[front], dome[front])
+    back = rays[:, 2] > 0.3
+    off = [(v[back] - box[back]).norm(dim=-1).mean() for v in (dome, found)]
+    assert off[1] < 0.5 * off[0]
 
 
 def test_a_spin_in_flight_is_found_by_texture() -> None:
