@@ -53,6 +53,7 @@ class Waiting:
         self.short = False
         self._before = (0, 0)
         self._release = threading.Event()
+        self._holder: threading.Thread | None = None
 
     def look(self) -> None:
         """Compare the times since the last call, and change how threads wait."""
@@ -69,9 +70,14 @@ class Waiting:
             if gomp is None:
                 return
             self._release = threading.Event()
-            threading.Thread(target=_idle_threads, args=(gomp, self._release), daemon=True).start()
-        elif self.short and not short:
+            self._holder = threading.Thread(
+                target=_idle_threads, args=(gomp, self._release), daemon=True
+            )
+            self._holder.start()
+        elif self._holder is not None and not short:
             self._release.set()
+            self._holder.join()
+            self._holder = None
         self.short = short
 
 
@@ -89,12 +95,15 @@ def short_waits_when_busy() -> Iterator[None]:
             waiting.look()
         waiting.set(False)
 
+    watcher = threading.Thread(target=watch, name="hoigs-waits", daemon=True)
     if os.environ.get("GOMP_SPINCOUNT") == SHORT_SPIN:
-        threading.Thread(target=watch, name="hoigs-waits", daemon=True).start()
+        watcher.start()
     try:
         yield
     finally:
         ended.set()
+        if watcher.is_alive():  # no thread is to run on while the interpreter ends
+            watcher.join()
 
 
 def scheduled() -> tuple[int, int] | None:
@@ -130,7 +139,7 @@ def _idle_threads(gomp: Any, release: threading.Event) -> None:
 
     libgomp ends them with the thread that runs this.
     """
-    nothing = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(lambda _: None)
+    nothing = ctypes.CDLL(None).free  # of NULL; no thread of libgomp is to enter Python
     count = ctypes.c_uint(gomp.omp_get_num_procs() + 1)
     gomp.GOMP_parallel(nothing, None, count, ctypes.c_uint(0))
     release.wait()
