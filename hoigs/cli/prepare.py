@@ -187,6 +187,8 @@ def prepare(
         typer.echo(printable(f"- {warning}"))
     typer.echo(f"clip: {out}")
     typer.echo(f"report: {out / 'report.html'}")
+    if (picture := out / "object.jpg").is_file():
+        typer.echo(f"the object as it was found: {picture}")
 
 
 def _announce(plan: EstimatorPlan) -> None:

@@ -166,6 +166,11 @@ def on_thing(found: EntityMasks, things: list[np.ndarray]) -> None:
     for prompt in found.chosen["object"]:
         (point,) = prompt.points
         assert things[prompt.frame][int(point.y), int(point.x)]
+    taken = found.chosen["object"][0]
+    where = (
+        f"what is at {taken.points[0].x:g},{taken.points[0].y:g} in frame {taken.frame} was taken"
+    )
+    assert where in found.notes[0]
 
 
 def before_the_body(flag: bool = False, away: range = range(0)):
