@@ -133,8 +133,9 @@ def _cheapest(frames: list, size: float, known: list[int]) -> Path:
     for i, (places, unary, still) in enumerate(frames):
         here = [(p, 0) for p in places]
         if i == 0:
-            total = [*unary, ABSENT]
-            state = [*here, (None, 1)]
+            # where it is known it is not absent, from where it could turn up anywhere
+            total = [*unary, *(() if i in known else (ABSENT,))]
+            state = [*here, *(() if i in known else ((None, 1),))]
             parent = [-1] * len(total)
         else:
             total, parent, state = [], [], []

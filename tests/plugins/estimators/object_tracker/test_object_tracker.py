@@ -306,6 +306,17 @@ def test_an_object_does_not_jump_to_a_thing_of_its_colours_that_was_always_there
     assert (_cheapest(frames(still=True), 10.0, [0]).centers[:, 0] < 40).all()
 
 
+def test_a_path_from_a_known_place_does_not_begin_with_an_absence() -> None:
+    """From which the object turned up, at no cost, in a picture on the wall of its colours."""
+    here, there = np.array([20.0, 20.0]), np.array([80.0, 20.0])
+    frames = [(here[None], np.array([-4.0]), np.zeros(1, bool))]
+    for i in range(1, 14):
+        places = np.stack((here + np.array((i, 0)), there))
+        frames.append((places, np.array([0.3, -0.2]), np.array([False, True])))
+    path = _cheapest(frames, 10.0, [0])
+    assert path.seen.all() and (path.centers[:, 0] < 40).all()
+
+
 def test_a_click_on_the_person_is_noted(tmp_path: Path) -> None:
     found = masks_of(request(tmp_path, world(), (click(0, 50, 66),)))
     assert "lies on the person's mask" in found.notes[0]
