@@ -58,9 +58,11 @@ def failures_as_messages() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as stop:
-        print(str(stop) or "stopped", file=sys.stderr)
-        sys.exit(stop.code if isinstance(stop, Interrupted) else 128 + signal.SIGINT)
+        _end(stop)
     except Exception as error:
+        stop_within = _stop_within(error)
+        if stop_within is not None:
+            _end(stop_within)
         message = message_of(error)
         if message is None or os.environ.get("HOIGS_TRACEBACK", "0") not in ("", "0"):
             raise
@@ -69,6 +71,18 @@ def failures_as_messages() -> Iterator[None]:
     finally:
         if before is not None:
             signal.signal(signal.SIGTERM, before)
+
+
+def _end(stop: KeyboardInterrupt) -> NoReturn:
+    print(str(stop) or "stopped", file=sys.stderr)
+    sys.exit(stop.code if isinstance(stop, Interrupted) else 128 + signal.SIGINT)
+
+
+def _stop_within(error: BaseException | None) -> KeyboardInterrupt | None:
+    """The Ctrl-C or SIGTERM that caused an error, as it does within the import of an extension."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error
 
 
 def message_of(error: Exception) -> str | None:

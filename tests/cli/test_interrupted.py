@@ -71,6 +71,21 @@ def test_a_study_that_is_stopped_says_by_what(hoigs, tmp_path, monkeypatch, comm
     assert (stopped.code, stopped.err) == (143, "stopped\n")
 
 
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_within_the_import_of_an_extension(hoigs, monkeypatch, number, code):
+    """Extensions make an ImportError of it."""
+
+    def fails() -> None:
+        try:
+            signal.raise_signal(number)
+        except KeyboardInterrupt as stop:
+            raise ImportError("initialization failed") from stop
+
+    monkeypatch.setattr("hoigs.workflows.doctor.doctor", fails)
+    stopped = hoigs("doctor")
+    assert (stopped.code, stopped.err) == (code, "stopped\n")
+
+
 def test_a_trained_run_that_is_not_yet_scored(hoigs, clip, tmp_path, monkeypatch):
     def stop(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGINT)
