@@ -25,6 +25,7 @@ import argparse
 import copy
 import json
 import os
+import signal
 import statistics
 import subprocess
 import sys
@@ -180,7 +181,7 @@ def main() -> None:
     )
     parser.add_argument("--commit", help="to compare with")
     parser.add_argument("--rounds", type=int, default=12)
-    parser.add_argument("--warmup", type=int, default=60, help="training steps before")
+    parser.add_argument("--warmup", type=int, default=120, help="training steps before")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--set", dest="overrides", nargs="*", default=[], help="of the spec")
     parser.add_argument("--clip", default="builtin:lift-and-swing")
@@ -192,6 +193,7 @@ def main() -> None:
         return
     if options.commit is None:
         parser.error("--commit is missing: the commit to compare this tree with")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the checkout goes then, too
     sys.path.insert(0, str(ROOT))
     import torch
 

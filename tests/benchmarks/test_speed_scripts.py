@@ -9,6 +9,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 TINY = ["--device", "cpu", "--size", "64x36", "--splats", "200", "100", "50", "--frames", "6"]
 
@@ -42,3 +44,27 @@ def test_train_speed(tmp_path: Path) -> None:
     assert all(found["waited_ms"][part] > 0 for part in parts)
     assert found["graphs"]["mode"] == "plain" and "CUDA" in found["graphs"]["reason"]
     assert 500 < found["operations"] < 1600  # it was 2422 before launches were counted
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="not a git checkout")
+def test_against_commit(tmp_path: Path) -> None:
+    out = tmp_path / "against.json"
+    clip = "builtin:lift-and-swing?width=64&frames=8&samples=1&held_out_views=0&test_frames=2"
+    points = [f"model.{name}.points=60" for name in ("scene", "human", "object")]
+    command = [sys.executable, "benchmarks/against_commit.py", "--commit", "HEAD", "--clip", clip,
+               "--rounds", "2", "--warmup", "1", "--threads", "1", "--json", str(out),
+               "--set", *points]  # fmt: skip
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(out.read_text())
+    assert found["commit"] == found["tree"] and found["splats"]["human"] == 60
+    assert set(found["measured"]) == {"step", "human", "forward", "pose", "frame"}
+    for kinds in found["measured"].values():
+        for row in kinds.values():
+            assert row["commit_ms"] > 0 and row["tree_ms"] > 0 and 0.1 < row["ratio"] < 10
+    trees = ["git", "worktree", "list"]
+    listed = subprocess.run(trees, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert str(tmp_path) not in listed.stdout, "the checkout is still there"
