@@ -47,6 +47,7 @@ def test_train_speed(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="not a git checkout")
+@pytest.mark.slow
 def test_against_commit(tmp_path: Path) -> None:
     out = tmp_path / "against.json"
     clip = "builtin:lift-and-swing?width=64&frames=8&samples=1&held_out_views=0&test_frames=2"

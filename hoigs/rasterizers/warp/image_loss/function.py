@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from hoigs.rasterizers.warp.common.cpu_launch import prepared
+from hoigs.core.cpu_kernels.launch import prepared
 from hoigs.rasterizers.warp.cuda.launch import CudaStreams
 from hoigs.rasterizers.warp.image_loss.kernels import backward_tiles, forward_tiles
 from hoigs.rasterizers.warp.ssim.tile_source import SIDE, THREADS

@@ -5,8 +5,8 @@
 Threads are numbered as in `warp.ssim.tile_kernels`. One image of three channels: batch is 1.
 """
 
+from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
 from hoigs.rasterizers.warp.common.records import F32, U8
-from hoigs.rasterizers.warp.common.runtime import CPU_FLAGS, wp
 from hoigs.rasterizers.warp.image_loss import source
 from hoigs.rasterizers.warp.ssim.tile_source import THREADS
 
