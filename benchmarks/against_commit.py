@@ -32,7 +32,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,10 @@ def serve(options: argparse.Namespace) -> None:
     import torch
 
     torch.set_num_threads(options.threads)
+    with suppress(ImportError):  # as the command line does, which older trees may not
+        from hoigs.core.machine.memory import keep_freed_memory
+
+        keep_freed_memory()
     from hoigs.training.session import Session
     from hoigs.viewing.playback import Playback
 

@@ -29,6 +29,7 @@ from hoigs.cli import (
 )
 from hoigs.cli.failures import GuardedGroup, failures_as_messages
 from hoigs.core.machine.busy import share_processors, short_waits_when_busy
+from hoigs.core.machine.memory import keep_freed_memory
 
 app = typer.Typer(
     name="hoigs",
@@ -80,5 +81,6 @@ def _options(
 def main() -> None:
     """Entry point: what goes wrong becomes one message on stderr and an exit code."""
     share_processors()
+    keep_freed_memory()
     with short_waits_when_busy(), failures_as_messages():
         app()
