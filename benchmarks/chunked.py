@@ -39,7 +39,7 @@ BODY_JOINTS = 22
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--clip", default="builtin:lift-and-swing?frames=96&width=96&fps=24")
-    parser.add_argument("--chunk", type=int, default=24)
+    parser.add_argument("--chunk", type=int, default=16)
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--device", default="cpu")

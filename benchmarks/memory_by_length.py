@@ -1,7 +1,8 @@
 """Peak memory of prepare, train, eval and render against the length of a video.
 
     python benchmarks/memory_by_length.py --json benchmarks/results/memory-by-length.json
-    python benchmarks/memory_by_length.py --chunk 500 --json benchmarks/results/memory-chunked.json
+    python benchmarks/memory_by_length.py --light --commands prepare,train,eval --chunk 100 \\
+        --json benchmarks/results/memory-chunked.json
     python benchmarks/memory_by_length.py --table benchmarks/results/memory-by-length.json
 
 A made-up person stands still while a ball goes to and fro; the video's landmarks and the masks of
@@ -35,6 +36,7 @@ import tiny
 
 MARGIN, FRAME = 64 * 2**20, 20 * 2**10  # bytes: of a command, and of a frame
 CACHE = {"train": 512 * 2**20}  # of frames
+SHORT = 16  # frames of a window in training
 COMMANDS = ("prepare", "train", "eval", "render")
 
 
@@ -43,7 +45,14 @@ def main() -> int:
     parser.add_argument("--lengths", default="100,1000,5000", help="frames")
     parser.add_argument("--scale", type=int, default=4, help="frames are so many times 96x64")
     parser.add_argument("--commands", default=",".join(COMMANDS))
-    parser.add_argument("--chunk", type=int, help="prepare and train in windows of so many frames")
+    parser.add_argument(
+        "--chunk", type=int, help=f"prepare in windows of so many frames, train in those of {SHORT}"
+    )
+    parser.add_argument(
+        "--light", action="store_true",
+        help="frames of 96x64 with masks of person and ball apart, and no overlay: bodies are not "
+        "drawn, which takes most of the time",
+    )  # fmt: skip
     parser.add_argument("--folder", type=Path, help="keep what is made here, and use it again")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--table", type=Path, metavar="JSON", help="print the docs' table, only")
@@ -51,17 +60,18 @@ def main() -> int:
     if arguments.table:
         print(table(json.loads(arguments.table.read_text())))
         return 0
+    scale = 1 if arguments.light else arguments.scale
     lengths = [int(word) for word in arguments.lengths.split(",")]
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as temporary:
         for frames in lengths:
             folder = (arguments.folder or Path(temporary)) / f"{frames}"
-            make_source(folder / "source", frames, arguments.scale)
+            make_source(folder / "source", frames, scale, arguments.light)
             for name in arguments.commands.split(","):
-                took = measured(name, folder, arguments.chunk)
+                took = measured(name, folder, arguments.chunk, arguments.light)
                 rows.append({"frames": frames, "command": name, **took})
                 print(json.dumps(rows[-1]), flush=True)
-    size = [tiny.WIDTH * arguments.scale, tiny.HEIGHT * arguments.scale]
+    size = [tiny.WIDTH * scale, tiny.HEIGHT * scale]
     record = {"size": size, "lengths": lengths, "chunk": arguments.chunk, "rows": rows,
               "holds": judged(rows)}  # fmt: skip
     print(table(record))
@@ -70,7 +80,7 @@ def main() -> int:
     return int(not all(record["holds"].values()))
 
 
-def measured(name: str, folder: Path, chunk: int | None) -> dict[str, Any]:
+def measured(name: str, folder: Path, chunk: int | None, light: bool) -> dict[str, Any]:
     """Runs a command in a process of its own, and reads where windows of the body fit meet.
 
     Raises:
@@ -87,7 +97,9 @@ def measured(name: str, folder: Path, chunk: int | None) -> dict[str, Any]:
         "render": ["render", run, "--out", str(folder / "film.mp4")],
     }[name]  # fmt: skip
     if chunk is not None and name in ("prepare", "train"):
-        words += ["--chunk", str(chunk)]
+        words += ["--chunk", str(chunk if name == "prepare" else SHORT)]
+    if light and name == "prepare":
+        words += ["--set", "overlay_width=0"]
     log = folder / f"{name}.log"
     began = time.perf_counter()
     with log.open("w") as out:
@@ -107,11 +119,14 @@ def measured(name: str, folder: Path, chunk: int | None) -> dict[str, Any]:
     return found
 
 
-def make_source(folder: Path, frames: int, scale: int) -> None:
-    """Video, masks of both together and landmarks; the ball goes to and fro in the tiny scene."""
+def make_source(folder: Path, frames: int, scale: int, apart: bool) -> None:
+    """Video, landmarks and masks, of both together or `apart`; the ball goes to and fro in the tiny
+    scene."""
     if (folder / "pose_mediapipe.npz").is_file():
         return
-    (folder / "hoi_mask").mkdir(parents=True, exist_ok=True)
+    names = ("masks/human", "masks/object") if apart else ("hoi_mask",)
+    for name in names:
+        (folder / name).mkdir(parents=True, exist_ok=True)
     way = list(chain(range(tiny.FRAMES), range(tiny.FRAMES - 2, 0, -1)))
     big = np.ones((scale, scale, 1), np.uint8)
     pictures = [np.kron(tiny.picture(i), big) for i in range(tiny.FRAMES)]
@@ -119,9 +134,10 @@ def make_source(folder: Path, frames: int, scale: int) -> None:
         for i in range(frames):
             at = way[i % len(way)]
             video.add(pictures[at])
-            both = np.logical_or(*tiny.masks(at)).astype(np.uint8)
-            both = np.kron(both, big[..., 0]) * 255
-            Image.fromarray(both).save(folder / f"hoi_mask/{i:05d}.png", compress_level=1)
+            shown = tiny.masks(at) if apart else [np.logical_or(*tiny.masks(at))]
+            for name, mask in zip(names, shown, strict=True):
+                drawn = np.kron(mask.astype(np.uint8), big[..., 0]) * 255
+                Image.fromarray(drawn).save(folder / f"{name}/{i:05d}.png", compress_level=1)
     known = {k: np.repeat(v[:1], frames, 0) for k, v in tiny.landmarks().items()}
     known["image_xyzv"][..., :3] *= scale
     np.savez(folder / "pose_mediapipe.npz", **known)

@@ -131,19 +131,20 @@ def fit_person(
         options=options, points=known, masks=masks, times=times, turns=turns,
         chunking=chunking, progress=progress,
     )  # fmt: skip
-    joints, lowest = [], []
-    for vertices, at in posed(body, fit.poses):
-        joints.append(at.clone())  # not a view, which would keep all vertices
-        lowest.append(vertices[:, 1].max())
+    # not lists: thousands of small tensors between large ones leave memory in pieces
+    joints = torch.empty(len(track.cameras), len(body.parents), 3)
+    lowest = torch.empty(len(track.cameras))
+    for i, (vertices, at) in enumerate(posed(body, fit.poses)):
+        joints[i], lowest[i] = at, vertices[:, 1].max()
     residual = float(fit.residual_px.nanmedian())
     found, solid = int(landmarks.found.sum()), int(landmarks.solid.sum())
     return FittedBody(
         poses=fit.poses,
-        joints=torch.stack(joints),
+        joints=joints,
         scene_scale=fit.scene_scale,
         residual_px=residual,
         residuals=fit.residual_px,
-        ground=float(torch.stack(lowest).median()),
+        ground=float(lowest.median()),
         found=landmarks.found.numpy(),
         provenance=(
             f"fitted to {source} landmarks{'' if solid else ' in the image only'} of {found} of "
