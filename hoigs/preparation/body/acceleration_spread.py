@@ -9,7 +9,7 @@ from torch import Tensor
 AT_ONCE = 256  # accelerations that are decorrelated together
 FEWEST = 16  # accelerations that an estimate needs
 RATIOS = torch.logspace(0.5, 5, 46, dtype=torch.float64)  # of accelerations to noise, 1/s^2
-SLOWEST, FASTEST = 1.0, 60.0  # m/s^2: none is taken to be slower or faster
+SLOWEST, FASTEST = 3.0, 60.0  # m/s^2: a throw after a long rest is not held still
 JITTERY, JITTER = 1.5, 16.0  # of the points' median noise; least acceleration from there on, m/s^2
 
 
