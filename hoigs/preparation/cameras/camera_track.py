@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -210,4 +211,5 @@ def parallax(cameras: list[Camera], target: Float[Tensor, " 3"]) -> float:
     """Largest angle, degrees, between two views of a point: 0 for a static camera."""
     rays = torch.stack([c.center for c in cameras]) - target
     rays = torch.nn.functional.normalize(rays.double(), dim=-1)
-    return float(torch.rad2deg(torch.acos((rays @ rays.mT).clamp(-1, 1)).max()))
+    least = min(float((some @ rays.mT).min()) for some in rays.split(256))  # not F times F at once
+    return math.degrees(math.acos(min(max(least, -1.0), 1.0)))
