@@ -86,7 +86,7 @@ def train(
         budget: a time, "90s", "20m", "2h": image width and steps are chosen so that training and
             scores take about that long here. Not with `resume`.
         chunk: frames of a window, for a long clip (`train.chunk`): of what grows with the clip, one
-            window's part is in memory, and training visits the windows in turn.
+            window's part is in memory at a time.
         plugins: Python files to load (and run) first.
         view: show the training in the browser while it lasts, by a process of its own that reads
             checkpoints, of which one is then written about every 10 seconds. port: of its address
