@@ -104,25 +104,18 @@ def train(
         given: dict[str, Any] = {
             "out": out, "overrides": settings or (), "rasterizer": rasterizer, "device": device,
             "resume": resume, "overwrite": overwrite, "allow_faults": allow_faults,
-            "evaluate": evaluate, "plugins": plugin or (), "view": view, "port": port,
+            "evaluate": evaluate, "chunk": chunk, "plugins": plugin or (), "view": view,
+            "port": port,
             "on_start": show.started, "on_step": show.step,
             "progress": show.fraction, "report": show.line,
         }  # fmt: skip
         if auto:
             named = _clip_for_auto(clip, reader, reader_set, budget)
-            if chunk is not None:
-                given["overrides"] = [*given["overrides"], f"train.chunk={chunk}"]
             made = train_auto(named, spec, on_found=print_needs, **given)
             run = made.run
         else:
             run = train_spec(
-                clip,
-                spec,
-                reader=reader,
-                reader_settings=reader_set or (),
-                budget=budget,
-                chunk=chunk,
-                **given,
+                clip, spec, reader=reader, reader_settings=reader_set or (), budget=budget, **given
             )
     if auto:
         _print_after(made.after)

@@ -47,7 +47,7 @@ WITHOUT = {
     # the options of prepare_until are ready-made
     hoigs.prepare_until: {"width", "camera", "max_frames", "every", "fps", "focal", "keep_black",
                           "overwrite", "overrides", "start", "end", "intrinsics", "calibration",
-                          "person_height"},
+                          "person_height", "chunk", "overlap"},
 }  # fmt: skip
 # arguments that only a Python caller can give: objects and callbacks
 PYTHON = {"on_start", "on_step", "on_found", "progress", "report", "body", "estimators",

@@ -49,6 +49,7 @@ def auto(
     overwrite: bool = False,
     allow_faults: bool = False,
     evaluate: bool = True,
+    chunk: int | None = None,
     plugins: Sequence[Path | str] = (),
     view: bool = False,
     port: int = 8090,
@@ -68,12 +69,14 @@ def auto(
         out: the run folder; by default runs/CLIP-SPEC-auto.
         resume: continue the training in `out`, with the answer that it was started with.
         on_found: called with the result of the search, before the training.
-        overrides, rasterizer, device, overwrite, allow_faults, evaluate, plugins, view, port,
-            on_start, on_step, progress, report: as for `train`.
+        overrides, rasterizer, device, overwrite, allow_faults, evaluate, chunk, plugins, view,
+            port, on_start, on_step, progress, report: as for `train`.
 
     Raises:
         HoigsError: anything wrong with the input, or the run to resume was pruned already.
     """
+    if chunk is not None:
+        overrides = [*overrides, f"train.chunk={chunk}"]
     name = str(spec or DEFAULT_SPEC)
     path = Path(out) if out is not None else Path("runs") / f"{clip_name(clip)}-{Path(name).stem}"
     if out is None:
