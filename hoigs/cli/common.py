@@ -78,36 +78,64 @@ def study_device(device: str, executor: str) -> str:
 
 
 def print_table(
-    title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], notes: Sequence[str] = ()
+    title: str,
+    columns: Sequence[str],
+    rows: Sequence[Sequence[Any]],
+    notes: Sequence[str] = (),
+    *,
+    widest: int | None = None,
 ) -> None:
     """Print a table on stdout; without rows its title and notes alone.
 
-    No cell is cut: in a terminal that is too narrow words break, elsewhere lines are as long as
-    they need to be.
+    No cell is cut: in a terminal that is too narrow lines break, between words where these fit;
+    elsewhere lines are as long as they need to be, or as `widest` allows.
     """
     from rich.console import Console
     from rich.markup import escape
-    from rich.measure import Measurement
     from rich.table import Table
 
     console = Console()
-    table = Table(title=escape(printable(title)), title_justify="left")
-    for i, column in enumerate(columns):
-        cells = [str(row[i]) for row in rows if str(row[i])]
-        numbers = i > 0 and all(cell.lstrip("+-")[:1].isdigit() for cell in cells)
-        table.add_column(
-            escape(printable(column)), justify="right" if numbers else "left", overflow="fold"
-        )
-    for row in rows:
-        table.add_row(
-            *(escape(printable(str(cell))) for cell in row)
-        )  # "hoigs[gsplat]" is no markup
+    cells = [[printable(str(cell)) for cell in row] for row in (columns, *rows)]
+    widths, room = _widths(cells), 3 * len(columns) + 1  # of lines and spaces between columns
     if not console.is_terminal:
-        wide = console.options.update(max_width=10_000)
-        console.width = max(160, Measurement.get(console, wide, table).maximum)
+        console.width = widest or max(160, sum(most for _, most in widths) + room)
+    table = Table(title=escape(printable(title)), title_justify="left")
+    for i, width in enumerate(_shared(widths, console.width - room)):
+        values = [row[i] for row in cells[1:] if row[i]]
+        numbers = i > 0 and all(value.lstrip("+-")[:1].isdigit() for value in values)
+        table.add_column(
+            escape(cells[0][i]),
+            justify="right" if numbers else "left",
+            overflow="fold",
+            width=width,
+        )
+    for row in cells[1:]:
+        table.add_row(*map(escape, row))  # "hoigs[gsplat]" is no markup
     console.print(table if rows else f"[bold]{table.title}[/bold]", highlight=False)
     for note in notes:
         console.print(f"[dim]{escape(printable(note))}[/dim]", highlight=False)
+
+
+def _widths(cells: Sequence[Sequence[str]]) -> list[tuple[int, int]]:
+    """Of each column the width of its longest word, and of its longest line."""
+    from rich.cells import cell_len
+
+    found = []
+    for column in zip(*cells, strict=True):
+        lines = [line for cell in column for line in cell.split("\n")]
+        words = [word for line in lines for word in line.split()]
+        found.append((max(map(cell_len, words), default=0), max(map(cell_len, lines))))
+    return found
+
+
+def _shared(widths: Sequence[tuple[int, int]], space: int) -> list[int | None]:
+    """The width of each column: that of its lines, or the same for all whose lines have to break,
+    but never less than their words. None where not even words fit."""
+    for limit in range(max((most for _, most in widths), default=0), 0, -1):
+        shared = [max(least, min(most, limit)) for least, most in widths]
+        if sum(shared) <= space:
+            return list(shared)
+    return [None] * len(widths)
 
 
 class Bar:

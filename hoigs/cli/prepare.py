@@ -192,9 +192,10 @@ def prepare(
 
 
 def _announce(plan: EstimatorPlan) -> None:
-    title = "plan" if plan.frames is None else f"plan for {plan.frames} frames"
+    frames = "" if plan.frames is None else f" for {plan.frames} frames"
+    title = f"plan{frames}, with the time that each step takes on 2 cores"
     if plan.choices:
-        print_table(title, ("what", "from", "why", "about, on 2 cores"), plan.rows())
+        print_table(title, ("what", "from", "why", "about"), plan.rows(), widest=80)
     for note in plan.notes:
         typer.echo(printable(note))
 

@@ -58,6 +58,7 @@ _HUB: dict[Place, ComponentSpec] = {
         checkpoint="depth-anything/Depth-Anything-V2-Small-hf",
     ),
 }  # fmt: skip
+OFFLINE_NOTE = "none of it needs a network; --estimators hub downloads neural networks instead"
 HUB_LICENCES = "all Apache-2.0: SAM 2.1 tiny, ViTPose base, RT-DETR v2 r18, Depth Anything V2 Small"
 
 
@@ -117,8 +118,9 @@ class EstimatorPlan:
         for choice in self.choices.values():
             seconds = 0.0 if choice.use in met and choice.place != "object" else choice.seconds
             met.add(choice.use)
-            rows.append((choice.what, choice.use, choice.why, self._time(seconds)))
-        rest = "body, object, scene, the clip"
+            use = choice.use.removeprefix("estimator:")
+            rows.append((choice.what, use, choice.why, self._time(seconds)))
+        rest = "body, object, scene, clip"
         if self.cameras:
             rows.append(("cameras", self.cameras, "lies beside the video", ""))
         else:
@@ -154,7 +156,9 @@ def plan_estimators(
     _check_prompt(found, options)
     known = source.cameras or source.colmap
     cameras = "" if known is None else _cameras(known)
-    return EstimatorPlan(found, _frames(source.video, options), cameras=cameras)
+    offline = options.preset == "auto" and any(c.spec is not None for c in found.values())
+    notes = (OFFLINE_NOTE,) if offline else ()
+    return EstimatorPlan(found, _frames(source.video, options), notes, cameras)
 
 
 def _cameras(path: Path) -> str:
@@ -220,13 +224,9 @@ def _object(source: Source, options: PrepareOptions, given: Collection[str]) -> 
 def _of_preset(place: Place, options: PrepareOptions) -> Choice:
     hub = options.preset == "hub"
     spec = (_HUB if hub else _OFFLINE)[place]
-    why = "--estimators hub"
-    if not hub:
-        why = "nothing beside the video; works without a network"
-        if options.preset == "auto":
-            why += " (--estimators hub: networks to download)"
-        if place == "landmarks":
-            why = f"{_people(options)}{why}"
+    why = "--estimators hub" if hub else "no file beside the video"
+    if place == "landmarks" and not hub:
+        why = f"{_people(options)}{why}"
     if place == "object":
         why = "; ".join(_shown(name, options) for name in options.objects)
         if not _installed(spec.use):
@@ -254,7 +254,7 @@ def _shown(name: str, options: PrepareOptions) -> str:
         return f'"{prompt.text}"'
     where = prompt.places() if prompt else []
     if not where:
-        return "proposed: what hands move or hold"
+        return "what hands move or hold"
     what = name if options.further_objects else "--object"
     frames = ", ".join("first" if at.frame is None else str(at.frame) for at in where)
     return f"{what} in frame {frames}"

@@ -58,3 +58,18 @@ def test_texts_start_at_the_left_and_numbers_end_at_the_right(
     print_table("t", ["what", "why", "time"], [["a", "short", "9 s"], ["b", "rather long", "10 s"]])
     row = next(line for line in capsys.readouterr().out.splitlines() if "short" in line)
     assert [cell[1:-1] for cell in row[1:-1].split("│")] == ["a   ", "short      ", " 9 s"]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_narrow_table_breaks_lines_between_words(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, terminal: bool
+) -> None:
+    monkeypatch.setenv("COLUMNS", "44" if terminal else "200")
+    if terminal:
+        monkeypatch.setenv("FORCE_COLOR", "1")
+    rows = [["masks", "object-tracker", "no file of it lies beside the video", "12 s"]]
+    print_table("t", ["what", "from", "why", "time"], rows, widest=None if terminal else 44)
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    columns = [[line.split("│")[k].strip() for line in lines] for k in range(1, 5)]
+    assert [" ".join(column).strip() for column in columns] == rows[0]
+    assert len(lines) > 1 and all(len(line) <= 44 for line in lines)

@@ -113,7 +113,7 @@ def test_a_video_alone_becomes_a_clip_of_a_person(
         alone, out, object="none", options=OPTIONS, body=AnnyBody(), announce=plans.append
     )
     rows = {row[0]: row[1] for row in plans[0].rows()}
-    assert rows["person's mask"] == rows["person's landmarks"] == "estimator:mediapipe"
+    assert rows["person's mask"] == rows["person's landmarks"] == "mediapipe"
     assert rows["object's mask"] == "none" and plans[0].frames == FRAMES
     assert check_clip(out) == [] and report.object_observed is None
     clip = ClipFolderReader().read(out)
