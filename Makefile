@@ -11,7 +11,8 @@ demo: $(INSTALLED)
 
 # one worker a core; a file stays with one worker, whose fixtures its tests share
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder \
+		--max-worker-restart 3
 
 # types in one process, all else in another
 lint: $(INSTALLED)
