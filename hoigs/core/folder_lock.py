@@ -4,7 +4,7 @@ The lock is a file beside the folder, since the folder itself may be replaced. I
 exclusively and removed by rename, which NFS does atomically where flock may do nothing. It names
 its process, and a thread renews its time: a lock whose process is dead on this machine, or that was
 not renewed for two minutes on another one, is taken over. Its token is new each time, so a holder
-that was suspended, and processes that work for it, see that it is another's by now (`is_token`).
+that was suspended, and processes that work for it, see that it is another's by now (`is_held`).
 
 A disk offers no write that depends on a lock. Holders therefore look (`require_held`) right before
 they rename what they wrote into place; a suspension between these two steps is not covered.
@@ -117,7 +117,7 @@ class FolderLock:
 
     def is_lost(self) -> bool:
         """Whether the lock was this holder's and is another's or gone, by a disk that answers."""
-        return bool(self._token) and not is_token(self.path, self._token)
+        return bool(self._token) and not is_held(self.path, self._token)
 
     def require_held(self) -> None:
         """Raise `error` if another process took the lock over, as after a long suspension."""
@@ -181,15 +181,16 @@ class _Heartbeat(threading.Thread):
                 os.utime(self._path)
 
 
-def is_token(path: Path, token: str) -> bool:
-    """Whether the lock file `path` has this token, or cannot be read now."""
+def is_held(path: Path, token: str) -> bool:
+    """Whether the lock file `path` has this token, and its holder is not known to be dead (one on
+    another machine may be alive); also where it cannot be read now."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return False
     except (OSError, ValueError, RecursionError):
         return True
-    return isinstance(found, dict) and found.get("token") == token
+    return isinstance(found, dict) and found.get("token") == token and not _is_stale(found, 0.0)
 
 
 def _create(path: Path, text: str) -> bool:

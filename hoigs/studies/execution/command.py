@@ -1,6 +1,7 @@
 """A Python module as a job: `python -m hoigs.studies.execution.command PARENT LEASE MODULE WORD …`.
 
-It leads a process group of its own, which ends when the parent is killed or the lease is another's.
+It leads a process group of its own, which ends when the parent or the driver is killed, or the
+lease is another's.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import threading
 import time
 from pathlib import Path
 
-from hoigs.core.folder_lock import is_token
+from hoigs.core.folder_lock import is_held
 
 PARENT_POLL_S = 0.25
 LEASE_POLLS = 4  # looks at the parent for one at the lease, which may lie on a slow disk
@@ -25,6 +26,8 @@ def end_with(parent: int, lease: str = "") -> None:
         parent: its number; it is gone once this process has another parent.
         lease: `FolderLock.lease` of the driver's lock. Where two looks find it gone or another's,
             another driver has taken the work over; one look may fall into a take-over that fails.
+            It also ends with a driver on this machine, which on a cluster is not the parent: where
+            the head is gone too, a Ray worker goes on for a minute.
     """
     path, _, token = lease.rpartition(":")
 
@@ -34,9 +37,10 @@ def end_with(parent: int, lease: str = "") -> None:
             time.sleep(PARENT_POLL_S)
             looks += 1
             if path and (lost or looks % LEASE_POLLS == 0):
-                lost = 0 if is_token(Path(path), token) else lost + 1
+                lost = 0 if is_held(Path(path), token) else lost + 1
         if lost:
-            print("error: another driver has taken this work over", file=sys.stderr, flush=True)
+            why = "the driver has ended, or another one has taken this work over"
+            print(f"error: {why}", file=sys.stderr, flush=True)
         os.killpg(0, signal.SIGKILL)
 
     threading.Thread(target=watch, daemon=True).start()

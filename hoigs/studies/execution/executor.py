@@ -69,7 +69,8 @@ class Executor(Protocol):
         Args:
             command: the module, then its arguments: "hoigs", "train", …
             log: its output is appended to this file.
-            lease: `FolderLock.lease`; the process ends when that lock is another's.
+            lease: `FolderLock.lease`; the process ends when that lock is another's, or its holder
+                on the same machine is dead.
 
         Returns:
             None if all is busy; the caller comes again.

@@ -126,7 +126,41 @@ def test_a_process_ends_when_its_lease_is_anothers(tmp_path, monkeypatch):
         assert process.poll() == -9 and time.monotonic() - began < 4
     finally:
         process.stop()
-    assert "another driver has taken this work over" in (tmp_path / "log").read_text()
+    assert "another one has taken this work over" in (tmp_path / "log").read_text()
+
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from hoigs.core.folder_lock import FolderLock
+lock = FolderLock(Path(sys.argv[1]), "hoigs batch").acquire()
+print(lock.lease, flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_process_ends_with_its_driver_though_its_parent_lives(tmp_path, monkeypatch):
+    """As where both the driver and the head of a Ray cluster are killed."""
+    monkeypatch.chdir(tmp_path)
+    Path("sleeper.py").write_text("import time\nprint('here', flush=True)\ntime.sleep(60)\n")
+    words = [sys.executable, "-c", HOLDER, str(tmp_path / "row")]
+    driver = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    assert driver.stdout is not None
+    lease = driver.stdout.readline().strip()
+    process = LocalExecutor().start(("sleeper",), tmp_path / "log", Needs(), lease)
+    try:
+        assert printed(tmp_path / "log") == "here"
+        time.sleep(1.5)
+        assert process.poll() is None
+        driver.kill()
+        driver.communicate()
+        began = time.monotonic()
+        while process.poll() is None and time.monotonic() < began + 10:
+            time.sleep(0.02)
+        assert process.poll() == -9 and time.monotonic() - began < 4
+    finally:
+        driver.kill()
+        process.stop()
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
