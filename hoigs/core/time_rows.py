@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
+
+from torch import nn
 
 MARGIN = 2  # rows beside those about a time that an interpolation may read
 
@@ -40,3 +43,10 @@ class TimeRows:
         if present == self.count:
             return time
         return (time * (self.count - 1) - self.first) / max(1, present - 1)
+
+
+def timed_parameters(model: nn.Module) -> Iterator[tuple[str, TimeRows]]:
+    """The dotted name of every parameter that has rows for times."""
+    for path, module in model.named_modules():
+        for name, rows in getattr(module, "time_rows", {}).items():
+            yield f"{path}.{name}", rows

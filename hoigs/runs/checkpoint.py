@@ -19,12 +19,14 @@ from hoigs.core.errors import CheckpointError
 from hoigs.core.json_file import read_json, short, validated
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.storage.tensor_files import TensorFile, save_tensors
+from hoigs.core.time_rows import timed_parameters
 from hoigs.core.whole_files import write_whole, written_whole
 from hoigs.runs.records import CheckpointRecord, CompactRecord
 
 FORMAT = "hoigs-checkpoint"
 VERSION = 2
 MOST_GAUSSIANS = 10**8  # of an entity whose means are not stored, since spec and clip give them
+PIECE = 2**20  # numbers checked at a time, which takes memory for a few times as many
 ADVICE = "train again, or restore it from a copy"
 READABLE = (1, VERSION)  # spec keys of version 1 had other names, so its model hashes differ
 
@@ -178,6 +180,8 @@ def load_checkpoint(meta_path: Path, parts: Collection[str] | None = None) -> Ch
         except CheckpointError as error:
             raise CheckpointError(f"{weights}: {error}; {ADVICE}") from error
     _check_values(weights, tensors)
+    if not compact:
+        tensors = _read(weights, parts)  # anew: no page of the file is in memory until it is used
     _check_counts(meta_path, meta["counts"], tensors)
     return Checkpoint(tensors, meta)
 
@@ -193,7 +197,8 @@ def _check_values(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
     for name, values in tensors.items():
         if not values.is_floating_point() or name.startswith("density."):
             continue
-        count = int((~torch.isfinite(values)).sum())
+        pieces = values.flatten().split(PIECE)
+        count = sum(int((~torch.isfinite(piece)).sum()) for piece in pieces)
         if count:
             raise CheckpointError(
                 f"{path}: damaged: {name} has {count} of {values.numel()} values that are NaN or "
@@ -213,8 +218,15 @@ def _check_counts(path: Path, counts: dict[str, int], tensors: dict[str, torch.T
             )
 
 
-def restore_model(model: SceneModel, checkpoint: Checkpoint, model_hash: str) -> None:
+def restore_model(
+    model: SceneModel, checkpoint: Checkpoint, model_hash: str, *, in_file: bool = False
+) -> None:
     """Load the parameters of a checkpoint into a composed model.
+
+    Args:
+        in_file: parameters with rows for times, which grow with the clip, stay in the checkpoint's
+            file, and come into memory as they are read. For models that are not trained, and files
+            that nobody removes.
 
     Raises:
         CheckpointError: the checkpoint belongs to another spec, or its tensors do not fit.
@@ -240,10 +252,19 @@ def restore_model(model: SceneModel, checkpoint: Checkpoint, model_hash: str) ->
         raise CheckpointError(f"checkpoint does not fit the model: {error}") from error
     composed = model.state_dict()
     known = {name: composed[name] for name in checkpoint.meta.get(COMPOSED, ()) if name in composed}
+    stored = known | checkpoint.part("model")
+    timed = {name for name, _ in timed_parameters(model)} if in_file else set()
+    kept = {
+        name: parameter
+        for name, parameter in model.named_parameters()
+        if name in timed and name in stored and stored[name].shape == parameter.shape
+    }
     try:
-        model.load_state_dict(known | checkpoint.part("model"))
+        model.load_state_dict(stored | kept)
     except RuntimeError as error:
         raise CheckpointError(f"checkpoint does not fit the model: {error}") from error
+    for name, parameter in kept.items():
+        parameter.data = stored[name].to(parameter.dtype)
 
 
 def restore_cameras(cameras: nn.Module | None, checkpoint: Checkpoint) -> None:

@@ -82,7 +82,8 @@ class LoadedRun:
         source = read_clip(folder, registry, spec.train.width, allow_faults=allowed, reader=choice)
         checkpoint = load_newest(run.checkpoints, DRAWN)
         model = compose(spec, source, registry)
-        restore_model(model, checkpoint, spec.model_hash())
+        ended = checkpoint.meta["step"] >= spec.train.steps  # or else training removes old ones
+        restore_model(model, checkpoint, spec.model_hash(), in_file=ended)
         _try(model, source, run.checkpoints)
         model.to(device)
         if checkpoint.part("cameras"):

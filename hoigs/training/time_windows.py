@@ -30,7 +30,7 @@ from torch import Tensor, nn
 
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.storage.tensor_files import TensorFile
-from hoigs.core.time_rows import TimeRows
+from hoigs.core.time_rows import TimeRows, timed_parameters
 from hoigs.core.values.moment import Moment
 from hoigs.training.optimizer import GroupedAdam
 
@@ -274,8 +274,6 @@ def _rows_of(model: SceneModel, fixed: Collection[str]) -> Iterator[tuple[str, T
         for entity in fixed
         for name, _ in model.entity(entity).per_gaussian()
     }
-    for path, module in model.named_modules():
-        for name, rows in getattr(module, "time_rows", {}).items():
-            full = f"{path}.{name}"
-            if full not in whole and rows.count > 1:
-                yield full, rows
+    for name, rows in timed_parameters(model):
+        if name not in whole and rows.count > 1:
+            yield name, rows

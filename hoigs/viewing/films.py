@@ -162,7 +162,7 @@ def _draw(
 ) -> Film:
     camera, clear = film[0][1], background == TRANSPARENT
     behind = None if clear or background is None else read_background(background, camera)
-    play = playback_of(loaded.model, film, only, behind)
+    play = playback_of(loaded.model, film, only, behind, copied=False)
     shown = frames_shown(loaded.clip, film) if compare else []
     drawn, draw_s = 0, 0.0
 
@@ -210,10 +210,11 @@ def playback_of(
     film: Sequence[View],
     only: Sequence[str] = (),
     background: Tensor | None = None,
+    copied: bool = True,
 ) -> Playback:
     """A Playback made from a few frames of a film; an empty `only` draws all entities."""
     some = film[:: max(1, len(film) // VIEWS)]
     request = RenderRequest()
     if background is not None:
         request = replace(request, background=background.to(model.device))
-    return Playback(model, some, only=list(only) or None, request=request)
+    return Playback(model, some, only=list(only) or None, request=request, copied=copied)

@@ -38,8 +38,9 @@ class Playback:
     components receive it as a 0-d tensor on the device. (A table of deformed Gaussians with a row
     per frame would be simpler, but has no times between frames.)
 
-    The model is copied, so later training has no effect. Body shapes (`betas`) and hand conventions
-    are constants of the graphs; a moment with others captures new graphs, which takes a while.
+    The model is copied, so later training has no effect, unless `copied` is False. Body shapes
+    (`betas`) and hand conventions are constants of the graphs; a moment with others captures new
+    graphs, which takes a while.
 
     Args:
         model: composed and trained. views: at least one moment and camera, all of the image size to
@@ -50,6 +51,7 @@ class Playback:
             `SceneModel.render`. "auto" is "graph" on CUDA and "cached" elsewhere, or "plain", with
             a warning, if that fails (a component that reads the time as a number cannot be
             captured). Both are compared with the plain mode at two times before use.
+        copied: False takes the model itself, which nothing else may use then, with less memory.
 
     Attributes:
         mode: in use. reason: why this mode. captures: how often graphs were captured.
@@ -66,6 +68,7 @@ class Playback:
         only: Iterable[str] | None = None,
         request: RenderRequest | None = None,
         mode: Mode = "auto",
+        copied: bool = True,
     ) -> None:
         if not views:
             raise RenderError("Playback: views is empty, expected a moment and a camera or more")
@@ -74,8 +77,9 @@ class Playback:
             raise RenderError(f"Playback: views of sizes {sorted(sizes)}, expected one size")
         training = model.training
         model.eval()
-        self._model = copy.deepcopy(model).requires_grad_(False)
-        model.train(training)
+        self._model = (copy.deepcopy(model) if copied else model).requires_grad_(False)
+        if copied:
+            model.train(training)
         self._names = [n for n in model.entities if only is None or n in set(only)]
         self._request = request or RenderRequest()
         self._views, self._size = list(views), sizes.pop()

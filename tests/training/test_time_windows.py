@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -123,6 +124,29 @@ def test_a_finished_training_leaves_the_model_that_its_checkpoint_has(tmp_path: 
                 strict=True)  # fmt: skip
     for frame, numbers in pairs:
         torch.testing.assert_close(frame, numbers)
+
+
+def in_memory(folder: Path) -> list[int]:
+    """Bytes in memory of each mapping of a file below a folder."""
+    text = Path("/proc/self/smaps").read_text()
+    return [1024 * int(kib) for kib in re.findall(rf"{folder}/.*\n(?:.*\n){{3}}Rss: +(\d+)", text)]
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps").is_file(), reason="reads /proc/self/smaps")
+def test_a_finished_model_takes_rows_from_the_file_as_they_are_read(tmp_path: Path) -> None:
+    words = ("model.human.deformation.time_resolution=4096", "train.steps=2",
+             "model.human.deformation.channels=32", "train.checkpoint_every=1")  # fmt: skip
+    session = opened(tmp_path / "run", *words)
+    session.trainer.train(until=1)
+    session.run.unlock()
+    unfinished = LoadedRun.open(tmp_path / "run")
+    assert not in_memory(tmp_path), "a training that goes on removes its checkpoints"
+    assert unfinished.step == 1
+    opened(tmp_path / "run", *words, resume=True).train()
+    loaded = LoadedRun.open(tmp_path / "run")
+    planes = loaded.model.state_dict()["entities.human.deformation.planes.time"]
+    assert sum(in_memory(tmp_path)) < 0.75 * planes.nbytes, "the system reads ahead, by 2 MB"
+    assert torch.isfinite(planes).all() and sum(in_memory(tmp_path)) >= planes.nbytes
 
 
 def test_a_resumed_training_in_windows_equals_an_unbroken_one(tmp_path: Path) -> None:
