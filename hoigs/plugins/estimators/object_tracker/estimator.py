@@ -27,15 +27,31 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.core.progress import Progress, no_progress
 from hoigs.plugins.estimators.common.subprocess import settings_key
 from hoigs.plugins.estimators.object_tracker.alike import told_apart
+from hoigs.plugins.estimators.object_tracker.behind import Behind
 from hoigs.plugins.estimators.object_tracker.camera_motion import is_static
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage
 from hoigs.plugins.estimators.object_tracker.held import skeletons
-from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, prompted_mask
+from hoigs.plugins.estimators.object_tracker.prompts import (
+    PromptedMask,
+    looks_like_person,
+    prompted_mask,
+)
 from hoigs.plugins.estimators.object_tracker.proposal import proposed
-from hoigs.plugins.estimators.object_tracker.scene import Scene, moving_scene, static_scene
-from hoigs.plugins.estimators.object_tracker.tracker import Track, at_rest, color_model, tracked
+from hoigs.plugins.estimators.object_tracker.scene import (
+    Scene,
+    StaticScene,
+    moving_scene,
+    static_scene,
+)
+from hoigs.plugins.estimators.object_tracker.tracker import (
+    Track,
+    at_rest,
+    color_model,
+    tracked,
+    tracked_again,
+)
 
-VERSION = 7  # of what is kept in `work`; raised when masks change
+VERSION = 8  # of what is kept in `work`; raised when masks change
 SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
 WEAK = 0.6  # confidence below which a frame is named in a note
 
@@ -115,9 +131,8 @@ class ObjectTrackerEstimator(Estimator):
                     entity, footage, scene, people, tracks, notes
                 )
             prompts[entity.name] = masks
-            tracks[entity.name] = (
-                tracked(footage, scene, masks, _part(progress, start, share)) if masks else None
-            )
+            part = _part(progress, start, share)
+            tracks[entity.name] = _followed(footage, scene, masks, part) if masks else None
         tracks, alike = told_apart(footage, scene, prompts, tracks)
         notes += [*alike, *_doubts(tracks, footage)]
         _write(file, video, footage, tracks, chosen, notes)
@@ -133,10 +148,10 @@ class ObjectTrackerEstimator(Estimator):
             found = prompted_mask(footage, scene, i, prompt, known)
             if not (found.soft > 0.5).any():
                 raise HoigsError(_nothing_there(entity, prompt, footage, i))
-            if found.on_person:
+            if looks_like_person(footage, found):
                 notes.append(
-                    f"{entity.name}: the click in frame {prompt.frame} lies on the person's mask; "
-                    "if the person was meant, click on the object"
+                    f"{entity.name}: what was clicked in frame {prompt.frame} lies on the person "
+                    "and has their colours: if it is a part of them, click on the object"
                 )
             if found.quality < SET_OFF and at_rest(scene, {i: found.soft > 0.5}):
                 notes.append(
@@ -146,6 +161,22 @@ class ObjectTrackerEstimator(Estimator):
                 )
             masks.append(found)
         return masks
+
+
+def _followed(
+    footage: Footage,
+    scene: Scene,
+    masks: Sequence[PromptedMask],
+    progress: Callable[[float], None],
+) -> Track:
+    """Masks of all frames; in a second pass where the object hides a person who keeps still."""
+    first = tracked(footage, scene, masks, lambda x: progress(0.6 * x))
+    behind = None
+    if isinstance(scene, StaticScene):
+        behind = Behind.of(footage, scene, first.soft > 127)
+    if behind is None:
+        return first
+    return tracked_again(footage, behind, masks, first, lambda x: progress(0.6 + 0.4 * x))
 
 
 def _proposed(

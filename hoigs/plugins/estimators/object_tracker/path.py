@@ -165,8 +165,18 @@ def _cheapest(frames: list, size: float, known: list[int]) -> Path:
         if age == 0:
             centers[i] = place
         k = back[i][k]
+    return _interpolated(centers)
+
+
+def path_of(masks: Bool[np.ndarray, "F h w"]) -> Path:
+    """The way of an object whose masks are known; it is not seen where they are empty."""
+    return _interpolated(np.array([center_of(m) if m.any() else (np.nan, np.nan) for m in masks]))
+
+
+def _interpolated(centers: Float[np.ndarray, "F 2"]) -> Path:
+    """The path through centres, NaN where it is not seen."""
     seen = np.isfinite(centers[:, 0])
-    rows = np.arange(len(frames))
+    rows = np.arange(len(centers))
     for axis in range(2):
         centers[:, axis] = np.interp(rows, rows[seen], centers[seen, axis])
     return Path(centers, seen)

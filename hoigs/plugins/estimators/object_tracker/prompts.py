@@ -18,6 +18,7 @@ from hoigs.plugins.estimators.object_tracker.windows import Window
 RADII = (0.025, 0.04, 0.06, 0.09, 0.13, 0.19)  # of the object, in diagonals of the image
 ROUNDS = 4
 USUAL, LARGEST = 0.25, 0.55  # of the person's mask: what a held thing may, and cannot, cover of it
+LIKE, HELD = 0.45, 0.5  # likeness to the person's colours, share that no limb reaches: see below
 INSIDE = (0.6, 1.5, 3.0)  # log-odds of the inside of a box, tried in turn
 
 
@@ -28,12 +29,14 @@ class PromptedMask:
     Attributes:
         soft: probability of each pixel of the frame. quality: how well it is set off, 0 to 1.
         on_person: the click lies on the person's mask.
+        barred: pixels that the prompt rules out.
     """
 
     frame: int
     soft: Float[np.ndarray, "h w"]
     quality: float
     on_person: bool
+    barred: Bool[np.ndarray, "h w"]
 
 
 def prompted_mask(
@@ -50,9 +53,11 @@ def prompted_mask(
     on_person = bool(footage.person[i][shown].mean() > 0.5) if shown.any() else False
     at_rest = not median_of(away[seed]) > 4
     fixed = _evidence(footage.body(i), away, on_person, at_rest, box is not None)
-    fixed[_disc(footage.shape, outside, max(1.5, 0.008 * footage.diagonal))] = -9
-    fixed[footage.blank[i]] = -9
+    barred = footage.blank[i] | _disc(footage.shape, outside, max(1.5, 0.008 * footage.diagonal))
+    fixed[barred] = -9
     fixed[seed] = 6
+    if box is not None:
+        barred = barred | ~shown
     if box is None:
         reach = float(np.hypot(*(inside - center).T).max())
         spreads = [reach + r * footage.diagonal for r in RADII]
@@ -64,7 +69,7 @@ def prompted_mask(
         ]
     tried = [g for g in grown if g is not None]
     if not tried:
-        return PromptedMask(i, np.zeros(footage.shape, np.float32), 0.0, on_person)
+        return PromptedMask(i, np.zeros(footage.shape, np.float32), 0.0, on_person, barred)
     masks = [soft > 0.5 for _, soft in tried]
     new = np.ones(len(masks)) if on_person else _novelty(masks, away, footage.diagonal)
     scores = [
@@ -75,7 +80,20 @@ def prompted_mask(
     if box is not None:  # which is drawn so that the object reaches its sides
         scores = [score * _reaching(m, box) ** 2 for score, m in zip(scores, masks)]
     best = int(np.argmax(scores))
-    return PromptedMask(i, tried[best][1], scores[best], on_person)
+    return PromptedMask(i, tried[best][1], scores[best], on_person, barred)
+
+
+def looks_like_person(footage: Footage, found: PromptedMask) -> bool:
+    """Whether what was clicked on the person's mask has the colours of the rest of it. A thing that
+    is held in front of a person lies on their mask, too, but looks otherwise, or is beyond their
+    limbs."""
+    i, mask = found.frame, found.soft > 0.5
+    if not found.on_person or footage.held[i][mask].mean() > HELD:
+        return False
+    rest = footage.person[i] & ~ndimage.binary_dilation(mask, iterations=2 * footage.unit)
+    bins = bins_of(footage.colors(i))
+    own, theirs = (histogram(bins, region * 1.0) for region in (mask, rest))
+    return float(np.sqrt(own * theirs).sum()) > LIKE
 
 
 def _steadiness(masks: list[np.ndarray], k: int) -> float:

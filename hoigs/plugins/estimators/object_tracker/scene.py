@@ -42,14 +42,35 @@ class StaticScene:
         return shadowless(self.footage.colors(i) - self.median, self.median) / self.spread
 
 
-def static_scene(footage: Footage, exclude: np.ndarray | None = None) -> StaticScene:
-    """`exclude`: pixels [F, h, w] that show no scene beside the person's, such as the object's."""
-    picks = np.unique(np.linspace(0, len(footage) - 1, SAMPLES).astype(int))
+def static_scene(footage: Footage) -> StaticScene:
+    picks = _samples(footage, SAMPLES)
     hidden = footage.person[picks] | footage.blank[picks]
-    if exclude is not None:
-        hidden |= exclude[picks]
     for row in range(len(picks)):
         hidden[row] = ndimage.binary_dilation(hidden[row], iterations=4)
+    return _still_parts(footage, picks, hidden)
+
+
+def scene_behind(footage: Footage, masks: Bool[np.ndarray, "F h w"], around: float) -> StaticScene:
+    """What an object passes in front of: the scene, and of people what keeps still.
+
+    Args:
+        masks: of the object. around: pixels beside them that may be its own, too.
+    """
+    picks = _samples(footage, 2 * SAMPLES)
+    hidden = masks[picks] | footage.blank[picks]
+    for row in range(len(picks)):
+        hidden[row] = ndimage.distance_transform_edt(~hidden[row]) <= around
+    return _still_parts(footage, picks, hidden)
+
+
+def _samples(footage: Footage, count: int) -> np.ndarray:
+    return np.unique(np.linspace(0, len(footage) - 1, count).astype(int))
+
+
+def _still_parts(
+    footage: Footage, picks: np.ndarray, hidden: Bool[np.ndarray, "S h w"]
+) -> StaticScene:
+    """Of samples of frames, where they are not hidden."""
     median, spread = np.empty((*footage.shape, 3), np.float32), np.empty(footage.shape, np.float32)
     for y in range(footage.shape[0]):  # a row of pixels at a time, which fits the cache
         median[y], spread[y] = _median_and_spread(footage.lab[picks, y], hidden[:, y])

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
+from hoigs.plugins.estimators.object_tracker.behind import Behind
 from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram
 from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
-from hoigs.plugins.estimators.object_tracker.path import Path, center_of, found_path
+from hoigs.plugins.estimators.object_tracker.path import Path, center_of, found_path, path_of
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
 from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, median_of
 from hoigs.plugins.estimators.object_tracker.transfer import shift_of, transferred
@@ -56,19 +58,50 @@ def tracked(
     path = found_path(footage, used, colors, known, progress=lambda x: progress(0.3 * x))
     stands = not rests and stands_out(footage, used, path, known)
     unchanged = 1.2 if stands else 0.1
+    walk = partial(_Walk, footage, used, colors, path, unchanged=unchanged, moving=moving)
+    return _walked(footage, prompts, walk, lambda x: progress(0.3 + 0.7 * x))
+
+
+def tracked_again(
+    footage: Footage,
+    behind: Behind,
+    prompts: Sequence[PromptedMask],
+    before: Track,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Track:
+    """Better masks of an object that covers a person, by what is behind it.
+
+    Args:
+        before: by which `behind` was found; the object is taken to be where it has it.
+    """
+    prompts = [behind.regrown(p) for p in prompts]
+    colors = color_model(footage, {p.frame: p.soft for p in prompts})
+    path = path_of(before.soft > 127)
+    walk = partial(
+        _Walk, footage, behind.scene, colors, path, unchanged=0.1, moving=False, behind=behind
+    )
+    return _walked(footage, prompts, walk, progress)
+
+
+def _walked(
+    footage: Footage,
+    prompts: Sequence[PromptedMask],
+    walk_from: Callable[..., _Walk],
+    progress: Callable[[float], None],
+) -> Track:
+    """Masks of all frames, each by a walk from one of the prompted ones."""
     soft = np.zeros(footage.lab.shape[:3], np.uint8)
     confidence = np.zeros(len(footage))
     for p in prompts:
         soft[p.frame], confidence[p.frame] = np.rint(p.soft * 255), 1.0
-    walks = _walks(sorted(known), len(footage))
+    by_frame = {p.frame: p for p in prompts}
     done = 0
-    for start, frames in walks:
-        first = next(p for p in prompts if p.frame == start)
-        walk = _Walk(footage, used, colors, path, first, unchanged, moving)
+    for start, frames in _walks(sorted(by_frame), len(footage)):
+        walk = walk_from(start=by_frame[start])
         for i in frames:
             confidence[i], soft[i] = walk.step(i)
             done += 1
-            progress(0.3 + 0.7 * done / max(len(footage) - len(known), 1))
+            progress(done / max(len(footage) - len(by_frame), 1))
     return Track(soft, confidence)
 
 
@@ -129,8 +162,10 @@ class _Walk:
         start: PromptedMask,
         unchanged: float,
         moving: bool,
+        behind: Behind | None = None,
     ) -> None:
         self.footage, self.scene, self.colors, self.path = footage, scene, colors, path
+        self.behind = behind
         self.unchanged = unchanged  # log-odds by which a pixel that shows the scene is not ours
         window = _window_of(start.soft > 0.5)
         self.first = self._sighting(start.frame, window, window.cut(start.soft))
@@ -216,7 +251,12 @@ class _Walk:
         valid = window.inside(self.footage.shape)
         near = histogram(bins_of(colors), (prior < 0.3) * valid * 1.0)
         shape = np.log((prior + 0.03) / (1.03 - prior)) * (0.4 + 0.6 * similar)
-        odds = shape + self._odds(i, window, colors, away, near, prior)
+        odds = self._odds(i, window, colors, away, near, prior)
+        if self.behind is not None:
+            outside = (prior < 0.3) & valid
+            better = self.behind.odds(i, window, colors, self.colors.inside, outside)
+            odds = np.where(np.isnan(better), odds, better)
+        odds = shape + odds
         odds = np.where(valid, odds, -9)
         return walked(odds, colors), prior
 
