@@ -8,16 +8,14 @@ same, and with it every result.
 
 from __future__ import annotations
 
-import ctypes
 import os
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from hoigs.core.machine.cpus import available_cpus
+from hoigs.core.machine.gomp import Gomp, c_library, loaded_gomp
 
 TASKS = Path("/proc/self/task")
 SHORT_SPIN = "30000"
@@ -97,6 +95,7 @@ def short_waits_when_busy() -> Iterator[None]:
 
     watcher = threading.Thread(target=watch, name="hoigs-waits", daemon=True)
     if os.environ.get("GOMP_SPINCOUNT") == SHORT_SPIN:
+        c_library()
         watcher.start()
     try:
         yield
@@ -121,25 +120,11 @@ def scheduled() -> tuple[int, int] | None:
     return (ran, queued) if known else None
 
 
-def loaded_gomp() -> Any:
-    """The libgomp that torch brought and has loaded; None without one."""
-    torch = sys.modules.get("torch")
-    if torch is None or not hasattr(os, "RTLD_NOLOAD"):
-        return None
-    for path in sorted((Path(str(torch.__file__)).parent / "lib").glob("libgomp*.so*")):
-        try:
-            return ctypes.CDLL(str(path), mode=os.RTLD_NOLOAD | os.RTLD_NOW)
-        except OSError:  # torch is just being imported
-            continue
-    return None
-
-
-def _idle_threads(gomp: Any, release: threading.Event) -> None:
+def _idle_threads(gomp: Gomp, release: threading.Event) -> None:
     """Keep a thread more than there are processors, all asleep, until `release`.
 
     libgomp ends them with the thread that runs this.
     """
-    nothing = ctypes.CDLL(None).free  # of NULL; no thread of libgomp is to enter Python
-    count = ctypes.c_uint(gomp.omp_get_num_procs() + 1)
-    gomp.GOMP_parallel(nothing, None, count, ctypes.c_uint(0))
+    nothing = c_library().free  # of NULL; no thread of libgomp is to enter Python
+    gomp.parallel(nothing, None, gomp.processors() + 1, 0)
     release.wait()

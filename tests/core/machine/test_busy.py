@@ -99,3 +99,26 @@ def test_threads_that_queue_do_not_spin():
     assert during < before / 3, (before, during)
     assert len(sums) == 1, "as many threads work as before"
     assert left == ["MainThread"]
+
+
+IMPORTS = """
+import faulthandler, os
+faulthandler.dump_traceback_later(60, exit=True)
+from hoigs.core.machine import busy
+
+os.environ["GOMP_SPINCOUNT"] = busy.SHORT_SPIN
+busy.INTERVAL = 0.0001
+busy.Waiting.look = lambda self: self.set(not self.short)
+import torch
+
+with busy.short_waits_when_busy():
+    from pxr import Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
+"""
+
+
+def test_extensions_may_take_pythons_lock_while_they_are_loaded():
+    pytest.importorskip("pxr", reason="an extension that does: pip install 'hoigs[usd]'")
+    done = subprocess.run(
+        [sys.executable, "-c", IMPORTS], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr

@@ -20,7 +20,7 @@ from hoigs.core.cpu_kernels.launch import prepared
 from hoigs.core.cpu_kernels.runtime import wp
 from hoigs.core.cpu_kernels.workers import SerialWorkers, ThreadWorkers, Workers
 from hoigs.core.errors import RenderError
-from hoigs.core.machine.busy import loaded_gomp
+from hoigs.core.machine.gomp import loaded_gomp
 
 Scheduler = Literal["auto", "openmp", "threads", "serial"]
 
@@ -56,8 +56,7 @@ class OpenMPWorkers:
         gomp = loaded_gomp()
         if gomp is None:
             raise OSError(f"no libgomp beside {torch.__file__}: it was built with another OpenMP")
-        self._gomp = gomp.GOMP_parallel
-        self._gomp.restype = None
+        self._gomp = gomp.parallel
         address = wp.zeros(1, dtype=wp.uint64, device="cpu")
         wp.launch(native_kernels.queue_address, dim=1, inputs=[address], device="cpu")
         self._drain = ctypes.c_void_p(int(address.numpy()[0]))
@@ -74,7 +73,7 @@ class OpenMPWorkers:
             job.bounds = ctypes.addressof(bounds)
             job.arguments = ctypes.addressof(arguments)
         queue = _Queue(ctypes.addressof(jobs), len(launches), 0)
-        self._gomp(self._drain, ctypes.byref(queue), ctypes.c_uint(len(launches)), ctypes.c_uint(0))
+        self._gomp(self._drain, ctypes.byref(queue), len(launches), 0)
 
     def _check(self, kernel: Any) -> None:
         """Run a small kernel and compare its results."""
