@@ -95,7 +95,7 @@ def short_waits_when_busy() -> Iterator[None]:
 
     watcher = threading.Thread(target=watch, name="hoigs-waits", daemon=True)
     if os.environ.get("GOMP_SPINCOUNT") == SHORT_SPIN:
-        c_library()
+        c_library()  # before there is a second thread
         watcher.start()
     try:
         yield

@@ -21,6 +21,12 @@ print(os.environ.get("CUDA_VISIBLE_DEVICES"), os.environ["OMP_NUM_THREADS"], flu
 time.sleep(60)
 """
 
+SLEEPER = """
+import time
+print("here", flush=True)
+time.sleep(60)
+"""
+
 
 def executor(slots: int, **more: object) -> LocalExecutor:
     return LocalExecutor(slots, program=(sys.executable, "-c", PRINTS), **more)  # type: ignore[arg-type]
@@ -38,6 +44,14 @@ def runs(pid: int) -> bool:
         return "zombie" not in Path(f"/proc/{pid}/status").read_text()
     except (FileNotFoundError, ProcessLookupError):
         return False
+
+
+def assert_killed(process: Process) -> None:
+    """Within four seconds, by itself."""
+    began = time.monotonic()
+    while process.poll() is None and time.monotonic() < began + 10:
+        time.sleep(0.02)
+    assert process.poll() == -9 and time.monotonic() - began < 4
 
 
 class Starts:
@@ -111,7 +125,7 @@ def test_gpus_of_the_environment(monkeypatch):
 def test_a_process_ends_when_its_lease_is_anothers(tmp_path, monkeypatch):
     """Even while its driver is suspended: it looks for itself."""
     monkeypatch.chdir(tmp_path)
-    Path("sleeper.py").write_text("import time\nprint('here', flush=True)\ntime.sleep(60)\n")
+    Path("sleeper.py").write_text(SLEEPER)
     where, lock = LocalExecutor(), FolderLock(tmp_path / "row", "hoigs batch").acquire()
     process = where.start(("sleeper",), tmp_path / "log", Needs(), lock.lease)
     try:
@@ -120,10 +134,7 @@ def test_a_process_ends_when_its_lease_is_anothers(tmp_path, monkeypatch):
         assert process.poll() is None, "it looks at the lease once a second"
         lock.path.unlink()
         FolderLock(tmp_path / "row", "another").acquire()
-        began = time.monotonic()
-        while process.poll() is None and time.monotonic() < began + 10:
-            time.sleep(0.02)
-        assert process.poll() == -9 and time.monotonic() - began < 4
+        assert_killed(process)
     finally:
         process.stop()
     assert "another one has taken this work over" in (tmp_path / "log").read_text()
@@ -142,7 +153,7 @@ time.sleep(60)
 def test_a_process_ends_with_its_driver_though_its_parent_lives(tmp_path, monkeypatch):
     """As where both the driver and the head of a Ray cluster are killed."""
     monkeypatch.chdir(tmp_path)
-    Path("sleeper.py").write_text("import time\nprint('here', flush=True)\ntime.sleep(60)\n")
+    Path("sleeper.py").write_text(SLEEPER)
     words = [sys.executable, "-c", HOLDER, str(tmp_path / "row")]
     driver = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     assert driver.stdout is not None
@@ -154,10 +165,7 @@ def test_a_process_ends_with_its_driver_though_its_parent_lives(tmp_path, monkey
         assert process.poll() is None
         driver.kill()
         driver.communicate()
-        began = time.monotonic()
-        while process.poll() is None and time.monotonic() < began + 10:
-            time.sleep(0.02)
-        assert process.poll() == -9 and time.monotonic() - began < 4
+        assert_killed(process)
     finally:
         driver.kill()
         process.stop()

@@ -25,7 +25,11 @@ ROUNDS = 4
 
 @dataclass(frozen=True)
 class Behind:
-    """What an object that is known roughly passes in front of."""
+    """What an object that is known roughly passes in front of.
+
+    Attributes:
+        scene: what was there while the object was elsewhere, people who keep still included.
+    """
 
     footage: Footage
     scene: StaticScene

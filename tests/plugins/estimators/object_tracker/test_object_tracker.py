@@ -8,86 +8,33 @@ from typing import cast
 
 import numpy as np
 import pytest
-from scipy import ndimage
+from disc_world import (
+    COUNT,
+    RADIUS,
+    H,
+    W,
+    click,
+    masks_of,
+    overlaps,
+    places,
+    request,
+    texture,
+    world,
+)
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import (
     EntityMasks,
     EntityRequest,
-    Estimates,
     FramePrompt,
     Landmarks,
     PromptPoint,
     VideoRequest,
-    checked,
 )
-from hoigs.plugins.estimators.object_tracker.behind import Behind
-from hoigs.plugins.estimators.object_tracker.colors import bins_of, histogram
-from hoigs.plugins.estimators.object_tracker.estimator import ObjectTrackerEstimator
 from hoigs.plugins.estimators.object_tracker.footage import Footage, lab_of
 from hoigs.plugins.estimators.object_tracker.path import _cheapest
 from hoigs.plugins.estimators.object_tracker.proposal import Candidate, ranked, without_scenery
-from hoigs.plugins.estimators.object_tracker.scene import MovingScene, static_scene
-from hoigs.plugins.estimators.object_tracker.windows import Window
-
-H, W, RADIUS, COUNT = 72, 108, 8, 14
-
-
-def texture(seed: int, color: tuple[int, int, int], shape=(H, W + 60)) -> np.ndarray:
-    noise = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=(*shape, 3)), (2, 2, 0))
-    return np.clip(np.array(color) + 18 * noise / noise.std(), 0, 255)
-
-
-def places() -> list[tuple[float, float]]:
-    """Of the disc: it swings past the person."""
-    return [(16 + 5.2 * i, 40 + 14 * np.sin(i / 3)) for i in range(COUNT)]
-
-
-def world(pan: float = 0.0, hidden: range = range(0)):
-    """Frames, masks of the person, masks of the disc; `hidden`: frames with a board before it."""
-    wall, ball = texture(0, (120, 130, 90)), texture(1, (200, 60, 50))
-    y, x = np.mgrid[:H, :W] + 0.5
-    frames, people, discs = [], [], []
-    for i, (cx, cy) in enumerate(places()):
-        image = wall[:, round(pan * i) :][:, :W].copy()
-        person = (np.abs(x - 50 - 3 * np.sin(i)) < 8) & (y > 14)
-        disc = np.hypot(x - cx, y - cy) < RADIUS
-        image[person] = (70, 80, 150)
-        rolled = np.roll(ball[:, :W], (round(cy), round(cx)), (0, 1))
-        image[disc] = rolled[disc]
-        if i in hidden:
-            image[disc] = wall[:, round(pan * i) :][:, :W][disc]
-            disc = np.zeros_like(disc)
-        frames.append(image.astype(np.uint8))
-        people.append(person & ~disc)
-        discs.append(disc)
-    return frames, people, discs
-
-
-def request(tmp_path: Path, scene, prompts: tuple[FramePrompt, ...] = ()) -> VideoRequest:
-    frames, people, _ = scene
-    entity = EntityRequest("object", "object", further=prompts)
-    return VideoRequest(
-        len(frames), W, H, lambda i: frames[i], tmp_path, tmp_path, entities=(entity,),
-        known=Estimates(EntityMasks({"human": people})),
-    )  # fmt: skip
-
-
-def click(frame: int, x: float | None = None, y: float | None = None) -> FramePrompt:
-    cx, cy = places()[frame]
-    return FramePrompt(frame, (PromptPoint(cx if x is None else x, cy if y is None else y),))
-
-
-def masks_of(video: VideoRequest) -> EntityMasks:
-    estimator = ObjectTrackerEstimator()
-    found = checked(estimator.estimate(video), video, estimator).masks
-    assert found is not None
-    return found
-
-
-def overlaps(found: EntityMasks, discs: list[np.ndarray]) -> np.ndarray:
-    masks = [found.entities["object"][i] for i in range(len(discs))]
-    return np.array([(m & d).sum() / max((m | d).sum(), 1) for m, d in zip(masks, discs)])
+from hoigs.plugins.estimators.object_tracker.scene import MovingScene
 
 
 @pytest.mark.parametrize("pan", [0.0, 1.5])
@@ -330,51 +277,6 @@ def test_a_click_on_a_thing_that_the_persons_mask_takes_in_is_not_doubted(tmp_pa
     taken = [person | disc for person, disc in zip(people, discs)]
     found = masks_of(request(tmp_path, (frames, taken, discs), (click(6),)))
     assert people[6].any() and not any("click" in note for note in found.notes)
-
-
-def seated():
-    """A disc, one half of it of a colour of the shirt, before a person who keeps still."""
-    wall, red = texture(0, (120, 130, 90)), texture(1, (150, 40, 40))
-    shirt = 0.2 * (texture(2, (0, 0, 0)) - 9)[:, :W]
-    tan = np.array((186, 176, 165))
-    y, x = np.mgrid[:H, :W] + 0.5
-    person = (np.abs(x - 54) < 46) & (y > 8)
-    stripes = np.where((y % 24 < 12)[..., None], (226, 222, 220), (190, 176, 160))
-    frames, discs = [], []
-    for i in range(3 * COUNT):
-        cx, cy = 54 + 26 * np.sin(i / 5), 40 + 12 * np.cos(i / 5)
-        disc = np.hypot(x - cx, y - cy) < 12
-        image = np.where(person[..., None], stripes + shirt, wall[:, :W])
-        around = np.roll(red[:, :W], (round(cy), round(cx)), (0, 1))
-        half = ((x > cx + 2) | (np.abs(x - cx + 6) < 1.5))[..., None]
-        image[disc] = np.where(half, np.roll(shirt, i, 1) + tan, around)[disc]
-        frames.append(image.clip(0, 255).astype(np.uint8))
-        discs.append(disc)
-    return frames, [person] * len(frames), discs
-
-
-def test_what_is_behind_a_held_thing_tells_it_from_a_person_of_its_colours() -> None:
-    """Pale parts of a disc lie before white stripes of a shirt that has pale stripes, too."""
-    frames, people, discs = seated()
-    lab, none = np.stack([lab_of(f) for f in frames]), np.zeros((len(frames), H, W), bool)
-    footage = Footage(tuple(range(len(frames))), 1.0, lab, np.stack(people), none, none)
-    behind = Behind.of(footage, static_scene(footage), np.stack(discs))
-    assert behind is not None
-    window, i = Window(0, 0, W, 1), 8
-    colors, disc = window.cut(footage.colors(i)), window.cut(discs[i]) > 0
-    bins = bins_of(colors)
-    inside, valid = histogram(bins, disc * 1.0), window.inside((H, W))
-    odds = behind.odds(i, window, colors, inside, ~disc & valid)
-    on_shirt = (window.cut(people[i]) > 0) & ~ndimage.binary_dilation(disc, iterations=2)
-    changed = disc & (window.cut(np.nan_to_num(behind.scene.difference(i))) > 4)
-    assert np.median(odds[on_shirt]) < -2 and np.median(odds[changed]) > 2
-
-
-def test_a_person_who_is_seldom_hidden_needs_no_second_pass() -> None:
-    frames, people, discs = world()
-    lab, none = np.stack([lab_of(f) for f in frames]), np.zeros((len(frames), H, W), bool)
-    footage = Footage(tuple(range(len(frames))), 1.0, lab, np.stack(people), none, none)
-    assert Behind.of(footage, static_scene(footage), np.stack(discs)) is None
 
 
 def test_a_click_on_a_black_border_is_an_error_that_says_so(tmp_path: Path) -> None:
