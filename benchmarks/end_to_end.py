@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from estimates.figures import body_figures, camera_motion, object_figures
+from estimates.figures import body_figures, camera_motion, draw_masks, object_figures
 from estimates.source import landmarks, write_video
 from estimates.training import Training, trained
 from object_tracking import click_on
@@ -165,24 +165,6 @@ def scale_ratio(made: Any, truth: Any) -> float | str:
     if min(spread) < 0.01:
         return "not computed: the camera stands still"
     return _rounded(spread[0] / spread[1])
-
-
-def draw_masks(made: Any, file: Path) -> None:
-    """Eight frames with the outlines of person (green) and object (magenta)."""
-    from PIL import Image
-    from scipy import ndimage
-
-    tiles = []
-    for i in np.linspace(0, len(made) - 1, 8).astype(int):
-        image = made[int(i)].image.numpy().copy()
-        for name, color in (("human", (0, 255, 0)), ("object", (255, 0, 255))):
-            if name in made.kinds:
-                mask = made[int(i)].masks[name].numpy()
-                image[ndimage.binary_dilation(mask, iterations=2) & ~mask] = color
-        tiles.append(image)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    rows = [np.concatenate(tiles[k : k + 4], 1) for k in (0, 4)]
-    Image.fromarray(np.concatenate(rows)).save(file)
 
 
 def table(found: dict[str, Any]) -> str:

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
+from scipy import ndimage
 
 World = tuple[np.ndarray, np.ndarray]  # rotation and shift from the clip's world to the true one
 
@@ -141,3 +143,19 @@ def _spread(values: np.ndarray, *, mean: bool = False) -> dict[str, float]:
     middle = ("mean", values.mean()) if mean else ("median", np.median(values))
     found = (middle, ("p95", np.quantile(values, 0.95)), ("worst", values.max()))
     return {name: round(float(value), 2) for name, value in found}
+
+
+def draw_masks(made: Any, file: Path) -> None:
+    """Eight frames with the outlines of people (green), and of objects (magenta, yellow)."""
+    colors = {"human": [(0, 255, 0)], "object": [(255, 0, 255), (255, 220, 0)]}
+    shown = [(n, colors[kind].pop(0)) for n, kind in made.kinds.items() if colors.get(kind)]
+    tiles = []
+    for i in np.linspace(0, len(made) - 1, 8).astype(int):
+        image = made[int(i)].image.numpy().copy()
+        for name, color in shown:
+            mask = made[int(i)].masks[name].numpy()
+            image[ndimage.binary_dilation(mask, iterations=2) & ~mask] = color
+        tiles.append(image)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    rows = [np.concatenate(tiles[k : k + 4], 1) for k in (0, 4)]
+    Image.fromarray(np.concatenate(rows)).save(file)

@@ -14,7 +14,7 @@ from hoigs.plugins.estimators.object_tracker.footage import Footage
 from hoigs.plugins.estimators.object_tracker.path import center_of
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overlap
 from hoigs.plugins.estimators.object_tracker.scene import Scene
-from hoigs.plugins.estimators.object_tracker.tracker import Track, tracked
+from hoigs.plugins.estimators.object_tracker.tracker import Track, followed
 
 SAME = 0.5  # intersection over union from which two masks are of one thing
 
@@ -93,7 +93,7 @@ def _without(
         closed[i] |= ndimage.binary_dilation(other.soft[i] > 127, iterations=3)
     for p in prompts:  # which are right even there
         closed[p.frame] &= ~(p.soft > 0.5)
-    again = tracked(replace(footage, blank=closed), scene, prompts)
+    again = followed(replace(footage, blank=closed), scene, prompts)
     soft, confidence = again.soft.copy(), again.confidence.copy()
     for i in np.flatnonzero(_claimed_twice(again, other)).tolist():
         if i in frames and i not in {p.frame for p in prompts}:

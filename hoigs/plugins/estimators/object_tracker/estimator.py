@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,45 +13,32 @@ from pydantic import Field
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import (
-    EntityMasks,
     EntityRequest,
     Estimates,
     Estimator,
     FramePrompt,
     LazyFrames,
-    PromptPoint,
     VideoRequest,
 )
 from hoigs.core.progress import Progress, no_progress
 from hoigs.plugins.estimators.common.subprocess import settings_key
 from hoigs.plugins.estimators.object_tracker.alike import told_apart
-from hoigs.plugins.estimators.object_tracker.behind import Behind
 from hoigs.plugins.estimators.object_tracker.camera_motion import is_static
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage
 from hoigs.plugins.estimators.object_tracker.held import skeletons
+from hoigs.plugins.estimators.object_tracker.notes import doubts, nothing_there
 from hoigs.plugins.estimators.object_tracker.prompts import (
     PromptedMask,
     looks_like_person,
     prompted_mask,
 )
 from hoigs.plugins.estimators.object_tracker.proposal import proposed
-from hoigs.plugins.estimators.object_tracker.scene import (
-    Scene,
-    StaticScene,
-    moving_scene,
-    static_scene,
-)
-from hoigs.plugins.estimators.object_tracker.tracker import (
-    Track,
-    at_rest,
-    color_model,
-    tracked,
-    tracked_again,
-)
+from hoigs.plugins.estimators.object_tracker.scene import Scene, moving_scene, static_scene
+from hoigs.plugins.estimators.object_tracker.tracker import Track, at_rest, color_model, followed
+from hoigs.plugins.estimators.object_tracker.tracks_file import read_tracks, write_tracks
 
-VERSION = 8  # of what is kept in `work`; raised when masks change
+VERSION = 9  # of what is kept in `work`; raised when masks change
 SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
-WEAK = 0.6  # confidence below which a frame is named in a note
 
 
 class ObjectTrackerConfig(ComponentConfig):
@@ -83,7 +68,7 @@ class ObjectTrackerEstimator(Estimator):
         if not file.is_file():
             self._track(video, wanted, file, progress)
         progress(1.0, "object")
-        return Estimates(_read(file, video, [e.name for e in wanted]))
+        return Estimates(read_tracks(file, video, [e.name for e in wanted]))
 
     def _key(self, video: VideoRequest, wanted: Sequence[EntityRequest]) -> str:
         """Of everything that masks depend on; the person's masks by a few frames of them."""
@@ -132,10 +117,10 @@ class ObjectTrackerEstimator(Estimator):
                 )
             prompts[entity.name] = masks
             part = _part(progress, start, share)
-            tracks[entity.name] = _followed(footage, scene, masks, part) if masks else None
+            tracks[entity.name] = followed(footage, scene, masks, part) if masks else None
         tracks, alike = told_apart(footage, scene, prompts, tracks)
-        notes += [*alike, *_doubts(tracks, footage)]
-        _write(file, video, footage, tracks, chosen, notes)
+        notes += [*alike, *doubts(tracks, footage)]
+        write_tracks(file, video, footage, tracks, chosen, notes)
 
     def _prompted(
         self, entity: EntityRequest, footage: Footage, scene: Scene, notes: list[str]
@@ -147,7 +132,7 @@ class ObjectTrackerEstimator(Estimator):
             known = color_model(footage, {m.frame: m.soft for m in masks}) if masks else None
             found = prompted_mask(footage, scene, i, prompt, known)
             if not (found.soft > 0.5).any():
-                raise HoigsError(_nothing_there(entity, prompt, footage, i))
+                raise HoigsError(nothing_there(entity, prompt, footage, i))
             if looks_like_person(footage, found):
                 notes.append(
                     f"{entity.name}: what was clicked in frame {prompt.frame} lies on the person "
@@ -161,22 +146,6 @@ class ObjectTrackerEstimator(Estimator):
                 )
             masks.append(found)
         return masks
-
-
-def _followed(
-    footage: Footage,
-    scene: Scene,
-    masks: Sequence[PromptedMask],
-    progress: Callable[[float], None],
-) -> Track:
-    """Masks of all frames; in a second pass where the object hides a person who keeps still."""
-    first = tracked(footage, scene, masks, lambda x: progress(0.6 * x))
-    behind = None
-    if isinstance(scene, StaticScene):
-        behind = Behind.of(footage, scene, first.soft > 127)
-    if behind is None:
-        return first
-    return tracked_again(footage, behind, masks, first, lambda x: progress(0.6 + 0.4 * x))
 
 
 def _proposed(
@@ -219,123 +188,3 @@ def _person(video: VideoRequest) -> Sequence[Any] | None:
     if len(each) == 1:
         return each[0]
     return LazyFrames(video.frames, lambda i: np.any([m[i] for m in each], axis=0))
-
-
-def _nothing_there(entity: EntityRequest, prompt: FramePrompt, footage: Footage, i: int) -> str:
-    """What lies under a prompt from which no mask grows."""
-    point = next((p for p in prompt.points if p.inside), None)
-    where = f"{point.x:g},{point.y:g}" if point else f"the box {prompt.box}"
-    there = "a surface without an outline"
-    if point is not None:
-        h, w = footage.shape
-        x, y = int(point.x * footage.scale), int(point.y * footage.scale)
-        if not (0 <= x < w and 0 <= y < h):
-            there = "nothing: that is outside the picture"
-        elif footage.blank[i, y, x]:
-            there = "a black border of the video"
-        elif footage.person[i, y, x]:
-            there = "the person"
-    return (
-        f"estimator:object-tracker: no {entity.name} was found at {where} in frame {prompt.frame}: "
-        f"there is {there}; click on the middle of the object in a frame that shows it well"
-    )
-
-
-def _doubts(tracks: dict[str, Track | None], footage: Footage) -> list[str]:
-    """A sentence for each object on the frames that were not done, or not well."""
-    notes = []
-    for name, track in tracks.items():
-        if track is None:
-            continue
-        seen = [bool((soft > 127).any()) for soft in track.soft]
-        lost = [n for n, s in zip(footage.numbers, seen) if not s]
-        weak = [n for n, s, c in zip(footage.numbers, seen, track.confidence) if s and c < WEAK]
-        if lost:
-            notes.append(f"{name}: not seen in {_ranges(lost)}")
-        if weak:
-            notes.append(
-                f"{name}: its mask is doubtful in {_ranges(weak)}; a click there corrects it"
-            )
-    return notes
-
-
-def _ranges(numbers: Sequence[int]) -> str:
-    """Numbers of frames as "3 frames (10-12)", the first few ranges."""
-    runs: list[list[int]] = []
-    for n in numbers:
-        if runs and n - runs[-1][1] <= 2:
-            runs[-1][1] = n
-        else:
-            runs.append([n, n])
-    texts = [f"{a}" if a == b else f"{a}-{b}" for a, b in runs[:6]]
-    more = ", …" if len(runs) > 6 else ""
-    return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
-
-
-def _write(
-    file: Path,
-    video: VideoRequest,
-    footage: Footage,
-    tracks: dict[str, Track | None],
-    chosen: dict[str, list[FramePrompt]],
-    notes: list[str],
-) -> None:
-    """Everything that `_read` needs, under a temporary name first."""
-    arrays: dict[str, np.ndarray] = {}
-    none = np.zeros(footage.lab.shape[:3], np.uint8)
-    soft = {n: none if t is None else t.soft for n, t in tracks.items()}
-    strongest = np.max(list(soft.values()), axis=0)
-    for name, track in tracks.items():
-        arrays[f"soft {name}"] = np.where(soft[name] == strongest, soft[name], 0)
-        confidence = np.full(video.frames, np.nan, np.float32)
-        confidence[list(footage.numbers)] = 0.0 if track is None else track.confidence
-        arrays[f"confidence {name}"] = confidence
-    about = {
-        "numbers": footage.numbers,
-        "notes": notes,
-        "chosen": {
-            n: [[p.frame, [[q.x, q.y, q.inside] for q in p.points], p.box] for p in prompts]
-            for n, prompts in chosen.items()
-            if prompts
-        },
-    }
-    file.parent.mkdir(parents=True, exist_ok=True)
-    half = file.with_suffix(".part")
-    with half.open("wb") as out:
-        np.savez_compressed(out, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
-    half.replace(file)
-
-
-def _read(file: Path, video: VideoRequest, names: Sequence[str]) -> EntityMasks:
-    with np.load(file, allow_pickle=False) as saved:
-        about = json.loads(str(saved["about"]))
-        soft = {n: saved[f"soft {n}"] for n in names}
-        confidence = {n: saved[f"confidence {n}"] for n in names}
-    row = {number: k for k, number in enumerate(about["numbers"])}
-    masks = {n: LazyFrames(video.frames, partial(_mask_at, soft[n], row, video)) for n in names}
-    chosen = {
-        n: tuple(
-            FramePrompt(frame, tuple(PromptPoint(*p) for p in points), tuple(box) if box else None)
-            for frame, points, box in prompts
-        )
-        for n, prompts in about["chosen"].items()
-    }
-    return EntityMasks(
-        masks, None, "object tracker without a network", confidence, chosen, tuple(about["notes"])
-    )
-
-
-def _mask_at(soft: np.ndarray, row: dict[int, int], video: VideoRequest, i: int) -> np.ndarray:
-    return _enlarged(soft, row.get(i), video)
-
-
-def _enlarged(soft: np.ndarray, row: int | None, video: VideoRequest) -> np.ndarray:
-    """A mask at the video's size; empty in frames that were not wanted."""
-    from PIL import Image
-
-    if row is None or not soft[row].any():
-        return np.zeros((video.height, video.width), bool)
-    image = Image.fromarray(soft[row]).resize(
-        (video.width, video.height), Image.Resampling.BILINEAR
-    )
-    return np.asarray(image) > 127

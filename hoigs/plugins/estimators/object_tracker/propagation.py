@@ -1,0 +1,233 @@
+"""Masks from frame to frame, outwards from a prompted one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from hoigs.plugins.estimators.object_tracker.behind import Behind
+from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram
+from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
+from hoigs.plugins.estimators.object_tracker.path import Path, center_of, found_path
+from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
+from hoigs.plugins.estimators.object_tracker.scene import Scene
+from hoigs.plugins.estimators.object_tracker.transfer import shift_of, transferred
+from hoigs.plugins.estimators.object_tracker.walker import walked
+from hoigs.plugins.estimators.object_tracker.windows import Window
+
+AGAIN, AHEAD = 6, 14  # frames after which the path is found anew, and how far
+SURE = 0.35  # confidence below which the object counts as not seen
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """The object in one frame, cut out by a window."""
+
+    window: Window
+    colors: Float[np.ndarray, "n n 3"]
+    soft: Float[np.ndarray, "n n"]
+
+
+class Propagation:
+    """Masks from frame to frame, away from a prompted one."""
+
+    def __init__(
+        self,
+        footage: Footage,
+        scene: Scene | None,
+        colors: ColorModel,
+        path: Path,
+        start: PromptedMask,
+        unchanged: float,
+        moving: bool,
+        behind: Behind | None = None,
+    ) -> None:
+        self.footage, self.scene, self.colors, self.path = footage, scene, colors, path
+        self.behind = behind
+        self.unchanged = unchanged  # log-odds by which a pixel that shows the scene is not ours
+        window = _window_of(start.soft > 0.5)
+        self.first = self._sighting(start.frame, window, window.cut(start.soft))
+        self.last = self.first
+        self.center = np.array(window.center)  # of the last window
+        self.off = self.center - path.centers[start.frame]  # of windows from the path
+        self.velocity = np.zeros(2)
+        self.unseen = 0
+        self.moving = moving  # the camera, so that the path is found anew on the way
+        self.seen, self.steps = (start.frame, start.soft > 0.5), 0
+        self.area = float(self.seen[1].sum())
+
+    def _sighting(self, i: int, window: Window, soft: np.ndarray) -> Sighting:
+        return Sighting(window, self._colors(i, window), soft)
+
+    def step(self, i: int) -> tuple[float, np.ndarray]:
+        """Confidence and soft mask (uint8) of frame `i`, next to the one before."""
+        nothing = np.zeros(self.footage.shape, np.uint8)
+        if self.moving and not self.unseen and self.steps % AGAIN == 0:
+            self._look_ahead(i)
+        self.steps += 1
+        if not self.path.seen[i]:
+            self.unseen += 1
+            return 0.0, nothing
+        away = None if self.scene is None else self.scene.difference(i)
+        window = self._aligned(i, away)
+        soft, prior = self._segmented(i, window, away)
+        mask = self._kept(soft > 0.5, prior, window.step)
+        soft = np.where(ndimage.binary_dilation(mask, iterations=2), soft, 0)
+        confidence = self._confidence(mask, soft, self._colors(i, window))
+        if confidence < SURE:
+            self.unseen += 1
+            return confidence, nothing
+        pasted = window.paste(soft, self.footage.shape)
+        self._remember(i, pasted, window, confidence)
+        return confidence, pasted
+
+    def _look_ahead(self, i: int) -> None:
+        """Finds the path of the next frames anew, by what the object looks like by now."""
+        last, mask = self.seen
+        step = 1 if i > last else -1
+        ahead = range(last, last + step * (AHEAD + 1), step)
+        frames = [k for k in ahead if 0 <= k < len(self.footage)]
+        found = found_path(self.footage, self.scene, self.colors, {last: mask}, frames)
+        centers, seen = self.path.centers.copy(), self.path.seen.copy()
+        centers[frames], seen[frames] = found.centers, found.seen
+        self.path = Path(centers, seen)
+
+    def _colors(self, i: int, window: Window) -> np.ndarray:
+        return to_features(window.cut(self.footage.lab[i]))
+
+    def _aligned(self, i: int, away: np.ndarray | None) -> Window:
+        """The last sighting's window moved to where it fits best near the path."""
+        last, step = self.last, self.last.window.step
+        reach = self.path.centers[i] + self.off
+        guesses = [reach] if self.unseen else [reach, self.center + self.velocity]
+        slack = max(4, int(0.22 * last.window.n))
+        n = last.window.n + 2 * slack
+        best = None
+        for x, y in guesses:
+            wide = Window(round(x - n * step / 2), round(y - n * step / 2), n, step)
+            colors = self._colors(i, wide)
+            odds = self._odds(i, wide, colors, away)
+            odds = np.where(wide.inside(self.footage.shape), odds, -3)
+            dx, dy, error = shift_of(colors, last.colors, last.soft, odds, slack)
+            place = np.array(wide.center) + np.array((dx, dy)) * step
+            # a place far from the path is unlikely
+            error += 0.5 * (np.hypot(*(place - reach)) / (last.window.n * step / 2)) ** 2
+            if best is None or error < best[0]:
+                best = (error, place)
+        assert best is not None
+        return last.window.at(*best[1])
+
+    def _segmented(
+        self, i: int, window: Window, away: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Soft mask, and what other frames alone say of it."""
+        colors = self._colors(i, window)
+        known = [(self.last.colors, self.last.soft)]
+        if self.first is not self.last and self.first.window.n == window.n:
+            known.append((self.first.colors, self.first.soft))
+        prior, similar = transferred(colors, known)
+        valid = window.inside(self.footage.shape)
+        near = histogram(bins_of(colors), (prior < 0.3) * valid * 1.0)
+        shape = np.log((prior + 0.03) / (1.03 - prior)) * (0.4 + 0.6 * similar)
+        odds = self._odds(i, window, colors, away, near, prior)
+        if self.behind is not None:
+            outside = (prior < 0.3) & valid
+            better = self.behind.odds(i, window, colors, self.colors.inside, outside)
+            odds = np.where(np.isnan(better), odds, better)
+        odds = shape + odds
+        odds = np.where(valid, odds, -9)
+        return walked(odds, colors), prior
+
+    def _odds(
+        self,
+        i: int,
+        window: Window,
+        colors: np.ndarray,
+        away: np.ndarray | None,
+        near: np.ndarray | None = None,
+        prior: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Log-odds of a window's pixels by colour, person's mask and scene.
+
+        near: colours around the object in this frame. prior: where other frames put it.
+        """
+        odds = 0.6 * self.colors.odds(bins_of(colors), near)
+        person = window.cut(self.footage.body(i))
+        # a person's mask that takes in most of what is known to be the object says little
+        taken = 0.5 if prior is None else float((prior * person).sum() / max(prior.sum(), 1e-6))
+        odds -= 2.0 * max(0.0, 1 - 1.3 * taken) * person
+        if away is not None:
+            changed = np.nan_to_num(1.2 * np.tanh((away - 4) / 3), nan=0.0)
+            odds += window.cut(np.maximum(changed, -self.unchanged))
+        return odds
+
+    def _kept(self, mask: np.ndarray, prior: np.ndarray, step: int) -> np.ndarray:
+        """The part of a mask that the labels of other frames support, holes filled.
+
+        Where it is larger than the object was, what hangs on by a narrow bridge is cut off.
+        """
+        kept = _supported(mask, prior)
+        for width in (1, 2, 3, 4, 6):
+            if kept.sum() * step**2 < 1.2 * self.area:
+                break
+            core = ndimage.binary_erosion(kept, iterations=width)
+            part = ndimage.binary_dilation(_supported(core, prior), iterations=width) & kept
+            if part.sum() * step**2 < 0.6 * self.area:
+                break
+            kept = part
+        filled = ndimage.binary_fill_holes(kept)
+        holes, _ = ndimage.label(filled & ~kept)
+        big = np.bincount(holes.ravel()) > 0.03 * kept.sum()
+        big[0] = True
+        return kept | ((holes > 0) & ~big[holes])
+
+    def _confidence(self, mask: np.ndarray, soft: np.ndarray, colors: np.ndarray) -> float:
+        """By colours like the object's, decided pixels, and a size like that before."""
+        if mask.sum() < 6:
+            return 0.0
+        seen = histogram(bins_of(colors), mask * 1.0)
+        decided = float(np.abs(2 * soft[mask] - 1).mean()) ** 0.5
+        area = float(mask.sum()) * self.last.window.step**2
+        ratio = min(area, self.area) / max(area, self.area)
+        return self.colors.likeness(seen) ** 0.5 * decided * min(1.0, 2.0 * ratio**0.5)
+
+    def _remember(self, i: int, pasted: np.ndarray, window: Window, confidence: float) -> None:
+        mask = pasted > 127
+        self.seen = (i, mask)
+        fresh = _window_of(mask) if mask.any() else window
+        # the size changes slowly, so that windows of neighbouring frames can be compared
+        if not 0.8 < fresh.n * fresh.step / (window.n * window.step) < 1.25:
+            window = fresh
+        else:
+            window = window.at(*center_of(mask)) if mask.any() else window
+        center = np.array(window.center)
+        self.velocity = center - self.center if self.unseen == 0 else np.zeros(2)
+        self.center, self.unseen = center, 0
+        self.off = 0.7 * self.off + 0.3 * (center - self.path.centers[i])
+        self.last = self._sighting(i, window, window.cut(pasted.astype(np.float32) / 255))
+        self.area = 0.9 * self.area + 0.1 * float(mask.sum())
+        # it turns, and other sides of it have other colours
+        if confidence > (0.6 if self.moving else 0.75):
+            seen = histogram(bins_of(self.last.colors), np.where(self.last.soft > 0.5, 1.0, 0.0))
+            self.colors = self.colors.blended(seen, 0.12 if self.moving else 0.04)
+
+
+def _supported(mask: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """The part of a mask with most support, and others whose own is strong."""
+    labels, count = ndimage.label(mask)
+    if count < 2:
+        return mask
+    rows = np.arange(1, count + 1)
+    sums, means = (f(prior, labels, rows) for f in (ndimage.sum_labels, ndimage.mean))
+    kept = (sums == sums.max()) | ((sums > 0.1 * sums.max()) & (means > 0.7))
+    return np.isin(labels, rows[kept])
+
+
+def _window_of(mask: Bool[np.ndarray, "h w"]) -> Window:
+    """A window with room about a mask."""
+    y, x = np.nonzero(mask)
+    half = 0.5 * max(np.ptp(x), np.ptp(y)) + 1
+    return Window.around((x.min() + x.max() + 1) / 2, (y.min() + y.max() + 1) / 2, 1.5 * half + 8)
