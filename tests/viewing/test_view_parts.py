@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ import torch
 from hoigs.core.values.between import camera_between
 from hoigs.core.values.camera import Camera
 from hoigs.runs.loaded_run import LoadedRun
+from hoigs.viewing.viewer import eyes
 from hoigs.viewing.viewer.clip_drawing import ClipDrawing
 from hoigs.viewing.viewer.clock import Clock
 from hoigs.viewing.viewer.drawing import FAR, MODES, Look, RunDrawing
@@ -174,21 +176,31 @@ def test_a_clip_shows_its_frames_masks_and_depth(drawing: RunDrawing) -> None:
         assert shown.draw(2.0, camera, Look("depth")).image.std() > 1
 
 
-def test_a_late_answer_of_the_browser_is_no_drag() -> None:
-    """As Chromium sent them: its own start, the camera that was set, its start with that target."""
+def test_a_late_answer_of_the_browser_is_no_drag(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Chromium sent them: the camera that was set, its own start, that with another upright."""
+    now = [0.0]
+    monkeypatch.setattr(eyes, "time", SimpleNamespace(monotonic=lambda: now[0]))
     camera = SimpleNamespace(
-        position=np.array((2.7, 3.5, 2.6)), look_at=np.zeros(3), wxyz=np.array((1.0, 0, 0, 0)),
+        position=np.array((3.0, 3.0, 3.0)), look_at=np.zeros(3), wxyz=np.array((1.0, 0, 0, 0)),
         up_direction=np.array((0.0, 1, 0)), fov=1.0, image_width=64, image_height=48,
     )  # fmt: skip
     drags: list[Eye] = []
     eye = Eye(SimpleNamespace(camera=camera, atomic=nullcontext), 640, drags.append)
-    start = camera.position
-    goal = View(np.array((-0.8, 1.2, 3.5)), np.array((0, 0.8, 0.0)), np.eye(3), start, 1.0)
+    target = np.array((0, 0.8, 0.0))
+    goal = View(np.array((-0.8, 1.2, 3.5)), target, np.eye(3), np.array((0.0, 1, 0)), 1.0)
+
+    def sent(position: Sequence[float], at: float) -> None:
+        camera.position, now[0] = np.array(position), at
+        eye.moved()
+
+    sent((3.0, 3.0, 3.0), 0.0)
     eye.look(goal)
-    eye.moved()
-    camera.position = start
-    eye.moved()
+    sent((2.7, 3.5, 2.6), 0.1)
+    sent(goal.position, 0.2)
+    sent((0.3, -0.8, -4.9), 0.4)
+    sent(goal.position + 0.3, 0.5)
+    sent((2.7, 3.5, 2.6), 5.0)
     assert not drags
-    camera.position = goal.position + 0.3
-    eye.moved()
+    sent(goal.position, 5.1)
+    sent(goal.position + 0.3, 5.2)
     assert drags == [eye]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,8 @@ from hoigs.viewing.viewer.resolution import Resolution
 from hoigs.viewing.viewer.views import View
 
 STILL_S = 0.25  # a picture is drawn in full once nothing has changed for so long
+START_S = 2.0  # after a browser's first answer, in which its own start may still come
+STEP = 0.6  # of the distance to the target: how far the mouse moves a camera at once, at most
 
 
 class Eye:
@@ -35,8 +39,8 @@ class Eye:
         self.full, self.changed = False, 0.0
         self.rates: deque[float] = deque(maxlen=20)
         self._set: deque[np.ndarray] = deque(maxlen=400)  # positions of cameras
-        self._own: list[np.ndarray] = []  # positions of the browser's own start
-        self._answered = False  # whether the browser has taken a camera that was set
+        self._answered = math.inf  # when the browser first took a camera that was set, seconds
+        self._taken = np.zeros(3)  # the position of the last that it took
 
     @property
     def canvas(self) -> tuple[int, int]:
@@ -50,8 +54,6 @@ class Eye:
 
     def look(self, view: View) -> None:
         """Set the browser's camera."""
-        if not self._set:
-            self._own.append(self.view.position)
         self._set.append(view.position)
         with self.client.atomic():
             view.apply(self.client.camera)
@@ -61,20 +63,16 @@ class Eye:
 
         A busy browser answers seconds later, and with the position of one camera and the target
         of another, as it takes them one after the other; whatever the mouse does to the camera
-        moves its position. What comes before the browser has taken the first one that was set is
-        its own start, which may also come once more, with the target that was set.
+        moves its position. Its own start, turned or not by the scene's upright, may still come
+        after the first camera that was set: a drag is neither so early nor so far in one step.
         """
-        seen = self.view
-        scale = 0.01 * max(float(np.linalg.norm(seen.target - seen.position)), 1e-3)
-
-        def at(places: Iterable[np.ndarray]) -> bool:
-            return any(np.linalg.norm(seen.position - place) < scale for place in places)
-
-        if at(self._set):
-            self._answered = True
-        elif not self._answered:
-            self._own.append(seen.position)
-        elif not at(self._own):
+        seen, now = self.view, time.monotonic()
+        distance = max(float(np.linalg.norm(seen.target - seen.position)), 1e-3)
+        if any(np.linalg.norm(seen.position - place) < 0.01 * distance for place in self._set):
+            self._answered, self._taken = min(self._answered, now), seen.position
+            return
+        near = np.linalg.norm(seen.position - self._taken) < STEP * distance
+        if near and now - self._answered > START_S:
             self._dragged(self)
 
     def rate(self) -> float:
