@@ -77,7 +77,8 @@ def place_objects(
                 f"{owner}'s, who is nearest to it in most frames"
             )
         marks = None if estimates.landmarks is None else estimates.landmarks.image
-        said = [*doubts(stack, marks), *_remarks(made, disc is not None)]
+        windows = options.chunk is not None and options.chunk < len(cameras)
+        said = [*doubts(stack, marks), *_remarks(made, disc is not None, windows)]
         placed.warnings.extend(text.replace("the object", what) for text in said)
     return placed
 
@@ -103,14 +104,20 @@ def _without(name: str, what: str, options: PrepareOptions, placed: PlacedObject
         )
 
 
-def _remarks(made: MadeObject, disc: bool) -> list[str]:
-    """Sentences on frames that do not show it, and on poses that are not known well."""
+def _remarks(made: MadeObject, disc: bool, windows: bool) -> list[str]:
+    """Sentences on frames that do not show it, on poses that are not known well, and on memory."""
     said, confidence = [], made.confidence
     lost = (~made.track.observed).nonzero().flatten().tolist()
     if lost:
         said.append(f"the object is not seen in {len(lost)} frames: {ranges(lost)}")
     if confidence.way == "ball" and not disc:
         said.append(f"the object: {confidence.reason}; if it is none, --set object_track=texture")
+    if confidence.way == "texture and hands" and windows:
+        said.append(
+            "the object is tracked by texture in all frames at once, whose small images are in "
+            "memory together whatever --chunk is; --set object_track=outline needs none, and does "
+            "not track its rotation"
+        )
     if confidence.way == "outline":
         said.append(
             "the object's rotation is not tracked but for its roll, and its shape is a cushion "

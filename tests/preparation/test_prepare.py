@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +20,8 @@ from hoigs.core.errors import ClipError, HoigsError, SpecError
 from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
+from hoigs.preparation import place_objects
+from hoigs.preparation.objects.make_object import MadeObject, make_object
 from hoigs.preparation.prepare import PrepareOptions, PrepareReport, prepare
 from hoigs.preparation.video.frames import VideoFrames
 from hoigs.preparation.video.pictures import Picture
@@ -244,6 +248,24 @@ def test_a_body_fitted_in_windows_says_so(
     assert "in 2 windows of at most 8 frames with one shape" in report.provenance["body"]
     _, report = prepared(tiny_source, tmp_path / "whole", body, chunk=12, fit_steps=3)
     assert report.provenance["body"].endswith("one window of 12: nothing was split")
+
+
+def test_what_windows_do_not_bound_is_said(
+    tiny_source: Path, tmp_path: Path, body: AnnyBody, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if the ball had been tracked by texture."""
+
+    def by_texture(*inputs: Any, **settings: Any) -> MadeObject:
+        made = make_object(*inputs, **settings)
+        outline = np.zeros(FRAMES)
+        confidence = replace(made.confidence, way="texture and hands", outline=outline)
+        return replace(made, confidence=confidence)
+
+    monkeypatch.setattr(place_objects, "make_object", by_texture)
+    for chunk, count in ((8, 1), (12, 0)):
+        out = tmp_path / str(chunk)
+        _, report = prepared(tiny_source, out, body, chunk=chunk, overlap=4, fit_steps=3)
+        assert sum("tracked by texture in all frames" in text for text in report.warnings) == count
 
 
 def test_windows_that_cannot_be_joined_are_refused(tiny_source: Path, tmp_path: Path) -> None:

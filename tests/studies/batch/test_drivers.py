@@ -25,7 +25,7 @@ from hoigs.studies.execution.command import end_with
 end_with(int(sys.argv[1]), sys.argv[2])
 words = sys.argv[4:]
 def note(text):
-    with open(os.environ["NOTES"], "a") as file:
+    with open(os.environ["HOIGS_TEST_NOTES"], "a") as file:
         file.write(f"{text} {words[0]} {target.parent.name} {os.getpid()}\\n")
 target = Path(words[words.index("--out") + 1] if "--out" in words else words[1])
 if words[0] == "export":
@@ -33,7 +33,7 @@ if words[0] == "export":
 note("start")
 if "broken" in str(target):
     sys.exit("error: this one is broken")
-time.sleep(float(os.environ["SECONDS"]))
+time.sleep(float(os.environ["HOIGS_TEST_SECONDS"]))
 if words[0] == "export":
     (target / words[words.index("--format") + 1]).mkdir(parents=True)
 elif words[0] == "eval":
@@ -46,7 +46,11 @@ DRIVER = """
 import sys
 import hoigs
 from hoigs.studies.execution.local import LocalExecutor
-where = LocalExecutor(2, program=(sys.executable, sys.argv[1]))
+from hoigs.studies.execution.ray_tasks import RayExecutor
+if len(sys.argv) > 4:
+    where = RayExecutor(2, threads=1, address=sys.argv[4], program=(sys.argv[1],))
+else:
+    where = LocalExecutor(2, program=(sys.executable, sys.argv[1]))
 done = hoigs.batch(sys.argv[2], sys.argv[3], executor=where)
 sys.exit(len(done.failed))
 """
@@ -62,11 +66,14 @@ class Batches:
         text = "".join(f"  - {{name: {row}, clip: clip}}\n" for row in rows)
         (folder / "rows.yaml").write_text(f"rows:\n{text}")
 
-    def start(self, seconds: float = 0.1) -> subprocess.Popen[bytes]:
+    def start(self, seconds: float = 0.1, address: str = "") -> subprocess.Popen[bytes]:
+        """A driver, with processes on the Ray cluster at an address, or on this machine."""
         names = [str(self.folder / name) for name in ("stage.py", "rows.yaml")]
-        environment = os.environ | {"NOTES": str(self.notes), "SECONDS": str(seconds)}
-        return subprocess.Popen([sys.executable, "-c", DRIVER, *names, str(self.out)],
-                                env=environment)  # fmt: skip
+        environment = os.environ | {
+            "HOIGS_TEST_NOTES": str(self.notes), "HOIGS_TEST_SECONDS": str(seconds),
+        }  # fmt: skip
+        words = [*names, str(self.out), *([address] if address else [])]
+        return subprocess.Popen([sys.executable, "-c", DRIVER, *words], env=environment)
 
     def noted(self) -> list[list[str]]:
         return (
@@ -101,9 +108,24 @@ def all_gone(pids: list[int]) -> bool:
     return False
 
 
-def test_two_drivers_do_every_stage_once_and_a_failed_row_costs_only_itself(tmp_path):
+@pytest.fixture(params=["local", "ray"])
+def address(request, monkeypatch):
+    """Of a Ray cluster of this machine, or empty."""
+    if request.param == "local":
+        yield ""
+        return
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'hoigs[ray]'")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 4})
+    yield cluster.address
+    cluster.shutdown()
+
+
+def test_two_drivers_do_every_stage_once_and_a_failed_row_costs_only_itself(tmp_path, address):
     batches = Batches(tmp_path, ["a", "b", "broken", "c"])
-    first, second = batches.start(), batches.start()
+    first, second = (batches.start(address=address) for _ in range(2))
     assert first.wait(60) == 1 and second.wait(60) == 1
     assert set(batches.ends().values()) == {1} and len(batches.ends()) == 9
     assert batches.states() == {"a": "done", "b": "done", "broken": "failed", "c": "done"}
@@ -131,8 +153,8 @@ def test_after_a_kill_every_row_is_done_once(tmp_path, victim):
 
 def test_two_drivers_in_threads_of_one_process(tmp_path, monkeypatch):
     batches = Batches(tmp_path, ["a", "b", "c"])
-    monkeypatch.setenv("NOTES", str(batches.notes))
-    monkeypatch.setenv("SECONDS", "0.1")
+    monkeypatch.setenv("HOIGS_TEST_NOTES", str(batches.notes))
+    monkeypatch.setenv("HOIGS_TEST_SECONDS", "0.1")
 
     def drive(_: int) -> hoigs.batch:
         where = LocalExecutor(2, program=(sys.executable, str(tmp_path / "stage.py")))
