@@ -11,8 +11,7 @@ from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
-from PIL import Image
+from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.clip_folder.check import check_clip
@@ -26,89 +25,22 @@ from hoigs.core.clip_folder.format import (
     EntityHeader,
     SplitHeader,
     ViewsHeader,
-    depth_path,
-    ignored_path,
     is_clip_folder,
-    mask_path,
-    stem,
 )
+from hoigs.core.clip_folder.frame_files import (
+    Depth,
+    FrameFiles,
+    Image8,
+    ImageFormat,
+    Mask,
+    as_array,
+)
+from hoigs.core.clip_folder.track_files import save_body, save_object
 from hoigs.core.errors import ClipError
 from hoigs.core.safe_replace import refuse_unwritable, require_replaceable
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, ObjectTrack, uniform_test_split
 from hoigs.core.whole_files import failures_named
-
-Image8 = UInt8[Tensor, "H W 3"] | UInt8[np.ndarray, "H W 3"]
-Mask = Bool[Tensor, "H W"] | Bool[np.ndarray, "H W"]
-Depth = Float[Tensor, "H W"] | Float[np.ndarray, "H W"]
-ImageFormat = Literal["png", "jpg"]
-
-
-def _array(values: Any, dtype: type = np.float32) -> np.ndarray:
-    if isinstance(values, Tensor):
-        values = values.detach().cpu().numpy()
-    return np.asarray(values, dtype=dtype)
-
-
-def _save_mask(path: Path, mask: Mask) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(_array(mask, np.bool_).astype(np.uint8) * 255).save(path, compress_level=3)
-
-
-class _Views:
-    """The frames of the clip itself, or of its held_out folder."""
-
-    def __init__(self, root: Path, image_format: ImageFormat, quality: int) -> None:
-        self.root, self.image_format, self.quality = root, image_format, quality
-        self.cameras: list[Camera] = []
-        self.size: tuple[int, int] | None = None
-
-    def add(
-        self,
-        image: Image8,
-        camera: Camera,
-        masks: Mapping[str, Mask],
-        depth: Depth | None,
-        depth_dtype: type,
-        ignored: Mask | None = None,
-    ) -> int:
-        frame = len(self.cameras)
-        pixels = _array(image, np.uint8)
-        height, width = pixels.shape[:2]
-        self.size = self.size or (width, height)
-        if (width, height) != self.size or (camera.width, camera.height) != self.size:
-            raise ClipError(
-                f"frame {frame}: image is {width}x{height} and its camera "
-                f"{camera.width}x{camera.height}, but the clip is {self.size[0]}x{self.size[1]}"
-            )
-        self._save_image(pixels, frame)
-        for name, mask in masks.items():
-            _save_mask(mask_path(self.root, name, frame), mask)
-        if ignored is not None and _array(ignored, np.bool_).any():
-            _save_mask(ignored_path(self.root, frame), ignored)
-        if depth is not None:
-            path = depth_path(self.root, frame)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            np.savez_compressed(path, depth=_array(depth, depth_dtype))
-        self.cameras.append(camera)
-        return frame
-
-    def _save_image(self, pixels: np.ndarray, frame: int) -> None:
-        folder = self.root / "images"
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{stem(frame)}.{self.image_format}"
-        if self.image_format == "jpg":
-            # 4:4:4: chroma subsampling would smear the borders that masks cut along
-            Image.fromarray(pixels).save(path, quality=self.quality, subsampling=0)
-        else:
-            Image.fromarray(pixels).save(path, compress_level=3)
-
-    def save_cameras(self) -> None:
-        np.savez_compressed(
-            self.root / "cameras.npz",
-            K=np.stack([_array(c.K) for c in self.cameras]),
-            world_to_camera=np.stack([_array(c.world_to_camera) for c in self.cameras]),
-        )
 
 
 class ClipWriter:
@@ -167,8 +99,8 @@ class ClipWriter:
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         self._root = Path(tempfile.mkdtemp(prefix=f".{self.folder.name}.", dir=self.folder.parent))
         self._root.chmod(0o755)
-        self._main = _Views(self._root, self.image_format, self.quality)
-        self._held_out = _Views(self._root / "held_out", self.image_format, self.quality)
+        self._main = FrameFiles(self._root, self.image_format, self.quality)
+        self._held_out = FrameFiles(self._root / "held_out", self.image_format, self.quality)
         return self
 
     def __exit__(
@@ -238,7 +170,7 @@ class ClipWriter:
         colors: Float[Tensor, "P 3"] | Float[np.ndarray, "P 3"],
     ) -> None:
         """Scene points in the world, metres, and RGB in [0, 1]."""
-        self._points = (_array(points), _array(colors))
+        self._points = (as_array(points), as_array(colors))
 
     def set_split(self, split: Mapping[str, Sequence[int]]) -> None:
         """ "train" and "test" frame numbers; `uniform_test_split` when never called."""
@@ -258,9 +190,9 @@ class ClipWriter:
             raise ClipError(f"{self.folder}: no frame was added; a clip has at least one")
         self._main.save_cameras()
         for name, body in self._bodies.items():
-            _save_body(self._root / "bodies" / f"{name}.npz", body)
+            save_body(self._root / "bodies" / f"{name}.npz", body)
         for name, track in self._objects.items():
-            _save_object(self._root / "objects" / f"{name}.npz", track)
+            save_object(self._root / "objects" / f"{name}.npz", track)
         if self._points:
             points, colors = self._points
             np.savez_compressed(self._root / "points.npz", points=points, colors=colors)
@@ -365,47 +297,3 @@ def replace_folder(source: Path, target: Path) -> None:
     target.rename(old)
     source.rename(target)
     shutil.rmtree(old.parent)
-
-
-def _save_body(path: Path, track: BodyTrack) -> None:
-    path.parent.mkdir(exist_ok=True)
-    poses = track.poses
-    if poses.betas.dim() != 1:
-        raise ClipError(f"betas have shape {list(poses.betas.shape)}; a clip shares one [B]")
-    # numpy declares these keywords as its own options
-    special: dict[str, Any] = {}
-    if track.gender is not None:
-        special["gender"] = np.array(track.gender)
-    if track.template is not None:
-        special["template"] = _array(track.template)
-    np.savez_compressed(
-        path,
-        **special,
-        global_orient=_array(poses.global_orient),
-        body=_array(poses.body),
-        left_hand=_array(poses.left_hand),
-        right_hand=_array(poses.right_hand),
-        transl=_array(poses.transl),
-        betas=_array(poses.betas),
-        hand_pose_convention=np.array(poses.hand_pose_convention),
-        model=np.array(track.model),
-        provenance=np.array(track.provenance),
-    )
-
-
-def _save_object(path: Path, track: ObjectTrack) -> None:
-    path.parent.mkdir(exist_ok=True)
-    # numpy declares these keywords as its own options
-    parts: dict[str, Any] = {}
-    if track.moving is not None:
-        parts["moving"] = _array(track.moving, np.bool_)
-    np.savez_compressed(
-        path,
-        **parts,
-        points=_array(track.points),
-        colors=_array(track.colors),
-        rotations=_array(track.rotations),
-        translations=_array(track.translations),
-        observed=_array(track.observed, np.bool_),
-        provenance=np.array(track.provenance),
-    )
