@@ -1,7 +1,7 @@
 """Peak memory of prepare, train, eval and render against the length of a video.
 
     python benchmarks/memory_by_length.py --json benchmarks/results/memory-by-length.json
-    python benchmarks/memory_by_length.py --light --commands prepare,train,eval --chunk 100 \\
+    python benchmarks/memory_by_length.py --light --chunk 100 \\
         --json benchmarks/results/memory-chunked.json
     python benchmarks/memory_by_length.py --table benchmarks/results/memory-by-length.json
 
