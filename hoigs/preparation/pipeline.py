@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import torch
 
-import hoigs
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.clip import BodyTrack
@@ -20,12 +18,7 @@ from hoigs.preparation.body.silhouette import silhouette
 from hoigs.preparation.cameras.calibration import calibration_file
 from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras, known_lens
 from hoigs.preparation.choose_people import chosen_people
-from hoigs.preparation.entity_masks import (
-    EntityMasks,
-    disjoint,
-    entity_masks,
-    without_others,
-)
+from hoigs.preparation.entity_masks import EntityMasks
 from hoigs.preparation.estimates import (
     EstimateReader,
     Estimators,
@@ -36,8 +29,10 @@ from hoigs.preparation.estimates import (
     identity,
     paths_of,
 )
+from hoigs.preparation.final_masks import blank_warning, final_masks
 from hoigs.preparation.fit_people import fit_people
 from hoigs.preparation.given import GivenMasks
+from hoigs.preparation.kept_stages import KeptStages
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.nobody import nobody
 from hoigs.preparation.objects.ball import BallTrack, load_ball, refine_ball
@@ -47,25 +42,18 @@ from hoigs.preparation.person import FittedPeople
 from hoigs.preparation.place_objects import place_objects
 from hoigs.preparation.prompts import check_prompts, placed_prompts
 from hoigs.preparation.saved import from_result, load_cameras, save_cameras, to_result
-from hoigs.preparation.scene.depth import (
-    POOR,
-    DepthFit,
-    DepthSource,
-    fit_depth,
-    seen_points,
-    seen_surface,
-)
-from hoigs.preparation.scene.scene_points import ScenePoints, camera_scene, static_scene
+from hoigs.preparation.scene.depth import POOR, DepthFit, DepthSource
+from hoigs.preparation.scene.metres import depth_in_metres, find_scene
+from hoigs.preparation.scene.scene_points import ScenePoints
 from hoigs.preparation.stages.plan import PLAN
 from hoigs.preparation.stages.progress import Stages
-from hoigs.preparation.stages.work_folder import Result, WorkFolder, digest, fingerprint
-from hoigs.preparation.video.blank import blank_pixels, require_pictures
+from hoigs.preparation.stages.work_folder import Result, WorkFolder, fingerprint
+from hoigs.preparation.video.blank import require_pictures
 from hoigs.preparation.video.frames import FrameList, open_frames
 from hoigs.preparation.video.header import missing_frames
 from hoigs.preparation.video.source import NobodyFoundError, Source, SourceError
 from hoigs.preparation.video.span import Span
 
-FORMAT = 11  # of what the stages keep; another number makes older results unread
 LARGEST, REDUCED = 1920, 1280  # longer sides, pixels: of frames that are kept, and of smaller ones
 T = TypeVar("T")
 
@@ -88,10 +76,8 @@ class Pipeline:
         self.source, self.out, self.body = source, out, body
         self.options, self.stages, self.work = options, stages, work
         self.estimators, self.bodies, self.announce = estimators, bodies, announce
-        self.warnings: list[str] = []
-        self.provenance: dict[str, str] = {}
-        self.worth_keeping = False
-        self._keys: dict[str, str] = {}
+        self.kept = KeptStages(stages, work)
+        self.warnings, self.provenance = self.kept.warnings, self.kept.provenance
 
     def run(self, until: str | None = None) -> None:
         """All stages but the writing of the clip, or those up to `until`."""
@@ -112,51 +98,14 @@ class Pipeline:
         save: Callable[[T], Result] = to_result,
         load: Callable[[Result], T] = from_result,
     ) -> T:
-        """A stage's result from the work folder; it is made first where it is not there.
+        """`KeptStages.run` with the options as they are now."""
+        return self.kept.run(name, self._set_to(), make, made_from, save, load, self._remarks)
 
-        It is read back even when it has just been made, so that a resumed run gives the same as an
-        unbroken one.
+    def _set_to(self) -> dict[str, Any]:
+        return self.options.model_dump(mode="json")
 
-        Args:
-            made_from: JSON of whatever else the result depends on, beside PLAN's options.
-        """
-        key = self._keys[name] = self._key(name, made_from)
-        with self.stages.stage(name):
-            stored = self.work.load(name, key)
-            if stored is None:
-                warned, known = len(self.warnings), dict(self.provenance)
-                made = save(make())
-                read = self.video.notes if hasattr(self, "video") else []
-                self.warnings += [note for note in read if note not in self.warnings]
-                notes: dict[str, Any] = {
-                    "warnings": self.warnings[warned:],
-                    "provenance": {k: v for k, v in self.provenance.items() if k not in known},
-                    "seconds": self.stages.elapsed(),
-                }
-                values = {"made": made.values, "notes": notes}
-                stored = self.work.save(
-                    name, key, Result(values, made.arrays, made.files, made.folder)
-                )
-                self.worth_keeping |= PLAN[name].slow
-            else:
-                notes = stored.values["notes"]
-                self.warnings += notes["warnings"]
-                self.provenance |= notes["provenance"]
-            value = load(Result(stored.values["made"], stored.arrays, None, stored.folder))
-        self.stages.seconds[name] = notes["seconds"]
-        return value
-
-    def _key(self, name: str, made_from: Any) -> str:
-        options = self.options.model_dump(mode="json")
-        stage = PLAN[name]
-        return digest(
-            {
-                "format": [FORMAT, hoigs.__version__],
-                "options": {key: options[key] for key in stage.options},
-                "reads": {other: self._keys[other] for other in stage.reads},
-                "from": made_from,
-            }
-        )
+    def _remarks(self) -> Sequence[str]:
+        return self.video.notes if hasattr(self, "video") else []
 
     def _frames(self) -> None:
         options, path = self.options, self.source.video
@@ -214,7 +163,7 @@ class Pipeline:
             self.raw = self._people_and_masks()
         except NobodyFoundError as error:
             if self.options.object not in self.options.prompts or not self.options.find_object:
-                self.worth_keeping = False
+                self.kept.worth_keeping = False
                 raise
             said = f"{error}; so the clip has the object alone (--person X,Y@FRAME shows somebody)"
             self.announce(said)
@@ -237,7 +186,7 @@ class Pipeline:
             self.reader.of_both,
             self._prompts(*((self.options.object,) if self.reader.of_both else ())),
         ]
-        self.worth_keeping |= any(kind not in beside for kind in used)
+        self.kept.worth_keeping |= any(kind not in beside for kind in used)
         return self._stage(
             "evidence", lambda: self.reader.landmarks_and_masks(self.stages.advance), made_from
         )
@@ -301,13 +250,13 @@ class Pipeline:
         known = [p for p in (self.source.colmap, self.source.cameras, lens) if p is not None]
         known += [] if self.bodies is None else [self.bodies.path]
         files = [[str(path), fingerprint([path])] for path in known]
-        folder = self.work.unfinished("cameras", self._key("cameras", files))
+        folder = self.work.unfinished("cameras", self.kept.key("cameras", self._set_to(), files))
         chosen = self._stage(
             "cameras", lambda: self._choose_cameras(folder), files, save_cameras, load_cameras
         )
         shutil.rmtree(folder, ignore_errors=True)
         self.track = chosen.track
-        self.worth_keeping |= chosen.own_model
+        self.kept.worth_keeping |= chosen.own_model
         if len(self.track.positions) < len(self.video):
             self.video = self.video.subset(self.track.positions)
 
@@ -354,7 +303,7 @@ class Pipeline:
         if self.bodies is not None:
             model.append(fingerprint([self.bodies.path]))
         if not self.options.people:  # its size is the unit
-            model.append(self._keys["object_masks"])
+            model.append(self.kept.key_of("object_masks"))
         self.people: FittedPeople = self._stage("body", self._fit_people, model)
         scale = self.people.world.scene_scale
         self.cameras = [camera.scaled(scale) for camera in self.track.cameras]
@@ -377,25 +326,13 @@ class Pipeline:
 
     def _masks(self) -> None:
         def make() -> EntityMasks:
-            first = self.people.first
-            human, object_masks, text = entity_masks(
-                self._given_masks(), self.estimates.ball, self.images, self._silhouettes,
-                np.zeros(len(self.video), bool) if first is None else first.found,
-                self.work.root,
+            masks, self.provenance["masks"] = final_masks(
+                self._given_masks(), self.estimates, self.people, self.found_object, self.track,
+                self.images, self._silhouettes, keep_black=self.options.keep_black,
+                folder=self.work.root,
             )  # fmt: skip
-            found = self.found_object
-            further: dict[str, MaskStack] = {}
-            self.provenance["masks"] = text if found is None else f"{text}: {found.provenance}"
-            if found is not None and found.further:
-                human, object_masks, further = self._further(human, object_masks, found)
-            things = [object_masks, *further.values()]
-            people = without_others(
-                {name: person.masks for name, person in self.estimates.further.items()},
-                human,
-                things,
-            )
-            blank = self._blank([human, *people.values(), *things])
-            return EntityMasks(human, object_masks, blank, further, people)
+            self.warnings += blank_warning(masks.blank)
+            return masks
 
         self.masks = self._stage("masks", make)
 
@@ -409,42 +346,6 @@ class Pipeline:
         undistort = self.track.undistort
         masks = MaskStack(undistort.mask(found.masks[i]) for i in self.track.positions)
         return replace(given, object=masks)
-
-    def _further(
-        self, human: MaskStack, first: MaskStack, found: FoundObject
-    ) -> tuple[MaskStack, MaskStack, dict[str, MaskStack]]:
-        """The masks of person and objects without common pixels; the objects' win."""
-        undistort, rows = self.track.undistort, list(self.track.positions)
-        stacks = [
-            MaskStack(undistort.mask(other.masks[i]) for i in rows)
-            for other in found.further.values()
-        ]
-        sure = [
-            None if other.confidence is None else other.confidence[rows]
-            for other in (found, *found.further.values())
-        ]
-        first, *stacks = disjoint([first, *stacks], sure)
-        human = MaskStack(
-            person & ~np.logical_or.reduce(held)
-            for person, *held in zip(human, *stacks, strict=True)
-        )
-        return human, first, dict(zip(found.further, stacks, strict=True))
-
-    def _blank(self, entities: Sequence[MaskStack]) -> MaskStack:
-        if self.options.keep_black:
-            return MaskStack(np.zeros_like(human) for human in entities[0])
-        blank = MaskStack(
-            blank_pixels(image, np.logical_or.reduce(shown))
-            for image, *shown in zip(self.images(), *entities, strict=True)
-        )
-        coverage = blank.coverage()
-        if coverage.any():
-            self.warnings.append(
-                f"{int((coverage > 0).sum())} frames have flat black patches, up to "
-                f"{100 * coverage.max():.1f} % of the image, which show no scene: they are left "
-                "out of training and scores (--keep-black if they are real)"
-            )
-        return blank
 
     def _silhouettes(self) -> MaskStack:
         assert self.people.first is not None  # masks of nobody are not separated
@@ -483,18 +384,10 @@ class Pipeline:
         if "depth" not in self.estimators:
             return None
         self.depth_maps = self._read_depth()
-        first = self.people.first
-        surfaces = [] if first is None else [vertices for vertices, _ in first.posed(self.body)]
-        points = self.track.points * self.people.world.scene_scale
-        fit = fit_depth(
-            self.depth_maps,
-            lambda i: seen_points(points, self.cameras[i], self.masks.moving(i)),
-            lambda i: seen_surface(
-                surfaces[i] if surfaces else torch.zeros(0, 3), self.cameras[i], self.masks.human[i]
-            ),
-            len(self.video),
+        fit = depth_in_metres(
+            self.depth_maps, self.people, self.body, self.track, self.cameras, self.masks,
             self.stages.advance,
-        )
+        )  # fmt: skip
         self.provenance["depth"] = fit.provenance
         if fit.typical > POOR:
             self.warnings.append(
@@ -512,25 +405,15 @@ class Pipeline:
         self.scene = self._stage("scene", self._find_scene)
 
     def _find_scene(self) -> ScenePoints:
-        if not self.track.static:
-            scale = self.people.world.scene_scale
-            scene = camera_scene(
-                self.track.points * scale, self.track.colors, self.masks, self.cameras, self.images,
-                self.options.scene_points,
-            )  # fmt: skip
-        else:
-            scene = static_scene(
-                self.images, self.masks, self.cameras,
-                ground=self.people.world.ground,
-                distance=self.people.world.distance(self.cameras),
-                backdrop=self.options.backdrop, count=self.options.scene_points,
-                metres=None if self.depth is None else self._metres_of,
-            )  # fmt: skip
-            if self.depth is None:
-                self.warnings.append(
-                    "the camera stays in one place: the scene's depth is supposed, only what moves "
-                    "has a measured place"
-                )
+        metres = None if self.depth is None else self._metres_of
+        scene = find_scene(
+            self.people, self.track, self.cameras, self.masks, self.images, self.options, metres
+        )
+        if self.track.static and self.depth is None:
+            self.warnings.append(
+                "the camera stays in one place: the scene's depth is supposed, only what moves "
+                "has a measured place"
+            )
         self.provenance["scene"] = scene.provenance
         return scene
 

@@ -233,7 +233,7 @@ def _run(
             pipeline.run(until)
             report = None if until else write_clip_folder(pipeline, cleanup)
         except HoigsError:
-            if work.new and not pipeline.worth_keeping:
+            if work.new and not pipeline.kept.worth_keeping:
                 work.discard()
             raise
     return pipeline, report
