@@ -25,7 +25,7 @@ class Training:
 
 def trained(clip: Path, run: Path, how: Training, truth: Any = None) -> dict[str, Any]:
     """PSNR by region of test frames and held-out cameras, with the body poses of test frames as the
-    clip has them ("given"), and interpolated from training frames.
+    clip has them ("given"), interpolated from training frames, and blended from both.
 
     Args:
         truth: a clip of the same frames whose pixels and masks are scored in place of the clip's.
@@ -50,7 +50,7 @@ def trained(clip: Path, run: Path, how: Training, truth: Any = None) -> dict[str
     if truth is not None:
         pixels = truth.resized(scored.cameras[0].width).store
         scored = replace(scored, store=pixels, kinds=truth.kinds)
-    for poses in ("given", "interpolated"):
+    for poses in ("given", "interpolated", "blended"):
         scores = evaluate(session.trainer.model, scored, timing_frames=0, test_pose=poses)
         found[f"{poses} poses"] = {
             view.name: {r: _value(scores.score(r, "psnr", view.name)) for r in REGIONS}

@@ -29,8 +29,9 @@ def evaluate(
         str | None,
         typer.Option(
             "--test-pose",
-            help="Body poses of test frames: auto (interpolated if the clip's are estimates), "
-            "given, interpolated (from training frames) or fitted (to the test images). "
+            help="Body poses of test frames: auto (blended if the clip's are estimates), "
+            "given, interpolated (from training frames), blended (between both) or fitted (to the "
+            "test images). "
             "Default: the spec's.",
         ),
     ] = None,

@@ -15,9 +15,10 @@ from hoigs.core.errors import did_you_mean
 from hoigs.core.interfaces.rasterizer import RenderOutput
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
-from hoigs.core.spec.train_schema import TestPoseSetting
+from hoigs.core.spec.train_schema import TestCamera, TestPoseSetting
 from hoigs.core.values.clip import CAMERAS_REFINED, Clip, Frame
 from hoigs.core.values.tokens import EntityKind
+from hoigs.evaluation.blending import own_share
 from hoigs.evaluation.geometry import measure_geometry
 from hoigs.evaluation.measure import device_name, model_size, render_time
 from hoigs.evaluation.posing import FIT_STEPS, posed_clip, source_of_poses
@@ -39,7 +40,7 @@ def evaluate(
     lpips_weights: Path | str | None = None,
     held_out: bool = True,
     test_pose: TestPoseSetting = "auto",
-    test_camera: TestPose = "given",
+    test_camera: TestCamera = "given",
     fit_steps: int = FIT_STEPS,
     pixels: Pixels = "float",
     band: int | None = None,
@@ -81,11 +82,16 @@ def evaluate(
     was_training = model.training
     model.eval()
     poses = source_of_poses(clip, test_pose)
+    begun = FITTING_SHARE if {"blended", "fitted"} & {poses, test_camera} else 0.0
+
+    def posing(done: float, text: str) -> None:
+        report(FITTING_SHARE * done, text)
+
+    share = own_share(model, clip, split, posing) if poses == "blended" else None
     clip = posed_clip(
         model, clip, split=split, test_pose=poses, test_camera=test_camera,
-        fit_steps=fit_steps, progress=lambda done, text: report(FITTING_SHARE * done, text),
+        fit_steps=fit_steps, share=share, progress=posing,
     )  # fmt: skip
-    begun = FITTING_SHARE if "fitted" in (poses, test_camera) else 0.0
     chosen = [("test frames" if split == "test" else f"{split} frames", clip, split)]
     if held_out and clip.held_out is not None and len(clip.held_out):
         chosen.append(("held-out cameras", clip.held_out, "test"))
@@ -96,7 +102,8 @@ def evaluate(
         protocol = replace(
             _protocol(model, source, title, name, trained, poses, pixels, band, lpips),
             test_camera=test_camera if source is clip else "given",
-            fit_steps=fit_steps if begun else 0,
+            fit_steps=fit_steps if "fitted" in (poses, test_camera) else 0,
+            own_share=share,
         )
         frames = []
         for position in source.split[name]:

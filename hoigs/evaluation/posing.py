@@ -1,4 +1,4 @@
-"""Body poses and cameras of scored frames: given, interpolated or fitted."""
+"""Body poses and cameras of scored frames: given, interpolated, blended or fitted."""
 
 from __future__ import annotations
 
@@ -11,20 +11,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.maths.rotations import (
-    axis_angle_to_quats,
-    matrices_to_quats,
-    quats_to_axis_angle,
-    quats_to_matrices,
-    slerp,
-)
 from hoigs.core.maths.splines import neighbours
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
-from hoigs.core.spec.train_schema import TestPose, TestPoseSetting
+from hoigs.core.spec.train_schema import TestCamera, TestPose, TestPoseSetting
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import POSES_ESTIMATED, Clip, Frame
 from hoigs.core.values.moment import BodyPose, Moment
+from hoigs.evaluation.blending import blended, own_share
+from hoigs.evaluation.interpolation import camera_between, pose_between
 from hoigs.metrics.image_loss import image_loss
 
 FIT_STEPS = 40
@@ -33,10 +28,11 @@ FIT_DSSIM = 0.2  # weight of D-SSIM in the image loss
 
 
 def source_of_poses(clip: Clip, setting: TestPoseSetting) -> TestPose:
-    """What "auto" stands for: poses that were estimated from test images are not used there."""
+    """What "auto" stands for: poses that were estimated are trusted as far as training frames bear
+    out."""
     if setting != "auto":
         return setting
-    return "interpolated" if clip.provenance.get(POSES_ESTIMATED) else "given"
+    return "blended" if clip.provenance.get(POSES_ESTIMATED) else "given"
 
 
 def posed_clip(
@@ -45,16 +41,19 @@ def posed_clip(
     *,
     split: str = "test",
     test_pose: TestPose = "given",
-    test_camera: TestPose = "given",
+    test_camera: TestCamera = "given",
     fit_steps: int = FIT_STEPS,
+    share: float | None = None,
     progress: Progress | None = None,
 ) -> Clip:
     """The clip with the poses and cameras of a protocol for the frames of a split.
 
     "given" changes nothing. "interpolated" takes them from the two neighbouring training frames,
     rotations by SLERP, positions linearly; the model then adds its learned corrections, which it
-    interpolates likewise. "fitted" optimises them on the *image that is scored*, with the model
-    frozen, starting from the given ones. Training frames and intrinsics never change.
+    interpolates likewise. "blended" goes from these poses a share of the way to the frame's own;
+    `share` is it, or None to find it in training frames (`blending.own_share`). "fitted" optimises
+    them on the *image that is scored*, with the model frozen, starting from the given ones.
+    Training frames and intrinsics never change.
 
     Views of `clip.held_out` take the body poses of their moments; their cameras stay, and nothing
     is fitted to their images.
@@ -62,14 +61,17 @@ def posed_clip(
     Raises:
         ValueError: there is no training frame to interpolate from.
     """
+    report = progress or no_progress
     trained = sorted(clip.split.get("train", ()), key=lambda p: clip.moments[p].time)
     chosen = [p for p in clip.split[split] if p not in set(trained)]
-    if "interpolated" in (test_pose, test_camera) and chosen:
+    if {"interpolated", "blended"} & {test_pose, test_camera} and chosen:
         if not trained:
             raise ValueError("nothing to interpolate from: the clip has no training frames")
+        if test_pose == "blended":
+            share = own_share(model, clip, split, report) if share is None else share
+            clip = _blended(model, clip, chosen, share)
         clip = _interpolated(clip, trained, chosen, test_pose, test_camera)
     if "fitted" in (test_pose, test_camera):
-        report = progress or no_progress
         moments, cameras = list(clip.moments), list(clip.cameras)
         for done, p in enumerate(chosen):
             fit = fit_frame(
@@ -85,8 +87,15 @@ def posed_clip(
     return replace(clip, held_out=replace(clip.held_out, moments=views))
 
 
+def _blended(model: SceneModel, clip: Clip, chosen: list[int], share: float) -> Clip:
+    moments = list(clip.moments)
+    for p in chosen:
+        moments[p] = blended(model, clip, p, share)
+    return replace(clip, moments=moments)
+
+
 def _interpolated(
-    clip: Clip, trained: list[int], chosen: list[int], pose: TestPose, camera: TestPose
+    clip: Clip, trained: list[int], chosen: list[int], pose: TestPose, camera: TestCamera
 ) -> Clip:
     times = [clip.moments[p].time for p in trained]
     moments, cameras = list(clip.moments), list(clip.cameras)
@@ -101,46 +110,6 @@ def _interpolated(
             viewmat = camera_between(clip.cameras[a], clip.cameras[b], r).world_to_camera
             cameras[p] = replace(clip.cameras[p], world_to_camera=viewmat)
     return replace(clip, moments=moments, cameras=cameras)
-
-
-def pose_between(a: BodyPose, b: BodyPose, r: float) -> BodyPose:
-    """Joint rotations by SLERP, translation and shape linearly; r in [0, 1]."""
-    turned = quats_to_axis_angle(
-        slerp(axis_angle_to_quats(a.rotations), axis_angle_to_quats(b.rotations), r)
-    )
-    turned = _nearest_axis_angle(turned, a.rotations)
-    return a.replace(
-        global_orient=turned[0],
-        body=turned[1:22],
-        left_hand=turned[22:37],
-        right_hand=turned[37:],
-        transl=torch.lerp(a.transl, b.transl, r),
-        betas=torch.lerp(a.betas, b.betas, r),
-    )
-
-
-def _nearest_axis_angle(
-    vectors: Float[Tensor, "J 3"], reference: Float[Tensor, "J 3"]
-) -> Float[Tensor, "J 3"]:
-    """Of the two axis-angles of each rotation (below and above pi) the one nearer to `reference`.
-
-    Corrections that are added to axis-angles were learned for the neighbours' vector; near half a
-    turn they would act in the opposite direction on the other one.
-    """
-    angle = vectors.norm(dim=-1, keepdim=True)
-    other = vectors - 2 * math.pi * vectors / angle.clamp_min(1e-6)
-    nearer = (other - reference).norm(dim=-1) < (vectors - reference).norm(dim=-1)
-    return torch.where(nearer[:, None] & (angle > 1e-3), other, vectors)
-
-
-def camera_between(a: Camera, b: Camera, r: float) -> Camera:
-    """Rotation by SLERP, centre linearly, intrinsics of `a`; r in [0, 1]."""
-    quats = [matrices_to_quats(c.world_to_camera[:3, :3]) for c in (a, b)]
-    R = quats_to_matrices(slerp(quats[0], quats[1], r))
-    viewmat = a.world_to_camera.clone()
-    viewmat[:3, :3] = R
-    viewmat[:3, 3] = -R @ torch.lerp(a.center, b.center, r)
-    return replace(a, world_to_camera=viewmat)
 
 
 @dataclass(frozen=True)

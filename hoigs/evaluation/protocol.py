@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-from hoigs.core.spec.train_schema import TestPose
+from hoigs.core.spec.train_schema import TestCamera, TestPose
 
 Pixels = Literal["float", "8-bit"]
 
@@ -33,8 +33,9 @@ class Protocol:
         unseen_times: number of these frames at times without a training frame.
         region: one of regions.REGIONS. band: width of the interaction band, pixels.
         test_pose: source of the body poses: "given" by the clip, with the corrections of
-            neighbouring training frames; "interpolated" from these frames; or "fitted" to the test
-            images themselves (`posing.posed_clip`).
+            neighbouring training frames; "interpolated" from these frames; "blended" from both; or
+            "fitted" to the test images themselves (`posing.posed_clip`).
+        own_share: of "blended" poses: 0 is "interpolated", 1 nearly "given"; None of others.
         pixels: "float" renders, or rounded to "8-bit"; clamped to [0, 1] either way.
         background: colour behind all Gaussians.
         width, height: of the scored images, pixels.
@@ -60,7 +61,8 @@ class Protocol:
     lpips_net: str | None
     device: str
     rasterizer: str
-    test_camera: TestPose = "given"
+    test_camera: TestCamera = "given"
+    own_share: float | None = None
     fit_steps: int = 0
     cameras_refined: bool = False
     ignored: float = 0.0
@@ -79,6 +81,14 @@ class Protocol:
     def _cameras(self) -> str:
         moved = ", moved by the corrections that training learned" if self.cameras_refined else ""
         return f"cameras: {self.test_camera}{moved if self.test_camera != 'interpolated' else ''}"
+
+    def _poses(self) -> str:
+        if self.own_share is None:
+            return self.test_pose
+        return (
+            f"{self.test_pose}, {100 * self.own_share:.0f} % of the way from those between "
+            "neighbouring training frames to the frame's own, as draws training frames best"
+        )
 
     def _warnings(self) -> list[str]:
         """The first note of a score whose poses or cameras were fitted to its images."""
@@ -120,7 +130,7 @@ class Protocol:
         return [
             f"{self.frames} frames of split {self.split!r} from {self.views}, "
             f"{self.unseen_times or 'none'} of them at times that were not trained on; "
-            f"body poses: {self.test_pose}; {self._cameras()}.",
+            f"body poses: {self._poses()}; {self._cameras()}.",
             *self._warnings(),
             f"{self.width}x{self.height}, {self.pixels} pixels clamped to [0, 1] over "
             f"{self.background}; {self.averages}; drawn by {self.rasterizer} on {self.device}"

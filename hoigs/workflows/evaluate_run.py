@@ -56,8 +56,8 @@ def evaluate_run(
         lpips_weights: LPIPS weights; by default those that $HOIGS_LPIPS_WEIGHTS names, or
             AlexNet's, which are shipped.
         test_pose: body poses of test frames: "auto", "given", "interpolated" from training frames,
-            or "fitted" to the test images; by default the spec's. test_camera: likewise, but for
-            "auto".
+            "blended" from both, or "fitted" to the test images; by default the spec's.
+            test_camera: "given", "interpolated" or "fitted".
         fit_steps: optimizer steps per "fitted" frame; by default the spec's.
         report: write report.html. progress: called with the share done, in [0, 1], and the work.
 

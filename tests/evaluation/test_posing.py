@@ -18,13 +18,8 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import POSES_ESTIMATED, Clip, FrameStore
 from hoigs.core.values.moment import BodyPose
 from hoigs.evaluation.evaluate import evaluate
-from hoigs.evaluation.posing import (
-    camera_between,
-    fit_frame,
-    pose_between,
-    posed_clip,
-    source_of_poses,
-)
+from hoigs.evaluation.interpolation import camera_between, pose_between
+from hoigs.evaluation.posing import fit_frame, posed_clip, source_of_poses
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.synthesis import SceneConfig, builtin_clip
@@ -145,12 +140,12 @@ def turned(a: BodyPose, b: BodyPose) -> Tensor:
     return torch.rad2deg(apart.norm(dim=-1))
 
 
-def test_poses_that_were_estimated_from_test_frames_are_not_used_there(
+def test_estimated_poses_of_test_frames_are_blended(
     scene: tuple[SceneModel, Clip],
 ) -> None:
     model, clip = scene
     estimated = replace(clip, provenance={POSES_ESTIMATED: True})
-    for source, pose in ((clip, "given"), (estimated, "interpolated")):
+    for source, pose in ((clip, "given"), (estimated, "blended")):
         (view,) = evaluate(model, source, timing_frames=0).views
         assert view.protocol.test_pose == pose
     assert source_of_poses(estimated, "given") == "given"

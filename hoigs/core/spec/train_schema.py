@@ -9,8 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from hoigs.core.errors import did_you_mean
 
 Graphs = Literal["auto", "on", "off"]
-TestPose = Literal["given", "interpolated", "fitted"]
-TestPoseSetting = Literal["auto", "given", "interpolated", "fitted"]
+TestCamera = Literal["given", "interpolated", "fitted"]
+TestPose = Literal["given", "interpolated", "blended", "fitted"]
+TestPoseSetting = Literal["auto", "given", "interpolated", "blended", "fitted"]
 
 
 class _Strict(BaseModel):
@@ -189,13 +190,14 @@ class EvaluationSpec(_Strict):
     """How a run is scored."""
 
     test_pose: TestPoseSetting = "auto"
-    """Body poses of test frames. "auto" is "interpolated" where the clip's poses were estimated
+    """Body poses of test frames. "auto" is "blended" where the clip's poses were estimated
     from its frames (`hoigs prepare`), and "given" elsewhere. "given" are the clip's, moved by the
     corrections that neighbouring training frames learned; "interpolated" are these neighbours'
-    poses, as if the clip had none for test frames; "fitted" are optimised on the test images that
-    are scored. Stored with every score (docs/reference/refinement.md)."""
-    test_camera: TestPose = "given"
-    """Cameras of test frames, with the same choices as `test_pose`."""
+    poses, as if the clip had none for test frames; "blended" lie between both, at the share of
+    the way that draws training frames best when each is posed so; "fitted" are optimised on the
+    test images that are scored. Stored with every score (docs/reference/refinement.md)."""
+    test_camera: TestCamera = "given"
+    """Cameras of test frames: "given" by the clip, "interpolated" or "fitted"."""
     fit_steps: int = Field(default=40, ge=1)
     """Optimization steps of "fitted" for each frame."""
     held_out: bool = True
