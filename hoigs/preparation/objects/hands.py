@@ -24,6 +24,7 @@ MASS = {0: 0.4, 9: 0.3, 16: 0.15, 17: 0.15}  # about: pelvis, chest, shoulders; 
 UPRIGHT = 0.25  # of the frames: those in which the body stands straightest
 REACH = 0.13  # metres in the image between a palm and what it holds
 STILL = 0.07  # metres a second: an object that moves less rests
+STAYS = 0.4  # seconds for which an object with a hand at it has to keep its place to rest
 HIDDEN = 0.6  # of the median area of its masks: under this most of the object is hidden
 SHORTEST = 0.2  # seconds of a grasp or a rest
 RELEASE = 0.12  # seconds for which hands are near what they have let go
@@ -87,7 +88,11 @@ def hand_motion(
     near = _kept_while_hidden(_cleaned(away < REACH, round(SHORTEST * fps)), outlines)
     depths = hand_depths(masks, cameras, joints[:, [LEFT_WRIST, RIGHT_WRIST]])
     depths = smooth(depths, window)
-    rests = _cleaned(_rests(outlines, depths, cameras, fps)[:, None], round(SHORTEST * fps))[:, 0]
+    still = _rests(outlines, depths, cameras, fps)
+    runs, _ = ndimage.label(still)
+    sure = np.unique(runs[_stays(outlines, depths, cameras, fps)])
+    still &= ~near.any(1) | np.isin(runs, sure)
+    rests = _cleaned(still[:, None], round(SHORTEST * fps))[:, 0]
     held = near.any(1) & ~rests
     # hands are still, or already, near for a moment while it flies
     flies = ndimage.binary_dilation(~(held | rests), iterations=max(1, round(RELEASE * fps)))
@@ -198,6 +203,37 @@ def _rests(
             found.append(metres * fps / abs(j - i))
         speed[i] = min(found, default=np.inf)
     return speed < STILL
+
+
+def _stays(
+    outlines: Outlines,
+    depths: Float[np.ndarray, " F"],
+    cameras: Sequence[Camera],
+    fps: float,
+) -> Bool[np.ndarray, " F"]:
+    """Frames of spans of `STAYS` seconds in which the mask's middle keeps to one still point.
+
+    That it is where it was a moment ago may be chance with a hand that moves it: one that moves
+    towards the camera, turns back or is only just set in motion.
+    """
+    import torch
+
+    count, span = len(cameras), max(3, round(STAYS * fps))
+    stays = np.zeros(count, dtype=bool)
+    for first in range(count - span + 1):
+        rows = np.arange(first, first + span)
+        if not outlines.whole[rows].all():
+            continue
+        middle = int(rows[span // 2])
+        pixel = torch.tensor(outlines.centers[middle], dtype=torch.float32)
+        point = cameras[middle].unproject(pixel, torch.tensor(float(depths[middle])))
+        off = []
+        for i in rows.tolist():
+            xy, depth = cameras[i].project(point[None])
+            pixels = float(np.linalg.norm(xy[0].numpy() - outlines.centers[i]))
+            off.append(pixels * float(depth[0]) / float(cameras[i].K[0, 0]))
+        stays[rows] |= max(off) < STILL * STAYS / 2
+    return stays
 
 
 def _cleaned(flags: Bool[np.ndarray, "F N"], shortest: int) -> Bool[np.ndarray, "F N"]:
