@@ -15,6 +15,7 @@ from hoigs.core.maths.series import fill_gaps, smooth
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.masks.outlines import Outlines
+from hoigs.preparation.objects.rests import cleaned, resting
 from hoigs.preparation.objects.track import hand_depths
 
 HAND_JOINTS = 30  # the last joints of a body: fifteen of each hand, three a finger, index first
@@ -23,10 +24,7 @@ FEET = (7, 8, 10, 11)  # ankles and balls of the feet
 MASS = {0: 0.4, 9: 0.3, 16: 0.15, 17: 0.15}  # about: pelvis, chest, shoulders; the centre of mass
 UPRIGHT = 0.25  # of the frames: those in which the body stands straightest
 REACH = 0.13  # metres in the image between a palm and what it holds
-STILL = 0.07  # metres a second: an object that moves less rests
-STAYS = 0.4  # seconds for which an object with a hand at it has to keep its place to rest
 HIDDEN = 0.6  # of the median area of its masks: under this most of the object is hidden
-SHORTEST = 0.2  # seconds of a grasp or a rest
 RELEASE = 0.12  # seconds for which hands are near what they have let go
 STEADY = 0.45  # seconds over which the distance of the nearest wrist is smoothed
 ALONG = 5  # points of a bone
@@ -75,8 +73,7 @@ def hand_motion(
     """Grasps and rests of the object, and the frame that the hands span.
 
     A hand is at the object where its palm is within `REACH` of the mask, measured in the image at
-    the palm's depth. The object rests where its middle moves in the image as a point that stands
-    still in the world does.
+    the palm's depth. When it rests, see `resting`.
     """
     window = max(5, round(STEADY * fps) | 1)
     places = joints.double().numpy()
@@ -85,14 +82,10 @@ def hand_motion(
     middle = places[:, [first + MIDDLE, first + HAND_JOINTS // 2 + MIDDLE]]
     palms = (wrists + middle) / 2
     away = _palm_distances(palms, masks, cameras)
-    near = _kept_while_hidden(_cleaned(away < REACH, round(SHORTEST * fps)), outlines)
+    near = _kept_while_hidden(cleaned(away < REACH, fps), outlines)
     depths = hand_depths(masks, cameras, joints[:, [LEFT_WRIST, RIGHT_WRIST]])
     depths = smooth(depths, window)
-    still = _rests(outlines, depths, cameras, fps)
-    runs, _ = ndimage.label(still)
-    sure = np.unique(runs[_stays(outlines, depths, cameras, fps)])
-    still &= ~near.any(1) | np.isin(runs, sure)
-    rests = _cleaned(still[:, None], round(SHORTEST * fps))[:, 0]
+    rests = resting(outlines, depths, cameras, fps, near.any(1))
     held = near.any(1) & ~rests
     # hands are still, or already, near for a moment while it flies
     flies = ndimage.binary_dilation(~(held | rests), iterations=max(1, round(RELEASE * fps)))
@@ -111,7 +104,7 @@ def no_hands(
 ) -> HandMotion:
     """Of an object in a clip without people, at supposed depths along the view, metres."""
     count = len(depths)
-    rests = _cleaned(_rests(outlines, depths, cameras, fps)[:, None], round(SHORTEST * fps))[:, 0]
+    rests = resting(outlines, depths, cameras, fps, np.zeros(count, bool))
     if not rests.all():  # a thing that turns on its spot rests by its middle
         rests = np.zeros_like(rests)
     nothing = np.zeros((count, 2, 3))
@@ -177,72 +170,6 @@ def _palm_distances(
         pixels[mask[row, column]] = 0
         away[i] = pixels * depth.numpy() / float(camera.K[0, 0])
     return away
-
-
-def _rests(
-    outlines: Outlines,
-    depths: Float[np.ndarray, " F"],
-    cameras: Sequence[Camera],
-    fps: float,
-) -> Bool[np.ndarray, " F"]:
-    """Frames around which the mask's middle follows a point that stands still in the world."""
-    import torch
-
-    count, step = len(cameras), max(1, round(SHORTEST * fps / 2))
-    speed = np.full(count, np.inf)
-    for i in range(count):
-        found = []
-        for j in (i - step, i + step):
-            if not 0 <= j < count or not (outlines.whole[i] and outlines.whole[j]):
-                continue
-            pixel = torch.tensor(outlines.centers[i], dtype=torch.float32)
-            point = cameras[i].unproject(pixel, torch.tensor(float(depths[i])))
-            xy, depth = cameras[j].project(point[None])
-            moved = float(np.linalg.norm(xy[0].numpy() - outlines.centers[j]))
-            metres = moved * float(depth[0]) / float(cameras[j].K[0, 0])
-            found.append(metres * fps / abs(j - i))
-        speed[i] = min(found, default=np.inf)
-    return speed < STILL
-
-
-def _stays(
-    outlines: Outlines,
-    depths: Float[np.ndarray, " F"],
-    cameras: Sequence[Camera],
-    fps: float,
-) -> Bool[np.ndarray, " F"]:
-    """Frames of spans of `STAYS` seconds in which the mask's middle keeps to one still point.
-
-    That it is where it was a moment ago may be chance with a hand that moves it: one that moves
-    towards the camera, turns back or is only just set in motion.
-    """
-    import torch
-
-    count, span = len(cameras), max(3, round(STAYS * fps))
-    stays = np.zeros(count, dtype=bool)
-    for first in range(count - span + 1):
-        rows = np.arange(first, first + span)
-        if not outlines.whole[rows].all():
-            continue
-        middle = int(rows[span // 2])
-        pixel = torch.tensor(outlines.centers[middle], dtype=torch.float32)
-        point = cameras[middle].unproject(pixel, torch.tensor(float(depths[middle])))
-        off = []
-        for i in rows.tolist():
-            xy, depth = cameras[i].project(point[None])
-            pixels = float(np.linalg.norm(xy[0].numpy() - outlines.centers[i]))
-            off.append(pixels * float(depth[0]) / float(cameras[i].K[0, 0]))
-        stays[rows] |= max(off) < STILL * STAYS / 2
-    return stays
-
-
-def _cleaned(flags: Bool[np.ndarray, "F N"], shortest: int) -> Bool[np.ndarray, "F N"]:
-    """Without runs and gaps shorter than `shortest` frames."""
-    structure = np.ones((max(1, shortest), 1), dtype=bool)
-    padded = np.pad(flags, ((len(structure), len(structure)), (0, 0)), mode="edge")
-    closed = ndimage.binary_closing(padded, structure)
-    opened = ndimage.binary_opening(closed, structure)
-    return opened[len(structure) : -len(structure)]
 
 
 def _kept_while_hidden(

@@ -142,6 +142,24 @@ def test_hands_turn_what_they_hold_and_nothing_else() -> None:
     assert not away.held.any() and np.allclose(away.rotations, np.eye(3))
 
 
+def test_what_a_hand_moves_does_not_rest_where_it_turns_back() -> None:
+    """A push to and fro: half a period after a frame the object is where it was."""
+    phase = torch.arange(FRAMES) * torch.pi / 2
+    places = torch.stack((0.05 * phase.sin(), 0 * phase, 2 + 0 * phase), -1)
+    _, objects, _, joints = filmed(motion=(torch.eye(3).expand(FRAMES, 3, 3), places))
+    outlines, cameras = outlines_of(objects), [CAMERA] * FRAMES
+    pushed = hand_motion(joints, objects, outlines, cameras, 2 * FPS)
+    assert pushed.near.all() and pushed.held.all() and not pushed.rests.any()
+
+
+def test_what_stays_rests_with_hands_at_it_or_not() -> None:
+    still = torch.eye(3).expand(FRAMES, 3, 3), torch.tensor([0.0, 0, 2]).expand(FRAMES, 3)
+    _, objects, _, joints = filmed(motion=still)
+    for offset in (0.0, 1.0):
+        motion = hand_motion(joints + offset, objects, outlines_of(objects), [CAMERA] * FRAMES, FPS)
+        assert motion.rests.all() and not motion.held.any()
+
+
 def test_what_is_hidden_moves_with_the_hands_that_hold_it() -> None:
     phase = torch.linspace(0, 1, FRAMES)[:, None]
     rotations = axis_angle_to_matrices(phase * torch.tensor([0.0, 2.0, 0.0]))
