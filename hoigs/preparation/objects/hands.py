@@ -85,7 +85,7 @@ def hand_motion(
     near = _kept_while_hidden(cleaned(away < REACH, fps), outlines)
     depths = hand_depths(masks, cameras, joints[:, [LEFT_WRIST, RIGHT_WRIST]])
     depths = smooth(depths, window)
-    rests = resting(outlines, depths, cameras, fps, near.any(1))
+    rests = resting(outlines, depths, cameras, fps, np.asarray(near.any(1)))
     held = near.any(1) & ~rests
     # hands are still, or already, near for a moment while it flies
     flies = ndimage.binary_dilation(~(held | rests), iterations=max(1, round(RELEASE * fps)))
