@@ -55,6 +55,7 @@ class Job:
     keep: Path | None
     pictures: Path | None
     threads: int
+    given: bool
     given_runs: Path | None
 
 
@@ -135,9 +136,10 @@ def _measure(job: Job, folder: Path) -> dict[str, Any]:
             shutil.copytree(truth_folder / "held_out", out / "held_out", dirs_exist_ok=True)
         how = Training(job.train, job.train_width, job.device, job.seed, job.pictures)
         row["estimated"] = trained(out, folder / f"{name}.run", how)
-        row["every_pose_given"] = _earlier(job) or trained(
-            truth_folder, folder / f"{name}.given-run", how
-        )
+        if job.given:
+            row["every_pose_given"] = _earlier(job) or trained(
+                truth_folder, folder / f"{name}.given-run", how
+            )
     return row
 
 
@@ -171,6 +173,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--train", type=int, default=0, metavar="STEPS")
     parser.add_argument("--train-width", type=int, help="default: --width")
+    parser.add_argument("--no-given", action="store_true", help="train on estimated poses only")
     parser.add_argument(
         "--given-runs", type=Path, metavar="JSON",
         help="an earlier --json, whose trainings with every pose given are taken over where clip, "
@@ -200,7 +203,7 @@ def _jobs(options: argparse.Namespace) -> Iterator[Job]:
             settings=tuple(filter(None, variant[2].split(","))), camera=camera, seed=seed,
             train=options.train, train_width=options.train_width or options.width,
             device=options.device, keep=options.keep, pictures=options.pictures, threads=threads,
-            given_runs=options.given_runs,
+            given=not options.no_given, given_runs=options.given_runs,
         )  # fmt: skip
 
 
@@ -234,12 +237,13 @@ def table(rows: list[dict[str, Any]]) -> str:
             row["root_aligned_joints_mm"], row["wrists_mm"], row["acceleration_error_m_s2"],
             row["rotation_deg"]["median"], row["place_mm"]["mean"], row["chamfer_mm"],
         ]  # fmt: skip
-        runs = (row["estimated"]["blended poses"], row["every_pose_given"]["given poses"])
+        given = row.get("every_pose_given")
+        runs = (row["estimated"]["blended poses"], given and given["given poses"])
         for view, region in (
             ("test frames", "human_object"), ("held-out cameras", "human_object"),
             ("held-out cameras", "object"),
         ):  # fmt: skip
-            found += [run[view][region] for run in runs]
+            found += [run[view][region] if run else "-" for run in runs]
         lines.append([str(value) for value in found])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 

@@ -218,6 +218,25 @@ def test_a_back_that_no_frame_shows_is_filled(angle: float, one_sided: bool) -> 
     assert off[1] < 0.5 * off[0]
 
 
+def test_what_is_seen_from_above_does_not_hang_down_at_the_back() -> None:
+    """Outlines allow everything behind the lower front edge, on the rays that go down past it."""
+    swing, places = poses(0.3)
+    rotations = axis_angle_to_matrices(torch.tensor([0.4, 0.0, 0.0])) @ swing
+    images, objects, humans, _ = filmed(motion=(rotations, places))
+    crops = make_crops(
+        lambda: iter(images), objects, humans, humans, [CAMERA] * FRAMES, np.ones(FRAMES, bool),
+        96, torch.zeros(FRAMES, 0, 3), np.full(FRAMES, 2.5),
+    )  # fmt: skip
+    surface = hull(crops, Poses(rotations, places), 0.35, 800)
+    found, depth = completed(crops, surface, Poses(rotations, places), surface.rest, 0.35)
+    assert depth is not None
+    # y points down, z away from the camera
+    below = [
+        float((v[:, 1] - HALF[1])[v[:, 2] > 0].clamp_min(0).max()) for v in (surface.rest, found)
+    ]
+    assert below[0] > 0.05 and below[1] < 0.4 * below[0], below
+
+
 def test_a_spin_in_flight_is_found_by_texture() -> None:
     _, places = poses(0.7)
     flight = slice(3, 9)
