@@ -252,8 +252,8 @@ def _result(
     back = "as small and smooth as the outlines allow"
     if depth is not None:
         back = (
-            "filled as far as the outlines allow: all frames show one side, and it is taken to be "
-            f"{1000 * depth:.0f} mm deep, by the size of its outlines"
+            "as far from its middle as the side opposite, within the outlines: all frames show one "
+            f"side, and it is taken to be {1000 * depth:.0f} mm deep, by the size of its outlines"
         )
     shown = outlines.observed
     dense = with_samples(found.vertices, surface.faces, count)

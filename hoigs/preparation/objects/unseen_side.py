@@ -1,4 +1,4 @@
-"""The side of an object that no frame shows: as far as outlines allow, and of a supposed depth."""
+"""The side of an object that no frame shows: like the opposite side, within the outlines."""
 
 from __future__ import annotations
 
