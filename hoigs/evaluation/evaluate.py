@@ -13,6 +13,7 @@ from torch import Tensor
 
 from hoigs.core.errors import did_you_mean
 from hoigs.core.interfaces.rasterizer import RenderOutput
+from hoigs.core.machine.pages import PIECE, release_time_rows
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.spec.train_schema import TestCamera, TestPoseSetting
@@ -109,6 +110,8 @@ def evaluate(
         for position in source.split[name]:
             frames.append(score_frame(model, source[position], source, protocol, lpips))
             done += 1
+            if done % PIECE == 0:
+                release_time_rows(model)
             report(begun + (1 - TIMING_SHARE - begun) * done / work, title)
         views.append(ViewScores(title, protocol, frames))
     report(1 - TIMING_SHARE, "geometry")
@@ -138,7 +141,7 @@ def _protocol(
     positions = clip.split[split]
     camera = clip.cameras[positions[0] if positions else 0]
     first = camera.world_to_camera
-    ignored = [clip.store.ignored(p) for p in positions]
+    ignored = (clip.store.ignored(p) for p in positions)
     share = sum(float(m.float().mean()) for m in ignored if m is not None) / max(1, len(positions))
     fixed = all(torch.equal(c.world_to_camera, first) for c in clip.cameras)
     views = title if title == "held-out cameras" else "training cameras"

@@ -14,10 +14,9 @@ from torch import Tensor
 
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
-from hoigs.core.machine.pages import release_pages
+from hoigs.core.machine.pages import PIECE, release_time_rows
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
-from hoigs.core.time_rows import timed_parameters
 from hoigs.core.values.between import frame_numbers
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
@@ -30,7 +29,6 @@ from hoigs.viewing.paths import OLDER, View, film_path, frames_shown
 from hoigs.viewing.playback import Mode, Playback
 
 VIEWS = 8  # frames of a film, evenly spread, that a Playback is made from
-PIECE = 256  # frames after which the rows for their times leave memory
 TRANSPARENT = "transparent"
 
 __all__ = ["Film", "film_views", "playback_of", "render", "write_video"]
@@ -167,7 +165,6 @@ def _draw(
     behind = None if clear or background is None else read_background(background, camera)
     play = playback_of(loaded.model, film, only, behind, copied=False)
     shown = frames_shown(loaded.clip, film) if compare else []
-    timed = [loaded.model.get_parameter(name) for name, _ in timed_parameters(loaded.model)]
     drawn, draw_s = 0, 0.0
 
     def frames() -> Iterator[UInt8[np.ndarray, "H W C"]]:
@@ -185,7 +182,7 @@ def _draw(
             drawn += 1
             report(drawn / len(film), f"frame {drawn} of {len(film)}")
             if drawn % PIECE == 0:
-                release_pages(timed)
+                release_time_rows(loaded.model)
             yield picture
 
     began = time.perf_counter()

@@ -7,11 +7,18 @@ import mmap
 import sys
 from collections.abc import Iterable
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from hoigs.core.machine.gomp import c_library
+from hoigs.core.time_rows import timed_parameters
 
 PAGEOUT = 21  # Linux's MADV_PAGEOUT: pages are read anew when they are used, nothing is lost
+PIECE = 256  # frames after which what was read for them is given back
+
+
+def release_time_rows(model: nn.Module) -> None:
+    """Give back the memory of rows for times that `restore_model` left in a file."""
+    release_pages(model.get_parameter(name) for name, _ in timed_parameters(model))
 
 
 def release_pages(tensors: Iterable[Tensor]) -> None:
