@@ -46,6 +46,7 @@ from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.preparation.estimates import FoundObject, RawEstimates
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.prepare import prepare, prepare_until, work_folder
+from hoigs.preparation.prompts import split_name
 from hoigs.preparation.saved import from_result
 from hoigs.preparation.stages.work_folder import ARRAYS, RESULT, Result
 
@@ -115,7 +116,7 @@ def measure(source: Path, keep: Path, args: argparse.Namespace) -> dict[str, Any
     raw, found = evidence(work_folder(out)), object_found(work_folder(out))
     row |= {**person_against(raw, source), **landmarks_against(raw, source)}
     if found is not None:
-        row |= objects_found(found) | object_against(raw, found, source)
+        row |= objects_found(found, clicks) | object_against(raw, found, source)
     if args.pictures and not args.until:
         file = args.pictures / f"{source.name}-{args.prompt}.png"
         draw_masks(ClipFolderReader().read(out), file)
@@ -197,9 +198,10 @@ def object_against(raw: RawEstimates, found: FoundObject, source: Path) -> dict[
     }
 
 
-def objects_found(found: FoundObject) -> dict[str, Any]:
+def objects_found(found: FoundObject, clicks: list[str]) -> dict[str, Any]:
     """Frames without each object, its share of the image, and what the tracker says of it."""
-    every = {"object": found, **found.further}
+    first = split_name(clicks[0])[0] if clicks else ""
+    every = {first or "object": found, **found.further}
     sizes = {n: [float(m.mean()) for m in f.masks] for n, f in every.items()}
     return {
         "frames_without": {n: sum(s == 0 for s in size) for n, size in sizes.items()},

@@ -54,7 +54,7 @@ def test_without_a_track_person_and_object_are_compared_together(source: Path) -
     found = SimpleNamespace(masks=[ball] * COUNT, further={}, notes=[])
     row = prepare_alone.object_against(found_person(person), found, source)
     assert row["person_and_object_iou"] == 1 and str(row["object_iou"]).startswith("not computed")
-    row |= prepare_alone.objects_found(found)
+    row |= prepare_alone.objects_found(found, ["4,2"])
     assert row["frames_without"] == {"object": 0}
     line = prepare_alone.table({"a, click": row | {"seconds": 9.4, "processor_seconds": 8.0}})
     assert line.splitlines()[-1] == "| a, click | - | - | 1.00, 1.00 | 0 | - | 9, 8 | - | - |"

@@ -7,7 +7,8 @@ Entry point: `estimator`. In the order in which they work:
 - `proposal`: what moves and is not the person, where nothing was clicked.
 - `prompts`: the mask in a clicked frame. `colors`, `walker`: what it is made with.
 - `path`: where the object is in each frame. `propagation`: its masks there, by `transfer` of labels
-  between `windows`. `tracker`: both, once more where `behind` knows better what is behind it.
+  between `windows`. `tracker`: both, and again by what is `behind` it, or from `anchors`, frames
+  in which it was found best.
 - `alike`: objects of which two tracks claim the same pixels. `notes`: what is doubtful.
 - `tracks_file`: the result, kept.
 """

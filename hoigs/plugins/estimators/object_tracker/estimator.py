@@ -32,12 +32,13 @@ from hoigs.plugins.estimators.object_tracker.prompts import (
     looks_like_person,
     prompted_mask,
 )
+from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.proposal import proposed
 from hoigs.plugins.estimators.object_tracker.scene import Scene, moving_scene, static_scene
-from hoigs.plugins.estimators.object_tracker.tracker import Track, at_rest, color_model, followed
+from hoigs.plugins.estimators.object_tracker.tracker import at_rest, color_model, followed
 from hoigs.plugins.estimators.object_tracker.tracks_file import read_tracks, write_tracks
 
-VERSION = 9  # of what is kept in `work`; raised when masks change
+VERSION = 10  # of what is kept in `work`; raised when masks change
 SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
 
 

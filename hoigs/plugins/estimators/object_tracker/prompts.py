@@ -219,7 +219,7 @@ def _grown(
     mask = _connected(soft > 0.5, window, seeds)
     if mask.sum() < 9:
         return None
-    score = _set_off(mask, colors, bins, valid)
+    score = set_off(mask, colors, bins, valid)
     soft = np.where(ndimage.binary_dilation(mask, iterations=2), soft, 0)
     return score * spread**0.1, window.paste(soft, footage.shape) / np.float32(255)
 
@@ -233,7 +233,7 @@ def _connected(mask: np.ndarray, window: Window, seeds: np.ndarray) -> np.ndarra
     return ndimage.binary_fill_holes(kept) if kept.any() else kept
 
 
-def _set_off(mask: np.ndarray, colors: np.ndarray, bins: np.ndarray, valid: np.ndarray) -> float:
+def set_off(mask: np.ndarray, colors: np.ndarray, bins: np.ndarray, valid: np.ndarray) -> float:
     """How well a mask's rim is an edge and its colours are not those around it, 0 to 1."""
     grown, shrunk = (
         ndimage.binary_dilation(mask, iterations=3) & valid,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.behind import Behind
@@ -20,6 +20,14 @@ from hoigs.plugins.estimators.object_tracker.windows import Window
 
 AGAIN, AHEAD = 6, 14  # frames after which the path is found anew, and how far
 SURE = 0.35  # confidence below which the object counts as not seen
+
+
+@dataclass(frozen=True)
+class Track:
+    """The result: soft masks as uint8 at the footage's size, and how sure each is."""
+
+    soft: UInt8[np.ndarray, "F h w"]
+    confidence: Float[np.ndarray, "F"]
 
 
 @dataclass(frozen=True)
@@ -48,7 +56,7 @@ class Propagation:
         self.footage, self.scene, self.colors, self.path = footage, scene, colors, path
         self.behind = behind
         self.unchanged = unchanged  # log-odds by which a pixel that shows the scene is not ours
-        window = _window_of(start.soft > 0.5)
+        window = window_of(start.soft > 0.5)
         self.first = self._sighting(start.frame, window, window.cut(start.soft))
         self.last = self.first
         self.center = np.array(window.center)  # of the last window
@@ -197,7 +205,7 @@ class Propagation:
     def _remember(self, i: int, pasted: np.ndarray, window: Window, confidence: float) -> None:
         mask = pasted > 127
         self.seen = (i, mask)
-        fresh = _window_of(mask) if mask.any() else window
+        fresh = window_of(mask) if mask.any() else window
         # the size changes slowly, so that windows of neighbouring frames can be compared
         if not 0.8 < fresh.n * fresh.step / (window.n * window.step) < 1.25:
             window = fresh
@@ -226,7 +234,7 @@ def _supported(mask: np.ndarray, prior: np.ndarray) -> np.ndarray:
     return np.isin(labels, rows[kept])
 
 
-def _window_of(mask: Bool[np.ndarray, "h w"]) -> Window:
+def window_of(mask: Bool[np.ndarray, "h w"]) -> Window:
     """A window with room about a mask."""
     y, x = np.nonzero(mask)
     half = 0.5 * max(np.ptp(x), np.ptp(y)) + 1

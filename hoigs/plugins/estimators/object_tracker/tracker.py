@@ -3,56 +3,59 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
+from hoigs.plugins.estimators.object_tracker.anchors import anchors
 from hoigs.plugins.estimators.object_tracker.behind import Behind
 from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram
 from hoigs.plugins.estimators.object_tracker.footage import Footage
 from hoigs.plugins.estimators.object_tracker.path import Path, found_path, path_of
-from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
-from hoigs.plugins.estimators.object_tracker.propagation import Propagation
+from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overlap
+from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Track
 from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, StaticScene, median_of
 
-
-@dataclass(frozen=True)
-class Track:
-    """The result: soft masks as uint8 at the footage's size, and how sure each is."""
-
-    soft: UInt8[np.ndarray, "F h w"]
-    confidence: Float[np.ndarray, "F"]
+SAME = 0.7  # intersection over union from which two passes agree on a frame
 
 
 def followed(
     footage: Footage,
     scene: Scene,
-    masks: Sequence[PromptedMask],
+    prompts: Sequence[PromptedMask],
     progress: Callable[[float], None] = lambda share: None,
 ) -> Track:
-    """Masks of all frames; in a second pass where the object hides a person who keeps still."""
-    first = tracked(footage, scene, masks, lambda x: progress(0.6 * x))
+    """Masks of all frames, in two passes: the second knows what is behind an object that hides a
+    person who keeps still, or follows any other from the frames in which the first found it best.
+    """
+    first = tracked(footage, scene, prompts, progress=lambda x: progress(0.5 * x))
     behind = None
     if isinstance(scene, StaticScene):
         behind = Behind.of(footage, scene, first.soft > 127)
-    if behind is None:
-        return first
-    return tracked_again(footage, behind, masks, first, lambda x: progress(0.6 + 0.4 * x))
+
+    def second(x: float) -> None:
+        progress(0.5 + 0.5 * x)
+
+    if behind is not None:
+        return tracked_again(footage, behind, prompts, first, second)
+    best = anchors(footage, first, prompts)
+    return _joined(first, tracked(footage, scene, prompts, best, second)) if best else first
 
 
 def tracked(
     footage: Footage,
     scene: Scene,
     prompts: Sequence[PromptedMask],
+    further: Sequence[PromptedMask] = (),
     progress: Callable[[float], None] = lambda share: None,
 ) -> Track:
-    """Masks of every frame from those of the prompted ones."""
+    """Masks of every frame from those of the prompted ones, and of `further` frames."""
+    rests = at_rest(scene, {p.frame: p.soft > 0.5 for p in prompts})
+    prompts = [*prompts, *further]
     known = {p.frame: p.soft > 0.5 for p in prompts}
     colors = color_model(footage, {p.frame: p.soft for p in prompts})
-    rests = at_rest(scene, known)
     moving = isinstance(scene, MovingScene)
     # what rests is a part of a still camera's scene; a moving one's is that of nearby frames
     used = scene if moving or not rests else None
@@ -61,6 +64,17 @@ def tracked(
     unchanged = 1.2 if stands else 0.1
     walk = partial(Propagation, footage, used, colors, path, unchanged=unchanged, moving=moving)
     return _walked(footage, prompts, walk, lambda x: progress(0.3 + 0.7 * x))
+
+
+def _joined(first: Track, again: Track) -> Track:
+    """The first pass where both have about the same: what comes from fewer frames drifts more, but
+    is not tied to the small faults of more of them. Elsewhere the second."""
+    pairs = zip(first.soft > 127, again.soft > 127, strict=True)
+    same = np.array([overlap(a, b) > SAME for a, b in pairs])
+    return Track(
+        np.where(same[:, None, None], first.soft, again.soft),
+        np.where(same, first.confidence, again.confidence),
+    )
 
 
 def tracked_again(

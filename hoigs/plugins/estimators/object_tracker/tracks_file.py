@@ -17,7 +17,7 @@ from hoigs.core.interfaces.estimator import (
     VideoRequest,
 )
 from hoigs.plugins.estimators.object_tracker.footage import Footage
-from hoigs.plugins.estimators.object_tracker.tracker import Track
+from hoigs.plugins.estimators.object_tracker.propagation import Track
 
 
 def write_tracks(

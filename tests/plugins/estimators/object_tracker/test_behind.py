@@ -11,8 +11,8 @@ from hoigs.plugins.estimators.object_tracker.behind import Behind
 from hoigs.plugins.estimators.object_tracker.colors import bins_of, histogram
 from hoigs.plugins.estimators.object_tracker.footage import Footage, lab_of
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overlap
+from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.scene import static_scene
-from hoigs.plugins.estimators.object_tracker.tracker import Track
 from hoigs.plugins.estimators.object_tracker.windows import Window
 
 
