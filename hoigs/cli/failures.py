@@ -54,11 +54,15 @@ class GuardedGroup(TyperGroup):
 @contextmanager
 def failures_as_messages() -> Iterator[None]:
     """Turn failures of the block into a message on stderr and SystemExit."""
-    before = _stop_on_sigterm()
+    before = _raise_stops()
     try:
         yield
     except KeyboardInterrupt as stop:
         _end(stop)
+    except SystemExit as leaving:
+        if _stops and leaving.code == 128 + signal.SIGINT:  # typer's, without a word
+            _end(_stops[0])
+        raise
     except Exception as error:
         stop_within = _stop_within(error)
         if stop_within is not None:
@@ -69,20 +73,26 @@ def failures_as_messages() -> Iterator[None]:
         print(f"error: {printable(message)}", file=sys.stderr)
         sys.exit(2)
     finally:
-        if before is not None:
-            signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _end(stop: KeyboardInterrupt) -> NoReturn:
+    _stops.clear()
     print(str(stop) or "stopped", file=sys.stderr)
     sys.exit(stop.code if isinstance(stop, Interrupted) else 128 + signal.SIGINT)
 
 
-def _stop_within(error: BaseException | None) -> KeyboardInterrupt | None:
-    """The Ctrl-C or SIGTERM that caused an error, as it does within the import of an extension."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error
+def _stop_within(error: BaseException) -> KeyboardInterrupt | None:
+    """The Ctrl-C or SIGTERM that caused an error.
+
+    It is in the error's chain where an extension's import was stopped; compiled code that reads a
+    file raises an error of its own, and keeps nothing of the stop.
+    """
+    found: BaseException | None = error
+    while found is not None and not isinstance(found, KeyboardInterrupt):
+        found = found.__cause__ or found.__context__
+    return found or (_stops[0] if _stops else None)
 
 
 def message_of(error: Exception) -> str | None:
@@ -115,20 +125,27 @@ def _first_line(error: Exception) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
-def _stop_on_sigterm() -> Any:
+_stops: list[Interrupted] = []  # that were raised, and have not ended the command yet
+
+
+def _raise_stops() -> dict[signal.Signals, Any]:
     """Let SIGTERM end the command as Ctrl-C does, so that temporary files are removed.
 
     Returns:
-        the handler before, or None where none was replaced.
+        the handlers before, of signals whose handler was replaced: whoever has set one keeps it.
     """
     if threading.current_thread() is not threading.main_thread():
-        return None
-    before = signal.getsignal(signal.SIGTERM)
-    if before is not signal.SIG_DFL:
-        return None
-    signal.signal(signal.SIGTERM, _stop)
+        return {}
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    before = {n: handler for n, handler in usual.items() if signal.getsignal(n) is handler}
+    if before:
+        _stops.clear()
+    for number in before:
+        signal.signal(number, _stop)
     return before
 
 
 def _stop(number: int, _: FrameType | None) -> NoReturn:
-    raise Interrupted("stopped", number)
+    stop = Interrupted("stopped", number)
+    _stops.append(stop)
+    raise stop

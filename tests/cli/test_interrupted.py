@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 
 import pytest
@@ -9,6 +10,7 @@ from small_clip import small_clip
 
 from hoigs.cli.display import Display
 from hoigs.core.clip_folder.write import write_clip
+from hoigs.core.errors import HoigsError
 
 SMALL = ["--device", "cpu", "--set", "train.steps=9", "--set", "train.preview_every=0",
          "--set", "train.log_every=1"]  # fmt: skip
@@ -82,6 +84,32 @@ def test_a_signal_within_the_import_of_an_extension(hoigs, monkeypatch, number, 
             raise ImportError("initialization failed") from stop
 
     monkeypatch.setattr("hoigs.workflows.doctor.doctor", fails)
+    stopped = hoigs("doctor")
+    assert (stopped.code, stopped.err) == (code, "stopped\n")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_that_compiled_code_turns_into_an_error_of_its_own(
+    hoigs, monkeypatch, number, code
+):
+    """As safetensors does while it opens a file, which would be called damaged."""
+
+    def fails() -> None:
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(number)
+        raise HoigsError("damaged")
+
+    monkeypatch.setattr("hoigs.workflows.doctor.doctor", fails)
+    stopped = hoigs("doctor")
+    assert (stopped.code, stopped.err) == (code, "stopped\n")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_while_options_are_read(hoigs, monkeypatch, number, code):
+    def stop(*_: object, **__: object) -> None:
+        signal.raise_signal(number)
+
+    monkeypatch.setattr("hoigs.cli.failures.GuardedGroup.make_context", stop)
     stopped = hoigs("doctor")
     assert (stopped.code, stopped.err) == (code, "stopped\n")
 
