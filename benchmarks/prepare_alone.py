@@ -80,7 +80,8 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as temporary:
             row = measure(SHARED / "data" / name, (args.keep or Path(temporary)).absolute(), args)
         print(name, json.dumps(row, indent=1))
-        found[f"{name}, {args.prompt}, complexity {args.complexity}"] = row
+        key = f"{name}, {args.prompt}, complexity {args.complexity}"
+        found[key] = found.get(key, {}) | row  # a training stays, which --train made earlier
         if args.json:
             args.json.write_text(json.dumps(found, indent=1) + "\n")
     return 0
