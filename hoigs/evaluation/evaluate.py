@@ -13,6 +13,7 @@ from torch import Tensor
 
 from hoigs.core.errors import did_you_mean
 from hoigs.core.interfaces.rasterizer import RenderOutput
+from hoigs.core.machine.busy import short_waits_when_busy
 from hoigs.core.machine.pages import PIECE, release_time_rows
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
@@ -33,6 +34,7 @@ from hoigs.metrics.ssim import ssim_map
 TIMING_SHARE, FITTING_SHARE = 0.3, 0.5  # of the progress bar
 
 
+@short_waits_when_busy()
 def evaluate(
     model: SceneModel,
     clip: Clip,

@@ -15,6 +15,7 @@ from hoigs.core.clip_folder.write import refuse_to_overwrite
 from hoigs.core.errors import ClipError, HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.machine.busy import short_waits_when_busy
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.storage.fetch import local_path
@@ -170,6 +171,7 @@ def prepare_until(
     return pipeline.stages.seconds
 
 
+@short_waits_when_busy()
 def _run(
     source: str | Path,
     out: str | Path,

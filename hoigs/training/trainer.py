@@ -14,6 +14,7 @@ from hoigs.core.clip_folder.health import depth_factor
 from hoigs.core.errors import CheckpointError, Interrupted
 from hoigs.core.interfaces.deformation import DeformationModel, StepStatistics
 from hoigs.core.interfaces.density import DensityControl, DensityStatistics, check_rasterizer
+from hoigs.core.machine.busy import short_waits_when_busy
 from hoigs.core.model.camera_refinement import CameraRefinement, check_camera_gradients
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.train_schema import TrainSpec
@@ -144,6 +145,7 @@ class Trainer:
         frames = self.clip.num_frames
         return TimeWindows(self.model, self.optimizer, frames, self.spec.chunk, fixed, folder)
 
+    @short_waits_when_busy()
     def train(
         self, on_step: Callable[[StepReport], object] | None = None, *, until: int | None = None
     ) -> None:

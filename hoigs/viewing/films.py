@@ -14,6 +14,7 @@ from torch import Tensor
 
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
+from hoigs.core.machine.busy import short_waits_when_busy
 from hoigs.core.machine.pages import PIECE, release_time_rows
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
@@ -67,6 +68,7 @@ class Film:
         )
 
 
+@short_waits_when_busy()
 def render(
     run: Path | str,
     *,

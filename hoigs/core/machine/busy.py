@@ -79,13 +79,21 @@ class Waiting:
         self.short = short
 
 
+_one = threading.Lock()  # held by the block that looks
+
+
 @contextmanager
 def short_waits_when_busy() -> Iterator[None]:
     """In the block, look every second whether this process has to queue for processors.
 
-    Nothing is done under other settings than those of `share_processors`, or where torch uses
-    another library than libgomp.
+    Nothing is done within another such block, where a user has set how threads wait, where the
+    system does not say how long they queue, or where torch uses another library than libgomp.
     """
+    users = {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & os.environ.keys()
+    ours = not users or os.environ.get("GOMP_SPINCOUNT") == SHORT_SPIN
+    if not ours or scheduled() is None or not _one.acquire(blocking=False):
+        yield
+        return
     waiting, ended = Waiting(), threading.Event()
 
     def watch() -> None:
@@ -93,16 +101,15 @@ def short_waits_when_busy() -> Iterator[None]:
             waiting.look()
         waiting.set(False)
 
+    c_library()  # before there is a second thread
     watcher = threading.Thread(target=watch, name="hoigs-waits", daemon=True)
-    if os.environ.get("GOMP_SPINCOUNT") == SHORT_SPIN:
-        c_library()  # before there is a second thread
-        watcher.start()
+    watcher.start()
     try:
         yield
     finally:
         ended.set()
-        if watcher.is_alive():  # no thread is to run on while the interpreter ends
-            watcher.join()
+        watcher.join()  # no thread is to run on while the interpreter ends
+        _one.release()
 
 
 def scheduled() -> tuple[int, int] | None:

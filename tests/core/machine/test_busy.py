@@ -54,11 +54,12 @@ def test_a_machine_is_busy_where_threads_queue(monkeypatch, ran, queued, short):
 
 
 TRIAL = """
-import json, os, threading, time
+import json, os, sys, threading, time
 from hoigs.core.machine import busy
 
 busy.INTERVAL = 0.2
-busy.share_processors()
+if "command" in sys.argv:
+    busy.share_processors()
 import torch
 
 torch.set_num_threads(2)
@@ -77,11 +78,12 @@ one = {min(os.sched_getaffinity(0))}
 for task in os.listdir("/proc/self/task"):
     os.sched_setaffinity(int(task), one)
 before = measure(0.5)
-with busy.short_waits_when_busy():
+with busy.short_waits_when_busy(), busy.short_waits_when_busy():
+    watchers = [t.name for t in threading.enumerate()].count("hoigs-waits")
     measure(1)
     during = measure(0.5)
 left = [t.name for t in threading.enumerate()]
-print(json.dumps([before[0], during[0], list(before[1] | during[1]), left]))
+print(json.dumps([before[0], during[0], list(before[1] | during[1]), watchers, left]))
 """
 
 
@@ -89,16 +91,18 @@ print(json.dumps([before[0], during[0], list(before[1] | during[1]), left]))
     not sys.platform.startswith("linux") or available_cpus() < 2 or busy.scheduled() is None,
     reason="needs two processors and /proc/self/task/*/schedstat",
 )
-def test_threads_that_queue_do_not_spin():
+@pytest.mark.parametrize("how", ["command", "from Python"])
+def test_threads_that_queue_do_not_spin(how):
     """Two threads on one processor: each spins while the other one would have to run."""
     environment = {k: v for k, v in os.environ.items() if k not in NAMES}
     done = subprocess.run(
-        [sys.executable, "-c", TRIAL], env=environment, capture_output=True, text=True, check=True
-    )
-    before, during, sums, left = json.loads(done.stdout)
+        [sys.executable, "-c", TRIAL, how],
+        env=environment, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    before, during, sums, watchers, left = json.loads(done.stdout)
     assert during < before / 3, (before, during)
     assert len(sums) == 1, "as many threads work as before"
-    assert left == ["MainThread"]
+    assert watchers == 1 and left == ["MainThread"]
 
 
 IMPORTS = """
