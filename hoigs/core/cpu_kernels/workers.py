@@ -47,6 +47,16 @@ class ThreadWorkers:
     _owner = 0
 
     def run(self, launches: Sequence[Any]) -> None:
+        try:
+            self._run(launches)
+        except KeyboardInterrupt:
+            # A stop within the start of a thread leaves one that its pool does not know, and
+            # Python would wait for it at its end. A pool that is shut down wakes it.
+            self._executor().shutdown(wait=False)
+            type(self)._pool = None
+            raise
+
+    def _run(self, launches: Sequence[Any]) -> None:
         others = [(self._executor().submit(launch.launch), launch) for launch in launches[1:]]
         launches[0].launch()
         for future, launch in reversed(others):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -45,3 +47,32 @@ def test_an_error_of_a_worker_reaches_the_caller() -> None:
 
     with pytest.raises(RuntimeError, match="no memory"):
         ThreadWorkers().run([Launch(), Broken()])
+
+
+STOPPED = """
+import threading
+from hoigs.core.cpu_kernels.workers import ThreadWorkers
+
+start = threading.Thread.start
+
+
+def stopped(self):
+    start(self)
+    raise KeyboardInterrupt
+
+
+class Launch:
+    def launch(self):
+        pass
+
+
+threading.Thread.start = stopped
+ThreadWorkers().run([Launch(), Launch()])
+"""
+
+
+def test_a_stop_while_a_thread_starts_leaves_none_that_python_waits_for() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", STOPPED], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert "KeyboardInterrupt" in done.stderr
