@@ -23,7 +23,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from itertools import product
@@ -221,22 +221,28 @@ def _add(
         temporary.replace(options.json)
 
 
+FIGURES = ("joints mm", "wrists mm", "acceleration m/s²", "rotation °", "place mm", "Chamfer mm")
+
+
 def table(rows: list[dict[str, Any]]) -> str:
-    """Markdown: what was estimated, and PSNR of person + object beside the run with all poses."""
+    """Markdown: what was estimated, and PSNR of person + object beside the run with all poses; of
+    rows without trainings, the noise of the landmarks and the source of the cameras."""
+    trained = [row for row in rows if "estimated" in row]
+    if not trained:
+        first = ("clip", "seed", "noise", "camera", *FIGURES)
+        lines = [
+            [*_first(row), f"{row['noise_px']:g} px, {row['noise_cm']:g} cm", row["camera"],
+             *_figures(row)]
+            for row in rows if "rotation_deg" in row
+        ]  # fmt: skip
+        return _markdown(first, lines)
     head = (
-        "clip", "seed", "joints mm", "wrists mm", "acceleration m/s²", "rotation °", "place mm",
-        "Chamfer mm", "path", "path, all given", "held out", "held out, all given",
+        "clip", "seed", *FIGURES, "path", "path, all given", "held out", "held out, all given",
         "object held out", "object held out, all given",
     )  # fmt: skip
-    lines = [head, ["---"] * len(head)]
-    for row in rows:
-        if "estimated" not in row:
-            continue
-        found: list[Any] = [
-            row["clip"].removeprefix("builtin:").split("?")[0], row["seed"],
-            row["root_aligned_joints_mm"], row["wrists_mm"], row["acceleration_error_m_s2"],
-            row["rotation_deg"]["median"], row["place_mm"]["mean"], row["chamfer_mm"],
-        ]  # fmt: skip
+    lines = []
+    for row in trained:
+        found: list[Any] = [*_first(row), *_figures(row)]
         given = row.get("every_pose_given")
         runs = (row["estimated"]["blended poses"], given and given["given poses"])
         for view, region in (
@@ -244,8 +250,24 @@ def table(rows: list[dict[str, Any]]) -> str:
             ("held-out cameras", "object"),
         ):  # fmt: skip
             found += [run[view][region] if run else "-" for run in runs]
-        lines.append([str(value) for value in found])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        lines.append(found)
+    return _markdown(head, lines)
+
+
+def _markdown(head: Sequence[str], lines: Sequence[Sequence[Any]]) -> str:
+    every = [head, ["---"] * len(head), *lines]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in every)
+
+
+def _first(row: dict[str, Any]) -> list[Any]:
+    return [row["clip"].removeprefix("builtin:").split("?")[0], row["seed"]]
+
+
+def _figures(row: dict[str, Any]) -> list[Any]:
+    return [
+        row["root_aligned_joints_mm"], row["wrists_mm"], row["acceleration_error_m_s2"],
+        row["rotation_deg"]["median"], row["place_mm"]["mean"], row["chamfer_mm"],
+    ]  # fmt: skip
 
 
 def _line(row: dict[str, Any]) -> str:
