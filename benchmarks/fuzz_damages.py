@@ -203,10 +203,7 @@ def _npy(data: bytes, rng: random.Random, mark: Path) -> bytes:
 def _pickle(data: bytes, rng: random.Random, mark: Path) -> bytes:
     """A pickled dictionary, or joblib's, with another value, in the same form."""
     try:
-        tree, dump = (
-            pickle.loads(data),
-            pickle.dumps,
-        )  # the fuzzer's own file
+        tree, dump = pickle.loads(data), pickle.dumps  # of the fuzzer's own file
     except (pickle.UnpicklingError, KeyError, EOFError, ValueError, IndexError):
         import joblib
 

@@ -40,6 +40,7 @@ TOO_LARGE = (
     "there is not enough memory; reduce what is held at once (--set train.width=320, "
     "--set model.human.points=5000, a shorter clip), or stop other programs"
 )
+_stops: list[Interrupted] = []  # that were raised, and have not ended the command yet
 ALLOCATORS = ("DefaultCPUAllocator", "out of memory", "Failed to allocate", "Storage size calc")
 
 
@@ -125,11 +126,9 @@ def _first_line(error: Exception) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
-_stops: list[Interrupted] = []  # that were raised, and have not ended the command yet
-
-
 def _raise_stops() -> dict[signal.Signals, Any]:
-    """Let SIGTERM end the command as Ctrl-C does, so that temporary files are removed.
+    """Let SIGTERM end the command as Ctrl-C does, so that temporary files are removed, and keep
+    either in `_stops`.
 
     Returns:
         the handlers before, of signals whose handler was replaced: whoever has set one keeps it.

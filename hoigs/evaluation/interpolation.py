@@ -9,26 +9,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.maths.rotations import (
-    axis_angle_to_quats,
-    matrices_to_quats,
-    quats_to_axis_angle,
-    quats_to_matrices,
-    slerp,
-)
+from hoigs.core.values.between import blend_cameras, blend_poses
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 
 
 def pose_between(a: BodyPose, b: BodyPose, r: float) -> BodyPose:
-    """Joint rotations by SLERP, translation and shape linearly; r in [0, 1]."""
-    turned = quats_to_axis_angle(
-        slerp(axis_angle_to_quats(a.rotations), axis_angle_to_quats(b.rotations), r)
-    )
-    turned = nearest_axis_angle(turned, a.rotations)
-    return with_rotations(a, turned).replace(
-        transl=torch.lerp(a.transl, b.transl, r), betas=torch.lerp(a.betas, b.betas, r)
-    )
+    """`blend_poses`, with the axis-angles that are nearer to those of `a`; r in [0, 1]."""
+    between = blend_poses(a, b, r)
+    return with_rotations(between, nearest_axis_angle(between.rotations, a.rotations))
 
 
 def with_rotations(pose: BodyPose, rotations: Float[Tensor, "52 3"]) -> BodyPose:
@@ -56,10 +45,5 @@ def nearest_axis_angle(
 
 
 def camera_between(a: Camera, b: Camera, r: float) -> Camera:
-    """Rotation by SLERP, centre linearly, intrinsics of `a`; r in [0, 1]."""
-    quats = [matrices_to_quats(c.world_to_camera[:3, :3]) for c in (a, b)]
-    R = quats_to_matrices(slerp(quats[0], quats[1], r))
-    viewmat = a.world_to_camera.clone()
-    viewmat[:3, :3] = R
-    viewmat[:3, 3] = -R @ torch.lerp(a.center, b.center, r)
-    return replace(a, world_to_camera=viewmat)
+    """`blend_cameras` with the intrinsics of `a`; r in [0, 1]."""
+    return replace(a, world_to_camera=blend_cameras(a, b, r).world_to_camera)

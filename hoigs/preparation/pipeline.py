@@ -99,12 +99,12 @@ class Pipeline:
         load: Callable[[Result], T] = from_result,
     ) -> T:
         """`KeptStages.run` with the options as they are now."""
-        return self.kept.run(name, self._set_to(), make, made_from, save, load, self._remarks)
+        return self.kept.run(name, self._settings(), make, made_from, save, load, self._video_notes)
 
-    def _set_to(self) -> dict[str, Any]:
+    def _settings(self) -> dict[str, Any]:
         return self.options.model_dump(mode="json")
 
-    def _remarks(self) -> Sequence[str]:
+    def _video_notes(self) -> Sequence[str]:
         return self.video.notes if hasattr(self, "video") else []
 
     def _frames(self) -> None:
@@ -250,7 +250,7 @@ class Pipeline:
         known = [p for p in (self.source.colmap, self.source.cameras, lens) if p is not None]
         known += [] if self.bodies is None else [self.bodies.path]
         files = [[str(path), fingerprint([path])] for path in known]
-        folder = self.work.unfinished("cameras", self.kept.key("cameras", self._set_to(), files))
+        folder = self.work.unfinished("cameras", self.kept.key("cameras", self._settings(), files))
         chosen = self._stage(
             "cameras", lambda: self._choose_cameras(folder), files, save_cameras, load_cameras
         )

@@ -55,6 +55,8 @@ def write_tracks(
 
 
 def read_tracks(file: Path, video: VideoRequest, names: Sequence[str]) -> EntityMasks:
+    """The masks of objects by name, at the video's size and empty in frames that were not wanted,
+    with the prompts and notes of `write_tracks`."""
     with np.load(file, allow_pickle=False) as saved:
         about = json.loads(str(saved["about"]))
         soft = {n: saved[f"soft {n}"] for n in names}
