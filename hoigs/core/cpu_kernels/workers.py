@@ -57,11 +57,11 @@ class ThreadWorkers:
             raise
 
     def _run(self, launches: Sequence[Any]) -> None:
-        others = [(self._executor().submit(launch.launch), launch) for launch in launches[1:]]
+        others = [(self._executor().submit(task), task) for task in map(_Task, launches[1:])]
         launches[0].launch()
-        for future, launch in reversed(others):
+        for future, task in reversed(others):
             if future.cancel():  # its worker has not begun, as on a busy machine
-                launch.launch()
+                task()
             else:
                 future.result()
 
@@ -71,6 +71,22 @@ class ThreadWorkers:
             cls._pool = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="hoigs-warp")
             cls._owner = os.getpid()
         return cls._pool
+
+
+class _Task:
+    """A launch that is let go when it is done.
+
+    A pool's thread drops what it ran, or would have run, when it gets a processor again. Arrays
+    that live on until then may keep the graph of a step, and with it the shapes that parameters had
+    in that step, beyond the moment at which they change.
+    """
+
+    def __init__(self, launch: Any) -> None:
+        self._launch = launch
+
+    def __call__(self) -> None:
+        launch, self._launch = self._launch, None
+        launch.launch()
 
 
 def shared(kernel: Any, items: int, arguments: Sequence[Any]) -> None:

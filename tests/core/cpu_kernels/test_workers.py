@@ -5,7 +5,9 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+import weakref
 from concurrent.futures import ThreadPoolExecutor
+from typing import ClassVar
 
 import pytest
 
@@ -38,6 +40,33 @@ def test_the_caller_does_what_no_worker_has_begun(monkeypatch: pytest.MonkeyPatc
         free.set()
     caller = threading.current_thread().name
     assert [launch.threads for launch in launches] == [[caller]] * 3
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_nothing_of_a_launch_lives_on_in_a_worker(
+    begun: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Pool(ThreadPoolExecutor):
+        kept: ClassVar[list[object]] = []
+
+        def submit(self, task, /, *args, **kwargs):  # type: ignore[no-untyped-def]
+            self.kept.append(task)  # as a thread does that gets no processor again for a while
+            future = super().submit(task, *args, **kwargs)
+            if begun:
+                future.exception()
+            return future
+
+    free = threading.Event()
+    with Pool(1) as pool:
+        if not begun:
+            ThreadPoolExecutor.submit(pool, free.wait, 10.0)
+        monkeypatch.setattr(ThreadWorkers, "_executor", lambda _: pool)
+        launches = [Launch() for _ in range(2)]
+        gone = [weakref.ref(launch) for launch in launches]
+        ThreadWorkers().run(launches)
+        del launches
+        assert [ref() for ref in gone] == [None, None] and pool.kept
+        free.set()
 
 
 def test_an_error_of_a_worker_reaches_the_caller() -> None:
