@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Iterator
+from enum import Enum
 from typing import Any
 
 # beside the names of `hoigs` itself: what plugins import
@@ -69,6 +70,8 @@ def _lines(name: str, value: Any) -> Iterator[str]:
 
 def _arguments(value: Any) -> str:
     """(name, other=default) without types; defaults that are objects are shown as ..."""
+    if isinstance(value, type) and issubclass(value, Enum):  # whose signature is Python's own
+        return f"({', '.join(value.__members__)})"
     try:
         parameters = inspect.signature(value).parameters.values()
     except (TypeError, ValueError):

@@ -234,7 +234,7 @@ def test_a_damaged_compact_run_is_told(run, tmp_path):
     data = bytearray(weights.read_bytes())
     data[-500] ^= 0x10
     weights.write_bytes(bytes(data))
-    with pytest.raises(CheckpointError, match=r"step_000030\.safetensors: .*damaged"):
+    with pytest.raises(CheckpointError, match=r"step_000030\.safetensors: .*(damaged|restore it)"):
         LoadedRun.open(tmp_path / "small")
     weights.write_bytes(bytes(data[:-2000]))
     with pytest.raises(CheckpointError, match="damaged or absent"):
