@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Bool, Float
-from PIL import Image
 from pydantic import Field
 
 from hoigs.core.config import ComponentConfig
@@ -28,12 +27,12 @@ from hoigs.core.interfaces.estimator import (
     Estimator,
     FramePrompt,
     Landmarks,
-    LazyFrames,
     VideoRequest,
 )
 from hoigs.core.progress import Progress, no_progress
 from hoigs.plugins.estimators.common.environments import HEAVY, MEDIAPIPE
 from hoigs.plugins.estimators.common.subprocess import run_tool, settings_key
+from hoigs.plugins.estimators.mediapipe_masks import frames_of, steadied
 
 SCRIPT = Path(__file__).with_name("mediapipe_script.py")
 PARTS = ("guided", "chosen", "people", "look")
@@ -142,11 +141,14 @@ class MediapipeEstimator(Estimator):
             landmarks[name] = Landmarks(image, world, text)
         if not self.config.masks:
             return Estimates(landmarks=landmarks)
+        frames = _frames(video, given, progress, "masks")
+        persons, still = steadied(out, found["person"], found["size"], frames, video)
         masks = {
-            name: _frames_of(found["person"][k], found["size"], first, video)
+            name: frames_of(persons[k], found["size"], first, video)
             for k, name in enumerate(people)
         }
         text = "MediaPipe's segmentation of selfies and of poses; it takes in what is held"
+        text += "; the same wherever frames of the still camera are" if still else ""
         text += "; of the person clicked on" if chosen else ""
         images = {name: track.image_xyzv for name, track in landmarks.items()}
         notes = _lost(given, images) if chosen else _others(found["several"], images[people[0]])
@@ -311,25 +313,10 @@ def _order(given: range, video: VideoRequest) -> tuple[list[int], dict[str, Any]
     return order, {"prompts": prompts, "order": order, "back": back, "shown": len(shown)}
 
 
-def _frames(video: VideoRequest, order: Sequence[int], progress: Progress) -> Iterator[np.ndarray]:
+def _frames(
+    video: VideoRequest, order: Sequence[int], progress: Progress, what: str = "landmarks"
+) -> Iterator[np.ndarray]:
     """The given frames, reporting progress."""
     for done, i in enumerate(order):
-        progress(done / len(order), "landmarks")
+        progress(done / len(order), what)
         yield video.frame(i)
-
-
-def _frames_of(bits: np.ndarray, size: np.ndarray, first: int, video: VideoRequest) -> LazyFrames:
-    """Masks of the video's size from bits, whose first row is of frame `first`; empty ones of
-    frames that were not looked at."""
-    width, height = (video.width, video.height)
-
-    def read(i: int) -> Bool[np.ndarray, "H W"]:
-        if not 0 <= i - first < len(bits):
-            return np.zeros((height, width), dtype=bool)
-        mask = np.unpackbits(bits[i - first], axis=1, count=int(size[0])).astype(bool)
-        if mask.shape == (height, width):
-            return mask
-        large = Image.fromarray(mask.astype(np.uint8) * 255)
-        return np.asarray(large.resize((width, height), Image.Resampling.BILINEAR)) > 127
-
-    return LazyFrames(video.frames, read)
