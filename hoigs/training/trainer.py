@@ -45,7 +45,7 @@ from hoigs.training.optimizer import GroupedAdam, entity_extent
 from hoigs.training.sampler import EpochSampler
 from hoigs.training.stop_request import StopRequest, resume_command
 from hoigs.training.time_windows import TimeWindows
-from hoigs.training.unseen import fill_unseen
+from hoigs.training.unseen import fill_unseen, spare_hidden
 from hoigs.training.views import TrainingViews
 
 
@@ -133,6 +133,7 @@ class Trainer:
             if not control.keeps_all
         }
         self._fills = {max(1, round(share * spec.steps)) for share in spec.fill_unseen}
+        self.hidden: dict[str, torch.Tensor] = {}  # of scenes, see `spare_hidden`
         self.guard = NanGuard()
         self.viewed = False
         self.step = 0
@@ -231,6 +232,7 @@ class Trainer:
             self.optimizer.zero_grad()
             return None
         self.guard.passed()
+        spare_hidden(self.model, self.hidden)
         interval = self.spec.sh_interval
         self.optimizer.step(None if interval is None else self.step // interval)
         if self.windows is not None:
@@ -239,7 +241,7 @@ class Trainer:
         self._evolve(result, view.frame.moment, fixed)
         self._refine(result, camera.width, camera.height)
         if self.step in self._fills:
-            fill_unseen(
+            self.hidden = fill_unseen(
                 self.model, self.clip, shapes=self.step < self.spec.steps,
                 opposite=self.spec.unseen_sides == "opposite",
             )  # fmt: skip
@@ -339,6 +341,7 @@ class Trainer:
             tensors |= {f"cameras.{k}": v for k, v in self.cameras.state_dict().items()}
         if self.windows is not None:
             tensors |= {f"windows.{k}": v for k, v in self.windows.state().items()}
+        tensors |= {f"hidden.{k}": v for k, v in self.hidden.items()}
         tensors["rng.generator"] = self.generator.get_state()
         tensors["rng.torch"] = torch.get_rng_state()
         meta = {
@@ -382,6 +385,8 @@ class Trainer:
             density.statistics = DensityStatistics.zeros(len(density.entity), self.model.device)
             for key, value in stored.items():
                 setattr(density.statistics, key, value.to(self.model.device).clone())
+        hidden = checkpoint.part("hidden")
+        self.hidden = {name: kept.to(self.model.device) for name, kept in hidden.items()}
         self.generator.set_state(checkpoint.tensors["rng.generator"])
         torch.set_rng_state(checkpoint.tensors["rng.torch"])
         self.sampler.load(checkpoint.meta["sampler"])

@@ -15,14 +15,9 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.synthesis import SceneConfig, builtin_clip
-from hoigs.training.unseen import (
-    _weights,
-    confidence,
-    fill_unseen,
-    opposite_points,
-    seen_weights,
-    spread,
-)
+from hoigs.training.unseen import fill_unseen
+from hoigs.training.unseen.neighbours import opposite_points, spread
+from hoigs.training.unseen.weights import blending_weights, confidence, seen_weights
 
 
 def ring(count: int) -> torch.Tensor:
@@ -103,8 +98,8 @@ def test_colours_of_unseen_sides_change_and_images_of_training_frames_do_not(
     moment, camera = clip[0].moment, clip[0].camera
     drawn = model(moment).joined().detach()
     maps = list(torch.rand(4, camera.height, camera.width))  # more than a picture has channels
-    together = _weights(model, drawn, camera, maps)
-    apart = [_weights(model, drawn, camera, [one])[0] for one in maps]
+    together = blending_weights(model, drawn, camera, maps)
+    apart = [blending_weights(model, drawn, camera, [one])[0] for one in maps]
     torch.testing.assert_close(torch.stack(together), torch.stack(apart))
     assert seen is not None and 0.2 < (seen > 0.5).float().mean() < 0.8
     before = human.sh.detach().clone()[:, 0]

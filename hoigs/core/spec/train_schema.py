@@ -163,8 +163,9 @@ class TrainSpec(_Strict):
     the start."""
     fill_unseen: tuple[Annotated[float, Field(gt=0, le=1)], ...] = ()
     """Shares of the steps after which sides of people and objects that no training frame shows take
-    their colour, and people their shape too, from what lies beside them (hoigs/training/unseen.py);
-    with 1.0 the colours are filled again at the end. Empty: they stay as they are."""
+    their colour, and people their shape too, from what lies beside them, and so does the scene that
+    they hide (hoigs/training/unseen); with 1.0 the colours are filled again at the end. Empty: they
+    stay as they are."""
     unseen_sides: Literal["neighbours", "opposite"] = "neighbours"
     """Where these colours come from. "neighbours" continues what was seen beside them, and on the
     other half of the body, which leaves no pattern; "opposite" also takes the pattern of the other
