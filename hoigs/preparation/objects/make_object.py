@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -34,6 +35,7 @@ ObjectWay = Literal["auto", "ball", "texture", "outline"]
 
 COLOR_FRAMES = 24  # a median over more changes nothing visible
 FOOTBALL = 0.11  # metres
+COVERED, COVERS_MORE = 0.7, 0.1  # IoU with the masks below which another way is tried, and is taken
 FARTHEST_OUTLINE = 0.5  # of its size: what is farther off its masks is no object
 
 
@@ -163,10 +165,11 @@ def make_object(
             count: of points.
     """
     hiding = MaskStack(h | o for h, o in zip(humans, others, strict=True))
+    colored = partial(_colored, masks=masks, humans=hiding, cameras=cameras, images=images)
     if ball is not None:
         track, normals, spread = ball_object(ball, cameras, radius or FOOTBALL, count)
         confidence = ObjectConfidence.none("ball", len(cameras), "a ball's spin is not tracked")
-        return _colored(track, normals, spread, confidence, masks, hiding, cameras, images)
+        return colored(track, normals, spread, confidence)
     reasons = []
     if way in ("auto", "ball"):
         try:
@@ -176,40 +179,55 @@ def make_object(
             track, normals, confidence = round_object(
                 cones, masks, cameras, joints, parents, radius, count
             )
-            return _colored(
-                track, normals, cones.jitter, confidence, masks, hiding, cameras, images
-            )
+            return colored(track, normals, cones.jitter, confidence)
         except NoBallError as reason:
             if way == "ball":
                 reasons.append(f"it cannot be posed as a ball: {reason}")
+    made = None
     try:
         if way == "outline":
             raise UntrackableError("object_track is outline")
         track, normals, confidence = tracked_object(
-            masks,
-            humans,
-            others,
-            cameras,
-            joints,
-            parents,
-            images,
-            count,
-            fps,
-            progress,
+            masks, humans, others, cameras, joints, parents, images, count, fps, progress,
             depths=depths,
-        )
-        spread = float(np.nanmean(confidence.outline) / track.points.norm(dim=-1).mean())
-        if not spread < FARTHEST_OUTLINE:
-            raise UntrackableError(
-                f"the shape found by its texture is off its masks' outlines by {100 * spread:.0f} "
-                f"% of its size ({100 * FARTHEST_OUTLINE:.0f} % at most)"
-            )
+        )  # fmt: skip
+        made = colored(track, normals, _spread(track, confidence), confidence)
+        if way == "texture" or np.nanmean(made.ious) >= COVERED:
+            return made
     except UntrackableError as reason:
-        wrists = None if joints is None else joints[:, [LEFT_WRIST, RIGHT_WRIST]]
-        track, normals, spread = held_object(masks, list(cameras), wrists, count, depths)
         reasons.append(str(reason))
-        confidence = ObjectConfidence.none("outline", len(cameras), "; ".join(reasons))
-    return _colored(track, normals, spread, confidence, masks, hiding, cameras, images)
+    wrists = None if joints is None else joints[:, [LEFT_WRIST, RIGHT_WRIST]]
+    track, normals, spread = held_object(masks, list(cameras), wrists, count, depths)
+    confidence = ObjectConfidence.none("outline", len(cameras), "; ".join(reasons))
+    rough = colored(track, normals, spread, confidence)
+    return rough if made is None else _covering(made, rough)
+
+
+def _spread(track: ObjectTrack, confidence: ObjectConfidence) -> float:
+    """How far the shape is off the masks' outlines, relative to its size.
+
+    Raises:
+        UntrackableError: so far that it is no shape.
+    """
+    spread = float(np.nanmean(confidence.outline) / track.points.norm(dim=-1).mean())
+    if not spread < FARTHEST_OUTLINE:
+        raise UntrackableError(
+            f"the shape found by its texture is off its masks' outlines by {100 * spread:.0f} "
+            f"% of its size ({100 * FARTHEST_OUTLINE:.0f} % at most)"
+        )
+    return spread
+
+
+def _covering(made: MadeObject, rough: MadeObject) -> MadeObject:
+    """The track by texture, unless that by outlines covers the masks much better."""
+    by_texture, by_outline = float(np.nanmean(made.ious)), float(np.nanmean(rough.ious))
+    if by_outline < by_texture + COVERS_MORE:
+        return made
+    reason = (
+        f"the poses that its texture gives cover its masks by {by_texture:.2f} (IoU), those of its "
+        f"outlines by {by_outline:.2f}: it may be shiny, or not rigid"
+    )
+    return replace(rough, confidence=replace(rough.confidence, reason=reason))
 
 
 def _colored(

@@ -19,7 +19,7 @@ from hoigs.preparation.objects.alignment import Aligned, Poses
 from hoigs.preparation.objects.crops import make_crops
 from hoigs.preparation.objects.flights import ballistic, flights_by_texture
 from hoigs.preparation.objects.hands import hand_motion, upward
-from hoigs.preparation.objects.make_object import make_object
+from hoigs.preparation.objects.make_object import ObjectWay, make_object
 from hoigs.preparation.objects.surface import hull, with_samples
 from hoigs.preparation.objects.tracked import (
     ObjectConfidence,
@@ -308,3 +308,29 @@ def test_a_shape_far_off_its_masks_is_refused(monkeypatch: pytest.MonkeyPatch) -
         way="texture", radius=None, count=200, fps=FPS, progress=lambda _: None,
     )  # fmt: skip
     assert made.confidence.way == "outline" and "off its masks" in made.confidence.reason
+
+
+@pytest.mark.parametrize(("way", "beside", "taken"), [
+    ("auto", 0.15, "outline"), ("auto", 0.0, "texture and hands"),
+    ("texture", 0.15, "texture and hands"),
+])  # fmt: skip
+def test_poses_that_leave_the_masks_lose_to_the_outlines(
+    way: ObjectWay, beside: float, taken: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of something shiny, whose texture is that of what it mirrors."""
+    images, objects, humans, joints = filmed()
+    around = (humans, humans, [CAMERA] * FRAMES, joints, PARENTS, lambda: iter(images))
+    settings = dict(radius=None, count=400, fps=FPS, progress=lambda _: None)
+    good = make_object(None, objects, *around, way="outline", **settings)  # type: ignore[arg-type]
+
+    def moved(*arguments: object, **_: object) -> object:
+        places = good.track.translations + torch.tensor([beside, 0.0, 0.0])
+        confidence = replace(
+            good.confidence, way="texture and hands", outline=np.full(FRAMES, 0.01)
+        )
+        return replace(good.track, translations=places), good.track.points, confidence
+
+    monkeypatch.setattr(making, "tracked_object", moved)
+    made = make_object(None, objects, *around, way=way, **settings)  # type: ignore[arg-type]
+    assert made.confidence.way == taken
+    assert ("cover its masks by" in made.confidence.reason) == (taken == "outline")
