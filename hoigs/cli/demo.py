@@ -19,7 +19,7 @@ def demo(
     out: Annotated[Path, typer.Option("--out", help="Run folder.")] = Path("runs/demo"),
     fast: Annotated[
         bool,
-        typer.Option("--fast", help="A first look in about a minute: smaller, less sharp."),
+        typer.Option("--fast", help="A first look in half a minute: smaller, less sharp."),
     ] = False,
     steps: Annotated[
         int | None,
