@@ -320,7 +320,7 @@ def test_poses_that_leave_the_masks_lose_to_the_outlines(
     """As of something shiny, whose texture is that of what it mirrors."""
     images, objects, humans, joints = filmed()
     around = (humans, humans, [CAMERA] * FRAMES, joints, PARENTS, lambda: iter(images))
-    settings = dict(radius=None, count=400, fps=FPS, progress=lambda _: None)
+    settings = {"radius": None, "count": 400, "fps": FPS, "progress": lambda _: None}
     good = make_object(None, objects, *around, way="outline", **settings)  # type: ignore[arg-type]
 
     def moved(*arguments: object, **_: object) -> object:
