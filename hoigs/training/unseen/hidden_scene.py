@@ -41,8 +41,8 @@ def fill_hidden(
 
     Args:
         shown: blending weights over the training frames. alone: those without people and objects.
-        centers: of the cameras, from which colours are meant. shapes: also opacity and size, which
-            changes images at outlines; else colours alone.
+        centers: of the cameras, from which colours are meant. shapes: also opacity and size, but at
+            the rim; else colours alone.
 
     Returns:
         How much of each Gaussian is kept, in [0, 1]; None where all of it is.
@@ -60,10 +60,13 @@ def fill_hidden(
     target = {"sh": torch.zeros_like(gaussians.sh[hidden])}
     target["sh"][:, 0] = _colors(scene, hidden, known, kept, centers)
     if shapes:
-        apart = nearest(gaussians.means[hidden], SPACING + 1, gaussians.means)[1][:, 1:]
-        size = apart.mean(1, keepdim=True).clamp_min(1e-6).log().to(gaussians.log_scales)
-        target["log_scales"] = size.expand(-1, 3)
-        target["opacity_logits"] = torch.full_like(size[:, 0], _logit(OPAQUE))
+        beside, apart = nearest(gaussians.means[hidden], NEIGHBOURS + 1, gaussians.means)
+        within = (kept[beside] < 1).all(1)  # at the rim they reach into what is seen
+        size = apart[:, 1 : SPACING + 1].mean(1, keepdim=True).clamp_min(1e-6).log()
+        size = size.to(gaussians.log_scales).expand(-1, 3)
+        target["log_scales"] = torch.where(within[:, None], size, gaussians.log_scales[hidden])
+        logits = gaussians.opacity_logits[hidden]
+        target["opacity_logits"] = torch.where(within, _logit(OPAQUE), logits)
     for name, value in target.items():
         parameter = scene.get_parameter(name)
         if parameter.requires_grad:
