@@ -26,6 +26,7 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.tokens import EntityKind
 
 SCENE = "scene"
+STILL = 0.02  # of the scene's extent: cameras that move less see each point from one side
 
 
 def compose(spec: Spec, clip: Clip, registry: Registry | None = None) -> SceneModel:
@@ -231,9 +232,10 @@ def initial_gaussians(
     object from the points of its track (the clip's, or its initializer's). Scales follow the
     spacing of the points (3DGS's rule).
     """
-    appearance: dict[str, Any] = {"opacity": block.opacity, "sh_degree": block.sh_degree}
     clip = context.clip
     assert clip is not None
+    degree = sh_degree_for(clip) if block.sh_degree == "auto" else block.sh_degree
+    appearance: dict[str, Any] = {"opacity": block.opacity, "sh_degree": degree}
     if kind != "scene":
         appearance["thickness"] = block.thickness
     if kind == "human":
@@ -246,6 +248,14 @@ def initial_gaussians(
         raise ValueError("thickness belongs to surfaces, of people and objects; remove it here")
     rows = _subset(len(clip.points), block.points, context.seed)
     return Gaussians.from_points(clip.points[rows], clip.point_colors[rows], **appearance)
+
+
+def sh_degree_for(clip: Clip) -> int:
+    """The degree "auto": 2, but 0 where the training cameras stay in one place, seen from which no
+    point shows another side of itself."""
+    places = torch.stack([clip.cameras[i].center for i in clip.split["train"]])
+    moved = float((places - places.mean(0)).norm(dim=-1).max())
+    return 0 if moved < STILL * clip.extent() else 2
 
 
 def _human(

@@ -10,7 +10,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
@@ -86,8 +86,10 @@ class EntitySpec(_Strict):
     """Settings of a human's body model; by default those of the one that the clip names."""
     initializer: ComponentSpec | None = None
     """Where an object's first points and its track come from; None takes the clip's own."""
-    sh_degree: int = Field(default=0, ge=0, le=3)
-    """Spherical-harmonics degree of its colours."""
+    sh_degree: Annotated[int, Field(ge=0, le=3)] | Literal["auto"] = 0
+    """Spherical-harmonics degree of its colours. "auto" is 2 where training cameras see it from
+    several sides, and 0 where they stay in one place: colours that depend on the direction are then
+    not determined, and look wrong from any other place."""
     points: int = Field(default=10_000, ge=1)
     """Gaussians at the start; scene and objects have fewer where the clip has fewer points for
     them."""

@@ -216,6 +216,20 @@ def test_entities_and_their_gaussians(parse, registry, clip):
     assert (scene.sh_degree, anna.sh_degree) == (0, 1)
 
 
+@pytest.mark.parametrize(("step", "degree"), [(0.0, 0), (0.001, 0), (0.1, 2)])
+def test_colours_depend_on_the_direction_where_training_cameras_move(
+    step, degree, parse, registry, clip
+):
+    spec = parse(TEXT.replace("points: 40", "points: 40, sh_degree: auto"))
+    places = [torch.eye(4) for _ in clip.cameras]
+    for i, place in enumerate(places):
+        place[0, 3] = step * i
+    places[2][0, 3] = 9.0  # a test camera may be anywhere
+    cameras = [replace(c, world_to_camera=p) for c, p in zip(clip.cameras, places, strict=True)]
+    model = compose(spec, replace(clip, cameras=cameras), registry)
+    assert model.entity("scene").canonical.sh_degree == degree
+
+
 def test_more_points_than_the_clip_has(parse, registry, clip):
     spec = parse(TEXT.replace("points: 40", "points: 400").replace("points: 8", "points: 21"))
     model = compose(spec, clip, registry)
