@@ -50,7 +50,7 @@ def fill_unseen(
         seen = confidence(*weights[name])
         if seen is not None:
             _fill(model.entity(name), seen, shapes, opposite)
-    centers = [clip[p].camera.center for p in training_frames(clip)]
+    centers = [clip.cameras[p].center for p in training_frames(clip)]
     kept = {}
     for name in model.names("scene"):
         share = fill_hidden(model.entity(name), *weights[name], centers, shapes)
