@@ -233,7 +233,13 @@ def _cameras(
     where = str(place.raw("egocam.dist"))
     read = {key: numbers(entry(ego, key, where), f"{where}: {key}") for key in EGO}
     turns = numbers(read["R_k_cam_np"], f"{where}: R_k_cam_np", -1, 3, 3)
-    shifts = numbers(read["T_k_cam_np"].reshape(len(turns), -1), f"{where}: T_k_cam_np", -1, 3)
+    shifts = read["T_k_cam_np"]  # [T, 3] or [T, 3, 1]
+    if shifts.size != 3 * len(turns):
+        raise ClipError(
+            f"{where}: T_k_cam_np: expected three numbers for each of {len(turns)} frames, got the "
+            f"shape {list(shifts.shape)}"
+        )
+    shifts = shifts.reshape(-1, 3)
     if len(turns) <= max(frames):
         raise ClipError(f"{where} ends before frame {max(frames)}")
     K = numbers(read["intrinsics"], f"{where}: intrinsics", 3, 3)

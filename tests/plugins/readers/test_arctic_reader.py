@@ -105,6 +105,19 @@ def test_gender_and_template_are_required(
         ArcticReader().read(folder)
 
 
+@pytest.mark.parametrize("shape", [(6,), (1,), (12, 3, 1)])
+def test_places_of_the_head_camera_that_do_not_fit_its_turns(
+    builtin: Clip, template: np.ndarray, tmp_path: Path, shape: tuple[int, ...]
+) -> None:
+    folder = arctic.write(shapeless(builtin), tmp_path, template, view=0)
+    (path,) = folder.parents[3].rglob("*.egocam.dist.npy")
+    table = np.load(path, allow_pickle=True).item()  # of our own making
+    table["T_k_cam_np"] = np.zeros(shape)
+    np.save(path, table, allow_pickle=True)
+    with pytest.raises(ClipError, match=r"T_k_cam_np: expected three numbers for each of"):
+        ArcticReader().read(folder)
+
+
 def test_images_are_offset(still: Clip, template: np.ndarray, tmp_path: Path) -> None:
     folder = arctic.write(shapeless(still), tmp_path, template)
     assert (folder / f"{arctic.OFFSET:05d}.jpg").is_file()
