@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import pickle
 from pathlib import Path
+from tokenize import TokenError
 from typing import IO, Any
 
 import numpy as np
@@ -84,7 +85,8 @@ def load_pickled_npy(path: Path) -> Any:
             if not dtype.hasobject:
                 file.seek(0)
                 return np.load(file, allow_pickle=False)
-        except (ValueError, KeyError, EOFError, OverflowError) as error:
+        # numpy reads a header that is no literal token by token, as Python 2 wrote it
+        except (ValueError, KeyError, EOFError, OverflowError, TokenError) as error:
             raise ClipError(f"{path} is not a readable .npy file ({error})") from error
         array = _load(file, path)
     return array.item() if shape == () else array

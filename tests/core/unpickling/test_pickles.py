@@ -81,3 +81,11 @@ def test_damage_is_told(tmp_path: Path, content: bytes) -> None:
         load_pickle(tmp_path / "x.pkl")
     with pytest.raises(ClipError, match=r"x\.npy is not a readable"):
         load_pickled_npy(tmp_path / "x.npy")
+
+
+def test_a_header_without_its_bracket_is_told(tmp_path: Path) -> None:
+    np.save(tmp_path / "x.npy", np.zeros((12, 7)))
+    content = (tmp_path / "x.npy").read_bytes()
+    (tmp_path / "x.npy").write_bytes(content.replace(b"'shape': (12", b"'shape': \xcc12"))
+    with pytest.raises(ClipError, match=r"x\.npy is not a readable"):
+        load_pickled_npy(tmp_path / "x.npy")
