@@ -52,12 +52,15 @@ class DatasetJson(BaseModel):
     val_ids: list[str] = []
 
 
+Number = Annotated[int, Field(ge=0, le=10**9)]
+
+
 class MetadataJson(BaseModel):
     """An entry of metadata.json."""
 
-    warp_id: int
-    camera_id: int = 0
-    time_id: int | None = None
+    warp_id: Number
+    camera_id: Number = 0
+    time_id: Number | None = None
 
     @property
     def step(self) -> int:

@@ -75,6 +75,16 @@ def test_time_is_warp_id_not_order(builtin: Clip, tmp_path: Path) -> None:
     assert sorted(clip.split["test"]) == sorted(theirs)
 
 
+@pytest.mark.parametrize("number", [-3, 10**30])
+def test_a_time_has_a_number_of_its_own(builtin: Clip, tmp_path: Path, number: int) -> None:
+    hypernerf.write(builtin, tmp_path)
+    rows = json.loads((tmp_path / "metadata.json").read_text())
+    next(iter(rows.values()))["warp_id"] = number
+    (tmp_path / "metadata.json").write_text(json.dumps(rows))
+    with pytest.raises(ClipError, match=r"metadata\.json[^\0]*warp_id: Input should be"):
+        HypernerfReader().read(tmp_path)
+
+
 def test_lens_and_principal_point(builtin: Clip, tmp_path: Path) -> None:
     bent = {"principal_point": [14.0, 18.0], "radial_distortion": [-0.2, 0.03, 0.01],
             "tangential_distortion": [0.002, -0.001], "pixel_aspect_ratio": 1.1,

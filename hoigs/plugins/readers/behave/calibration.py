@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from hoigs.core.errors import ClipError
 from hoigs.core.values.lens import Lens
 from hoigs.plugins.readers.common.poses import checked_rotation, rigid
 
+Name = Annotated[str, Field(max_length=1000)]  # of a file, as systems allow it
+
 
 class SequenceInfo(BaseModel):
     """info.json; config and intrinsic are relative to the sequence."""
 
-    config: str
-    intrinsic: str
-    cat: str
-    gender: str | None = None
+    config: Name
+    intrinsic: Name
+    cat: Name
+    gender: Name | None = None
 
 
 class ColorCalibration(BaseModel):
