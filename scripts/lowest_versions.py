@@ -56,7 +56,8 @@ def main() -> int:
     python = installed(arguments.environment, pins)
     found = tested(python, arguments.tests)
     record = {
-        "command": " ".join(["python scripts/lowest_versions.py", *sys.argv[1:]]),
+        "command": "python scripts/lowest_versions.py"
+        + f" --torch {arguments.torch}" * bool(arguments.torch),
         "declared": declared,
         "not the lowest": {name: pins[name] for name in pins if pins[name] != declared[name]},
         "tests": list(arguments.tests),

@@ -87,9 +87,9 @@ class EntitySpec(_Strict):
     initializer: ComponentSpec | None = None
     """Where an object's first points and its track come from; None takes the clip's own."""
     sh_degree: Annotated[int, Field(ge=0, le=3)] | Literal["auto"] = 0
-    """Spherical-harmonics degree of its colours. "auto" is 2 where training cameras see it from
-    several sides, and 0 where they stay in one place: colours that depend on the direction are then
-    not determined, and look wrong from any other place."""
+    """Spherical-harmonics degree of its colours. "auto", for a scene, is 2 where training
+    cameras see it from several sides, and 0 where they stay in one place: colours that depend on
+    the direction are then not determined, and look wrong from any other place."""
     points: int = Field(default=10_000, ge=1)
     """Gaussians at the start; scene and objects have fewer where the clip has fewer points for
     them."""

@@ -52,15 +52,15 @@ class DatasetJson(BaseModel):
     val_ids: list[str] = []
 
 
-Number = Annotated[int, Field(ge=0, le=10**9)]
+Identifier = Annotated[int, Field(ge=0, le=10**9)]
 
 
 class MetadataJson(BaseModel):
     """An entry of metadata.json."""
 
-    warp_id: Number
-    camera_id: Number = 0
-    time_id: Number | None = None
+    warp_id: Identifier
+    camera_id: Identifier = 0
+    time_id: Identifier | None = None
 
     @property
     def step(self) -> int:

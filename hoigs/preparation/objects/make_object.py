@@ -160,7 +160,8 @@ def make_object(
         others: pixels of other objects, which hide this one wherever the person's limbs are.
         joints: of the body, world, metres; None: nobody is there, and the object is at `depths`
             along the view. parents: of the joints. way: how; "auto": as a ball
-            where all masks are round, or else by texture. radius: of a ball, metres; None: a
+            where all masks are round, or else by texture, or by outlines where these cover the
+            masks better. radius: of a ball, metres; None: a
             football's for a tracked ball, and for a round mask that which the limbs at it give.
             count: of points.
     """
@@ -200,7 +201,7 @@ def make_object(
     track, normals, spread = held_object(masks, list(cameras), wrists, count, depths)
     confidence = ObjectConfidence.none("outline", len(cameras), "; ".join(reasons))
     rough = colored(track, normals, spread, confidence)
-    return rough if made is None else _covering(made, rough)
+    return rough if made is None else _better_covering(made, rough)
 
 
 def _spread(track: ObjectTrack, confidence: ObjectConfidence) -> float:
@@ -218,7 +219,7 @@ def _spread(track: ObjectTrack, confidence: ObjectConfidence) -> float:
     return spread
 
 
-def _covering(made: MadeObject, rough: MadeObject) -> MadeObject:
+def _better_covering(made: MadeObject, rough: MadeObject) -> MadeObject:
     """The track by texture, unless that by outlines covers the masks much better."""
     by_texture, by_outline = float(np.nanmean(made.ious)), float(np.nanmean(rough.ious))
     if by_outline < by_texture + COVERS_MORE:
@@ -227,7 +228,8 @@ def _covering(made: MadeObject, rough: MadeObject) -> MadeObject:
         f"the poses that its texture gives cover its masks by {by_texture:.2f} (IoU), those of its "
         f"outlines by {by_outline:.2f}: it may be shiny, or not rigid"
     )
-    return replace(rough, confidence=replace(rough.confidence, reason=reason))
+    reasons = "; ".join(filter(None, (rough.confidence.reason, reason)))
+    return replace(rough, confidence=replace(rough.confidence, reason=reasons))
 
 
 def _colored(

@@ -11,16 +11,16 @@ from hoigs.core.errors import ClipError
 from hoigs.core.values.lens import Lens
 from hoigs.plugins.readers.common.poses import checked_rotation, rigid
 
-Name = Annotated[str, Field(max_length=1000)]  # of a file, as systems allow it
+ShortText = Annotated[str, Field(max_length=1000)]  # no path or word is longer
 
 
 class SequenceInfo(BaseModel):
     """info.json; config and intrinsic are relative to the sequence."""
 
-    config: Name
-    intrinsic: Name
-    cat: Name
-    gender: Name | None = None
+    config: ShortText
+    intrinsic: ShortText
+    cat: ShortText
+    gender: ShortText | None = None
 
 
 class ColorCalibration(BaseModel):
