@@ -60,7 +60,7 @@ LONG_RUN = 30_000
 # what is wrapped: attribute path from the trainer, and the part that its time counts as
 WRAPPED = (
     ("objective._deform", "deform"),
-    ("model.rasterizer.render", "raster"),
+    ("model.draw", "raster"),
     ("objective", "loss"),
     ("optimizer.step", "optimiser"),
     ("optimizer.zero_grad", "optimiser"),

@@ -112,7 +112,7 @@ class JointObjective:
         absolutes = None
         if any(control.absolute_gradients for control in self.density.values()):
             absolutes = torch.zeros_like(offsets, requires_grad=True)
-        composite = self.model.rasterizer.render(
+        composite = self.model.draw(
             state.joined(),
             camera,
             RenderRequest(screen_offsets=offsets, absolute_gradients=absolutes),
@@ -231,7 +231,7 @@ class JointObjective:
                 screen_offsets=_of(scenes, state, offsets),
                 absolute_gradients=None if absolutes is None else _of(scenes, state, absolutes),
             )
-        return self.model.rasterizer.render(state.joined(scenes), camera, request)
+        return self.model.draw(state.joined(scenes), camera, request)
 
     def _alone(
         self,
@@ -250,7 +250,7 @@ class JointObjective:
         if self.spec.background == "random":
             background = torch.rand(3, generator=generator)
         background = background.to(camera.K)
-        output = self.model.rasterizer.render(
+        output = self.model.draw(
             state.gaussians[name], crop.seen_from(camera), RenderRequest(background=background)
         )
         compared = Comparison(

@@ -269,7 +269,7 @@ class Playback:
             self._packed[:16].to(kind, copy=True).view(4, 4),
             *self._size,
         )
-        return self._model.rasterizer.render(self._joined, camera, self._request)
+        return self._model.draw(self._joined, camera, self._request)
 
     def _capture(self) -> None:
         """Capture one graph of `_deform` and one of `_draw`."""

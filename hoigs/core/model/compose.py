@@ -50,7 +50,12 @@ def compose(spec: Spec, clip: Clip, registry: Registry | None = None) -> SceneMo
         }
         interaction = builder.part(("interaction",), spec.interaction, context)
         with _errors_at(spec, "interaction"):
-            return SceneModel(entities, interaction=interaction, rasterizer=rasterizer)
+            return SceneModel(
+                entities,
+                interaction=interaction,
+                rasterizer=rasterizer,
+                low_pass=spec.low_pass,
+            )
 
 
 def compose_bodies(

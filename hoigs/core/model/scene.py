@@ -59,6 +59,9 @@ class SceneModel(nn.Module):
         entities: by name; their order decides that of the joined Gaussians.
         interaction: couples the entities that have features; None couples nothing.
         rasterizer: any backend; `model.rasterizer` may be replaced at any time.
+        low_pass: variance added to the screen covariance, square pixels, wherever the model is
+            drawn: it learns its Gaussians with one value, and looks too thin or too soft with
+            another.
 
     Attributes:
         interaction_enabled: False during the warm-up of the interaction.
@@ -73,6 +76,7 @@ class SceneModel(nn.Module):
         *,
         interaction: InteractionModule | None = None,
         rasterizer: Rasterizer,
+        low_pass: float = 0.3,
     ) -> None:
         super().__init__()
         if not entities:
@@ -81,6 +85,7 @@ class SceneModel(nn.Module):
         self.interaction = interaction
         self.interaction_enabled = True
         self.rasterizer = rasterizer
+        self.low_pass = low_pass
         if interaction is not None:
             described = {n: e for n, e in entities.items() if e.features is not None}
             interaction.bind(
@@ -142,14 +147,26 @@ class SceneModel(nn.Module):
         Args:
             moment, camera: on the model's device.
             background: RGB in [0, 1], [3]; in place of `request.background`.
-            request: everything else that a rasterizer can be requested to do.
+            request: as for `draw`.
         """
         state = self(moment, only)
         request = request or RenderRequest()
         if background is not None:
             request = request.replace(background=background)
+        return self.draw(state.joined(), camera, request)
+
+    def draw(
+        self, gaussians: Gaussians, camera: Camera, request: RenderRequest | None = None
+    ) -> RenderOutput:
+        """Draw Gaussians of this model, which `forward` or `SceneState` gives, as it is trained.
+
+        Args:
+            request: everything that a rasterizer can be requested to do, but for `low_pass`, which
+                is the model's.
+        """
+        request = (request or RenderRequest()).replace(low_pass=self.low_pass)
         rasterizer = self.rasterizer
-        return call(rasterizer, "rasterizer", rasterizer.render, state.joined(), camera, request)
+        return call(rasterizer, "rasterizer", rasterizer.render, gaussians, camera, request)
 
     def set_progress(self, progress: float) -> None:
         """Pass the done share of the training run, in [0, 1], to every deformation."""

@@ -177,8 +177,8 @@ def _with_profile(document: Document, profile: str | None, source: str) -> Docum
 def _like_another(document: Document, shared: Document) -> Document:
     """`document` with the places that a shared profile lists copied from the spec that it names.
 
-    A place that is absent from that spec is removed here too, so that its default applies; places
-    that the profile keeps are not copied.
+    A place that is absent from that spec is removed here too, so that its default applies, as are
+    those that the profile lists under `default`; places that the profile keeps are not copied.
     """
     model = read_spec(shared.data["like"])
     own = [document.only(p) for d in shared.data["keep"] if document.has(p := tuple(d.split(".")))]
@@ -190,6 +190,8 @@ def _like_another(document: Document, shared: Document) -> Document:
             taken = taken.get(part, {})
         if place[-1] in taken:
             document = document.merged(model.only(place))
+    for dotted in shared.data["default"]:
+        document.remove(tuple(dotted.split(".")))
     for kept in own:
         document = document.merged(kept)
     return document

@@ -111,6 +111,10 @@ class Spec(_Strict):
     """For listings and reports."""
     rasterizer: ComponentSpec = ComponentSpec(use="rasterizer:warp")
     """Draws every image."""
+    low_pass: float = Field(default=0.3, ge=0, le=4)
+    """Variance added to every Gaussian's covariance on screen, square pixels, in training and
+    whenever the model is drawn. 0.3 is that of 3DGS; the square of a pixel has 1/12, and with 0.1
+    edges and patterns are sharper."""
     interaction: ComponentSpec = ComponentSpec(use="interaction:none")
     """Couples the entities."""
     entities: tuple[str, ...] | None = None

@@ -142,7 +142,7 @@ def picture_loss(request: ExportRequest, ours: Gaussians, read: Gaussians) -> st
     """PSNR in dB between the pictures of two sets, from the camera of the video."""
     frame = frame_of(request.clip, request.moments[0])
     camera = camera_between(request.clip, frame).to(ours.means.device)
-    draw = request.scene.rasterizer.render
+    draw = request.scene.draw
     pictures = [draw(g.to(ours.means.device), camera, RenderRequest()).color for g in (ours, read)]
     error = float((pictures[0] - pictures[1]).square().mean())
     if error == 0:

@@ -68,7 +68,7 @@ def blending_weights(
     sh = torch.zeros(len(drawn), 1, 3, device=model.device, requires_grad=True)
     found: list[Tensor] = []
     with torch.enable_grad():
-        color = model.rasterizer.render(drawn.replace(sh=sh), camera, RenderRequest()).color
+        color = model.draw(drawn.replace(sh=sh), camera, RenderRequest()).color
         for at in range(0, len(maps), 3):
             some = torch.stack(list(maps[at : at + 3]), -1)
             total = (color[..., : some.shape[-1]] * some).sum()

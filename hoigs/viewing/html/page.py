@@ -213,6 +213,7 @@ def _page(
         "fps": clip.fps,
         "stride": stride,
         "tracks": list(heads),
+        "lowPass": loaded.model.low_pass,
         "up": clip.up().tolist(),
         "distance": distance_to_subject(clip),
         "cameras": [

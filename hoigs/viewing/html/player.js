@@ -7,7 +7,6 @@ const $ = (id) => document.getElementById(id);
 const H = JSON.parse($("header").textContent);
 const ROW = 256;      // splats in a row of the texture; entities begin at a row
 const TEXELS = 4;     // of a splat: position and opacity, quaternion, scales, colour
-const LOW_PASS = 0.3; // square pixels
 
 const fail = (text) => { $("message").textContent = text; $("message").hidden = false; $("message").style.display = ""; };
 
@@ -255,7 +254,7 @@ function draw() {
   gl.uniform2f(uniforms.focal, camera.K[0], camera.K[1]);
   gl.uniform2f(uniforms.center, camera.K[2], camera.K[3]);
   gl.uniform2f(uniforms.size, width, height);
-  gl.uniform1f(uniforms.blur, LOW_PASS);
+  gl.uniform1f(uniforms.blur, H.lowPass);
   gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
 }
 

@@ -164,7 +164,7 @@ class RunDrawing:
         background = None if plain else gaussians.means.new_tensor(look.background)
         request = RenderRequest(background=background)
         device = self.loaded.model.device
-        return self.loaded.model.rasterizer.render(gaussians, camera.to(device), request)
+        return self.loaded.model.draw(gaussians, camera.to(device), request)
 
     def _image(
         self, output: RenderOutput, look: Look, frame: float, camera: Camera

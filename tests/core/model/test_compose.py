@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from fake_plugins import PluginFolder
 
 from hoigs.core.errors import SpecError
+from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.maths.rotations import quats_to_matrices
 from hoigs.core.model.compose import compose, compose_density
 from hoigs.core.spec.schema import Spec
@@ -214,6 +216,17 @@ def test_entities_and_their_gaussians(parse, registry, clip):
     torch.testing.assert_close(anna.scales, torch.full((30, 3), 0.25))
     torch.testing.assert_close(anna.opacities, torch.full((30,), 0.9))
     assert (scene.sh_degree, anna.sh_degree) == (0, 1)
+
+
+def test_a_model_is_drawn_with_the_low_pass_of_its_spec(parse, registry, clip):
+    model = compose(parse(f"low_pass: 0.1\n{TEXT}"), clip, registry)
+    seen: list[RenderRequest] = []
+    model.rasterizer = SimpleNamespace(render=lambda gaussians, camera, how: seen.append(how))
+    moment, camera = clip.moments[0], clip.cameras[0]
+    model.draw(model(moment).joined(), camera, RenderRequest(near=0.2))
+    model.render(moment, camera, background=torch.ones(3))
+    assert [(how.low_pass, how.near) for how in seen] == [(0.1, 0.2), (0.1, RenderRequest.near)]
+    assert compose(parse(), clip, registry).low_pass == RenderRequest.low_pass  # that of 3DGS
 
 
 @pytest.mark.parametrize(("step", "degree"), [(0.0, 0), (0.001, 0), (0.1, 2)])

@@ -45,7 +45,7 @@ def sensitivities(
             joined = state.joined()
         rows = state.slices()
         logits = joined.opacity_logits.detach().requires_grad_()
-        drawn = model.rasterizer.render(
+        drawn = model.draw(
             joined.replace(opacity_logits=logits), camera.to(model.device), RenderRequest()
         ).color
         clear = (1 - torch.sigmoid(logits.detach())).clamp_min(SURE)
