@@ -1,4 +1,4 @@
-"""Named tables and their rows, after the tables of the paper."""
+"""Named tables and their rows, after the tables of the paper, all in matched settings."""
 
 from __future__ import annotations
 
@@ -50,39 +50,41 @@ TABLE_SETS = {
             "Ablation: how the object moves",
             (
                 # the paper's has no track, which would give it the true pose of every frame
-                Row("MLP", "hoigs-object-mlp", ("model.object.deformation.track=false",),
+                Row("MLP", "hoigs-object-mlp@matched", ("model.object.deformation.track=false",),
                     paper=("object-motion/mlp",)),
-                Row("MLP about the track's poses", "hoigs-object-mlp"),
-                Row("CHS that starts near the track", "hoigs",
+                Row("MLP about the track's poses", "hoigs-object-mlp@matched"),
+                Row("CHS that starts near the track", "hoigs@matched",
                     ("model.object.deformation.use=deformation:chs",),
                     paper=("object-motion/hoigs",)),
-                Row("CHS about the track, tangents by finite differences", "hoigs-chs-fd",
+                Row("CHS about the track, tangents by finite differences", "hoigs-chs-fd@matched",
                     paper=("object-motion/baseline-deformation",)),
-                Row("CHS about the track (hoigs)", "hoigs"),
+                Row("CHS about the track (hoigs)", "hoigs@matched"),
             ),
         ),
         TableSet(
             "ablation-interaction",
             "Ablation: the interaction module",
             (
-                Row("off", "hoigs-no-interaction", paper=("interaction/no-interaction",)),
-                Row("on (hoigs)", "hoigs", paper=("interaction/hoigs",)),
+                Row("off", "hoigs-no-interaction@matched", paper=("interaction/no-interaction",)),
+                Row("on (hoigs)", "hoigs@matched", paper=("interaction/hoigs",)),
             ),
         ),
         TableSet(
             "ablation-human-feature",
             "Ablation: the human's features",
             (
-                Row("embedding", "hoigs-human-embedding", paper=("interaction/no-human-feature",)),
-                Row("HexPlane (hoigs)", "hoigs", paper=("interaction/hoigs",)),
+                Row("embedding", "hoigs-human-embedding@matched",
+                    paper=("interaction/no-human-feature",)),
+                Row("HexPlane (hoigs)", "hoigs@matched", paper=("interaction/hoigs",)),
             ),
         ),
         TableSet(
             "object-prior",
             "Where the object's first Gaussians come from",
             (
-                Row("the clip's own points", "hoigs"),
-                Row("masked depth", "hoigs", ("model.object.initializer.use=initializer:depth",),
+                Row("the clip's own points", "hoigs@matched"),
+                Row("masked depth", "hoigs@matched",
+                    ("model.object.initializer.use=initializer:depth",),
                     paper=("object-prior/depth",)),
                 Row("MASt3R", None, paper=("object-prior/mast3r",),
                     why="hoigs ships no MASt3R; give its points with --specs, initializer:points"),
@@ -94,10 +96,10 @@ TABLE_SETS = {
             "mask-depth-source",
             "Where masks and depth come from",
             (
-                Row("the clip's own", "hoigs"),
-                Row("a third of the masks' borders wrong", "hoigs",
+                Row("the clip's own", "hoigs@matched"),
+                Row("a third of the masks' borders wrong", "hoigs@matched",
                     clip_settings="noise.mask_boundary=0.33"),
-                Row("depth with 5 % noise and 10 % holes", "hoigs",
+                Row("depth with 5 % noise and 10 % holes", "hoigs@matched",
                     clip_settings="noise.depth_relative=0.05&noise.depth_holes=0.1"),
                 _source("Samurai + Metric3D v2", "samurai+metric3dv2", "Samurai, no Metric3D"),
                 _source("Samurai + Video Depth Anything", "samurai+vda",

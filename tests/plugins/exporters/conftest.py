@@ -35,15 +35,13 @@ def psnr_to_ours(loaded) -> Callable[..., float]:
     """PSNR in dB between the run and Gaussians, both drawn from the camera of a frame."""
     import torch
 
-    from hoigs.core.interfaces.rasterizer import RenderRequest
-
     @torch.no_grad()
     def score(gaussians, frame: int, entities=(), camera=None) -> float:
         camera = camera or loaded.clip.cameras[frame]
         ours = loaded.model.render(
             loaded.clip.moments[frame], loaded.clip.cameras[frame], only=entities or None
         ).color
-        theirs = loaded.model.rasterizer.render(gaussians, camera, RenderRequest()).color
+        theirs = loaded.model.draw(gaussians, camera).color
         error = (ours - theirs).square().mean()
         return float(-10 * torch.log10(error.clamp_min(1e-12)))
 
