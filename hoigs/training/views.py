@@ -29,7 +29,9 @@ class TrainingView:
     @staticmethod
     def of(frame: Frame, device: torch.device | str) -> TrainingView:
         """The view of a frame that is on the CPU."""
-        placed = replace(frame.to(device), moment=frame.moment)
+        placed = frame.to(device)
+        # kernels read an image's bytes row by row
+        placed = replace(placed, image=placed.image.contiguous(), moment=frame.moment)
         found = {name: crop_around(frame, name, placed) for name in frame.masks}
         return TrainingView(placed, {name: crop for name, crop in found.items() if crop})
 

@@ -267,7 +267,7 @@ class ResizedStore(FrameStore):
         width, height = self.sizes[position]
         image = self.base.image(position).permute(2, 0, 1)[None].float()
         small = torch.nn.functional.interpolate(image, (height, width), mode="area")
-        return small[0].permute(1, 2, 0).round().to(torch.uint8)
+        return small[0].permute(1, 2, 0).round().to(torch.uint8).contiguous()
 
     def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
         return self._nearest(self.base.mask(entity, position).float(), position) > 0.5

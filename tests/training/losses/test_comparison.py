@@ -93,6 +93,13 @@ def test_kernels_agree_with_the_twin(device: str, chosen: slice) -> None:
     assert ((gradient == 0) == (exact_gradient == 0)).all()
 
 
+def test_pixels_in_another_order_are_refused() -> None:
+    render, comparisons = scene()
+    planes = comparisons[0].pixels.permute(2, 0, 1).contiguous().permute(1, 2, 0)
+    with pytest.raises(ValueError, match="rows of RGB bytes"):
+        comparison._by_kernels(render, [replace(comparisons[0], pixels=planes)], 0.3)
+
+
 def test_masks_of_unequal_strides_are_refused() -> None:
     render, comparisons = scene()
     one = comparisons[2]

@@ -90,6 +90,8 @@ _STREAMS = CudaStreams()
 def _launch(kernel: Any, target: Target, render: Tensor, rest: list[Any]) -> None:
     pixels = target.pixels
     height, width = pixels.shape[:2]
+    if pixels.stride()[1:] != (3, 1):
+        raise ValueError(f"pixels are rows of RGB bytes, got strides {pixels.stride()}")
     masks = [m for m in (target.shown, target.ignored) if m is not None]
     strides = {mask.stride() for mask in masks}
     if len(strides) > 1 or any(stride[1] != 1 for stride in strides):
