@@ -111,15 +111,16 @@ class GroupedAdam:
         views = [] if cameras is None else cameras.named_parameters(prefix="cameras")
         trained = chain(named_rates(model), ((name, p, "camera", None) for name, p in views))
         for name, parameter, rate, entity in trained:
-            start = getattr(rates, rate, None)
+            own = rates if entity is None else rates.of(name.split(".")[1], entity.kind)
+            start = getattr(own, rate, None)
             if start is None:
                 known = sorted(RatesSpec.model_fields)
                 raise ValueError(f"{name} declares the rate {rate!r}; train.rates has {known}")
-            final = getattr(rates, f"{rate}_final", None)
-            settles = final is None and rates.settle < 1
+            final = getattr(own, f"{rate}_final", None)
+            settles = final is None and own.settle < 1
             if final is None:
-                final = start * rates.settle
-            if rate in rates.by_extent and entity is not None:
+                final = start * own.settle
+            if rate in own.by_extent and entity is not None:
                 extent = entity_extent(entity, scene_extent)
                 start, final = start * extent, final * extent
             begin = getattr(warmup, WARMUPS[rate]) if rate in WARMUPS else 0.0

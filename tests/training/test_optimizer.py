@@ -74,6 +74,24 @@ def test_position_rate_of_the_scene_scales_with_its_extent():
     assert adam.learning_rates()["entities.scene.means"] == pytest.approx(5e-3)
 
 
+def test_an_entity_has_rates_of_its_own():
+    """By kind or by name, which wins; of the others nothing changes."""
+    own = {"scene": {"scale": 0.5, "means": 0.2}, "object": {"sh": 0.3}}
+    model = make_model()
+    found = GroupedAdam(model, RatesSpec(by_entity=own), WarmupSpec(), 5.0).learning_rates()
+    usual = GroupedAdam(model, RatesSpec(), WarmupSpec(), 5.0).learning_rates()
+    changed = {name for name, rate in found.items() if rate != usual[name]}
+    scene = {"entities.scene.log_scales", "entities.scene.means"}
+    assert changed == scene | {"entities.object.sh"}
+    assert found["entities.scene.log_scales"] == 0.5
+    assert found["entities.scene.means"] == pytest.approx(0.2 * 5.0)
+    both = RatesSpec(by_entity={"object": {"sh": 0.3, "scale": 0.4}, "cup": {"sh": 0.1}})
+    assert (both.of("cup", "object").sh, both.of("cup", "object").scale) == (0.1, 0.4)
+    assert both.of("scene", "scene") is both
+    with pytest.raises(ValueError, match='no rate "scales"; did you mean "scale"'):
+        RatesSpec(by_entity={"scene": {"scales": 0.1}})
+
+
 def test_motion_does_not_move_before_its_warmup():
     model = make_model()
     adam = GroupedAdam(model, RatesSpec(), WarmupSpec(motion=0.5), scene_extent=1.0)

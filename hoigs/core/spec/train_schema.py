@@ -133,6 +133,9 @@ class RatesSpec(_Strict):
     over the last fifth of the run."""
     by_extent: tuple[str, ...] = ("means",)
     """Rates in units of the entity's extent (3DGS: means; 4DGS: planes and networks too)."""
+    by_entity: dict[str, dict[str, Annotated[float, Field(ge=0)]]] = Field(default_factory=dict)
+    """Rates of some entities that differ from these, by exact entity name or by kind; the name
+    wins: `{scene: {scale: 0.02}}`."""
 
     @field_validator("by_extent")
     @classmethod
@@ -142,6 +145,18 @@ class RatesSpec(_Strict):
             if name not in rates:
                 raise ValueError(f'no rate "{name}"{did_you_mean(name, rates)}')
         return names
+
+    @field_validator("by_entity")
+    @classmethod
+    def _change_rates(cls, changes: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+        for rates in changes.values():
+            cls._are_rates(tuple(rates))
+        return changes
+
+    def of(self, entity: str, kind: str) -> RatesSpec:
+        """The rates of an entity of that kind."""
+        own = {**self.by_entity.get(kind, {}), **self.by_entity.get(entity, {})}
+        return self.model_copy(update=own) if own else self
 
 
 class TrainSpec(_Strict):

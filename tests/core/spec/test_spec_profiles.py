@@ -7,6 +7,7 @@ import pytest
 from hoigs.core.errors import SpecError
 from hoigs.core.spec.files import split_profile
 from hoigs.core.spec.schema import Spec, spec_profiles
+from hoigs.core.spec.train_schema import RatesSpec
 
 TEXT = """\
 name: mine
@@ -72,17 +73,20 @@ def test_a_profile_is_a_spec_of_its_own(path):
 
 
 def test_matched_takes_what_the_yardstick_has(path):
-    # as hoigs, but for what the profile leaves to its default
-    drawn_as_3dgs = [f"low_pass={Spec.load('static').low_pass}", "train.rates.settle=1"]
-    matched, hoigs = Spec.load(f"{path}@matched"), Spec.load("hoigs", overrides=drawn_as_3dgs)
-    assert hoigs.hash() != Spec.load("hoigs").hash()
+    matched, hoigs, yardstick = map(Spec.load, (f"{path}@matched", "hoigs", "hoigs@matched"))
     assert matched.train.steps == hoigs.train.steps
-    assert matched.train.loss == hoigs.train.loss and matched.train.rates == hoigs.train.rates
+    assert matched.train.loss == hoigs.train.loss
     # a whole component: no setting of the native one survives in it
     assert matched.model["scene"].density == hoigs.model["scene"].density
     assert matched.model["scene"].points == 66  # its own tree is laid over
     assert matched.train.warmup.interaction == 0.5 and matched.summary == "a spec with profiles"
-    assert matched.low_pass == hoigs.low_pass and Spec.load("hoigs@matched").hash() == hoigs.hash()
+    # what the profile leaves to its default is the same for all, and all else is hoigs
+    for spec in (matched, yardstick):
+        assert spec.low_pass == Spec.model_fields["low_pass"].default != hoigs.low_pass
+        assert spec.train.rates == RatesSpec() != hoigs.train.rates
+    as_it_is = {"low_pass": hoigs.low_pass, "name": hoigs.name}
+    rated = yardstick.train.model_copy(update={"rates": hoigs.train.rates})
+    assert yardstick.model_copy(update={**as_it_is, "train": rated}).hash() == hoigs.hash()
 
 
 def test_profiles_are_inherited(path, tmp_path):
