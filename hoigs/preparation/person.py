@@ -25,6 +25,7 @@ from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.nobody import Nobody
 
 SEEN, RARELY = 0.3, 0.2  # visibility; share of frames: a part seen in fewer of them is a guess
+DOUBTFUL = 0.25  # share of frames: networks see people in clouds and globes now and then
 PARTS = {"head": (0, 7, 8), "arms": (13, 14, 15, 16), "legs": (25, 26, 27, 28)}  # landmarks
 APART, APART_DEGREES = 0.01, 2.0  # metres: of the same frame in two windows, which then do not meet
 POOR_FIT = 0.02  # of the image's longer side: a fit that misses by more deserves a warning
@@ -224,7 +225,12 @@ def _unseen(landmarks: LandmarkTrack) -> list[str]:
     parts = [name for name, marks in PARTS.items() if seen[:, marks].any(1).float().mean() < RARELY]
     if not parts:
         return []
-    return [
+    said = [
         f"the person's {' and '.join(parts)} are out of view or hidden: their pose is not known "
         "and is held relaxed, and the body's height is a guess"
     ]
+    if "head" in parts and landmarks.found.float().mean() < DOUBTFUL:
+        said.insert(
+            0, "few frames show a person, and none a head: overlay.mp4 shows whether it is one"
+        )
+    return said
