@@ -13,7 +13,7 @@ from hoigs.annotation.video import ScrubbedVideo
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import EntityRequest, FramePrompt, VideoRequest
 from hoigs.plugins.estimators.common.environments import MEDIAPIPE
-from hoigs.plugins.estimators.mediapipe import MediapipeEstimator
+from hoigs.plugins.estimators.mediapipe.estimator import MediapipeEstimator
 
 KEPT = 40
 NAME = "human"

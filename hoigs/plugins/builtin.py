@@ -194,7 +194,7 @@ PARTS = (
      "depth of a video that any estimator has written: npy, npz, 16-bit PNG, EXR"),
     ("estimator:landmarks-files", f"{ESTIMATORS}.landmarks_files", "LandmarksFilesEstimator",
      "LandmarksFilesConfig", "landmarks of a person: MediaPipe's, COCO's, OpenPose's files"),
-    ("estimator:mediapipe", f"{ESTIMATORS}.mediapipe", "MediapipeEstimator",
+    ("estimator:mediapipe", f"{ESTIMATORS}.mediapipe.estimator", "MediapipeEstimator",
      "MediapipeConfig",
      "landmarks of a person by MediaPipe Pose, in an environment of its own"),
     ("estimator:object-tracker", f"{ESTIMATORS}.object_tracker.estimator",

@@ -21,7 +21,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.estimator import EntityRequest, checked
 from hoigs.core.registry.registry import default_registry
-from hoigs.plugins.estimators.mediapipe import MediapipeEstimator
+from hoigs.plugins.estimators.mediapipe.estimator import MediapipeEstimator
 
 # a tool like those of the field: a folder of frames in, masks and one depth array out; it finds
 # what is bright, and writes down that it ran

@@ -13,7 +13,7 @@ import pytest
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import EntityRequest, PromptPoint, VideoRequest
-from hoigs.plugins.estimators import mediapipe
+from hoigs.plugins.estimators.mediapipe import estimator as mediapipe
 
 WIDTH, HEIGHT, LEFT, RIGHT = 320, 180, 60, 200
 MARKS = {11: (12, -30), 12: (-12, -30), 13: (20, 0), 14: (-20, 0), 15: (20, 20), 16: (-20, 20),

@@ -7,7 +7,7 @@ from types import SimpleNamespace as Box
 import numpy as np
 import pytest
 
-from hoigs.plugins.estimators.mediapipe_guided import AGAIN, GuidedPose
+from hoigs.plugins.estimators.mediapipe.mediapipe_guided import AGAIN, GuidedPose
 
 IMAGE = np.zeros((90, 160, 3), np.uint8)
 # nose, shoulders, elbows, wrists, hips of someone cut off at the neck, pixels

@@ -18,7 +18,7 @@ HEAVY = NpmFile(
 MEDIAPIPE = ManagedEnvironment(
     name="mediapipe",
     summary="MediaPipe 0.10.21 and OpenCV, both Apache-2.0: 180 MB to download, 500 MB on disk",
-    requirements=Path(__file__).parents[1] / "mediapipe_requirements.txt",
+    requirements=Path(__file__).parents[1] / "mediapipe" / "requirements.txt",
     pythons=("3.12", "3.11", "3.10", "3.9"),
     trial=(
         "import cv2, numpy, mediapipe; mediapipe.solutions.pose.Pose; "

@@ -32,7 +32,7 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.core.progress import Progress, no_progress
 from hoigs.plugins.estimators.common.environments import HEAVY, MEDIAPIPE
 from hoigs.plugins.estimators.common.subprocess import run_tool, settings_key
-from hoigs.plugins.estimators.mediapipe_masks import frames_of, steadied
+from hoigs.plugins.estimators.mediapipe.masks import frames_of, steadied
 
 SCRIPT = Path(__file__).with_name("mediapipe_script.py")
 PARTS = ("guided", "chosen", "people", "look")
