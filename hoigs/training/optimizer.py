@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
+from typing import get_args
 
 import torch
 from torch import nn
 
+from hoigs.core.errors import SpecError, did_you_mean
 from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.train_schema import RatesSpec, WarmupSpec
+from hoigs.core.values.tokens import EntityKind
 from hoigs.core.values.topology import AxisChange, TopologyChange
 
 FIELD_RATES = {
@@ -95,6 +98,7 @@ class GroupedAdam:
 
     Raises:
         ValueError: a component declares a rate that `train.rates` does not have.
+        SpecError: `rates.by_entity` names an entity that the model does not have.
     """
 
     def __init__(
@@ -105,6 +109,13 @@ class GroupedAdam:
         scene_extent: float,
         cameras: nn.Module | None = None,
     ) -> None:
+        for named in rates.by_entity:
+            known = [*model.entities, *get_args(EntityKind)]
+            if named not in known:
+                raise SpecError(
+                    f'train.rates.by_entity: there is no entity or kind "{named}"'
+                    f"{did_you_mean(named, known)} (has: {', '.join(sorted(set(known)))})"
+                )
         self.names: dict[str, nn.Parameter] = {}
         self.roles: list[str] = []  # name of the rate of each, in the same order
         self.schedules: list[Schedule] = []  # of each, likewise

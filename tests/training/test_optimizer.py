@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from hoigs.core.errors import SpecError
 from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.train_schema import RatesSpec, WarmupSpec
@@ -90,6 +91,9 @@ def test_an_entity_has_rates_of_its_own():
     assert both.of("scene", "scene") is both
     with pytest.raises(ValueError, match='no rate "scales"; did you mean "scale"'):
         RatesSpec(by_entity={"scene": {"scales": 0.1}})
+    unknown = RatesSpec(by_entity={"scenne": {"scale": 0.1}})
+    with pytest.raises(SpecError, match='kind "scenne"; did you mean "scene"'):
+        GroupedAdam(model, unknown, WarmupSpec(), 5.0)
 
 
 def test_motion_does_not_move_before_its_warmup():
