@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import get_args
 
+import numpy as np
 import torch
+from jaxtyping import Float
 from torch import nn
 
 from hoigs.core.errors import SpecError, did_you_mean
@@ -56,6 +58,14 @@ class Schedule:
             return 0.0
         decayed = max(progress - self.decay_from, 0.0) / (1 - self.decay_from)
         return float(self.start * (max(self.final, 1e-12) / self.start) ** decayed)
+
+    def along(self, progress: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+        """`at` of many."""
+        if self.start == 0:
+            return np.zeros_like(progress)
+        decayed = np.maximum(progress - self.decay_from, 0.0) / (1 - self.decay_from)
+        rates = self.start * (max(self.final, 1e-12) / self.start) ** decayed
+        return np.where(progress < self.begin, 0.0, rates)
 
 
 def entity_extent(entity: Entity, scene_extent: float) -> float:
@@ -160,6 +170,10 @@ class GroupedAdam:
         """Present learning rate of each parameter, by name."""
         now = {group["schedule"]: float(group["lr"]) for group in self.adam.param_groups}
         return {name: now[s] for name, s in zip(self.names, self.schedules, strict=True)}
+
+    def schedule_of(self, name: str) -> Schedule:
+        """The schedule of a parameter, by its name."""
+        return self.schedules[list(self.names).index(name)]
 
     def position_rate(self, entity: str) -> float:
         """Present learning rate of an entity's positions, metres a step.

@@ -17,9 +17,10 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.core.storage.tensor_files import TensorFile
 from hoigs.core.time_rows import TimeRows, timed_parameters
 from hoigs.core.values.moment import Moment
-from hoigs.training.optimizer import GroupedAdam
+from hoigs.training.optimizer import GroupedAdam, Schedule
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 FADED = 120  # steps without a gradient after which a moment moves nothing any more
@@ -77,6 +78,7 @@ class TimeWindows:
     ) -> None:
         self.model, self.optimizer, self.folder = model, optimizer, folder
         self.chunk, self.count, self.done = chunk, max(1, -(-frames // chunk)), 0
+        self._end = 1  # the last step
         self._rows = dict(_rows_of(model, fixed)) if self.count > 1 else {}
         self.names = [name for name in self._rows if name in optimizer.names]
         self._last: dict[str, np.ndarray] = {}
@@ -113,6 +115,7 @@ class TimeWindows:
             folder = self.folder
             shutil.rmtree(folder, ignore_errors=True)  # of a killed training
             folder.mkdir()
+        self._end = end
         hook = self.model.register_forward_pre_hook(self._before_forward, with_kwargs=True)
         try:
             self._write(folder)
@@ -185,8 +188,8 @@ class TimeWindows:
         if window == self._present:
             return
         self._leave()
-        rates = self.optimizer.learning_rates()
         for name, paged in self._paged.items():
+            rates = partial(self._rates, self.optimizer.schedule_of(name))
             parameter, rows = paged.parameter, self._about(paged.rows, window)
             paged.rows.first, parameter.grad = rows.start, None
             device = parameter.device
@@ -194,7 +197,7 @@ class TimeWindows:
                 file.read(rows).to(device) for file in (paged.values, *paged.moments.values())
             )
             parameter.data, mean, square = _caught_up(
-                values, mean, square, paged.last[rows], self.done, rates[name]
+                values, mean, square, paged.last[rows], self.done, rates
             )
             self.optimizer.adam.state[parameter] = {
                 "step": torch.tensor(float(self.done), device=device),
@@ -202,6 +205,10 @@ class TimeWindows:
                 "exp_avg_sq": square,
             }
         self._present = window
+
+    def _rates(self, schedule: Schedule, steps: Int[np.ndarray, "S R"]) -> np.ndarray:
+        """Learning rates of steps by their numbers, from 1."""
+        return schedule.along((steps - 1) / self._end)
 
     @torch.no_grad()
     def _leave(self) -> None:
@@ -242,14 +249,14 @@ def _caught_up(
     square: Float[Tensor, "A R *rest"],
     last: Int[np.ndarray, " R"],
     done: int,
-    rate: float,
+    rates: Callable[[Int[np.ndarray, "S R"]], Float[np.ndarray, "S R"]],
     betas: tuple[float, float] = (0.9, 0.999),
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Rows and their moments after steps of Adam without a gradient.
 
     Args:
-        last: steps that each row has seen. done: steps to be seen. rate: learning rate of the steps
-            between, which changes little while moments fade.
+        last: steps that each row has seen. done: steps to be seen. rates: learning rates of steps
+            by their numbers, from 1.
     """
     missed = (done - last).astype(np.float64)
     if not missed.any():
@@ -258,12 +265,12 @@ def _caught_up(
     step = np.arange(1, FADED + 1)[:, None]
     at = np.maximum(last, 1) + step
     moves = first**step / second ** (step / 2) * np.sqrt(1 - second**at) / (1 - first**at)
-    moved = np.where(step <= missed, moves, 0).sum(0)
+    moved = np.where(step <= missed, moves * rates(last + step), 0).sum(0)
 
     def by_row(factors: Float[np.ndarray, " R"]) -> Tensor:
         return torch.from_numpy(factors).to(values).reshape(1, -1, *[1] * (values.dim() - 2))
 
-    values = values - rate * by_row(moved) * mean / (square.sqrt() + 1e-15)
+    values = values - by_row(moved) * mean / (square.sqrt() + 1e-15)
     return values, mean * by_row(first**missed), square * by_row(second**missed)
 
 

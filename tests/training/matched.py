@@ -20,10 +20,11 @@ def score(model: SceneModel, clip: Clip) -> float:
 
 
 def matched(name: str) -> tuple[Spec, Spec]:
-    """The matched profile of a baseline and hoigs, which differ in the method alone."""
-    ours, hoigs = Spec.load(f"{name}@matched"), Spec.load("hoigs")
+    """The matched profiles of a baseline and of hoigs, which differ in the method alone."""
+    ours, hoigs = Spec.load(f"{name}@matched"), Spec.load("hoigs@matched")
     loss = ours.train.loss.model_copy(update={"regularizers": {}})
     assert loss == hoigs.train.loss.model_copy(update={"regularizers": {}})
     assert ours.train.rates == hoigs.train.rates and ours.train.steps == hoigs.train.steps
-    assert ours.rasterizer == hoigs.rasterizer and ours.evaluation == hoigs.evaluation
+    assert (ours.rasterizer, ours.low_pass) == (hoigs.rasterizer, hoigs.low_pass)
+    assert ours.evaluation == hoigs.evaluation
     return ours, hoigs

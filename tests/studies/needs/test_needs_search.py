@@ -255,7 +255,7 @@ def test_rates_settle_in_trials_and_the_answer_unless_they_are_given(clip, monke
     monkeypatch.setattr(search_module, "Trial", Seen)
     for given, settle in {"": SETTLE, "train.rates.settle=0.5": 0.5, f"{SETTLES}=1": 1}.items():
         tried.clear()
-        needs = Search(clip, "hoigs", (OBJECT,), (*GIVEN, *filter(None, [given]))).run()
+        needs = Search(clip, "hoigs@matched", (OBJECT,), (*GIVEN, *filter(None, [given]))).run()
         assert needs.spec.train.rates.settle == settle
         first, *trials = tried  # the first measures the pace of the spec as it is
         assert first.train.rates.settle == (1 if not given else settle)
@@ -264,7 +264,7 @@ def test_rates_settle_in_trials_and_the_answer_unless_they_are_given(clip, monke
 
 def test_a_search_space_beyond_the_budget_changes_nothing(clip):
     found = Search(clip, "hoigs", (OBJECT,), (*GIVEN, "train.steps=11")).run()
-    assert found.answers[0].chosen is None and found.overrides == {SETTLES: SETTLE}
+    assert found.answers[0].chosen is None and found.overrides == {}
     assert "unchanged, because 2 candidates need 9 steps at least, but get" in summary_line(
         found.answers[0]
     )
