@@ -231,6 +231,6 @@ def _unseen(landmarks: LandmarkTrack) -> list[str]:
     ]
     if "head" in parts and landmarks.found.float().mean() < DOUBTFUL:
         said.insert(
-            0, "few frames show a person, and none a head: overlay.mp4 shows whether it is one"
+            0, "few frames show a person, and hardly any a head: is it one? See overlay.mp4"
         )
     return said

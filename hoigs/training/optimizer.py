@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import get_args
 
-import numpy as np
 import torch
-from jaxtyping import Float
 from torch import nn
 
 from hoigs.core.errors import SpecError, did_you_mean
@@ -58,14 +56,6 @@ class Schedule:
             return 0.0
         decayed = max(progress - self.decay_from, 0.0) / (1 - self.decay_from)
         return float(self.start * (max(self.final, 1e-12) / self.start) ** decayed)
-
-    def along(self, progress: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-        """`at` of many."""
-        if self.start == 0:
-            return np.zeros_like(progress)
-        decayed = np.maximum(progress - self.decay_from, 0.0) / (1 - self.decay_from)
-        rates = self.start * (max(self.final, 1e-12) / self.start) ** decayed
-        return np.where(progress < self.begin, 0.0, rates)
 
 
 def entity_extent(entity: Entity, scene_extent: float) -> float:

@@ -22,6 +22,6 @@ def test_a_person_in_few_frames_and_without_a_head_is_doubted() -> None:
     assert _unseen(LandmarkTrack(image, image)) == []  # of few frames, but with a head
     image[:4, 0:11, 2] = 0.1
     doubt, _ = _unseen(LandmarkTrack(image, image))
-    assert "whether it is one" in doubt
+    assert "is it one?" in doubt
     whole = image[:4]
     assert len(_unseen(LandmarkTrack(whole, whole))) == 1

@@ -263,8 +263,8 @@ def test_rates_settle_in_trials_and_the_answer_unless_they_are_given(clip, monke
 
 
 def test_a_search_space_beyond_the_budget_changes_nothing(clip):
-    found = Search(clip, "hoigs", (OBJECT,), (*GIVEN, "train.steps=11")).run()
-    assert found.answers[0].chosen is None and found.overrides == {}
+    found = Search(clip, "hoigs@matched", (OBJECT,), (*GIVEN, "train.steps=11")).run()
+    assert found.answers[0].chosen is None and found.overrides == {SETTLES: SETTLE}
     assert "unchanged, because 2 candidates need 9 steps at least, but get" in summary_line(
         found.answers[0]
     )
