@@ -75,6 +75,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, request: RenderReque
         drawable=drawable,
         near=request.near,
         low_pass=request.low_pass,
+        antialiased=request.antialiased,
         min_alpha=request.min_alpha,
     )
 

@@ -104,12 +104,12 @@ def _blend(
     moved: bool,
 ) -> Float[Tensor, "P D"]:
     """Alpha, RGB, depth and features of every pixel, from the rows that are drawn."""
-    opacities = rows.opacities
     if moved:
         means2d, depths, conics = shown.means2d, shown.depths, shown.conics
-        radii = shown.extents.ceil().int()
+        opacities, radii = shown.opacities, shown.extents.ceil().int()
     else:
-        radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
+        opacities = rows.opacities
+        radii, means2d, depths, conics, kept = gsplat.fully_fused_projection(
             rows.means,
             None,
             rows.quats,
@@ -121,9 +121,12 @@ def _blend(
             eps2d=request.low_pass,
             near_plane=request.near,
             far_plane=LIMIT,
+            calc_compensations=request.antialiased,
             opacities=opacities,
         )
         radii, means2d, depths, conics = radii[0], means2d[0], depths[0], conics[0]
+        if request.antialiased:  # unset where gsplat's tighter box leaves a row out
+            opacities = opacities * torch.where((radii > 0).all(-1), kept[0], 0.0)
         if request.screen_offsets is not None:  # zeros that take the screen-space gradient
             means2d = means2d + request.screen_offsets[shown.index].to(means2d)
     channels = [_colors(gsplat, rows, camera, request), depths[:, None]]

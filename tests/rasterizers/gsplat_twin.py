@@ -29,9 +29,11 @@ def fully_fused_projection(
     eps2d: float,
     near_plane: float,
     far_plane: float,
+    calc_compensations: bool,
     opacities: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
-    """radii [C, N, 2] int32, means2d [C, N, 2], depths [C, N], conics [C, N, 3], None."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
+    """radii [C, N, 2] int32, means2d [C, N, 2], depths [C, N], conics [C, N, 3], and the shares of
+    opacities that are kept [C, N], or None."""
     count = means.shape[0]
     if count == 0:
         raise ZeroDivisionError("gsplat divides by the number of rows")
@@ -53,6 +55,7 @@ def fully_fused_projection(
     cov = jacobian @ axes @ axes.mT @ jacobian.mT
     a, b, c = cov[:, 0, 0] + eps2d, cov[:, 0, 1], cov[:, 1, 1] + eps2d
     det = a * c - b * b
+    kept_shares = ((a - eps2d) * (c - eps2d) - b * b).clamp_min(0).div(det).sqrt()
     conics = torch.stack((c / det, -b / det, a / det), -1)
     means2d = torch.stack((K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]), -1)
     with torch.no_grad():
@@ -68,7 +71,8 @@ def fully_fused_projection(
         blank = torch.full_like(values.detach(), torch.nan)
         return blank.index_copy(0, index, values[index])[None]
 
-    return radii[None], unset(means2d), unset(z), unset(conics), None
+    shares = unset(kept_shares) if calc_compensations else None
+    return radii[None], unset(means2d), unset(z), unset(conics), shares
 
 
 def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor) -> Tensor:

@@ -281,6 +281,9 @@ MUTANTS: dict[str, tuple[str, Callable[[], Rasterizer]]] = {
     "R11": ("PrincipalPointNearTheMiddle", lambda: on_camera(principal_point_near_the_middle)),
     "R12": ("DarkerFlatBackground", lambda: on_request(darker_if_flat)),
     "R13": ("HalfFloatsFarOff", lambda: on_rows(half_floats_far_off)),
+    "R14": ("OneKeepsItsOpacity", lambda: on_request(
+        lambda r, g: {"antialiased": False} if len(g) == 1 else {}
+    )),
     "R20": ("CornersAsCentres", lambda: on_output(
         lambda o, *_: {"info": o.info | {"means2d": o.info["means2d"] - 0.5}}
     )),
@@ -349,6 +352,10 @@ MUTANTS: dict[str, tuple[str, Callable[[], Rasterizer]]] = {
         lambda r, g: {} if r.absolute_gradients is None
         else {"absolute_gradients": scaled_gradient(r.absolute_gradients)}
     )),
+    "R52": ("HalfAScaleGradientOfDiscs", lambda: on_rows(
+        lambda g, c, r: g if not r.antialiased or len(g) == 1
+        else g.replace(log_scales=scaled_gradient(g.log_scales))
+    )),
     "R60": ("ZeroIsTheIdentity", lambda: on_rows(
         lambda g, *_: g.replace(
             quats=torch.where((g.quats == 0).all(-1, True), IDENTITY.to(g.quats), g.quats)
@@ -369,7 +376,7 @@ MUTANTS: dict[str, tuple[str, Callable[[], Rasterizer]]] = {
         if r.background is None else {"alpha": o.alpha + 0.0 * r.background.sum()}
     )),
     "R80": ("DicedGradient", lambda: on_rows(
-        lambda g, *_: g.replace(sh=scaled_gradient(g.sh, 1 + 1e-6 * torch.rand(1)))
+        lambda g, *_: g.replace(sh=scaled_gradient(g.sh, 1 + 3e-5 * torch.rand(1)))
         if single(g) else g
     )),
     "R81": ("BrighterCopies", BrighterCopies),

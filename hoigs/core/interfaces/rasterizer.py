@@ -60,6 +60,10 @@ class RenderRequest:
             2024, arXiv:2404.10484). Needs `Capabilities.absolute_gradients`.
         near: Gaussians whose centre is nearer than this are culled, metres.
         low_pass: variance added to the screen covariance, square pixels (3DGS: 0.3).
+        antialiased: multiply each opacity by the share of its area on screen that was there before
+            `low_pass` was added, so that a Gaussian of less than a pixel fades rather than grows,
+            and a picture of any size has the same brightness (Mip-Splatting, Yu et al. 2024,
+            arXiv:2311.16493, eq. 9; "antialiased" in gsplat). 3DGS: False.
         max_alpha: alpha of one Gaussian at one pixel is clamped to this (no gradient above).
         min_alpha: contributions below are skipped (3DGS: 1/255).
         min_transmittance: compositing stops before transmittance falls to this (3DGS: 1e-4).
@@ -73,6 +77,7 @@ class RenderRequest:
     absolute_gradients: Float[Tensor, "N 2"] | None = None
     near: float = 0.05
     low_pass: float = 0.3
+    antialiased: bool = False
     max_alpha: float = 0.999
     min_alpha: float = 1.0 / 255.0
     min_transmittance: float = 1e-4

@@ -15,7 +15,8 @@ backends agree exactly on the following.
     xx = m0.m0 + low_pass,  xy = m0.m1,  yy = m1.m1 + low_pass        screen covariance, square px
     det = |m0 x m1|^2 + low_pass (m0.m0 + m1.m1) + low_pass^2         = xx yy - xy^2, no cancelling
     conic = (yy, -xy, xx) / det                                       its inverse
-    opacity = sigmoid(opacity_logit)                                  not compensated for low_pass
+    opacity = sigmoid(opacity_logit)                                  as in 3DGS, or, antialiased,
+    opacity = sigmoid(opacity_logit) |m0 x m1| / sqrt(det)            Mip-Splatting's 2D filter
 
 With the principal point in the middle the clamp is 3DGS's 1.3 tan(fov / 2). It bounds only the
 Jacobian, never (u, v), and its gradient is clamp's: none to x / z outside the limits.
@@ -77,7 +78,7 @@ class Projection:
         depths: camera z, metres.
         covs: screen covariance (xx, xy, yy), low-pass included, square pixels.
         conics: inverse of `covs` (xx, xy, yy).
-        opacities: in (0, 1).
+        opacities: in (0, 1), as they are composited.
         extents: half width and half height of the box where alpha >= min_alpha, pixels; infinite
             when min_alpha is 0. No gradient.
         radii: ceil(3 sigma) of the longest axis, pixels. No gradient.
@@ -110,6 +111,7 @@ def project(
     drawable: Bool[Tensor, " N"] | None = None,
     near: float = 0.05,
     low_pass: float = 0.3,
+    antialiased: bool = False,
     min_alpha: float = 1.0 / 255.0,
 ) -> Projection:
     """Project by the rules at the head of this module.
@@ -122,7 +124,8 @@ def project(
         world_to_camera, K, width, height: the camera; the tensors in the dtype of the means.
         screen_offsets: added to the projected means, pixels.
         drawable: rows that are not culled for other reasons than their geometry and opacity.
-        near: metres. low_pass: square pixels. min_alpha: 0 means no cut-off.
+        near: metres. low_pass: square pixels. antialiased: opacities make up for `low_pass`.
+        min_alpha: 0 means no cut-off.
     """
     rows = (means, quats, log_scales, opacity_logits[:, None], screen_offsets)
     camera = (world_to_camera, K, K.new_tensor([width, height]), low_pass)
@@ -133,21 +136,27 @@ def project(
         norms = quats.norm(dim=-1)
         keep &= (norms >= QUAT_NORMS[0]) & (norms <= QUAT_NORMS[1])
         keep &= (log_scales.exp() <= LIMIT).all(-1)
-        cam, means2d, covs, det = _onto_screen(means, quats, log_scales, screen_offsets, *camera)
+        cam, means2d, covs, area, det = _onto_screen(
+            means, quats, log_scales, screen_offsets, *camera
+        )
         keep &= (cam[:, 2] > near) & (cam.abs() <= LIMIT).all(-1)
         keep &= (means2d.abs() <= LIMIT).all(-1)
         keep &= (covs[:, 0] + covs[:, 2] <= MAX_VARIANCE) & (det >= MIN_DETERMINANT)
         if min_alpha > 0:
             opacities = torch.sigmoid(opacity_logits)
+            if antialiased:
+                opacities = opacities * area / det.sqrt()
             extents = _extents(covs, opacities, min_alpha)
             keep &= opacities >= min_alpha
             keep &= ((means2d + extents >= 0) & (means2d - extents <= camera[2])).all(-1)
         index = keep.nonzero().squeeze(1)
     offsets = screen_offsets if screen_offsets is None else screen_offsets[index]
-    cam, means2d, covs, det = _onto_screen(
+    cam, means2d, covs, area, det = _onto_screen(
         means[index], quats[index], log_scales[index], offsets, *camera
     )
     opacities = torch.sigmoid(opacity_logits[index])
+    if antialiased:
+        opacities = opacities * area / det.sqrt()
     xx, xy, yy = covs.unbind(-1)
     conics = torch.stack((yy, -xy, xx), -1) / det[:, None]
     with torch.no_grad():
@@ -166,8 +175,14 @@ def _onto_screen(
     K: Float[Tensor, "3 3"],
     size: Float[Tensor, " 2"],
     low_pass: float,
-) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 2"], Float[Tensor, "M 3"], Float[Tensor, " M"]]:
-    """Camera-space centres, pixel centres, screen covariances (xx, xy, yy) and determinants."""
+) -> tuple[
+    Float[Tensor, "M 3"],
+    Float[Tensor, "M 2"],
+    Float[Tensor, "M 3"],
+    Float[Tensor, " M"],
+    Float[Tensor, " M"],
+]:
+    """Camera-space centres, pixel centres, screen covariances (xx, xy, yy), |m0 x m1| and det."""
     rotation = world_to_camera[:3, :3]
     cam = means @ rotation.mT + world_to_camera[:3, 3]
     inverse_z = 1.0 / cam[:, 2]
@@ -184,9 +199,10 @@ def _onto_screen(
     m = (focal * inverse_z[:, None])[..., None] * (axes[:, :2] - slopes[..., None] * axes[:, 2:])
     m0, m1 = m.unbind(1)
     xx, xy, yy = (m0 * m0).sum(-1), (m0 * m1).sum(-1), (m1 * m1).sum(-1)
-    area = torch.linalg.cross(m0, m1).square().sum(-1)  # xx yy - xy^2, by Lagrange's identity
-    det = area + low_pass * (xx + yy) + low_pass * low_pass
-    return cam, means2d, torch.stack((xx + low_pass, xy, yy + low_pass), -1), det
+    area = torch.linalg.vector_norm(torch.linalg.cross(m0, m1), dim=-1)
+    # area^2 = xx yy - xy^2, by Lagrange's identity
+    det = area.square() + low_pass * (xx + yy) + low_pass * low_pass
+    return cam, means2d, torch.stack((xx + low_pass, xy, yy + low_pass), -1), area, det
 
 
 def _extents(

@@ -55,6 +55,7 @@ def compose(spec: Spec, clip: Clip, registry: Registry | None = None) -> SceneMo
                 interaction=interaction,
                 rasterizer=rasterizer,
                 low_pass=spec.low_pass,
+                antialiased=spec.antialiased,
             )
 
 

@@ -61,7 +61,7 @@ class SceneModel(nn.Module):
         rasterizer: any backend; `model.rasterizer` may be replaced at any time.
         low_pass: variance added to the screen covariance, square pixels, wherever the model is
             drawn: it learns its Gaussians with one value, and looks too thin or too soft with
-            another.
+            another. antialiased: likewise, whether opacities make up for it (`RenderRequest`).
 
     Attributes:
         interaction_enabled: False during the warm-up of the interaction.
@@ -77,6 +77,7 @@ class SceneModel(nn.Module):
         interaction: InteractionModule | None = None,
         rasterizer: Rasterizer,
         low_pass: float = 0.3,
+        antialiased: bool = False,
     ) -> None:
         super().__init__()
         if not entities:
@@ -86,6 +87,7 @@ class SceneModel(nn.Module):
         self.interaction_enabled = True
         self.rasterizer = rasterizer
         self.low_pass = low_pass
+        self.antialiased = antialiased
         if interaction is not None:
             described = {n: e for n, e in entities.items() if e.features is not None}
             interaction.bind(
@@ -161,10 +163,12 @@ class SceneModel(nn.Module):
         """Draw Gaussians of this model, which `forward` or `SceneState` gives, as it is trained.
 
         Args:
-            request: everything that a rasterizer can be requested to do, but for `low_pass`, which
-                is the model's.
+            request: everything that a rasterizer can be requested to do, but for `low_pass` and
+                `antialiased`, which are the model's.
         """
-        request = (request or RenderRequest()).replace(low_pass=self.low_pass)
+        request = (request or RenderRequest()).replace(
+            low_pass=self.low_pass, antialiased=self.antialiased
+        )
         rasterizer = self.rasterizer
         return call(rasterizer, "rasterizer", rasterizer.render, gaussians, camera, request)
 

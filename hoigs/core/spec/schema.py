@@ -115,6 +115,9 @@ class Spec(_Strict):
     """Variance added to every Gaussian's covariance on screen, square pixels, in training and
     whenever the model is drawn. 0.3 is that of 3DGS; the square of a pixel has 1/12, and with 0.1
     edges and patterns are sharper."""
+    antialiased: bool = False
+    """Lower the opacity of a Gaussian by what `low_pass` adds to its area (Mip-Splatting), so that
+    pictures larger or smaller than those of the training look alike. False is 3DGS."""
     interaction: ComponentSpec = ComponentSpec(use="interaction:none")
     """Couples the entities."""
     entities: tuple[str, ...] | None = None

@@ -64,8 +64,9 @@ def _settings(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> S
     return Settings(
         width=camera.width, height=camera.height,
         active_bases=stored if degree is None else min(stored, (degree + 1) ** 2),
-        near=request.near, low_pass=request.low_pass, max_alpha=request.max_alpha,
-        min_alpha=request.min_alpha, min_transmittance=request.min_transmittance,
+        near=request.near, low_pass=request.low_pass, antialiased=request.antialiased,
+        max_alpha=request.max_alpha, min_alpha=request.min_alpha,
+        min_transmittance=request.min_transmittance,
     )  # fmt: skip
 
 

@@ -163,9 +163,10 @@ def another_device_is_refused(subject: RasterizerSubject) -> None:
 def fixed_options_are_refused_by_name(subject: RasterizerSubject) -> None:
     """Another value of an option that is declared fixed raises a RenderError with its value."""
     for option, value in subject.rasterizer.capabilities.fixed.items():
-        request = RenderRequest().replace(**{option: value * 0.5})
+        other = not value if isinstance(value, bool) else value * 0.5
+        request = RenderRequest().replace(**{option: other})
         message = _refusal(subject, GOOD, front_camera(), request)
-        require(message is not None, f"request.{option} = {value * 0.5} was drawn")
+        require(message is not None, f"request.{option} = {other} was drawn")
         named = option in (message or "") and str(value) in (message or "")
         require(named, f"the error does not name {option} and {value}: {message}")
 

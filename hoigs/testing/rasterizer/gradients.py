@@ -1,4 +1,4 @@
-"""R40 to R51: gradients, against the oracle's, the rules and finite differences."""
+"""R40 to R52: gradients, against the oracle's, the rules and finite differences."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from hoigs.testing.rasterizer.reference import (
     PARTS,
     reference,
     require_reference_gradients,
+    require_reference_picture,
     weighing,
 )
 from hoigs.testing.rasterizer.scenes import (
@@ -44,6 +45,16 @@ from hoigs.testing.rasterizer.subject import (
 @cache
 def graded_scene(seed: int = 0, degree: int = 3, offset: float = 0.5) -> Scene:
     return random_scene(100, degree=degree, seed=seed, offset=offset)
+
+
+@cache
+def thin_scene() -> Scene:
+    """Antialiased discs, some of them seen from their edge."""
+    scene = random_scene(100, seed=2)
+    log_scales = scene.gaussians.log_scales.clone()
+    log_scales[::2, 2] = -7.0
+    gaussians = scene.gaussians.replace(log_scales=log_scales)
+    return Scene(gaussians, scene.camera, scene.request.replace(antialiased=True))
 
 
 @CHECKS.check("R40")
@@ -229,3 +240,10 @@ def absolute_gradients_are_the_oracles(subject: RasterizerSubject) -> None:
     for parts in (PARTS, ("color",)):
         require_reference_gradients(subject, asking, parts)
     require_close("colour", subject.draw(asking).color, subject.draw(scene).color, atol=0.0)
+
+
+@CHECKS.check("R52", free("antialiased"))
+def antialiased_gradients_are_the_oracles(subject: RasterizerSubject) -> None:
+    """Antialiased, the picture and the gradient of every input are the oracle's, of discs too."""
+    require_reference_picture(subject, thin_scene())
+    require_reference_gradients(subject, thin_scene())

@@ -1,4 +1,4 @@
-"""R01 to R13: the drawing rules, one by one, against what can be written down by hand."""
+"""R01 to R14: the drawing rules, one by one, against what can be written down by hand."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hoigs.testing.rasterizer.scenes import (
     one_gaussian,
     random_gaussians,
 )
-from hoigs.testing.rasterizer.subject import CHECKS, RasterizerSubject
+from hoigs.testing.rasterizer.subject import CHECKS, RasterizerSubject, free
 
 CENTRE = (7, 10)  # pixel of `front_camera` at its principal point
 
@@ -151,6 +151,20 @@ def low_pass_is_the_variance_of_a_point(subject: RasterizerSubject) -> None:
         beside = 0.8 * math.exp(-0.5 / low_pass)  # one pixel from the centre
         require_close(f"low_pass {low_pass}: centre", output.alpha[CENTRE], 0.8, atol=1e-5)
         require_close(f"low_pass {low_pass}: beside", output.alpha[7, 11], beside, atol=1e-5)
+
+
+@CHECKS.check("R14", free("antialiased"))
+def antialiased_points_fade(subject: RasterizerSubject) -> None:
+    """Antialiased, a Gaussian keeps its opacity times its area on screen: small ones fade."""
+    request = RenderRequest(antialiased=True)
+    for sigma in (0.3, 1.0, 4.0):  # pixels
+        splat = one_gaussian(scale=sigma * 2.0 / 20.0, opacity=0.8)
+        output = subject.render(splat, front_camera(), request)
+        variance = sigma**2 + 0.3
+        centre = 0.8 * sigma**2 / variance
+        beside = centre * math.exp(-0.5 / variance)  # one pixel from the centre
+        require_close(f"sigma {sigma}: centre", output.alpha[CENTRE], centre, atol=1e-5)
+        require_close(f"sigma {sigma}: beside", output.alpha[7, 11], beside, atol=1e-5)
 
 
 @cache

@@ -214,6 +214,7 @@ def _page(
         "stride": stride,
         "tracks": list(heads),
         "lowPass": loaded.model.low_pass,
+        "antialiased": loaded.model.antialiased,
         "up": clip.up().tolist(),
         "distance": distance_to_subject(clip),
         "cameras": [

@@ -125,7 +125,7 @@ function multiply(p, q, out) {
 const VERTEX = `#version 300 es
 precision highp float; precision highp int;
 uniform highp sampler2D splats;
-uniform mat3 turn; uniform vec3 shift; uniform vec2 focal, center, size; uniform float blur;
+uniform mat3 turn; uniform vec3 shift; uniform vec2 focal, center, size; uniform float blur; uniform bool antialiased;
 in uint index;
 out vec4 color; out vec2 offset;
 void main() {
@@ -142,23 +142,25 @@ void main() {
                 2.0 * (x*y - w*z), 1.0 - 2.0 * (x*x + z*z), 2.0 * (y*z + w*x),
                 2.0 * (x*z + w*y), 2.0 * (y*z - w*x), 1.0 - 2.0 * (x*x + y*y));
   mat3 M = turn * R * mat3(s.x, 0, 0, 0, s.y, 0, 0, 0, s.z);
-  mat3 V = M * transpose(M);
   vec2 half_ = 0.5 * size / focal;
   vec2 t = clamp(p.xy / p.z, -(center / focal + 0.3 * half_), (size - center) / focal + 0.3 * half_);
   vec3 jx = vec3(focal.x / p.z, 0.0, -focal.x * t.x / p.z);
   vec3 jy = vec3(0.0, focal.y / p.z, -focal.y * t.y / p.z);
-  float a = dot(jx, V * jx) + blur, b = dot(jx, V * jy), c = dot(jy, V * jy) + blur;
+  vec3 m0 = transpose(M) * jx, m1 = transpose(M) * jy;
+  float a = dot(m0, m0) + blur, b = dot(m0, m1), c = dot(m1, m1) + blur;
+  float opacity = place.w;
+  if (antialiased) opacity *= length(cross(m0, m1)) / sqrt(max(a * c - b * b, 1e-12));
   float mid = 0.5 * (a + c), reach = sqrt(max(0.25 * (a - c) * (a - c) + b * b, 1e-12));
   float big = mid + reach, small = max(mid - reach, 1e-4);
   vec2 axis = abs(b) > 1e-6 ? normalize(vec2(b, big - a)) : (a >= c ? vec2(1, 0) : vec2(0, 1));
-  float cut = sqrt(max(2.0 * log(255.0 * place.w), 0.0));
+  float cut = sqrt(max(2.0 * log(255.0 * opacity), 0.0));
   if (cut <= 0.0) return;
   vec2 corner = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
   offset = corner * cut;
   vec2 at2 = pixel + axis * offset.x * sqrt(big) + vec2(-axis.y, axis.x) * offset.y * sqrt(small);
   if (pixel.x + cut * sqrt(big) < 0.0 || pixel.x - cut * sqrt(big) > size.x ||
       pixel.y + cut * sqrt(big) < 0.0 || pixel.y - cut * sqrt(big) > size.y) return;
-  color = vec4(texelFetch(splats, at + ivec2(3, 0), 0).rgb, place.w);
+  color = vec4(texelFetch(splats, at + ivec2(3, 0), 0).rgb, opacity);
   gl_Position = vec4(2.0 * at2.x / size.x - 1.0, 1.0 - 2.0 * at2.y / size.y, 0.0, 1.0);
 }`;
 const FRAGMENT = `#version 300 es
@@ -185,7 +187,7 @@ function prepare() {
   made.linkProgram(program);
   if (!made.getProgramParameter(program, made.LINK_STATUS)) throw new Error(made.getProgramInfoLog(program));
   made.useProgram(program);
-  for (const name of ["turn", "shift", "focal", "center", "size", "blur"]) uniforms[name] = made.getUniformLocation(program, name);
+  for (const name of ["turn", "shift", "focal", "center", "size", "blur", "antialiased"]) uniforms[name] = made.getUniformLocation(program, name);
   texture = made.createTexture();
   made.bindTexture(made.TEXTURE_2D, texture);
   for (const key of [made.TEXTURE_MIN_FILTER, made.TEXTURE_MAG_FILTER]) made.texParameteri(made.TEXTURE_2D, key, made.NEAREST);
@@ -255,6 +257,7 @@ function draw() {
   gl.uniform2f(uniforms.center, camera.K[2], camera.K[3]);
   gl.uniform2f(uniforms.size, width, height);
   gl.uniform1f(uniforms.blur, H.lowPass);
+  gl.uniform1i(uniforms.antialiased, H.antialiased ? 1 : 0);
   gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
 }
 

@@ -47,6 +47,18 @@ def plain_covariances(gaussians: Gaussians, camera: Camera, low_pass: float) -> 
 
 
 @pytest.mark.parametrize("low_pass", [0.0, 0.3, 5.0])
+def test_antialiased_opacities_keep_their_sum_over_the_image(low_pass: float) -> None:
+    """Mip-Splatting, eq. 9: opacity sqrt(det) is that without the low-pass."""
+    gaussians, camera = a_cloud(), a_camera()
+    request = RenderRequest(low_pass=low_pass, antialiased=True, min_alpha=0.0)
+    shown = project_gaussians(gaussians, camera, request)
+    rows = gaussians[shown.index]
+    sums = shown.opacities * torch.linalg.det(plain_covariances(rows, camera, low_pass)).sqrt()
+    without = torch.linalg.det(plain_covariances(rows, camera, 0.0)).sqrt()
+    torch.testing.assert_close(sums, rows.opacities * without)
+
+
+@pytest.mark.parametrize("low_pass", [0.0, 0.3, 5.0])
 def test_means_covariances_and_conics(low_pass: float) -> None:
     gaussians, camera = a_cloud(), a_camera()
     shown = project_gaussians(gaussians, camera, RenderRequest(low_pass=low_pass))

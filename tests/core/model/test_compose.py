@@ -219,14 +219,17 @@ def test_entities_and_their_gaussians(parse, registry, clip):
 
 
 def test_a_model_is_drawn_with_the_low_pass_of_its_spec(parse, registry, clip):
-    model = compose(parse(f"low_pass: 0.1\n{TEXT}"), clip, registry)
+    model = compose(parse(f"low_pass: 0.1\nantialiased: true\n{TEXT}"), clip, registry)
     seen: list[RenderRequest] = []
     model.rasterizer = SimpleNamespace(render=lambda gaussians, camera, how: seen.append(how))
     moment, camera = clip.moments[0], clip.cameras[0]
     model.draw(model(moment).joined(), camera, RenderRequest(near=0.2))
     model.render(moment, camera, background=torch.ones(3))
     assert [(how.low_pass, how.near) for how in seen] == [(0.1, 0.2), (0.1, RenderRequest.near)]
-    assert compose(parse(), clip, registry).low_pass == RenderRequest.low_pass  # that of 3DGS
+    assert all(how.antialiased for how in seen)
+    plain = compose(parse(), clip, registry)  # as 3DGS
+    ours = (plain.low_pass, plain.antialiased)
+    assert ours == (RenderRequest.low_pass, RenderRequest.antialiased)
 
 
 @pytest.mark.parametrize(("step", "degree"), [(0.0, 0), (0.001, 0), (0.1, 2)])

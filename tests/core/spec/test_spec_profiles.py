@@ -82,9 +82,10 @@ def test_matched_takes_what_the_yardstick_has(path):
     assert matched.train.warmup.interaction == 0.5 and matched.summary == "a spec with profiles"
     # what the profile leaves to its default is the same for all, and all else is hoigs
     for spec in (matched, yardstick):
-        assert spec.low_pass == Spec.model_fields["low_pass"].default != hoigs.low_pass
+        for key in ("low_pass", "antialiased"):
+            assert getattr(spec, key) == Spec.model_fields[key].default != getattr(hoigs, key)
         assert spec.train.rates == RatesSpec() != hoigs.train.rates
-    as_it_is = {"low_pass": hoigs.low_pass, "name": hoigs.name}
+    as_it_is = {key: getattr(hoigs, key) for key in ("low_pass", "antialiased", "name")}
     rated = yardstick.train.model_copy(update={"rates": hoigs.train.rates})
     assert yardstick.model_copy(update={**as_it_is, "train": rated}).hash() == hoigs.hash()
 

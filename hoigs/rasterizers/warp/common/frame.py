@@ -24,6 +24,7 @@ class Settings:
     active_bases: int
     near: float
     low_pass: float
+    antialiased: bool
     max_alpha: float
     min_alpha: float
     min_transmittance: float

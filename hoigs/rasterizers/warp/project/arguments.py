@@ -37,7 +37,7 @@ def project_arguments(inputs: Inputs, settings: Settings, out: Projected) -> lis
         *(inputs.screen_offsets, int(inputs.screen_offsets.numel() > 0)),
         *(inputs.subset, int(inputs.subset.numel() > 0)),
         *(inputs.K, inputs.world_to_camera, settings.width, settings.height),
-        *(settings.near, settings.low_pass, settings.min_alpha),
+        *(settings.near, settings.low_pass, int(settings.antialiased), settings.min_alpha),
         max(settings.min_alpha, SMALLEST_ALPHA),
         *(out.records, out.means2d, out.depths, out.drawn_depths, out.radii),
     ]
@@ -85,7 +85,8 @@ def adjoint_arguments(
         *(inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, inputs.sh),
         *(inputs.sh.shape[1], settings.active_bases, inputs.channels),
         *(inputs.screen_offsets, int(inputs.screen_offsets.numel() > 0)),
-        *(inputs.K, inputs.world_to_camera, settings.width, settings.height, settings.low_pass),
+        *(inputs.K, inputs.world_to_camera, settings.width, settings.height),
+        *(settings.low_pass, int(settings.antialiased)),
         *(records, intersections.first_partial, intersections.tiles_per_gaussian, partials),
         *(out.means, out.quats, out.log_scales, out.opacity_logits, out.sh),
         *(out.screen_offsets, out.features, out.absolutes, ABSOLUTES * int(len(out.absolutes) > 0)),

@@ -34,6 +34,7 @@ class Screen:
     xx: float
     xy: float
     yy: float
+    normal: wp.vec3  # m0 x m1, whose length is the area before the low-pass
     det: float
 
 
@@ -148,9 +149,9 @@ def onto_screen(
     s.m1 = fy * inverse_z * (a1 - s.slope_y * a2)
     xx = wp.dot(s.m0, s.m0)
     yy = wp.dot(s.m1, s.m1)
-    normal = wp.cross(s.m0, s.m1)
+    s.normal = wp.cross(s.m0, s.m1)
     s.xy = wp.dot(s.m0, s.m1)
-    s.det = wp.dot(normal, normal) + low_pass * (xx + yy) + low_pass * low_pass
+    s.det = wp.dot(s.normal, s.normal) + low_pass * (xx + yy) + low_pass * low_pass
     s.xx = xx + low_pass
     s.yy = yy + low_pass
     return s

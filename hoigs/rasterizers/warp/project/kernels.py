@@ -100,7 +100,7 @@ def project(
     has_offsets: int,
     subset: U8,  # empty when all are drawn
     has_subset: int, K: F32, world_to_camera: F32, width: int, height: int, near: float,
-    low_pass: float, min_alpha: float,
+    low_pass: float, antialiased: int, min_alpha: float,
     smallest_alpha: float,  # min_alpha, but not 0
     records: F32, means2d: F32, depths: F32,
     drawn_depths: F32,  # negative where nothing is drawn
@@ -131,6 +131,8 @@ def project(
     if not is_regular(s, quat, scale, near):
         return
     log2_opacity = log2_sigmoid(logit)
+    if antialiased != 0:
+        log2_opacity += 0.5 * (wp.log2(wp.dot(s.normal, s.normal)) - wp.log2(s.det))
     reach = (log2_opacity - wp.log2(smallest_alpha)) / HALF_LOG2E  # 2 ln(opacity / min_alpha)
     half_width = wp.sqrt(reach * s.xx)
     half_height = wp.sqrt(reach * s.yy)
@@ -196,7 +198,7 @@ def project(
 def project_adjoint(
     means: VEC3, quats: VEC4, log_scales: VEC3, opacity_logits: F32, sh: VEC3, stored_bases: int,
     active_bases: int, channels: int, offsets: F32, has_offsets: int, K: F32, world_to_camera: F32,
-    width: int, height: int, low_pass: float, records: F32,
+    width: int, height: int, low_pass: float, antialiased: int, records: F32,
     first_partial: I32,  # index in `partials` of a Gaussian's first
     partial_counts: I32,  # how many it has
     partials: F32, v_means: VEC3, v_quats: VEC4, v_log_scales: VEC3, v_opacity_logits: F32,
@@ -274,8 +276,11 @@ def project_adjoint(
     v_u = wide * gu
     v_v = gy / s.yy - shear * v_u
     # det = |m0 x m1|^2 + low_pass (m0.m0 + m1.m1) + low_pass^2
-    normal = wp.cross(s.m0, s.m1)
-    v_normal = 2.0 * v_det * normal
+    v_square = v_det  # by |m0 x m1|^2
+    if antialiased != 0:  # ln opacity has ln |m0 x m1| - ln det / 2
+        v_det -= 0.5 * g / s.det
+        v_square = v_det + 0.5 * g / wp.dot(s.normal, s.normal)
+    v_normal = 2.0 * v_square * s.normal
     v_m0 = wp.cross(s.m1, v_normal) + 2.0 * low_pass * v_det * s.m0 + v_xy * s.m1
     v_m1 = wp.cross(v_normal, s.m0) + 2.0 * (low_pass * v_det + v_yy) * s.m1 + v_xy * s.m0
     raw = onto_screen_adjoint(
