@@ -55,8 +55,8 @@ def name_of(point: Point, points: Sequence[Point], steps: bool = False) -> str:
 
 
 def machines(points: Sequence[Point]) -> list[str]:
-    """Descriptions of the machines, in order of their first point."""
-    return list(dict.fromkeys(p.machine for p in points))
+    """Descriptions of the machines, sorted: a machine has one letter however points are ordered."""
+    return sorted({p.machine for p in points})
 
 
 def machine_sentences(points: Sequence[Point]) -> list[str]:

@@ -19,7 +19,7 @@ from hoigs.studies.chart.curves import curve_chart
 from hoigs.studies.chart.data import load_chart, points_of
 from hoigs.studies.chart.interactive import details, page
 from hoigs.studies.chart.panels import accuracy_chart
-from hoigs.studies.chart.series import series_of
+from hoigs.studies.chart.series import machine_sentences, series_of
 from hoigs.studies.chart.write import by_clip, write_chart
 from hoigs.studies.plotting.style import is_log, short_number
 
@@ -73,7 +73,9 @@ def test_two_machines_are_named_and_their_times_refused() -> None:
     assert len(apart.axes) == 2 * 2 and len(mixed.axes) == 2 * 4
     for figure in (apart, mixed):
         text = _texts(figure)
-        assert "carry: points of 2 machines" in text and f"machine B: {B}" in text
+        assert "carry: points of 2 machines" in text and f"machine B: {max(A, B)}" in text
+        # one letter a machine, however the points of a figure are ordered
+        assert machine_sentences(points[::-1]) == machine_sentences(points)
     assert "not drawn: measured on 2 machines" in _texts(apart)
     assert len(curve_chart(points, "c").axes) == 1  # type: ignore[union-attr]
     assert len(curve_chart(points, "c", mix_machines=True).axes) == 2  # type: ignore[union-attr]
