@@ -10,9 +10,10 @@ from hoigs.testing.plugin.imports import probe_targets
 from hoigs.testing.runner import KINDS, Candidate
 
 REGISTRY = default_registry()
+HUMAN = "deformation:hexplane-skinning"
 SMALL = {  # smaller, but the same code
     "deformation:hexplane-field": {"channels": 2, "resolution": 8, "width": 16, "multires": [1, 2]},
-    "deformation:hexplane-skinning": {"resolution": 16, "channels": 4, "width": 16},
+    HUMAN: {"resolution": 16, "channels": 4, "width": 16},
     "deformation:triplane-avatar": {"resolution": 16, "channels": 4, "width": 16},
     "deformation:mlp": {"width": 32, "depth": 4},
     "deformation:se3-field": {"width": 32},
@@ -39,7 +40,10 @@ def _imported_at_once() -> None:
 @pytest.mark.parametrize(
     ("key", "settings"),
     [(key, SMALL.get(key, {})) for key in KEYS]
-    + [("interaction:cross-attention", {"places": "hands"})],  # as the spec hoigs has it
+    + [  # as the spec hoigs has them
+        ("interaction:cross-attention", {"places": "hands"}),
+        (HUMAN, SMALL[HUMAN] | {"free_attributes": "all", "nonrigid": True}),
+    ],
 )
 def test_conforms(key, settings) -> None:
     report = Candidate(key, Options(settings), REGISTRY).report()

@@ -72,11 +72,12 @@ def test_rows_about_a_time_are_those_that_are_read() -> None:
 
 
 def test_a_window_draws_what_the_whole_model_draws(tmp_path: Path) -> None:
-    session = opened(tmp_path / "run", "train.chunk=6")
+    clothes = "model.human.deformation.nonrigid=true"
+    session = opened(tmp_path / "run", "train.chunk=6", clothes)
     trainer, clip, model = session.trainer, session.clip, session.trainer.model
     windows = trainer.windows
     assert windows is not None
-    assert set(windows.names) == PAGED
+    assert set(windows.names) == PAGED | {"entities.human.deformation.nonrigid.planes.time"}
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for name in windows.names:

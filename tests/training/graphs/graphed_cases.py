@@ -193,6 +193,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "heads": {"attention": {"pose_head": "per-part", "object_residual": "both", "gate": "hard"}},
     "plain tokens": {"plain_tokens": True},
     "given poses": {"human": {"refine_poses": False}},
+    "clothes": {"human": {"nonrigid": True}},
     "skinned": {"person": partial(skinned, refine_poses=False), "unattended": True},
     "skinned, refined": {"person": partial(skinned, refine_poses=True), "unattended": True},
     "rigid": {"motion": keyframed(RigidSpline)},

@@ -27,7 +27,12 @@ from hoigs.plugins.deformation.avatars.canonical_head import (
     CanonicalHead,
     HeadKind,
 )
-from hoigs.plugins.deformation.avatars.skinned_body import SkinnedBodyConfig, at_frame
+from hoigs.plugins.deformation.avatars.nonrigid import NonRigidMotion
+from hoigs.plugins.deformation.avatars.skinned_body import (
+    SkinnedBodyConfig,
+    at_frame,
+    exact_poses,
+)
 from hoigs.plugins.deformation.avatars.surface_body import OPAQUE, SurfaceBody
 from hoigs.plugins.deformation.avatars.surface_laplacian import (
     LaplacianOn,
@@ -80,6 +85,11 @@ class HexPlaneSkinningConfig(SkinnedBodyConfig):
     residual_rule: ResidualRule = "add"
     """How delta theta joins theta: "add" axis-angles, as the paper prints it, or "compose"
     rotations, which differs for large angles."""
+    nonrigid: bool | Literal["auto"] = False
+    """Learn what clothes, hair and soft tissue do beside the skeleton: an offset and a change of
+    colour of every canonical point, at every time. "auto" learns it unless the clip declares its
+    poses to be exact, as `refine_poses` does: people of built-in clips are rigid between their
+    joints. False is the paper's Eq. 5."""
     laplacian: LaplacianOn = "points"
     """Where L_reg of psi_h is taken: over neighbouring "points", the Gaussians, at no further cost;
     or over the vertices of the body's "mesh" (the paper), by a second pass of psi_h, but then
@@ -108,6 +118,7 @@ class HexPlaneSkinning(SurfaceBody):
     learns_scale = True
     rates: ClassVar[Mapping[str, str]] = {
         "planes": "planes",
+        "nonrigid.planes": "planes",
         **SurfaceBody.rates,
         "log_alpha": "shape",
     }
@@ -119,6 +130,9 @@ class HexPlaneSkinning(SurfaceBody):
         "skinning": 1.0,
         "time_smoothness": 0.01,
         "time_sparsity": 1e-4,
+        "nonrigid": 1.0,
+        "nonrigid_smoothness": 0.01,
+        "nonrigid_sparsity": 1e-4,
     }
 
     field_vertices: Tensor
@@ -141,6 +155,7 @@ class HexPlaneSkinning(SurfaceBody):
             config.fusion, config.channels, config.resolution, time_resolution
         )
         self.head = CanonicalHead(self.planes.width, len(body.parents), config.width, config.head)
+        self.nonrigid = NonRigidMotion(self.num_frames or 0) if config.nonrigid else None
         owned: set[str] = set() if config.free_attributes == "all" else {"means", "quats"}
         owned |= {"opacity_logits"} if self.opaque else set()
         if not config.free_attributes:
@@ -151,12 +166,15 @@ class HexPlaneSkinning(SurfaceBody):
         self._cached: tuple[object, CanonicalAttributes, Tensor] | None = None
         self._own: tuple[object, Tensor] | None = None
         self._last: tuple[CanonicalAttributes, Tensor] | None = None
+        self._moved: Tensor | None = None  # offsets of `nonrigid` in the last forward pass
         self._held: tuple[Gaussians, Tensor] | None = None
 
     @classmethod
     def from_config(cls, config: Any, context: BuildContext) -> Self:
-        made = super().from_config(config, context)
         clip, track = context.clip, context.body_track
+        if config.nonrigid == "auto":
+            config = config.model_copy(update={"nonrigid": not exact_poses(clip)})
+        made = super().from_config(config, context)
         if config.alpha_start == "depth" and clip is not None and track is not None:
             ratio = depth_ratio(clip, context.entity, made.body, track)
             nn.init.constant_(made.log_alpha, math.log(ratio))
@@ -184,6 +202,10 @@ class HexPlaneSkinning(SurfaceBody):
             attributes, weights = self._attributes(canonical)
             change = self.shape_change(pose, vertices, moment)
             refined = self._canonical(canonical, attributes, change)
+        if self.nonrigid is not None:
+            delta = self.nonrigid(self._cell(canonical.means), moment.time, refined.sh.shape[1])
+            self._moved = delta.means if self._remembers() else None
+            refined = refined.moved(delta)
         return self.posed(refined, weights, pose, joints, moment, residual)
 
     @torch.no_grad()
@@ -224,7 +246,7 @@ class HexPlaneSkinning(SurfaceBody):
         if attributes.weights is not None:
             logits = logits + attributes.weights
         weights = logits.softmax(-1)
-        if self.training and torch.is_grad_enabled():
+        if self._remembers():
             self._remember(attributes, weights)
         elif keep:
             self._cached = (state, attributes, weights)
@@ -242,15 +264,21 @@ class HexPlaneSkinning(SurfaceBody):
 
     def _predicted(self, points: Float[Tensor, "N 3"]) -> CanonicalAttributes:
         """psi_h(f) at points of the zero pose, metres."""
-        attributes: CanonicalAttributes = self.head(
-            self.planes((points - self.rest_joints[PELVIS]) / self.half_box)
-        )
+        attributes: CanonicalAttributes = self.head(self.planes(self._cell(points)))
         return attributes
+
+    def _cell(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Points of the zero pose, metres, as planes take them: in [-1, 1]."""
+        return (points - self.rest_joints[PELVIS]) / self.half_box
+
+    def _remembers(self) -> bool:
+        """Whether `regularizers` may follow, for whose sake outputs are kept."""
+        return self.training and torch.is_grad_enabled()
 
     def train(self, mode: bool = True) -> Self:
         self._cached = self._held = None
         if not mode:
-            self._last = None  # it has the graph of a step, with which a model cannot be copied
+            self._last = self._moved = None  # a model cannot be copied with the graph of a step
         return super().train(mode)
 
     def _remember(self, attributes: CanonicalAttributes, weights: Tensor) -> None:
@@ -260,7 +288,7 @@ class HexPlaneSkinning(SurfaceBody):
 
             def forget(gradient: Tensor) -> None:
                 del gradient
-                self._last = None
+                self._last = self._moved = None
 
             attributes.offsets.register_hook(forget)
 
@@ -318,7 +346,8 @@ class HexPlaneSkinning(SurfaceBody):
 
     def on_topology(self, change: TopologyChange) -> None:
         super().on_topology(change)
-        self.neighbours = self._cached = self._own = self._last = self._held = None
+        self.neighbours = self._cached = self._own = self._held = None
+        self._last = self._moved = None
 
     def regularizers(self) -> dict[str, Tensor]:
         """Means over points (or cells) of squares, except the sparsity.
@@ -327,6 +356,7 @@ class HexPlaneSkinning(SurfaceBody):
         (L_reg of HOIGS, Eq. 16); "laplacian_scale", "laplacian_color": log-scale and RGB likewise
         (`laplacian_of`). "skinning": distance to the body's own weights (HUGS). "scale": distance
         of log-scales to the template's. "time_smoothness", "time_sparsity": see PairedPlanes.
+        "nonrigid": offsets of `NonRigidMotion`, m^2; its planes have penalties of their own.
 
         Those of points share the graph of the last forward pass: add them to the same loss.
         """
@@ -334,6 +364,10 @@ class HexPlaneSkinning(SurfaceBody):
             "time_smoothness": self.planes.time_smoothness(),
             "time_sparsity": self.planes.time_sparsity(),
         }
+        if self.nonrigid is not None:
+            penalties |= self.nonrigid.penalties()
+        if self._moved is not None:
+            penalties["nonrigid"] = self._moved.square().sum(-1).mean()
         if self._last is not None:
             attributes, weights = self._last
             penalties["offset"] = attributes.offsets.square().sum(-1).mean()

@@ -153,8 +153,7 @@ class SkinnedBody(DeformationModel):
                 "of kind human"
             )
         if config.refine_poses == "auto":
-            exact = context.clip is not None and context.clip.provenance.get(POSES_EXACT) is True
-            config = config.model_copy(update={"refine_poses": not exact})
+            config = config.model_copy(update={"refine_poses": not exact_poses(context.clip)})
         return cls(config, body=context.body, **context_settings(context))
 
     @property
@@ -290,6 +289,11 @@ class SkinnedBody(DeformationModel):
 def _time_on_device(moment: Moment) -> bool:
     """Whether time is a tensor, as while a CUDA graph is captured: the host must not wait then."""
     return isinstance(moment.time, Tensor)
+
+
+def exact_poses(clip: Clip | None) -> bool:
+    """Whether the clip declares that its body poses have no error."""
+    return clip is not None and clip.provenance.get(POSES_EXACT) is True
 
 
 def context_settings(context: BuildContext) -> dict[str, Any]:

@@ -301,6 +301,10 @@ def test_what_moves_alpha(toy_body, about, seen):  # F17
 @pytest.mark.parametrize(("provenance", "refined"), [({}, True), ({POSES_EXACT: False}, True),
                                                      ({POSES_EXACT: True}, False)])  # fmt: skip
 def test_exact_poses_are_not_refined_by_auto(toy_body, provenance, refined):
+    """Nor do people whose poses are exact move but rigidly."""
     clip = replace(clip_of(toy_body, 1.0), provenance=provenance)
-    assert (built(toy_body, clip, refine_poses="auto").refinement is not None) == refined
-    assert built(toy_body, clip, refine_poses=True).refinement is not None
+    model = built(toy_body, clip, refine_poses="auto", nonrigid="auto")
+    assert (model.refinement is not None) == refined
+    assert (model.nonrigid is not None) == refined
+    model = built(toy_body, clip, refine_poses=True, nonrigid=True)
+    assert model.refinement is not None and model.nonrigid is not None

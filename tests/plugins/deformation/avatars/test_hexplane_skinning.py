@@ -170,7 +170,7 @@ def test_every_part_has_field_points(toy_body):
 
 @pytest.mark.parametrize("head", ["full", "exavatar"])
 def test_every_parameter_learns(toy_body, toy_pose, head):
-    entity = perturb(human(toy_body, head=head, refine_poses=True, num_frames=5))
+    entity = perturb(human(toy_body, head=head, refine_poses=True, nonrigid=True, num_frames=5))
     moment = at(toy_pose(6), 0.4)
     out = entity(moment)
     g = torch.Generator().manual_seed(2)
@@ -205,7 +205,7 @@ def test_places_and_turns_can_be_trained_too(toy_body, toy_pose, head, owned):
 
 
 def test_gradcheck(toy_body, toy_pose):
-    entity = perturb(human(toy_body, channels=2, resolution=4, width=8)).double()
+    entity = perturb(human(toy_body, channels=2, resolution=4, width=8, nonrigid=True)).double()
     pose = toy_pose(7, dtype=torch.float64)
     model = entity.deformation
     canonical = entity.canonical[torch.arange(COUNT)]
@@ -292,7 +292,7 @@ def test_cache_follows_every_change(toy_body, toy_pose):
 
 
 def test_regularizers(toy_body, toy_pose):
-    entity = human(toy_body)
+    entity = human(toy_body, nonrigid=True)
     model, moment = entity.deformation, at(toy_pose(1))
     entity(moment)
     assert all(v == 0 for v in model.regularizers().values())
@@ -301,7 +301,9 @@ def test_regularizers(toy_body, toy_pose):
     perturb(entity)
     loss = entity(moment).means.sum() + sum(model.regularizers().values())
     loss.backward()
-    assert set(model.regularizers()) == {"time_smoothness", "time_sparsity"}  # graph is used up
+    of_planes = {"time_smoothness", "time_sparsity"}
+    of_planes |= {f"nonrigid_{name.removeprefix('time_')}" for name in of_planes}
+    assert set(model.regularizers()) == of_planes  # the graph of points is used up
     sum(model.regularizers().values()).backward()
     entity(moment)
     for name, value in model.regularizers().items():

@@ -1,0 +1,60 @@
+"""What a person does beside following the skeleton: clothes, hair, soft tissue, and shading."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from hoigs.core.cuda_graphs.device_constants import Time
+from hoigs.core.maths.feature_planes import PairedPlanes
+from hoigs.core.maths.networks import dense, zeroed
+from hoigs.core.values.gaussians import SH_C0, GaussianDelta
+
+CHANNELS = 32
+RESOLUTION = 64  # along each space axis: folds of clothes, not their pattern
+WIDTH = 64  # of the hidden layer
+FRAMES = 4  # a cell along time: a frame that is not trained on takes the motion of those around
+LEAST = 4  # cells along time
+UNIT = 0.1  # metres, of offsets: at the learning rate of networks, metres would diverge
+
+
+class NonRigidMotion(nn.Module):
+    """(dP, dc) = psi_n(phi(P_c, t)): offset and change of colour of canonical points at a time.
+
+    HOIGS describes soft tissue, learned by "temporally varying parameters alongside spatial
+    features", and gives no equation of it. Canonical points that move by a network before they are
+    skinned are those of 3DGS-Avatar (Qian et al. 2024, arXiv:2312.09228), which reads the pose
+    where this reads the time; its features are phi of HexPlane, so that motion is smooth over the
+    body and in time. It starts by changing nothing.
+
+    Args:
+        num_frames: of the clip.
+    """
+
+    def __init__(self, num_frames: int) -> None:
+        super().__init__()
+        self.planes = PairedPlanes(CHANNELS, RESOLUTION, max(LEAST, num_frames // FRAMES))
+        self.layers = nn.Sequential(
+            nn.Linear(self.planes.width, WIDTH),
+            nn.ReLU(inplace=True),
+            zeroed(nn.Linear(WIDTH, 6)),
+        )
+
+    def forward(self, points: Float[Tensor, "N 3"], time: Time, bands: int) -> GaussianDelta:
+        """
+        Args:
+            points: of the zero pose, in [-1, 1] within the planes. time: in [0, 1].
+            bands: number of coefficients of the Gaussians' harmonics.
+        """
+        offsets, colors = dense(self.layers, self.planes(points, time)).split(3, dim=-1)
+        return GaussianDelta(
+            means=UNIT * offsets, sh=pad(colors[:, None] / SH_C0, (0, 0, 0, bands - 1))
+        )
+
+    def penalties(self) -> dict[str, Tensor]:
+        """Of the planes, as those of the human's own (`HexPlaneSkinning.regularizers`)."""
+        return {
+            "nonrigid_smoothness": self.planes.time_smoothness(),
+            "nonrigid_sparsity": self.planes.time_sparsity(),
+        }
