@@ -27,7 +27,7 @@ from hoigs.plugins.deformation.avatars.canonical_head import (
     CanonicalHead,
     HeadKind,
 )
-from hoigs.plugins.deformation.avatars.nonrigid import NonRigidMotion
+from hoigs.plugins.deformation.avatars.nonrigid import NonRigidConfig, NonRigidMotion
 from hoigs.plugins.deformation.avatars.skinned_body import (
     SkinnedBodyConfig,
     at_frame,
@@ -90,6 +90,8 @@ class HexPlaneSkinningConfig(SkinnedBodyConfig):
     colour of every canonical point, at every time. "auto" learns it unless the clip declares its
     poses to be exact, as `refine_poses` does: people of built-in clips are rigid between their
     joints. False is the paper's Eq. 5."""
+    nonrigid_motion: NonRigidConfig = Field(default_factory=NonRigidConfig)
+    """Sizes of what `nonrigid` learns."""
     laplacian: LaplacianOn = "points"
     """Where L_reg of psi_h is taken: over neighbouring "points", the Gaussians, at no further cost;
     or over the vertices of the body's "mesh" (the paper), by a second pass of psi_h, but then
@@ -155,7 +157,9 @@ class HexPlaneSkinning(SurfaceBody):
             config.fusion, config.channels, config.resolution, time_resolution
         )
         self.head = CanonicalHead(self.planes.width, len(body.parents), config.width, config.head)
-        self.nonrigid = NonRigidMotion(self.num_frames or 0) if config.nonrigid else None
+        self.nonrigid: NonRigidMotion | None = None
+        if config.nonrigid:
+            self.nonrigid = NonRigidMotion(config.nonrigid_motion, self.num_frames or 0)
         owned: set[str] = set() if config.free_attributes == "all" else {"means", "quats"}
         owned |= {"opacity_logits"} if self.opaque else set()
         if not config.free_attributes:

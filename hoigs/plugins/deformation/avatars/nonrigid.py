@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from hoigs.core.config import ComponentConfig
 from hoigs.core.cuda_graphs.device_constants import Time
 from hoigs.core.maths.feature_planes import PairedPlanes
 from hoigs.core.maths.networks import dense, zeroed
 from hoigs.core.values.gaussians import SH_C0, GaussianDelta
 
-CHANNELS = 32
-RESOLUTION = 64  # along each space axis: folds of clothes, not their pattern
-WIDTH = 64  # of the hidden layer
-FRAMES = 4  # a cell along time: a frame that is not trained on takes the motion of those around
 LEAST = 4  # cells along time
 UNIT = 0.1  # metres, of offsets: at the learning rate of networks, metres would diverge
+
+
+class NonRigidConfig(ComponentConfig):
+    """Sizes of what is learned beside the skeleton."""
+
+    channels: int = Field(default=32, ge=1)
+    """Channels of each of its planes."""
+    resolution: int = Field(default=64, ge=2)
+    """Cells along each space axis of its planes: folds of clothes, not their pattern."""
+    frames: int = Field(default=3, ge=1)
+    """Frames of a cell along time: one that is not trained on takes the motion of those around."""
+    width: int = Field(default=64, ge=1)
+    """Width of its hidden layer."""
 
 
 class NonRigidMotion(nn.Module):
@@ -32,13 +43,14 @@ class NonRigidMotion(nn.Module):
         num_frames: of the clip.
     """
 
-    def __init__(self, num_frames: int) -> None:
+    def __init__(self, config: NonRigidConfig, num_frames: int) -> None:
         super().__init__()
-        self.planes = PairedPlanes(CHANNELS, RESOLUTION, max(LEAST, num_frames // FRAMES))
+        cells = max(LEAST, num_frames // config.frames)
+        self.planes = PairedPlanes(config.channels, config.resolution, cells)
         self.layers = nn.Sequential(
-            nn.Linear(self.planes.width, WIDTH),
+            nn.Linear(self.planes.width, config.width),
             nn.ReLU(inplace=True),
-            zeroed(nn.Linear(WIDTH, 6)),
+            zeroed(nn.Linear(config.width, 6)),
         )
 
     def forward(self, points: Float[Tensor, "N 3"], time: Time, bands: int) -> GaussianDelta:

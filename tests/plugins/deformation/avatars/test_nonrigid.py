@@ -13,7 +13,7 @@ from hoigs.plugins.deformation.avatars.hexplane_skinning import (
     HexPlaneSkinning,
     HexPlaneSkinningConfig,
 )
-from hoigs.plugins.deformation.avatars.nonrigid import FRAMES, LEAST, NonRigidMotion
+from hoigs.plugins.deformation.avatars.nonrigid import LEAST, NonRigidConfig, NonRigidMotion
 
 COUNT, NUM_FRAMES = 200, 32
 
@@ -82,9 +82,9 @@ def test_offsets_are_canonical(entity, toy_pose):
 @pytest.mark.parametrize("frames", [1, 8, 64])
 @torch.no_grad()
 def test_a_frame_in_between_takes_what_its_neighbours_learned(frames):
-    """Features are linear in time within a cell, which is FRAMES frames long."""
-    motion = NonRigidMotion(frames)
-    cells = max(LEAST, frames // FRAMES)
+    """Features are linear in time within a cell, which is some frames long."""
+    motion = NonRigidMotion(NonRigidConfig(frames=2, resolution=8), frames)
+    cells = max(LEAST, frames // 2)
     assert motion.planes.time.shape[1] == cells
     motion.planes.time.add_(torch.randn_like(motion.planes.time))
     points = torch.rand(20, 3) * 2 - 1
