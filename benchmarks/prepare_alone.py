@@ -278,7 +278,7 @@ def table(found: dict[str, Any]) -> str:
             for key in ("person_iou", "object_iou", "person_and_object_iou")
         ]  # fmt: skip
         runs = [
-            row[key]["given poses"]["test frames"]["human_object"] if key in row else "-"
+            row[key]["blended poses"]["test frames"]["human_object"] if key in row else "-"
             for key in ("alone", "supplied")
         ]
         without = ", ".join(str(n) for n in row.get("frames_without", {}).values()) or "-"
