@@ -18,7 +18,8 @@ else given but one click on each object (`--prompt none`: not even that). Compar
   supplied ones are of complexity 1, so `--complexity 1` tests the pipe, and 2 (the default) shows
   how far the two models are from each other.
 - with `--train`, PSNR of person + object on test frames after a short training on what was found,
-  and on the clip that is prepared from the supplied files, both in the masks of the latter.
+  and on the clip that is prepared from the supplied files, both in the masks of the latter. The
+  table has those with "blended" poses, as every score of such a clip.
 - seconds of each stage, which an idle machine has to be asked for, and seconds of all processors,
   which depend less on what else runs.
 """

@@ -207,7 +207,8 @@ class HexPlaneSkinning(SurfaceBody):
             change = self.shape_change(pose, vertices, moment)
             refined = self._canonical(canonical, attributes, change)
         if self.nonrigid is not None:
-            delta = self.nonrigid(self._cell(canonical.means), moment.time, refined.sh.shape[1])
+            points = self._plane_points(canonical.means)
+            delta = self.nonrigid(points, moment.time, refined.sh.shape[1])
             self._moved = delta.means if self._remembers() else None
             refined = refined.moved(delta)
         return self.posed(refined, weights, pose, joints, moment, residual)
@@ -268,11 +269,11 @@ class HexPlaneSkinning(SurfaceBody):
 
     def _predicted(self, points: Float[Tensor, "N 3"]) -> CanonicalAttributes:
         """psi_h(f) at points of the zero pose, metres."""
-        attributes: CanonicalAttributes = self.head(self.planes(self._cell(points)))
+        attributes: CanonicalAttributes = self.head(self.planes(self._plane_points(points)))
         return attributes
 
-    def _cell(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """Points of the zero pose, metres, as planes take them: in [-1, 1]."""
+    def _plane_points(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Points of the zero pose, metres, in the coordinates of the planes: [-1, 1]."""
         return (points - self.rest_joints[PELVIS]) / self.half_box
 
     def _remembers(self) -> bool:
