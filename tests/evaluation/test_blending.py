@@ -18,7 +18,7 @@ from hoigs.evaluation.evaluate import evaluate
 from hoigs.evaluation.interpolation import pose_between
 from hoigs.evaluation.posing import posed_clip
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.plugins.deformation.avatars.skinned_body import SkinnedBody
+from hoigs.plugins.deformation.avatars.body.skinned_body import SkinnedBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.synthesis import SceneConfig, builtin_clip
 

@@ -43,6 +43,7 @@ def _imported_at_once() -> None:
     + [  # as the spec hoigs has them
         ("interaction:cross-attention", {"places": "hands"}),
         (HUMAN, SMALL[HUMAN] | {"free_attributes": "all", "nonrigid": True}),
+        (HUMAN, SMALL[HUMAN] | {"free_attributes": "all", "nonrigid": "shading"}),
     ],
 )
 def test_conforms(key, settings) -> None:

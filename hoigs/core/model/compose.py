@@ -17,6 +17,7 @@ from hoigs.core.interfaces.deformation import DeformationModel
 from hoigs.core.interfaces.density import DensityControl, check_rasterizer
 from hoigs.core.interfaces.initializer import ObjectInitializer, check_track
 from hoigs.core.interfaces.rasterizer import Rasterizer
+from hoigs.core.maths.denser import denser
 from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.registry.registry import Registry, default_registry
@@ -237,17 +238,22 @@ def initial_gaussians(
     The scene starts from the clip's points; a human from points spread evenly over its body; an
     object from the points of its track (the clip's, or its initializer's). Scales follow the
     spacing of the points (3DGS's rule).
+
+    Raises:
+        ValueError: the clip has no points, or a setting belongs to another kind.
     """
     clip = context.clip
     assert clip is not None
     degree = sh_degree_for(clip) if block.sh_degree == "auto" else block.sh_degree
     appearance: dict[str, Any] = {"opacity": block.opacity, "sh_degree": degree}
+    if block.upsample and kind != "object":
+        raise ValueError("upsample belongs to objects; remove it here")
     if kind != "scene":
         appearance["thickness"] = block.thickness
     if kind == "human":
         return _human(context, deformation, block.points, appearance)
     if kind == "object":
-        return _object(context, deformation, block.points, appearance)
+        return _object(context, deformation, block, appearance)
     if len(clip.points) == 0:
         raise ValueError("the clip has no scene points to start from (points.npz is empty)")
     if block.thickness != 1.0:
@@ -284,16 +290,21 @@ def _human(
 
 
 def _object(
-    context: BuildContext, deformation: DeformationModel, count: int, appearance: dict[str, Any]
+    context: BuildContext,
+    deformation: DeformationModel,
+    block: EntitySpec,
+    appearance: dict[str, Any],
 ) -> Gaussians:
     track = context.object_track
     assert track is not None
-    rows = _subset(len(track.points), count, context.seed)
-    points = track.points[rows]
+    rows = _subset(len(track.points), block.points, context.seed)
+    points, colors = track.points[rows], track.colors[rows]
+    if block.upsample:
+        points, colors = denser(points, colors, block.points, context.seed)
     if deformation.input_space == "world":
         first = int(track.observed.nonzero()[0]) if track.observed.any() else 0
         points = points @ track.rotations[first].mT + track.translations[first]
-    return Gaussians.from_points(points, track.colors[rows], **appearance)
+    return Gaussians.from_points(points, colors, **appearance)
 
 
 def _subset(available: int, count: int, seed: int) -> Tensor:

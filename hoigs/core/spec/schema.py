@@ -93,6 +93,8 @@ class EntitySpec(_Strict):
     points: int = Field(default=10_000, ge=1)
     """Gaussians at the start; scene and objects have fewer where the clip has fewer points for
     them."""
+    upsample: bool = False
+    """For objects: where the track has fewer points than `points`, more are put between them."""
     opacity: float = Field(default=0.1, gt=0, lt=1)
     """Opacity of every Gaussian at the start."""
     thickness: float = Field(default=1.0, gt=0, le=1)

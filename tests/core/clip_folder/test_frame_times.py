@@ -16,7 +16,7 @@ from hoigs.core.clip_folder.write import ClipWriter, write_clip
 from hoigs.core.errors import ClipError
 from hoigs.core.maths.frame_times import frame_at, time_of
 from hoigs.core.values.between import frame_numbers, frame_of, moment_between
-from hoigs.plugins.deformation.avatars.trained_frames import TrainedFrames
+from hoigs.plugins.deformation.avatars.body.trained_frames import TrainedFrames
 from hoigs.plugins.deformation.splines.rigid_track import RigidTrack
 from hoigs.plugins.readers.clip import ClipFolderReader
 

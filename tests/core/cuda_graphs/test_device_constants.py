@@ -10,8 +10,8 @@ from hoigs.core.maths import splines
 from hoigs.core.maths.feature_planes import PairedPlanes, ProductPlanes
 from hoigs.core.maths.knots import Knots
 from hoigs.core.maths.splines import keyframe_position
-from hoigs.plugins.deformation.avatars.skinned_body import at_frame
-from hoigs.plugins.deformation.avatars.trained_frames import TrainedFrames
+from hoigs.plugins.deformation.avatars.body.skinned_body import at_frame
+from hoigs.plugins.deformation.avatars.body.trained_frames import TrainedFrames
 
 TIMES = (-0.2, 0.0, 0.1, 1 / 7, 0.3, 0.5, 0.77, 6 / 7, 0.999, 1.0, 1.3)
 

@@ -253,6 +253,18 @@ def test_more_points_than_the_clip_has(parse, registry, clip):
     torch.testing.assert_close(model.entity("scene").means, clip.points)
 
 
+def test_more_points_than_a_track_has(parse, registry, clip):
+    spec = parse(TEXT.replace("points: 8", "points: 50\n    upsample: true"))
+    model = compose(spec, clip, registry)
+    assert model.count()["cup"] == 50
+    again = compose(spec, clip, registry)
+    assert torch.equal(model.entity("cup").means, again.entity("cup").means)
+    message = refusal(
+        parse(TEXT.replace("points: 40", "points: 40, upsample: true")), clip, registry
+    )
+    assert message.endswith("model.scene: upsample belongs to objects; remove it here")
+
+
 def test_what_components_are_told(parse, registry, clip):
     model = compose(parse(TEXT + "train: {seed: 4}\n"), clip, registry)
     context = model.entity("anna").deformation.context

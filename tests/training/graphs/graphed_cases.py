@@ -194,6 +194,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "plain tokens": {"plain_tokens": True},
     "given poses": {"human": {"refine_poses": False}},
     "clothes": {"human": {"nonrigid": True}},
+    "shading": {"human": {"nonrigid": "shading", "free_attributes": "all"}},
     "skinned": {"person": partial(skinned, refine_poses=False), "unattended": True},
     "skinned, refined": {"person": partial(skinned, refine_poses=True), "unattended": True},
     "rigid": {"motion": keyframed(RigidSpline)},

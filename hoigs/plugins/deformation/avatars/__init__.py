@@ -3,5 +3,5 @@
 - `hexplane_skinning`: deformation:hexplane-skinning, the human of HOIGS.
 - `triplane_avatar`: deformation:triplane-avatar, the humans of ExAvatar and HUGS.
 - `lbs`: deformation:lbs, linear blend skinning and nothing else.
-- `surface_body`, `skinned_body`: their base classes.
+- `body`: their base classes.
 """

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from jaxtyping import Float, Int
-from pydantic import Field
 from torch import Tensor, nn
 
 from hoigs.core.interfaces.body import PELVIS, BodySurface
@@ -17,87 +16,21 @@ from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.deformation import Template
 from hoigs.core.maths.skinning import skin
 from hoigs.core.values.gaussians import SH_C0, GaussianDelta, Gaussians
-from hoigs.core.values.moment import Moment, ResidualRule
+from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.avatars.alpha_start import AlphaStart, depth_ratio
-from hoigs.plugins.deformation.avatars.body_planes import Fusion, body_planes, field_subset
-from hoigs.plugins.deformation.avatars.canonical_head import (
-    CanonicalAttributes,
-    CanonicalHead,
-    HeadKind,
-)
-from hoigs.plugins.deformation.avatars.nonrigid import NonRigidConfig, NonRigidMotion
-from hoigs.plugins.deformation.avatars.skinned_body import (
-    SkinnedBodyConfig,
-    at_frame,
-    exact_poses,
-)
-from hoigs.plugins.deformation.avatars.surface_body import OPAQUE, SurfaceBody
-from hoigs.plugins.deformation.avatars.surface_laplacian import (
-    LaplacianOn,
-    Smoothed,
+from hoigs.plugins.deformation.avatars.alpha_start import depth_ratio
+from hoigs.plugins.deformation.avatars.body.skinned_body import at_frame, exact_poses
+from hoigs.plugins.deformation.avatars.body.surface_body import OPAQUE, SurfaceBody
+from hoigs.plugins.deformation.avatars.body.surface_laplacian import (
     laplacians,
     mesh_edges,
     neighbours_of,
 )
-
-
-class HexPlaneSkinningConfig(SkinnedBodyConfig):
-    """The paper's human; sizes that the paper does not give are ExAvatar's."""
-
-    fusion: Fusion = "paired"
-    """How six planes give 96 features. "paired" multiplies each space plane with the time plane of
-    the third axis and concatenates the three (HexPlane); it is the default, as f and phi come from
-    the same planes, 3 x 32 wide. "product" multiplies all six, at three resolutions (4DGS,
-    K-Planes)."""
-    resolution: int = Field(default=128, ge=2)
-    """Cells along each space axis of the feature planes."""
-    channels: int = Field(default=32, ge=1)
-    """Channels of each feature plane."""
-    time_resolution: int | None = Field(default=None, ge=0)
-    """Cells along time. None is half the frames; 0 leaves the time planes out, for a human whose
-    tokens nothing reads."""
-    box: float = Field(default=2.5, gt=0)
-    """Side of the cube about the pelvis that the planes cover, metres."""
-    width: int = Field(default=128, ge=8)
-    """Width of the hidden layers of psi_h."""
-    head: HeadKind = "full"
-    """What psi_h predicts: "full" is the paper's colour, opacity, offset, rotation, scale and
-    skinning weights; "exavatar" colour, offset and one isotropic scale, of opaque Gaussians."""
-    free_attributes: bool | Literal["all"] = True
-    """Train each Gaussian's own colour, opacity and scale too, to which psi_h then adds; they
-    converge sooner. "all" trains its mean and rotation as well, so that it may leave the surface of
-    the template. False is the paper: all comes from the planes."""
-    scale_about: Literal["pelvis", "camera"] = "pelvis"
-    """The fixed point of alpha, which the paper does not give (with the world's origin the person
-    would move). "pelvis", the default, changes the person's size, which images show; "camera"
-    changes the depth but not the image, so that only L_depth can learn alpha."""
-    alpha_start: AlphaStart = "one"
-    """Alpha at the start: "one", or the ratio of the clip's metric "depth" to the body's own, which
-    fits the scale about the camera."""
-    field_points: int = Field(default=1536, ge=16)
-    """Body points at which phi is read, spread over the 16 parts."""
-    field_at: Literal["posed", "canonical"] = "posed"
-    """"posed" reads phi where the body is (the supplement's "dynamic coordinates", relative to the
-    pelvis, as planes over the world would leave most cells unused); "canonical" on the body in its
-    zero pose, so that only time changes a token."""
-    residual_rule: ResidualRule = "add"
-    """How delta theta joins theta: "add" axis-angles, as the paper prints it, or "compose"
-    rotations, which differs for large angles."""
-    nonrigid: bool | Literal["auto"] = False
-    """Learn what clothes, hair and soft tissue do beside the skeleton: an offset and a change of
-    colour of every canonical point, at every time. "auto" learns it unless the clip declares its
-    poses to be exact, as `refine_poses` does: people of built-in clips are rigid between their
-    joints. False is the paper's Eq. 5."""
-    nonrigid_motion: NonRigidConfig = Field(default_factory=NonRigidConfig)
-    """Sizes of what `nonrigid` learns."""
-    laplacian: LaplacianOn = "points"
-    """Where L_reg of psi_h is taken: over neighbouring "points", the Gaussians, at no further cost;
-    or over the vertices of the body's "mesh" (the paper), by a second pass of psi_h, but then
-    neighbours never reach from one thigh to the other."""
-    laplacian_of: tuple[Smoothed, ...] = ("offset",)
-    """What L_reg smooths: "offset", "scale" and "color" (ExAvatar), or fewer."""
+from hoigs.plugins.deformation.avatars.body_planes import body_planes, field_subset
+from hoigs.plugins.deformation.avatars.canonical_head import CanonicalAttributes, CanonicalHead
+from hoigs.plugins.deformation.avatars.hexplane_config import HexPlaneSkinningConfig
+from hoigs.plugins.deformation.avatars.nonrigid import NonRigid, NonRigidMotion, Shading
 
 
 class HexPlaneSkinning(SurfaceBody):
@@ -126,6 +59,7 @@ class HexPlaneSkinning(SurfaceBody):
     }
     regularizer_weights: ClassVar[Mapping[str, float]] = {
         "offset": 1.0,
+        "drift": 30.0,
         "laplacian": 10.0,
         "laplacian_scale": 0.1,
         "laplacian_color": 0.1,
@@ -133,6 +67,7 @@ class HexPlaneSkinning(SurfaceBody):
         "time_smoothness": 0.01,
         "time_sparsity": 1e-4,
         "nonrigid": 1.0,
+        "shading": 0.5,
         "nonrigid_smoothness": 0.01,
         "nonrigid_sparsity": 1e-4,
     }
@@ -157,9 +92,10 @@ class HexPlaneSkinning(SurfaceBody):
             config.fusion, config.channels, config.resolution, time_resolution
         )
         self.head = CanonicalHead(self.planes.width, len(body.parents), config.width, config.head)
-        self.nonrigid: NonRigidMotion | None = None
+        self.nonrigid: NonRigid | None = None
         if config.nonrigid:
-            self.nonrigid = NonRigidMotion(config.nonrigid_motion, self.num_frames or 0)
+            kind = Shading if config.nonrigid == "shading" else NonRigidMotion
+            self.nonrigid = kind(config.nonrigid_motion, self.num_frames or 0)
         owned: set[str] = set() if config.free_attributes == "all" else {"means", "quats"}
         owned |= {"opacity_logits"} if self.opaque else set()
         if not config.free_attributes:
@@ -169,15 +105,17 @@ class HexPlaneSkinning(SurfaceBody):
         self.register_buffer("field_vertices", field, persistent=False)
         self._cached: tuple[object, CanonicalAttributes, Tensor] | None = None
         self._own: tuple[object, Tensor] | None = None
-        self._last: tuple[CanonicalAttributes, Tensor] | None = None
-        self._moved: Tensor | None = None  # offsets of `nonrigid` in the last forward pass
+        self._last: tuple[CanonicalAttributes, Tensor, Tensor] | None = None
+        self._changes: dict[str, Tensor] = {}  # by `nonrigid` in the last forward pass
         self._held: tuple[Gaussians, Tensor] | None = None
 
     @classmethod
     def from_config(cls, config: Any, context: BuildContext) -> Self:
         clip, track = context.clip, context.body_track
         if config.nonrigid == "auto":
-            config = config.model_copy(update={"nonrigid": not exact_poses(clip)})
+            config = config.model_copy(
+                update={"nonrigid": "shading" if exact_poses(clip) else True}
+            )
         made = super().from_config(config, context)
         if config.alpha_start == "depth" and clip is not None and track is not None:
             ratio = depth_ratio(clip, context.entity, made.body, track)
@@ -208,8 +146,8 @@ class HexPlaneSkinning(SurfaceBody):
             refined = self._canonical(canonical, attributes, change)
         if self.nonrigid is not None:
             points = self._plane_points(canonical.means)
-            delta = self.nonrigid(points, moment.time, refined.sh.shape[1])
-            self._moved = delta.means if self._remembers() else None
+            delta, changes = self.nonrigid.change(refined, points, moment.time)
+            self._changes = changes if self._remembers() else {}
             refined = refined.moved(delta)
         return self.posed(refined, weights, pose, joints, moment, residual)
 
@@ -252,7 +190,7 @@ class HexPlaneSkinning(SurfaceBody):
             logits = logits + attributes.weights
         weights = logits.softmax(-1)
         if self._remembers():
-            self._remember(attributes, weights)
+            self._remember(attributes, weights, canonical.means)
         elif keep:
             self._cached = (state, attributes, weights)
         return attributes, weights
@@ -283,17 +221,17 @@ class HexPlaneSkinning(SurfaceBody):
     def train(self, mode: bool = True) -> Self:
         self._cached = self._held = None
         if not mode:
-            self._last = self._moved = None  # a model cannot be copied with the graph of a step
+            self._last, self._changes = None, {}  # no model is copied with the graph of a step
         return super().train(mode)
 
-    def _remember(self, attributes: CanonicalAttributes, weights: Tensor) -> None:
+    def _remember(self, attributes: CanonicalAttributes, weights: Tensor, means: Tensor) -> None:
         """Keep the outputs of this forward pass for `regularizers`, until their graph is freed."""
-        self._last = (attributes, weights)
+        self._last = (attributes, weights, means)
         if attributes.offsets.requires_grad:
 
             def forget(gradient: Tensor) -> None:
                 del gradient
-                self._last = self._moved = None
+                self._last, self._changes = None, {}
 
             attributes.offsets.register_hook(forget)
 
@@ -352,16 +290,18 @@ class HexPlaneSkinning(SurfaceBody):
     def on_topology(self, change: TopologyChange) -> None:
         super().on_topology(change)
         self.neighbours = self._cached = self._own = self._held = None
-        self._last = self._moved = None
+        self._last, self._changes = None, {}
 
     def regularizers(self) -> dict[str, Tensor]:
         """Means over points (or cells) of squares, except the sparsity.
 
         "offset": canonical offsets, m^2. "laplacian": offset against its neighbours' mean, m^2
         (L_reg of HOIGS, Eq. 16); "laplacian_scale", "laplacian_color": log-scale and RGB likewise
-        (`laplacian_of`). "skinning": distance to the body's own weights (HUGS). "scale": distance
-        of log-scales to the template's. "time_smoothness", "time_sparsity": see PairedPlanes.
-        "nonrigid": offsets of `NonRigidMotion`, m^2; its planes have penalties of their own.
+        (`laplacian_of`). "drift": means that are free against the template's surface, m^2.
+        "skinning": distance to the body's own weights (HUGS). "scale": distance of log-scales to
+        the template's. "time_smoothness", "time_sparsity": see PairedPlanes. "nonrigid": offsets
+        of `NonRigidMotion`, m^2; "shading": exponents of `Shading`; planes of either have penalties
+        of their own.
 
         Those of points share the graph of the last forward pass: add them to the same loss.
         """
@@ -371,10 +311,12 @@ class HexPlaneSkinning(SurfaceBody):
         }
         if self.nonrigid is not None:
             penalties |= self.nonrigid.penalties()
-        if self._moved is not None:
-            penalties["nonrigid"] = self._moved.square().sum(-1).mean()
+        for name, values in self._changes.items():
+            penalties[name] = values.square().sum(-1).mean()
         if self._last is not None:
-            attributes, weights = self._last
+            attributes, weights, means = self._last
+            if "means" not in self.owns:
+                penalties["drift"] = (means - self.surface_points()).square().sum(-1).mean()
             penalties["offset"] = attributes.offsets.square().sum(-1).mean()
             penalties["scale"] = attributes.log_scales.square().mean()
             if attributes.weights is not None:

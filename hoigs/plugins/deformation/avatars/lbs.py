@@ -8,8 +8,8 @@ from hoigs.core.maths.rotations import normalize_quats
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
-from hoigs.plugins.deformation.avatars.skinned_body import SkinnedBodyConfig
-from hoigs.plugins.deformation.avatars.surface_body import SurfaceBody
+from hoigs.plugins.deformation.avatars.body.skinned_body import SkinnedBodyConfig
+from hoigs.plugins.deformation.avatars.body.surface_body import SurfaceBody
 
 
 class LbsConfig(SkinnedBodyConfig):

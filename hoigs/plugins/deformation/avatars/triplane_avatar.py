@@ -26,6 +26,9 @@ from hoigs.core.values.gaussians import SH_C0, Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
+from hoigs.plugins.deformation.avatars.body.skinned_body import SkinnedBodyConfig
+from hoigs.plugins.deformation.avatars.body.surface_body import OPAQUE, SurfaceBody
+from hoigs.plugins.deformation.avatars.body.surface_laplacian import neighbours_of, point_roughness
 from hoigs.plugins.deformation.avatars.canonical_head import CanonicalAttributes
 from hoigs.plugins.deformation.avatars.decoders import (
     CanonicalDecoders,
@@ -34,9 +37,6 @@ from hoigs.plugins.deformation.avatars.decoders import (
     Shape,
     matrices_to_6d,
 )
-from hoigs.plugins.deformation.avatars.skinned_body import SkinnedBodyConfig
-from hoigs.plugins.deformation.avatars.surface_body import OPAQUE, SurfaceBody
-from hoigs.plugins.deformation.avatars.surface_laplacian import neighbours_of, point_roughness
 
 CANDIDATES = 16  # vertices near a canonical point; offsets of centimetres do not leave them
 

@@ -26,8 +26,8 @@ from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import Residual, displaced
-from hoigs.plugins.deformation.avatars.skinned_body import clip_settings
-from hoigs.plugins.deformation.avatars.trained_frames import FrameCorrections
+from hoigs.plugins.deformation.avatars.body.skinned_body import clip_settings
+from hoigs.plugins.deformation.avatars.body.trained_frames import FrameCorrections
 from hoigs.plugins.deformation.rigid.object_states import (
     Attach,
     Attachment,

@@ -16,8 +16,8 @@ from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual, displaced
-from hoigs.plugins.deformation.avatars.skinned_body import clip_settings
-from hoigs.plugins.deformation.avatars.trained_frames import FrameCorrections
+from hoigs.plugins.deformation.avatars.body.skinned_body import clip_settings
+from hoigs.plugins.deformation.avatars.body.trained_frames import FrameCorrections
 from hoigs.plugins.deformation.splines.rigid_track import RigidTrack
 
 

@@ -45,6 +45,10 @@ class TrackedHermite(CubicHermite):
 
     Config: ClassVar = TrackedHermiteConfig
     cuda_graph_safe = True
+    regularizer_weights: ClassVar[Mapping[str, float]] = {
+        **CubicHermite.regularizer_weights,
+        "departure": 1000.0,
+    }
     # Corrections, like those of a body's poses: at the rate of keyframes each would learn the noise
     # of the four frames about it.
     rates: ClassVar[Mapping[str, str]] = {
@@ -58,6 +62,7 @@ class TrackedHermite(CubicHermite):
         super().__init__(config, **given)
         self.carrier = RigidTrack(self._track) if self._track is not None else None
         self._track = None
+        self._shape: Tensor | None = None  # of the object in the last forward pass
         self.owns = frozenset()
         if self.carrier is None:  # all of the motion is then the splines' own
             self.rates = CubicHermite.rates  # type: ignore[misc]
@@ -76,6 +81,8 @@ class TrackedHermite(CubicHermite):
         self, canonical: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
         time = moment.time
+        if self.carrier is not None and self.training:
+            self._shape = canonical.means.detach()
         means = canonical.means + self._means(time)
         turns = self.knots.slerp(self.keyframe_quats, time)
         quats = multiply_quats(turns, canonical.quats)  # raw, as the canonical ones
@@ -112,6 +119,34 @@ class TrackedHermite(CubicHermite):
         logits = canonical.opacity_logits
         return logits + self.opacity_logits.amax(1) if self.keyed else logits
 
+    def regularizers(self) -> dict[str, Tensor]:
+        """As CubicHermite; about a track also "departure": what is left of the splines' knots, m^2,
+        without the small rigid motion of each that explains most, as errors of a track are rigid.
+        It needs a forward pass before, in training."""
+        penalties = super().regularizers()
+        if self._shape is not None:
+            own = nonrigid_part(self.keyframe_means, self._shape)
+            penalties["departure"] = own.square().sum(-1).mean()
+        return penalties
+
     def on_topology(self, change: TopologyChange) -> None:
         """Rows follow; the canonical means place a new Gaussian."""
         reindex((self.get_parameter(name) for name in self.per_gaussian), change)
+        self._shape = None
+
+
+def nonrigid_part(
+    offsets: Float[Tensor, "N K 3"], points: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N K 3"]:
+    """Offsets of points without the translation and the small rotation, for each k, that come
+    nearest to them: o - t - w x p, least squares."""
+    offsets = offsets - offsets.mean(0, keepdim=True)
+    arms = points - points.mean(0, keepdim=True)
+    spread = arms.mT @ arms / len(arms)
+    inertia = torch.eye(3).to(spread) * spread.trace() - spread
+    inertia = inertia + (1e-6 * spread.trace() + 1e-12) * torch.eye(3).to(spread)  # a straight bar
+    x, y, z = inertia  # its inverse by hand: recordings of a GPU's work take no solver
+    adjugate = torch.stack([y.cross(z, dim=0), z.cross(x, dim=0), x.cross(y, dim=0)])
+    moments = torch.linalg.cross(arms[:, None], offsets).mean(0)
+    turns = moments @ adjugate / (x @ adjugate[0])
+    return offsets - torch.linalg.cross(turns.expand_as(offsets), arms[:, None].expand_as(offsets))

@@ -296,7 +296,8 @@ def test_regularizers(toy_body, toy_pose):
     model, moment = entity.deformation, at(toy_pose(1))
     entity(moment)
     assert all(v == 0 for v in model.regularizers().values())
-    optional = {"laplacian_scale", "laplacian_color"}  # see laplacian_of
+    # see laplacian_of, free_attributes, nonrigid
+    optional = {"laplacian_scale", "laplacian_color", "drift", "shading"}
     assert set(model.regularizers()) >= set(model.regularizer_weights) - optional
     perturb(entity)
     loss = entity(moment).means.sum() + sum(model.regularizers().values())
@@ -308,6 +309,19 @@ def test_regularizers(toy_body, toy_pose):
     entity(moment)
     for name, value in model.regularizers().items():
         assert value > 0 and torch.isfinite(value), name
+
+
+def test_free_means_are_drawn_to_the_surface(toy_body, toy_pose):
+    entity = human(toy_body, free_attributes="all")
+    entity(at(toy_pose(1)))
+    assert entity.regularizers()["drift"] < 1e-12
+    with torch.no_grad():
+        entity.canonical.means[: COUNT // 2] += 0.02 * torch.tensor([0.6, 0.0, 0.8])
+    entity(at(toy_pose(1)))
+    penalty = entity.regularizers()["drift"]
+    torch.testing.assert_close(penalty, torch.tensor(0.02**2 / 2), rtol=1e-4, atol=0)
+    penalty.backward()
+    assert entity.canonical.means.grad[: COUNT // 2].abs().sum() > 0
 
 
 def test_topology_and_resize(toy_body, toy_pose):

@@ -8,24 +8,39 @@ import pytest
 import torch
 
 from hoigs.core.model.entity import Entity
+from hoigs.core.values.gaussians import SH_C0
 from hoigs.core.values.moment import Moment
 from hoigs.plugins.deformation.avatars.hexplane_skinning import (
     HexPlaneSkinning,
     HexPlaneSkinningConfig,
 )
-from hoigs.plugins.deformation.avatars.nonrigid import LEAST, NonRigidConfig, NonRigidMotion
+from hoigs.plugins.deformation.avatars.nonrigid import (
+    LEAST,
+    NonRigidConfig,
+    NonRigidMotion,
+    Shading,
+)
 
 COUNT, NUM_FRAMES = 200, 32
 
 
-@pytest.fixture
-def entity(toy_body) -> Entity:
+def human(toy_body, nonrigid: bool | str) -> Entity:
     torch.manual_seed(0)
     config = HexPlaneSkinningConfig(
-        resolution=16, channels=4, field_points=160, refine_poses=False, nonrigid=True
+        resolution=16, channels=4, field_points=160, refine_poses=False, nonrigid=nonrigid
     )
     model = HexPlaneSkinning(config, body=toy_body, num_frames=NUM_FRAMES)
     return Entity(toy_body.canonical(COUNT, model.betas, model.seed), model)
+
+
+@pytest.fixture
+def entity(toy_body) -> Entity:
+    return human(toy_body, True)
+
+
+@pytest.fixture
+def shaded(toy_body) -> Entity:
+    return human(toy_body, "shading")
 
 
 def learned(entity: Entity) -> Entity:
@@ -37,7 +52,9 @@ def learned(entity: Entity) -> Entity:
     return entity
 
 
-def test_it_starts_by_changing_nothing(entity, toy_pose):
+@pytest.mark.parametrize("kind", [True, "shading"])
+def test_it_starts_by_changing_nothing(toy_body, toy_pose, kind):
+    entity = human(toy_body, kind)
     moment = Moment(0.3, poses={"human": toy_pose(1)})
     with_it = entity(moment)
     entity.deformation.nonrigid = None
@@ -92,17 +109,47 @@ def test_a_frame_in_between_takes_what_its_neighbours_learned(frames):
     torch.testing.assert_close(at[1], (at[0] + at[2]) / 2, atol=1e-5, rtol=1e-4)
 
 
-def test_the_penalty_is_of_the_offsets(entity, toy_pose):
-    learned(entity)
+@torch.no_grad()
+def test_shading_makes_colours_lighter_or_darker_and_moves_nothing(shaded, toy_pose):
+    learned(shaded)
+    moment = Moment(0.4, poses={"human": toy_pose(1)})
+    lit = shaded(moment)
+    shaded.deformation.nonrigid = None
+    plain = shaded(moment)
+    for field in ("means", "quats", "log_scales", "opacity_logits"):
+        assert torch.equal(getattr(lit, field), getattr(plain, field)), field
+    colors, before = (0.5 + SH_C0 * gaussians.sh[:, 0] for gaussians in (lit, plain))
+    factors = colors / before
+    assert (factors.amax(1) / factors.amin(1)).max() < 1.001  # of all channels alike
+    assert factors.min() > 0 and factors.std() > 0.01
+
+
+@torch.no_grad()
+def test_shading_is_of_every_harmonic(shaded):
+    canonical = shaded.canonical.replace(sh=torch.randn(COUNT, 4, 3))
+    learned(shaded)
+    points = torch.rand(COUNT, 3) * 2 - 1
+    module = shaded.deformation.nonrigid
+    assert isinstance(module, Shading)
+    delta, changes = module.change(canonical, points, 0.4)
+    expected = changes["shading"].expm1()[..., None] * canonical.sh[:, 1:]
+    torch.testing.assert_close(delta.sh[:, 1:], expected)
+
+
+@pytest.mark.parametrize(("kind", "penalised"), [(True, "nonrigid"), ("shading", "shading")])
+def test_the_penalty_is_of_what_it_changes(toy_body, toy_pose, kind, penalised):
+    entity = learned(human(toy_body, kind))
     moment = Moment(0.4, poses={"human": toy_pose(1)})
     model = entity.deformation
-    loss = entity(moment).means.sum()
+    drawn = entity(moment)
+    loss = drawn.means.sum() + drawn.sh.sum()
     points = (entity.canonical.means - model.rest_joints[0]) / model.half_box
-    offsets = model.nonrigid(points, 0.4, 1).means
+    _, changes = model.nonrigid.change(entity.canonical, points, 0.4)
     penalties = model.regularizers()
-    torch.testing.assert_close(penalties["nonrigid"], offsets.square().sum(-1).mean())
+    expected = changes[penalised].square().sum(-1).mean()
+    torch.testing.assert_close(penalties[penalised], expected)
     (loss + sum(penalties.values())).backward()
-    assert "nonrigid" not in model.regularizers()  # its graph is used up
+    assert penalised not in model.regularizers()  # its graph is used up
     copy.deepcopy(model)
 
 

@@ -16,7 +16,7 @@ from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import Residual
-from hoigs.plugins.deformation.avatars.trained_frames import FrameCorrections
+from hoigs.plugins.deformation.avatars.body.trained_frames import FrameCorrections
 from hoigs.plugins.deformation.rigid.object_bone import ObjectBone, ObjectBoneConfig, attachments_of
 from hoigs.plugins.deformation.rigid.object_states import Attachment, rest_transitions, state_of
 from hoigs.plugins.deformation.rigid.rigid_frames import RigidFrames, RigidFramesConfig

@@ -14,7 +14,11 @@ from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
 from hoigs.plugins.deformation.splines.chs import CubicHermite
-from hoigs.plugins.deformation.splines.tracked_chs import TrackedHermite, TrackedHermiteConfig
+from hoigs.plugins.deformation.splines.tracked_chs import (
+    TrackedHermite,
+    TrackedHermiteConfig,
+    nonrigid_part,
+)
 
 FRAMES = 17
 
@@ -130,6 +134,42 @@ def test_residual_is_added_in_the_world():
     shift = torch.randn(10, 3, dtype=torch.float64)
     moved = entity(Moment(0.2), Residual(means=shift)).means
     torch.testing.assert_close(moved, entity(Moment(0.2)).means + shift)
+
+
+def test_departures_from_a_rigid_motion_are_penalised():
+    entity = entity_of(jittering_track())
+    knots, shape = entity.deformation.keyframe_means, entity.canonical.means
+    assert "departure" not in entity.regularizers()  # nothing is drawn yet
+    entity(Moment(0.3))
+    error = torch.tensor([0.01, -0.02, 0.03], dtype=shape.dtype)  # a turn of the track, radians
+    with torch.no_grad():
+        knots += torch.linalg.cross(error.expand_as(shape), shape)[:, None] + 5 * error
+    assert entity.regularizers()["departure"] < 1e-12
+    with torch.no_grad():
+        knots[0, 2] += 0.1
+    penalty = entity.regularizers()["departure"]
+    assert 0.3 * 0.03 / knots[..., 0].numel() < penalty < 0.03 / knots[..., 0].numel()
+    free = Entity(entity.canonical.detach(), TrackedHermite(num_frames=17))
+    free(Moment(0.3))
+    assert "departure" not in free.regularizers()  # all of the motion is the splines' own
+
+
+@pytest.mark.parametrize("axes", [3, 1])
+def test_a_rigid_part_is_the_nearest(axes):
+    """Also of points on one line, about which no turn shows."""
+    points = torch.randn(30, 3, dtype=torch.float64)
+    points[:, axes:] = 0
+    offsets = torch.randn(30, 4, 3, dtype=torch.float64, requires_grad=True)
+    left = nonrigid_part(offsets, points)
+    turns = torch.zeros(4, 3, dtype=torch.float64, requires_grad=True)
+    arms = points - points.mean(0)
+    moved = left.detach() + torch.linalg.cross(
+        turns.expand(30, 4, 3), arms[:, None].expand(30, 4, 3)
+    )
+    (slope,) = torch.autograd.grad(moved.square().sum(), turns)
+    assert slope.abs().max() < 1e-4 * offsets.square().sum()
+    assert left.square().sum() < offsets.square().sum()
+    torch.testing.assert_close(left.mean(0), torch.zeros(4, 3, dtype=torch.float64))
 
 
 def test_children_stay_beside_their_parents():

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from hoigs.core.cuda_graphs.device_constants import Time
 from hoigs.core.maths.frame_times import FrameTimes
 from hoigs.core.values.moment import BodyPose
-from hoigs.plugins.deformation.avatars.trained_frames import TrainedFrames
+from hoigs.plugins.deformation.avatars.body.trained_frames import TrainedFrames
 
 
 class PoseRefinement(nn.Module):

@@ -28,7 +28,7 @@ from hoigs.core.maths.skinning import ancestor_table, transform_points
 from hoigs.core.values.clip import POSES_EXACT, Clip
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
-from hoigs.plugins.deformation.avatars.pose_refinement import PoseRefinement
+from hoigs.plugins.deformation.avatars.body.pose_refinement import PoseRefinement
 
 # metres: Gaussians made with another seed are decimetres off, those on a padded surface centimetres
 APART = 0.05

@@ -18,8 +18,8 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment, ResidualRule
 from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.avatars.face_points import HEAD_JOINT, face_points
-from hoigs.plugins.deformation.avatars.skinned_body import SkinnedBody, checked_surface
+from hoigs.plugins.deformation.avatars.body.face_points import HEAD_JOINT, face_points
+from hoigs.plugins.deformation.avatars.body.skinned_body import SkinnedBody, checked_surface
 
 OPAQUE = 4.6  # logit of 0.99, the largest opacity that rasterizers draw
 
@@ -126,10 +126,15 @@ class SurfaceBody(SkinnedBody):
             log_scales=canonical.log_scales + self.log_alpha,
         )
 
+    def surface_points(self) -> Float[Tensor, "N 3"]:
+        """Where each canonical point lies on the template in its zero pose, metres."""
+        corners = self.rest_vertices[self.body.faces[self.faces]]
+        return (corners * self.barycentric[..., None]).sum(1)
+
     def template(self, canonical: Gaussians) -> Template:
         """The surface that the Gaussians belong to; `canonical` are drawn as they are."""
         corners = self.rest_vertices[self.body.faces[self.faces]]
-        points = (corners * self.barycentric[..., None]).sum(1)
+        points = self.surface_points()
         normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         middle = torch.zeros_like(points)
         middle[:, 0] = 2 * (self.rest_joints[PELVIS, 0] - points[:, 0])

@@ -1,0 +1,1 @@
+"""What people are made of: a skinned body, its surface, and corrections of its poses."""
