@@ -18,13 +18,15 @@ def overlay_frame(
     camera: Camera,
     vertices: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
-    strength: float = 0.6,
+    strength: float | Float[np.ndarray, "H W"] = 0.6,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """`image` with a mesh blended over it.
 
     Args:
-        vertices: world, metres. strength: 0 shows only the image, 1 only the mesh.
+        vertices: world, metres. strength: 0 shows only the image, 1 only the mesh; of all pixels
+            or of each.
     """
+    strength = np.asarray(strength)[..., None]
     with torch.no_grad():
         pixels, depth = camera.project(vertices)
         corners = pixels[faces]

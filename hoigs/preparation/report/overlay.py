@@ -18,6 +18,7 @@ from hoigs.preparation.video.resizing import shrink, shrink_mask
 
 HUMAN_COLOR, OBJECT_COLOR, TRACK_COLOR = (64, 220, 120), (255, 210, 40), (255, 60, 200)
 SHOWN_POINTS = 150
+SEEN, HIDDEN = 0.45, 0.12  # of the body's pixels, as shares of the mix
 
 
 class OverlayVideo:
@@ -76,8 +77,10 @@ class OverlayVideo:
         object_mask: Bool[np.ndarray, "H W"],
         points: Float[Tensor, "P 3"],
     ) -> UInt8[np.ndarray, "H W 3"]:
-        """The body shaded over the image, the masks' outlines and some of the object's points."""
-        drawn = overlay_frame(image, camera, vertices, self.faces, strength=0.45)
+        """The body shaded over the image, faintly where its mask says that it is hidden or not
+        there, the masks' outlines and some of the object's points."""
+        strength = np.where(human | (not human.any()), SEEN, HIDDEN)
+        drawn = overlay_frame(image, camera, vertices, self.faces, strength)
         draw_outline(drawn, human, HUMAN_COLOR)
         draw_outline(drawn, object_mask, OBJECT_COLOR)
         draw_points(drawn, points, camera, TRACK_COLOR)

@@ -9,7 +9,7 @@ import torch
 
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.body.silhouette import silhouette
-from hoigs.preparation.report.overlay import draw_outline, draw_points
+from hoigs.preparation.report.overlay import OverlayVideo, draw_outline, draw_points
 from hoigs.preparation.report.video_out import VideoWriter
 from hoigs.preparation.video.frames import VideoFrames
 from hoigs.preparation.video.resizing import shrink, shrink_mask
@@ -47,6 +47,19 @@ def test_outline_and_points() -> None:
     points = torch.tensor([[0.0, 0, 2], [0, 0, -2], [50, 0, 2]])
     draw_points(image, points, camera(), (9, 9, 9))
     assert (image[29:31, 39:41] == 9).all() and (image == 9).all(-1).sum() == 4
+
+
+def test_a_body_is_faint_where_it_is_hidden(tmp_path: Path) -> None:
+    grey, none = np.full((60, 80, 3), 128, np.uint8), np.zeros((60, 80), bool)
+    left = none.copy()
+    left[:, :40] = True  # of the quad, the right half is behind something
+    video = OverlayVideo(tmp_path / "none.mp4", 30, 0, FRONT)
+    points = torch.zeros(0, 3)
+    drawn = video._draw(grey, camera(), QUAD, left, none, points).astype(int)
+    change = np.abs(drawn - 128).sum(-1)[26:34]
+    assert 0 < 3 * change[:, 42:49].max() < change[:, 31:38].min()
+    unknown = video._draw(grey, camera(), QUAD, none, none, points).astype(int)
+    assert (np.abs(unknown - 128).sum(-1)[26:34, 31:49] == change[0, 33]).all()
 
 
 def test_shrinking() -> None:
