@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -219,11 +219,12 @@ def _check_counts(path: Path, counts: dict[str, int], tensors: dict[str, torch.T
 
 
 def restore_model(
-    model: SceneModel, checkpoint: Checkpoint, model_hash: str, *, in_file: bool = False
+    model: SceneModel, checkpoint: Checkpoint, hashes: Sequence[str], *, in_file: bool = False
 ) -> None:
     """Load the parameters of a checkpoint into a composed model.
 
     Args:
+        hashes: of models that it may be of, that of `model` first (`Spec.model_hashes`).
         in_file: parameters with rows for times, which grow with the clip, stay in the checkpoint's
             file, and come into memory as they are read. For models that are not trained, and files
             that nobody removes.
@@ -232,11 +233,11 @@ def restore_model(
         CheckpointError: the checkpoint belongs to another spec, or its tensors do not fit.
     """
     stored = checkpoint.meta["model_hash"]
-    if checkpoint.meta["version"] == VERSION and stored != model_hash:
+    if checkpoint.meta["version"] == VERSION and stored not in hashes:
         raise CheckpointError(
             f"checkpoint of step {checkpoint.meta['step']} was made by the spec "
             f"{checkpoint.meta['spec_name']!r} (model hash {stored[:12]}), but this model's hash "
-            f"is {model_hash[:12]}: its `model`, `interaction` or `entities` differ; use the "
+            f"is {hashes[0][:12]}: its `model`, `interaction` or `entities` differ; use the "
             "spec.yaml that lies beside the checkpoint"
         )
     counts = checkpoint.meta["counts"]

@@ -83,7 +83,7 @@ class LoadedRun:
         checkpoint = load_newest(run.checkpoints, DRAWN)
         model = compose(spec, source, registry)
         ended = checkpoint.meta["step"] >= spec.train.steps  # or else training removes old ones
-        restore_model(model, checkpoint, spec.model_hash(), in_file=ended)
+        restore_model(model, checkpoint, spec.model_hashes(), in_file=ended)
         _try(model, source, run.checkpoints)
         model.to(device)
         if checkpoint.part("cameras"):
@@ -104,7 +104,7 @@ class LoadedRun:
         if checkpoint.part("cameras"):
             raise HoigsError(f"{path}: with refined cameras the clip has to be read again")
         model = copy.deepcopy(self.model)
-        restore_model(model, checkpoint, self.spec.model_hash())
+        restore_model(model, checkpoint, self.spec.model_hashes())
         model.eval()
         step = checkpoint.meta["step"]
         model.set_progress(min(1.0, step / self.spec.train.steps))

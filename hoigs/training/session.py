@@ -141,6 +141,7 @@ class Session:
             identity={"spec_name": spec.name, "model_hash": spec.model_hash()},
             lpips=lpips_term(spec, lpips_weights, device),
         )
+        trainer.hashes = spec.model_hashes()
         record = {
             "spec_hash": spec.hash(),
             "clip": {

@@ -106,6 +106,7 @@ class Trainer:
             raise ValueError("train.loss.lpips > 0 needs LPIPS weights: give lpips=")
         self.model, self.clip, self.spec, self.run = model, clip, spec, run
         self.identity = dict(identity or {"spec_name": "", "model_hash": ""})
+        self.hashes: Sequence[str] = (self.identity["model_hash"],)  # of checkpoints to resume from
         self.generator = torch.Generator().manual_seed(spec.seed)
         self.views = TrainingViews(clip, model.device)
         for control in (density or {}).values():
@@ -377,7 +378,7 @@ class Trainer:
             self.run.cut_metrics(self.step)
 
     def _restore(self, checkpoint: Checkpoint) -> None:
-        restore_model(self.model, checkpoint, self.identity["model_hash"])
+        restore_model(self.model, checkpoint, self.hashes)
         restore_cameras(self.cameras, checkpoint)
         self.optimizer.load_tensors(checkpoint.part("optimizer"))
         for name, density in self.density.items():

@@ -222,15 +222,31 @@ class Spec(_Strict):
         without = {"model": {name: set(TRAINING_ONLY) for name in self.model}}
         return self._digest(MODEL_SECTIONS, without)
 
+    def model_hashes(self) -> tuple[str, ...]:
+        """Hashes of checkpoints that belong to this spec, `model_hash` first. The other is of the
+        settings that are written in its file: an older hoigs, which had fewer, took it of these,
+        and settings that came later do by default what it did."""
+        written = {key: self._document.data.get(key) for key in MODEL_SECTIONS}
+        blocks = written["model"] if isinstance(written["model"], dict) else {}
+        written["model"] = {
+            name: {key: value for key, value in block.items() if key not in TRAINING_ONLY}
+            for name, block in blocks.items()
+            if isinstance(block, dict)
+        }
+        return self.model_hash(), _sha256(written)
+
     def _digest(self, sections: Sequence[str], without: dict[str, Any] | None = None) -> str:
-        data = self.model_dump(mode="json", include=set(sections), exclude=without)
-        return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+        return _sha256(self.model_dump(mode="json", include=set(sections), exclude=without))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Spec) and self.model_dump() == other.model_dump()
 
     def __hash__(self) -> int:
         return hash((self.name, self.hash()))
+
+
+def _sha256(data: Any) -> str:
+    return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def _resolve(document: Document, registry: Registry) -> Spec:

@@ -108,7 +108,7 @@ def compress(
         )
         again = _composed(loaded, registry)
         packed = load_checkpoint(latest_checkpoint(temporary.checkpoints))
-        restore_model(again, packed, loaded.spec.model_hash())
+        restore_model(again, packed, loaded.spec.model_hashes())
         again.to(device).eval()
         again.set_progress(1.0)
         after = validator.score(again)
