@@ -90,7 +90,9 @@ def test_colours_of_unseen_sides_change_and_images_of_training_frames_do_not(
 ) -> None:
     monkeypatch.setenv("HOIGS_CACHE", str(tmp_path))
     clip = ClipFolderReader().read(builtin_clip(AnnyBody(), SceneConfig.tiny(held_out_views=0)))
-    model = compose(Spec.load("hoigs", overrides=["model.human.points=3000"]), clip)
+    # thicker than they start: nothing is trained here, and thin ones on outlines show what is behind
+    sizes = ["model.human.points=3000", "model.human.thickness=0.2"]
+    model = compose(Spec.load("hoigs", overrides=sizes), clip)
     human = model.entity("human")
     noise = torch.rand(3000, 3, generator=torch.Generator().manual_seed(0))
     human.sh.data[:, 0] += noise - 0.5

@@ -20,7 +20,8 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("viewing")
     clip = folder / "clip"
     shutil.copytree(hoigs.builtin_clip(hoigs.AnnyBody(), _tiny()), clip)
-    small = ["train.steps=4", "train.checkpoint_every=2", *SMALL]
+    # opacities that hardly change with time, as those of a trained object: it is then rigid
+    small = ["train.steps=4", "train.checkpoint_every=2", "train.rates.opacity=0.02", *SMALL]
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     hoigs.train(clip, out=folder / "run", overrides=small, device="cpu", evaluate=False)
