@@ -90,7 +90,7 @@ def test_colours_of_unseen_sides_change_and_images_of_training_frames_do_not(
 ) -> None:
     monkeypatch.setenv("HOIGS_CACHE", str(tmp_path))
     clip = ClipFolderReader().read(builtin_clip(AnnyBody(), SceneConfig.tiny(held_out_views=0)))
-    # thicker than they start: nothing is trained here, and thin ones on outlines show what is behind
+    # thicker than they start: untrained thin ones show on outlines what is behind them
     sizes = ["model.human.points=3000", "model.human.thickness=0.2"]
     model = compose(Spec.load("hoigs", overrides=sizes), clip)
     human = model.entity("human")
