@@ -57,6 +57,7 @@ class Job:
     threads: int
     given: bool
     given_runs: Path | None
+    refine: bool
 
 
 def main() -> int:
@@ -120,6 +121,7 @@ def _measure(job: Job, folder: Path) -> dict[str, Any]:
         overrides=["image_format=png", "overlay_width=0", f"folder_fps={truth.fps}", *job.settings],
     )  # fmt: skip
     seconds = time.perf_counter() - start
+    refined = _refined(out, folder / f"{name}.refined", job) if job.refine else None
     made = ClipFolderReader().read(out)
     row: dict[str, Any] = {
         "frames": len(made), "width": made.cameras[0].width,
@@ -131,16 +133,32 @@ def _measure(job: Job, folder: Path) -> dict[str, Any]:
     world = camera_motion(made, truth) if job.camera == "sfm" else (np.eye(3), np.zeros(3))
     row |= object_figures(made, truth, truth_folder, world)
     row |= body_figures(made, truth, body, world)
+    if refined is not None:
+        after = body_figures(ClipFolderReader().read(refined[0]), truth, body, world)
+        row["refined"] = after | {"refine_s": refined[1]}
     if job.train:
         if job.camera == "given":  # otherwise the held-out cameras are of another world
             shutil.copytree(truth_folder / "held_out", out / "held_out", dirs_exist_ok=True)
         how = Training(job.train, job.train_width, job.device, job.seed, job.pictures)
         row["estimated"] = trained(out, folder / f"{name}.run", how)
+        if refined is not None:
+            if (out / "held_out").is_dir():
+                shutil.copytree(out / "held_out", refined[0] / "held_out", dirs_exist_ok=True)
+            row["refined"] |= trained(refined[0], folder / f"{name}.refined-run", how)
         if job.given:
             row["every_pose_given"] = _earlier(job) or trained(
                 truth_folder, folder / f"{name}.given-run", how
             )
     return row
+
+
+def _refined(clip: Path, out: Path, job: Job) -> tuple[Path, float]:
+    """A clip whose body poses are refined, and how long that took, seconds."""
+    import hoigs
+
+    start = time.perf_counter()
+    hoigs.refine_poses(clip, out, device=job.device, seed=job.seed, overwrite=True)
+    return out, round(time.perf_counter() - start, 1)
 
 
 def _earlier(job: Job) -> dict[str, Any] | None:
@@ -173,6 +191,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--train", type=int, default=0, metavar="STEPS")
     parser.add_argument("--train-width", type=int, help="default: --width")
+    parser.add_argument("--refine", action="store_true", help="also with `hoigs refine`")
     parser.add_argument("--no-given", action="store_true", help="train on estimated poses only")
     parser.add_argument(
         "--given-runs", type=Path, metavar="JSON",
@@ -204,6 +223,7 @@ def _jobs(options: argparse.Namespace) -> Iterator[Job]:
             train=options.train, train_width=options.train_width or options.width,
             device=options.device, keep=options.keep, pictures=options.pictures, threads=threads,
             given=not options.no_given, given_runs=options.given_runs,
+            refine=options.refine,
         )  # fmt: skip
 
 
@@ -236,6 +256,8 @@ def table(rows: list[dict[str, Any]]) -> str:
             for row in rows if "rotation_deg" in row
         ]  # fmt: skip
         return _markdown(first, lines)
+    if any("refined" in row for row in trained):
+        return _refined_table(trained)
     head = (
         "clip", "seed", *FIGURES, "path", "path, all given", "held out", "held out, all given",
         "object held out", "object held out, all given",
@@ -250,6 +272,28 @@ def table(rows: list[dict[str, Any]]) -> str:
             ("held-out cameras", "object"),
         ):  # fmt: skip
             found += [run[view][region] if run else "-" for run in runs]
+        lines.append(found)
+    return _markdown(head, lines)
+
+
+def _refined_table(rows: Sequence[dict[str, Any]]) -> str:
+    """Markdown: bodies and PSNR of person + object as estimated, and refined."""
+    figures = ("joints mm", "wrists mm", "acceleration m/s²", "path", "interpolated", "held out")
+    head = ("clip", "seed", *(f"{name}, {how}" for name in figures for how in ("est.", "refined")))
+    views = (
+        ("blended poses", "test frames"), ("interpolated poses", "test frames"),
+        ("blended poses", "held-out cameras"),
+    )  # fmt: skip
+    lines = []
+    for row in rows:
+        both = (row, row["refined"])
+        found: list[Any] = _first(row)
+        for key in ("root_aligned_joints_mm", "wrists_mm", "acceleration_error_m_s2"):
+            found += [one[key] for one in both]
+        for poses, view in views:
+            found += [
+                run[poses][view]["human_object"] for run in (row["estimated"], row["refined"])
+            ]
         lines.append(found)
     return _markdown(head, lines)
 
@@ -289,7 +333,8 @@ def _line(row: dict[str, Any]) -> str:
         f"acceleration {row['acceleration_error_m_s2']} m/s2",
         f"{row['prepare_s']} s",
     ]
-    lines += [f"{name}: {row[name]}" for name in ("estimated", "every_pose_given") if name in row]
+    further = ("estimated", "refined", "every_pose_given")
+    lines += [f"{name}: {row[name]}" for name in further if name in row]
     return head + "\n  ".join(["", *lines])
 
 

@@ -74,6 +74,7 @@ _PUBLIC = {
     "prepare": "hoigs.preparation.prepare",
     "prepare_until": "hoigs.preparation.prepare",
     "publish": "hoigs.core.storage.publish",
+    "refine_poses": "hoigs.workflows.refine_poses",
     "render": "hoigs.viewing.films",
     "train": "hoigs.workflows.train",
     "view": "hoigs.viewing.view",

@@ -20,6 +20,7 @@ from hoigs.cli import (
     plugins,
     prepare,
     publish,
+    refine,
     render,
     spec,
     stress,
@@ -43,6 +44,7 @@ app = typer.Typer(
 app.command("demo")(demo.demo)
 app.command("annotate")(annotate.annotate)
 app.command("prepare")(prepare.prepare)
+app.command("refine")(refine.refine)
 app.command("train")(train.train)
 app.command("eval")(evaluate.evaluate)
 app.command("render")(render.render)
