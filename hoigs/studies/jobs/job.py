@@ -10,12 +10,13 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from hoigs.core.errors import CheckpointError
+from hoigs.core.errors import CheckpointError, SpecError
 from hoigs.core.spec.schema import Spec
 from hoigs.core.whole_files import write_whole
 
 RECORD = "job.json"
 SCORES = "evaluation.json"
+SEED = "train.seed"
 
 
 class JobState(StrEnum):
@@ -116,10 +117,12 @@ def make_job(
     under whichever profile's name.
 
     Raises:
-        SpecError: the spec cannot be used.
+        SpecError: the spec cannot be used, or a setting would be a second seed.
     """
     from hoigs.core.registry.registry import default_registry
 
+    if sum(setting.partition("=")[0].strip() == SEED for setting in settings) > 1:
+        raise SpecError(f"{SEED}: the seeds of a study are 0, 1 … of --seeds; leave the setting out")
     registry = default_registry([Path(p) for p in more.get("plugins", ())])
     loaded = Spec.load(spec, overrides=list(settings), registry=registry)
     name = f"{loaded.name.partition('@')[0]}-seed{loaded.train.seed}-{loaded.hash()[:8]}"

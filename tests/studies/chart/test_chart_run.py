@@ -118,6 +118,7 @@ def test_what_does_not_exist_is_told_before_anything_runs(tmp_path: Path) -> Non
         ("statik", [], 'did you mean "static'),
         ("static+model.scene.pints=3", [], "pints"),
         ("static", ["wrap"], "rasterizer:warp"),
+        ("static+train.seed=3", [], "--seeds"),
     ):
         with pytest.raises(HoigsError, match=told):
             plan(ChartStudy([CLIP], parse_variants(specs), tmp_path, rasterizers))
