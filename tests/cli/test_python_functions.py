@@ -19,6 +19,7 @@ FUNCTIONS = {
     "needs": (hoigs.needs,),
     "eval": (hoigs.evaluate_run,),
     "prepare": (hoigs.prepare, hoigs.prepare_until),
+    "refine": (hoigs.refine_poses,),
     "compress": (hoigs.compress,),
     "render": (hoigs.render,),
     "export": (hoigs.export,),

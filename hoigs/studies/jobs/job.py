@@ -122,7 +122,9 @@ def make_job(
     from hoigs.core.registry.registry import default_registry
 
     if sum(setting.partition("=")[0].strip() == SEED for setting in settings) > 1:
-        raise SpecError(f"{SEED}: the seeds of a study are 0, 1 … of --seeds; leave the setting out")
+        raise SpecError(
+            f"{SEED}: the seeds of a study are 0, 1 … of --seeds; leave the setting out"
+        )
     registry = default_registry([Path(p) for p in more.get("plugins", ())])
     loaded = Spec.load(spec, overrides=list(settings), registry=registry)
     name = f"{loaded.name.partition('@')[0]}-seed{loaded.train.seed}-{loaded.hash()[:8]}"
