@@ -157,7 +157,8 @@ def _refined(clip: Path, out: Path, job: Job) -> tuple[Path, float]:
     import hoigs
 
     start = time.perf_counter()
-    hoigs.refine_poses(clip, out, device=job.device, seed=job.seed, overwrite=True)
+    settings = [f"train.seed={job.seed}"]
+    hoigs.refine_poses(clip, out, overrides=settings, device=job.device, overwrite=True)
     return out, round(time.perf_counter() - start, 1)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hoigs.cli.common import DeviceOption, OverwriteOption
+from hoigs.cli.common import DeviceOption, OverwriteOption, SetOption
 from hoigs.cli.display import Display
 
 
@@ -23,6 +23,7 @@ def refine(
     width: Annotated[
         int, typer.Option("--width", min=16, help="Of the images that are compared, pixels.")
     ] = 256,
+    settings: SetOption = None,
     device: DeviceOption = "auto",
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -34,7 +35,7 @@ def refine(
 
     with Display() as show:
         done = refine_poses(
-            clip, out, steps=steps, width=width, device=device, overwrite=overwrite,
+            clip, out, steps=steps, width=width, overrides=settings or (), device=device, overwrite=overwrite,
             progress=show.fraction,
         )  # fmt: skip
         show.line(str(done))

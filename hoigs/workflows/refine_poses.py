@@ -80,7 +80,6 @@ def refine_poses(
     width: int = WIDTH,
     overrides: Sequence[str] = (),
     device: str = "auto",
-    seed: int = 0,
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> RefinedPoses:
@@ -100,7 +99,8 @@ def refine_poses(
         out: folder of the refined clip: a copy, whose images are hard links where the file system
             has them; or the clip's own folder, with `overwrite`.
         steps: of the training; by default 12.5 a frame, from 800 to 2000.
-        width: of the images that are compared, pixels. overrides: settings of the spec `hoigs`.
+        width: of the images that are compared, pixels. overrides: settings laid over the spec's,
+            "train.seed=1".
 
     Raises:
         ClipError: nobody in the clip has poses with errors, or `out` is there already.
@@ -119,7 +119,7 @@ def refine_poses(
         why = "nobody is in it" if not source.bodies else "it declares its poses to be exact"
         raise ClipError(f"{folder} has no body poses to refine: {why}")
     steps = steps or round(min(max(VISITS * len(source), LEAST), MOST))
-    model = _trained(source, steps, overrides, pick_device(device), seed, registry, progress)
+    model = _trained(source, steps, overrides, pick_device(device), registry, progress)
     tracks = {name: _refined(model, source, name, steps) for name in source.bodies}
     moved = {n: _moved(source.bodies[n], track, registry) for n, track in tracks.items()}
     _write(folder, out, tracks)
@@ -131,15 +131,14 @@ def _trained(
     steps: int,
     overrides: Sequence[str],
     device: str,
-    seed: int,
     registry: Registry,
     progress: Progress,
 ) -> SceneModel:
     """A model of the clip, trained on all its frames."""
-    settings = [*SETTINGS, f"train.steps={steps}", f"train.seed={seed}", *overrides]
+    settings = [*SETTINGS, f"train.steps={steps}", *overrides]
     spec = Spec.load("hoigs", overrides=settings, registry=registry)
     every = replace(clip, split={"train": list(range(len(clip))), "test": []}, held_out=None)
-    torch.manual_seed(seed)
+    torch.manual_seed(spec.train.seed)
     model = compose(spec, every, registry).to(device)
     density = compose_density(spec, every, registry)
     trainer = Trainer(model, every, spec.train, density=density)
