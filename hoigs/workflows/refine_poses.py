@@ -109,7 +109,10 @@ def refine_poses(
     folder, out = clip_folder(clip), Path(out)
     require_folder(folder)
     if not is_clip_folder(folder):
-        raise ClipError(f"{folder} is no clip folder: poses are written as one has them")
+        raise ClipError(
+            f"{folder} has no {HEADER}: refined poses are written as a copy of a clip folder, which "
+            "`hoigs prepare` makes"
+        )
     if out.exists() and not overwrite:
         raise ClipError(f"{out} is there already; --overwrite (overwrite=True) replaces it")
     refuse_to_overwrite(out)
