@@ -35,7 +35,8 @@ def refine(
 
     with Display() as show:
         done = refine_poses(
-            clip, out, steps=steps, width=width, overrides=settings or (), device=device, overwrite=overwrite,
+            clip, out, steps=steps, width=width, overrides=settings or (),
+            device=device, overwrite=overwrite,
             progress=show.fraction,
         )  # fmt: skip
         show.line(str(done))

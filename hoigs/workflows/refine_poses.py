@@ -110,8 +110,8 @@ def refine_poses(
     require_folder(folder)
     if not is_clip_folder(folder):
         raise ClipError(
-            f"{folder} has no {HEADER}: refined poses are written as a copy of a clip folder, which "
-            "`hoigs prepare` makes"
+            f"{folder} has no {HEADER}: refined poses are written as a copy of a clip folder, "
+            "which `hoigs prepare` makes"
         )
     if out.exists() and not overwrite:
         raise ClipError(f"{out} is there already; --overwrite (overwrite=True) replaces it")
