@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,17 +19,16 @@ from hoigs.core.clip_folder.check import require_clip
 from hoigs.core.clip_folder.format import HEADER, is_clip_folder
 from hoigs.core.clip_folder.track_files import save_body
 from hoigs.core.clip_folder.write import refuse_to_overwrite, replace_folder
-from hoigs.core.errors import ClipError
-from hoigs.core.interfaces.deformation import ProvidesSkeleton
+from hoigs.core.errors import ClipError, SpecError
+from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.machine.busy import short_waits_when_busy
 from hoigs.core.model.compose import compose, compose_density
-from hoigs.core.model.scene import SceneModel
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import POSES_EXACT, BodyTrack, Clip
-from hoigs.core.values.moment import BodyPose
 from hoigs.core.whole_files import write_whole
+from hoigs.plugins.deformation.avatars.body.skinned_body import SkinnedBody
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_folder, read_clip, require_folder
 from hoigs.training.trainer import Trainer
@@ -104,6 +103,7 @@ def refine_poses(
 
     Raises:
         ClipError: nobody in the clip has poses with errors, or `out` is there already.
+        SpecError: `overrides` are wrong, or name a deformation that refines no poses.
     """
     registry = default_registry()
     folder, out = clip_folder(clip), Path(out)
@@ -122,9 +122,12 @@ def refine_poses(
         why = "nobody is in it" if not source.bodies else "it declares its poses to be exact"
         raise ClipError(f"{folder} has no body poses to refine: {why}")
     steps = steps or round(min(max(VISITS * len(source), LEAST), MOST))
-    model = _trained(source, steps, overrides, pick_device(device), registry, progress)
-    tracks = {name: _refined(model, source, name, steps) for name in source.bodies}
-    moved = {n: _moved(source.bodies[n], track, registry) for n, track in tracks.items()}
+    people = _trained(source, steps, overrides, pick_device(device), registry, progress)
+    tracks = {name: _refined(person, source, name, steps) for name, person in people.items()}
+    moved = {
+        name: _moved(source.bodies[name], track, people[name].body)
+        for name, track in tracks.items()
+    }
     _write(folder, out, tracks)
     return RefinedPoses(out, steps, moved)
 
@@ -136,26 +139,32 @@ def _trained(
     device: str,
     registry: Registry,
     progress: Progress,
-) -> SceneModel:
-    """A model of the clip, trained on all its frames."""
+) -> dict[str, SkinnedBody]:
+    """The deformation of every person of the clip, on the CPU, trained on all its frames."""
     settings = [*SETTINGS, f"train.steps={steps}", *overrides]
     spec = Spec.load("hoigs", overrides=settings, registry=registry)
     every = replace(clip, split={"train": list(range(len(clip))), "test": []}, held_out=None)
     torch.manual_seed(spec.train.seed)
     model = compose(spec, every, registry).to(device)
+    people = {name: model.entity(name).deformation for name in clip.bodies}
+    for name, person in people.items():
+        if not isinstance(person, SkinnedBody) or person.refinement is None:
+            raise SpecError(
+                f"the deformation of {name} refines no poses; take one that has refine_poses, as "
+                "deformation:hexplane-skinning, and set that to true"
+            )
     density = compose_density(spec, every, registry)
     trainer = Trainer(model, every, spec.train, density=density)
     trainer.train(lambda report: progress(report.step / steps, "refining poses"))
-    return model.eval()
+    model.eval().to("cpu")
+    return {name: person for name, person in people.items() if isinstance(person, SkinnedBody)}
 
 
 @torch.no_grad()
-def _refined(model: SceneModel, clip: Clip, name: str, steps: int) -> BodyTrack:
-    """A person's track with the poses that the model has learned."""
-    track, deformation = clip.bodies[name], model.entity(name).deformation
-    if not isinstance(deformation, ProvidesSkeleton):
-        raise ClipError(f"the model of {name} has no skeleton: it refines no poses")
-    poses = {m.index: deformation.pose(m.to(model.device)).to("cpu") for m in clip.moments}
+def _refined(person: SkinnedBody, clip: Clip, name: str, steps: int) -> BodyTrack:
+    """A person's track with the poses, and the betas of all frames, that were learned."""
+    track = clip.bodies[name]
+    poses = {moment.index: person.pose(moment) for moment in clip.moments}
     count = len(track.poses.transl)
     every = [poses.get(i, track.poses.frame(i)) for i in range(count)]  # not all are in the clip
     first = next(iter(poses.values()))
@@ -169,14 +178,14 @@ def _refined(model: SceneModel, clip: Clip, name: str, steps: int) -> BodyTrack:
 
 
 @torch.no_grad()
-def _moved(before: BodyTrack, after: BodyTrack, registry: Registry) -> float:
+def _moved(before: BodyTrack, after: BodyTrack, body: BodyModel) -> float:
     """Mean distance between the joints of two tracks, metres."""
-    body = registry.get(before.model)()
-    joints: Callable[[BodyPose], Float[Tensor, "J 3"]] = lambda pose: body(pose).joints  # noqa: E731
-    apart = [
-        (joints(after.poses.frame(i)) - joints(before.poses.frame(i))).norm(dim=-1).mean()
-        for i in range(len(before.poses.transl))
-    ]
+
+    def joints(track: BodyTrack, frame: int) -> Float[Tensor, "J 3"]:
+        return body(track.poses.frame(frame)).joints
+
+    frames = range(len(before.poses.transl))
+    apart = [(joints(after, i) - joints(before, i)).norm(dim=-1).mean() for i in frames]
     return float(torch.stack(apart).mean())
 
 

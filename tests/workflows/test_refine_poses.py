@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from hoigs import refine_poses
-from hoigs.core.errors import ClipError
+from hoigs.core.errors import ClipError, SpecError
 from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
@@ -64,6 +64,9 @@ def test_nothing_is_written_where_there_is_nothing_to_refine(
 ) -> None:
     with pytest.raises(ClipError, match="exact"):
         refine_poses(clips[0], tmp_path / "out", steps=1)
+    fixed = ["model.human.deformation.refine_poses=false"]
+    with pytest.raises(SpecError, match="refines no poses"):
+        refine_poses(clips[1], tmp_path / "out", steps=1, device="cpu", overrides=fixed)
     assert not any(tmp_path.iterdir())
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
@@ -30,7 +32,7 @@ class NonRigidConfig(ComponentConfig):
     """Width of its hidden layer."""
 
 
-class NonRigid(nn.Module):
+class NonRigid(nn.Module, ABC):
     """A network over phi(P_c, t), HexPlane features of canonical points at a time.
 
     Each starts by changing nothing. Features are smooth over the body and in time, so that a frame
@@ -57,6 +59,7 @@ class NonRigid(nn.Module):
         """
         return dense(self.layers, self.planes(points, time))
 
+    @abstractmethod
     def change(
         self, canonical: Gaussians, points: Float[Tensor, "N 3"], time: Time
     ) -> tuple[GaussianDelta, dict[str, Tensor]]:
@@ -65,7 +68,6 @@ class NonRigid(nn.Module):
         Args:
             points: where the planes are read, see `read`.
         """
-        raise NotImplementedError
 
     def penalties(self) -> dict[str, Tensor]:
         """Of the planes, as those of the human's own (`HexPlaneSkinning.regularizers`)."""
