@@ -69,6 +69,7 @@ from hoigs.workflows.demo import demo as demo
 from hoigs.workflows.doctor import doctor as doctor
 from hoigs.workflows.evaluate_run import evaluate_run as evaluate_run
 from hoigs.workflows.export import export as export
+from hoigs.workflows.refine_poses import refine_poses as refine_poses
 from hoigs.workflows.train import train as train
 
 __version__: str
