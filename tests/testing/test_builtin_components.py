@@ -42,8 +42,9 @@ def _imported_at_once() -> None:
     [(key, SMALL.get(key, {})) for key in KEYS]
     + [  # as the spec hoigs has them
         ("interaction:cross-attention", {"places": "hands"}),
-        (HUMAN, SMALL[HUMAN] | {"free_attributes": "all", "nonrigid": True}),
-        (HUMAN, SMALL[HUMAN] | {"free_attributes": "all", "nonrigid": "shading"}),
+        (HUMAN, SMALL[HUMAN] | {"free_attributes": "all", "nonrigid": True, "light": True}),
+        (HUMAN, SMALL[HUMAN] | {"free_attributes": "all", "nonrigid": "shading", "light": True}),
+        ("deformation:tracked-chs", {"light": True, "opacity": "constant"}),
     ],
 )
 def test_conforms(key, settings) -> None:

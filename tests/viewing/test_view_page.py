@@ -56,6 +56,9 @@ def test_tracks_are_sorted_by_how_they_move() -> None:
         assert torch.allclose(placed, moved(turn).means, atol=1e-4)
     bent = [still.replace(means=still.means * (1 + 0.05 * i)) for i in range(6)]
     assert track_of("a", bent, EYES).motion == "moving"
+    turned = [moved(t) for t in turns]
+    lit = [g.replace(sh=g.sh * (1 + 0.2 * i)) for i, g in enumerate(turned)]
+    assert track_of("a", lit, EYES).motion == "moving"  # its light changes
     fading = [still.replace(opacity_logits=still.opacity_logits - i) for i in range(6)]
     assert track_of("a", fading, EYES).motion == "moving"
 

@@ -22,7 +22,7 @@ from hoigs.core.values.gaussians import Gaussians
 
 STILL_M = 5e-4  # an entity whose Gaussians all stay within this is stored once
 RIGID_M = 2e-3  # percentile 99 of what may be left of a motion that is stored as poses
-STEADY = 0.02  # of opacity and of the logarithm of scales, that a stored-once entity may change
+STEADY = 0.02  # change of colour, opacity and logarithm of scales of an entity that is stored once
 
 Motion = Literal["static", "rigid", "moving"]
 
@@ -94,8 +94,10 @@ def track_of(
     scales = torch.stack([g.log_scales for g in frames])
     rgba = torch.stack([rgba_of(g, eyes) for g in frames])
     whole = Track(name, "moving", means, quats, scales, rgba)
-    steady = all(float((x - x[:1]).abs().max()) < STEADY for x in (scales, rgba[..., 3]))
-    if not steady or not len(whole):
+    if not len(whole):
+        return whole
+    own = torch.stack([g.colors for g in frames])  # what the light changes, not the direction
+    if any(float((x - x[:1]).abs().max()) >= STEADY for x in (scales, rgba[..., 3], own)):
         return whole
     middle = len(frames) // 2
     one = replace(

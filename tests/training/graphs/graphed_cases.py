@@ -195,6 +195,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "given poses": {"human": {"refine_poses": False}},
     "clothes": {"human": {"nonrigid": True}},
     "shading": {"human": {"nonrigid": "shading", "free_attributes": "all"}},
+    "light": {"human": {"light": True}, "thing": {"light": True, "opacity": "constant"}},
     "skinned": {"person": partial(skinned, refine_poses=False), "unattended": True},
     "skinned, refined": {"person": partial(skinned, refine_poses=True), "unattended": True},
     "rigid": {"motion": keyframed(RigidSpline)},

@@ -14,6 +14,7 @@ from hoigs.core.cuda_graphs.device_constants import Time
 from hoigs.core.maths.feature_planes import PairedPlanes
 from hoigs.core.maths.networks import dense, zeroed
 from hoigs.core.values.gaussians import SH_C0, GaussianDelta, Gaussians
+from hoigs.plugins.deformation.irradiance import above_black
 
 LEAST = 4  # cells along time
 UNIT = 0.1  # metres, of offsets: at the learning rate of networks, metres would diverge
@@ -113,6 +114,5 @@ class Shading(NonRigid):
         self, canonical: Gaussians, points: Float[Tensor, "N 3"], time: Time
     ) -> tuple[GaussianDelta, dict[str, Tensor]]:
         exponents = self.read(points, time)
-        grey = canonical.sh.new_full((1, 1, 3), 0.5 / SH_C0)  # a colour is 0.5 + SH
-        color = canonical.sh + pad(grey, (0, 0, 0, canonical.sh.shape[1] - 1))
-        return GaussianDelta(sh=exponents.expm1()[..., None] * color), {"shading": exponents}
+        sh = exponents.expm1()[..., None] * above_black(canonical.sh)
+        return GaussianDelta(sh=sh), {"shading": exponents}
