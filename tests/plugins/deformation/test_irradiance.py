@@ -23,7 +23,11 @@ from hoigs.plugins.deformation.irradiance import (
     outward_normals,
     turned_normals,
 )
-from hoigs.plugins.deformation.splines.tracked_chs import TrackedHermite, TrackedHermiteConfig
+from hoigs.plugins.deformation.rigid.articulated import Articulated
+from hoigs.plugins.deformation.rigid.rigid_spline import RigidSpline
+from hoigs.plugins.deformation.splines.chs import CubicHermite
+from hoigs.plugins.deformation.splines.keyframed import Keyframed
+from hoigs.plugins.deformation.splines.tracked_chs import TrackedHermite
 
 TURNS = torch.tensor([[0.0, 0, 0], [0.0, 0, 1.2], [0.0, 0, 2.4]])  # of the ball, radians
 SUN = normalize(torch.tensor([0.3, 0.8, -0.5]), dim=0)
@@ -90,15 +94,15 @@ def test_it_scales_all_harmonics_of_a_colour():
     assert torch.equal(lit.means, gaussians.means)
 
 
-def turning_ball(**settings) -> Entity:
+def turning_ball(motion: type[Keyframed] = TrackedHermite, **settings) -> Entity:
     torch.manual_seed(0)
     turns = axis_angle_to_matrices(TURNS)
     flat = ball()
     track = ObjectTrack(
         flat.means, flat.colors, turns, torch.zeros(3, 3), torch.ones(3, dtype=torch.bool)
     )
-    config = TrackedHermiteConfig(opacity="constant", **settings)
-    return Entity(flat, TrackedHermite(config, track=track))
+    config = motion.Config(keyframes=9, **settings)
+    return Entity(flat, motion(config, track=track))
 
 
 def test_a_turning_object_learns_its_light():
@@ -138,11 +142,18 @@ def test_children_have_the_normals_of_their_parents():
     assert len(entity(Moment(0.5)).sh) == 3
 
 
-def test_without_a_track_nothing_turns_and_nothing_is_lit():
-    free = Entity(ball(), TrackedHermite(TrackedHermiteConfig(light=True), num_frames=9))
-    assert free.deformation.irradiance is None
-    assert "normals" not in dict(free.deformation.named_parameters())
-    assert turning_ball().deformation.irradiance is None
+@pytest.mark.parametrize("motion", [CubicHermite, TrackedHermite, RigidSpline, Articulated])
+def test_objects_of_any_keyframed_motion_are_lit_as_they_turn(motion):
+    entity = turning_ball(motion, light=True)
+    with torch.no_grad():
+        entity.deformation.irradiance.light[0] = 0.5
+        turned = axis_angle_to_matrices(TURNS)[2]
+        lit = entity(Moment(1.0)).colors / entity.canonical.colors
+    expected = 1 + 0.5 * (entity.canonical.means.detach() @ turned.mT)[:, :1].expand(-1, 3)
+    torch.testing.assert_close(lit, expected, atol=0.02, rtol=0)
+    unlit = turning_ball(motion)
+    assert unlit.deformation.irradiance is None
+    assert torch.equal(unlit(Moment(1.0)).sh, unlit.canonical.sh)
 
 
 @pytest.fixture

@@ -65,9 +65,6 @@ class HexPlaneSkinningConfig(SkinnedBodyConfig):
     the paper's Eq. 5."""
     nonrigid_motion: NonRigidConfig = Field(default_factory=NonRigidConfig)
     """Sizes of what `nonrigid` learns."""
-    light: bool = False
-    """Learn the light by the direction in which the surface faces (`Irradiance`), so that colours
-    change as the person turns; False is the paper."""
     laplacian: LaplacianOn = "points"
     """Where L_reg of psi_h is taken: over neighbouring "points", the Gaussians, at no further cost;
     or over the vertices of the body's "mesh" (the paper), by a second pass of psi_h, but then

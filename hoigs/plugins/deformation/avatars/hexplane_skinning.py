@@ -31,7 +31,6 @@ from hoigs.plugins.deformation.avatars.body_planes import body_planes, field_sub
 from hoigs.plugins.deformation.avatars.canonical_head import CanonicalAttributes, CanonicalHead
 from hoigs.plugins.deformation.avatars.hexplane_config import HexPlaneSkinningConfig
 from hoigs.plugins.deformation.avatars.nonrigid import NonRigid, NonRigidMotion, Shading
-from hoigs.plugins.deformation.irradiance import Irradiance, turned_normals
 
 
 class HexPlaneSkinning(SurfaceBody):
@@ -97,7 +96,6 @@ class HexPlaneSkinning(SurfaceBody):
         if config.nonrigid:
             kind = Shading if config.nonrigid == "shading" else NonRigidMotion
             self.nonrigid = kind(config.nonrigid_motion, self.num_frames or 0)
-        self.irradiance = Irradiance() if config.light else None
         owned: set[str] = set() if config.free_attributes == "all" else {"means", "quats"}
         owned |= {"opacity_logits"} if self.opaque else set()
         if not config.free_attributes:
@@ -152,10 +150,7 @@ class HexPlaneSkinning(SurfaceBody):
             delta, changes = self.nonrigid.change(refined, points, moment.time)
             self._changes = changes if self._remembers() else {}
             refined = refined.moved(delta)
-        posed = self.posed(refined, weights, pose, joints, moment, residual)
-        if self.irradiance is None:
-            return posed
-        return self.irradiance(posed, turned_normals(self.normals, refined.quats, posed.quats))
+        return self.posed(refined, weights, pose, joints, moment, residual)
 
     @torch.no_grad()
     def hold(self, canonical: Gaussians, moment: Moment) -> None:

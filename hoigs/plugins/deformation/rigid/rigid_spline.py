@@ -84,6 +84,7 @@ class RigidSpline(Keyframed):
             setattr(self, name, nn.Parameter(values[name].to(means).contiguous()))
         center = torch.zeros(3) if self._track is not None or len(means) == 0 else means.mean(0)
         self.register_buffer("center", center.to(means).clone())
+        self.bind_light(canonical)
         self._track = None
 
     def _initial(self, means: Tensor) -> dict[str, Tensor]:
@@ -176,7 +177,8 @@ class RigidSpline(Keyframed):
         means, quats = move_rigidly(
             means - self.center, normalize_quats(quats), quat, self.center + place
         )
-        return canonical.replace(means=displaced(means, residual), quats=quats)
+        moved = canonical.replace(means=displaced(means, residual), quats=quats)
+        return self.lit(moved, canonical)
 
     def velocity(self, canonical: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
         """Exact time derivative of the means, metres per keyframe interval."""

@@ -70,7 +70,7 @@ class CubicHermite(Keyframed):
         names = ["keyframe_means", "keyframe_quats"]
         names += ["tangents"] if self.learned else []
         names += ["opacity_logits"] if self.keyed else []
-        self.per_gaussian = tuple(names)
+        self.per_gaussian = (*names, *self.per_gaussian)
         self.knot_axes = dict.fromkeys(names, 1)
         self.time_rows = {} if self.knots.movable else dict.fromkeys(names, self.knots.rows)
         self.owns = frozenset({"means", "quats"} | ({"opacity_logits"} if self.keyed else set()))
@@ -86,6 +86,7 @@ class CubicHermite(Keyframed):
         if self.keyed:
             logits = canonical.opacity_logits[:, None].repeat(1, self.keyframes)
             self.opacity_logits = nn.Parameter(logits)
+        self.bind_light(canonical)
         # kept because offsets of new Gaussians come in canonical coordinates
         self.register_buffer("rest_quats", rest_quats.clone())
         self._track = None
@@ -107,7 +108,7 @@ class CubicHermite(Keyframed):
     ) -> Gaussians:
         means = displaced(self._means(moment.time), residual)
         quats = self.knots.slerp(self.keyframe_quats, moment.time)
-        moved = canonical.replace(means=means, quats=quats)
+        moved = self.lit(canonical.replace(means=means, quats=quats), canonical)
         if self.keyed:
             logits = self.knots.linear(self.opacity_logits, moment.time)
             moved = moved.replace(opacity_logits=logits)

@@ -10,7 +10,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from jaxtyping import Float
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.functional import normalize
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.context import BuildContext
@@ -23,6 +24,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.topology import AxisChange
+from hoigs.plugins.deformation.irradiance import Irradiance, outward_normals, turned_normals
 from hoigs.plugins.deformation.splines.knot_schedule import AdaptiveKnotsConfig, KnotSchedule
 from hoigs.plugins.deformation.splines.rigid_track import RigidTrack
 
@@ -43,12 +45,17 @@ class KeyframedConfig(ComponentConfig):
     """"learned" velocities at the knots (the paper), or "finite-difference" of its neighbours."""
     track: bool = True
     """Start from the object's rigid track, where it has one, else at rest."""
+    light: bool = False
+    """Learn the light by the direction in which the surface faces (`Irradiance`), so that colours
+    change as the object turns; False is the paper."""
     adaptive: AdaptiveKnotsConfig = Field(default_factory=AdaptiveKnotsConfig)
     """When and how knots change, if `keyframes` is "adaptive"."""
 
 
 class Keyframed(Resizing, DeformationModel):
     """Base of motions over K knots (`HasKnots`).
+
+    With `light`, `normals` [N, 3] are a parameter: of the canonical Gaussians' surface.
 
     Args:
         config: with `keyframes` None or "adaptive", K follows from the number of frames.
@@ -65,6 +72,7 @@ class Keyframed(Resizing, DeformationModel):
     provides = frozenset({"velocity"})
 
     knot_axes: Mapping[str, int]
+    normals: nn.Parameter
 
     def __init__(
         self,
@@ -95,6 +103,10 @@ class Keyframed(Resizing, DeformationModel):
         self.num_frames = num_frames
         self.input_space = "canonical" if track is not None else "world"
         self._track = track
+        self.irradiance: Irradiance | None = None
+        if config.light:
+            self.irradiance = Irradiance()
+            self.per_gaussian = (*self.per_gaussian, "normals")
 
     @classmethod
     def from_config(cls, config: Any, context: BuildContext) -> Self:
@@ -124,6 +136,22 @@ class Keyframed(Resizing, DeformationModel):
                 stacklevel=4,
             )
         return track
+
+    def bind_light(self, canonical: Gaussians) -> None:
+        """To be called by `bind`."""
+        if self.irradiance is not None:
+            self.irradiance.to(canonical.means)
+            self.normals = nn.Parameter(outward_normals(canonical.detach()))
+
+    def lit(self, moved: Gaussians, canonical: Gaussians) -> Gaussians:
+        """Gaussians that were turned from their canonical rotations, in the light there."""
+        if self.irradiance is None:
+            return moved
+        normals = normalize(self.normals, dim=-1)
+        lit: Gaussians = self.irradiance(
+            moved, turned_normals(normals, canonical.quats, moved.quats)
+        )
+        return lit
 
     def refitted(
         self, samples: Float[Tensor, "S D"], fit: Sequence[float], times: Sequence[float]

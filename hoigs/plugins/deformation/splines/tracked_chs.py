@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import normalize
 
 from hoigs.core.cuda_graphs.device_constants import Time
 from hoigs.core.maths.rotations import multiply_quats
@@ -17,7 +16,6 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual, displaced
 from hoigs.core.values.topology import TopologyChange, reindex
-from hoigs.plugins.deformation.irradiance import Irradiance, outward_normals, turned_normals
 from hoigs.plugins.deformation.splines.chs import CubicHermite, CubicHermiteConfig
 from hoigs.plugins.deformation.splines.rigid_track import RigidTrack
 
@@ -27,9 +25,6 @@ class TrackedHermiteConfig(CubicHermiteConfig):
 
     track: bool = True
     """Be carried by the object's rigid track, where it has one."""
-    light: bool = False
-    """Learn the light by the direction in which the surface faces (`Irradiance`), so that colours
-    change as the object turns; False is the paper. Not used where there is no track."""
 
 
 class TrackedHermite(CubicHermite):
@@ -46,11 +41,9 @@ class TrackedHermite(CubicHermite):
     `tangents` are d and its tangents, in the object's frame; `keyframe_quats` turn, and
     `opacity_logits` add to, those of the canonical Gaussians. `velocity` is that of the world.
     Without a track the object's frame is the world, and knots learn at CubicHermite's rates.
-    With `light` there are `normals` [N, 3] of the object's frame, too.
     """
 
     Config: ClassVar = TrackedHermiteConfig
-    config: TrackedHermiteConfig
     cuda_graph_safe = True
     regularizer_weights: ClassVar[Mapping[str, float]] = {
         **CubicHermite.regularizer_weights,
@@ -69,10 +62,6 @@ class TrackedHermite(CubicHermite):
         super().__init__(config, **given)
         self.carrier = RigidTrack(self._track) if self._track is not None else None
         self._track = None
-        self.irradiance: Irradiance | None = None
-        if self.config.light and self.carrier is not None:
-            self.irradiance = Irradiance()
-            self.per_gaussian = (*self.per_gaussian, "normals")
         self._shape: Tensor | None = None  # of the object in the last forward pass
         self.owns = frozenset()
         if self.carrier is None:  # all of the motion is then the splines' own
@@ -87,9 +76,7 @@ class TrackedHermite(CubicHermite):
             self.tangents = nn.Parameter(still.clone())
         if self.keyed:
             self.opacity_logits = nn.Parameter(still.new_zeros(len(canonical), self.keyframes))
-        if self.irradiance is not None:
-            self.irradiance.to(still)
-            self.normals = nn.Parameter(outward_normals(canonical.detach()))
+        self.bind_light(canonical)
 
     def forward(
         self, canonical: Gaussians, moment: Moment, residual: Residual | None = None
@@ -103,9 +90,7 @@ class TrackedHermite(CubicHermite):
         if self.carrier is not None:
             means, quats = self.carrier.place(means, quats, time)
         moved = canonical.replace(means=displaced(means, residual), quats=quats)
-        if self.irradiance is not None:
-            normals = normalize(self.normals, dim=-1)
-            moved = self.irradiance(moved, turned_normals(normals, canonical.quats, quats))
+        moved = self.lit(moved, canonical)
         if not self.keyed:
             return moved
         logits = canonical.opacity_logits + self.knots.linear(self.opacity_logits, time)

@@ -29,6 +29,7 @@ from hoigs.core.values.clip import POSES_EXACT, Clip
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.plugins.deformation.avatars.body.pose_refinement import PoseRefinement
+from hoigs.plugins.deformation.irradiance import Irradiance
 
 # metres: Gaussians made with another seed are decimetres off, those on a padded surface centimetres
 APART = 0.05
@@ -56,6 +57,9 @@ class SkinnedBodyConfig(ComponentConfig):
     """Learn per-frame corrections of pose and translation, and one of shape. "auto" learns them
     unless the clip declares its poses to be exact, as a built-in clip without noise does:
     corrections of exact poses hide errors of the shape in the views that were filmed."""
+    light: bool = False
+    """Learn the light by the direction in which the surface faces (`Irradiance`), so that colours
+    change as the person turns; False is the paper."""
 
 
 class SkinnedBody(DeformationModel):
@@ -125,6 +129,7 @@ class SkinnedBody(DeformationModel):
             self.refinement = PoseRefinement(
                 num_frames, body.num_betas, trained_frames, frame_times
             )
+        self.irradiance = Irradiance() if self.config.light else None
         betas = torch.zeros(body.num_betas) if betas is None else betas.detach().clone()
         with torch.no_grad():
             vertices, joints = body.shaped(betas)

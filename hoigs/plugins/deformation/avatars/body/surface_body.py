@@ -20,6 +20,7 @@ from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
 from hoigs.plugins.deformation.avatars.body.face_points import HEAD_JOINT, face_points
 from hoigs.plugins.deformation.avatars.body.skinned_body import SkinnedBody, checked_surface
+from hoigs.plugins.deformation.irradiance import turned_normals
 
 OPAQUE = 4.6  # logit of 0.99, the largest opacity that rasterizers draw
 
@@ -105,7 +106,8 @@ class SurfaceBody(SkinnedBody):
         moment: Moment,
         residual: Residual | None,
     ) -> Gaussians:
-        """alpha LBS(P_c, theta, W) (HOIGS, Eq. 6 and 14), plus the residual of the means.
+        """alpha LBS(P_c, theta, W) (HOIGS, Eq. 6 and 14), plus the residual of the means, in the
+        light there.
 
         Args:
             canonical: Gaussians of the zero pose. joints: of the zero pose, in the shape of `pose`,
@@ -119,12 +121,18 @@ class SurfaceBody(SkinnedBody):
         means, quats = skin_gaussians(canonical.means, canonical.quats, weights, scaled, turns)
         if residual is not None and residual.means is not None:
             means = means + residual.means
-        return replace(
+        posed = replace(
             canonical,
             means=means,
             quats=quats,
             log_scales=canonical.log_scales + self.log_alpha,
         )
+        if self.irradiance is None:
+            return posed
+        lit: Gaussians = self.irradiance(
+            posed, turned_normals(self.normals, canonical.quats, quats)
+        )
+        return lit
 
     def surface_points(self) -> Float[Tensor, "N 3"]:
         """Where each canonical point lies on the template in its zero pose, metres."""
