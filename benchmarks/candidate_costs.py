@@ -43,8 +43,9 @@ def main() -> None:
         return (time.perf_counter() - began) / options.steps
 
     class Timed(Search):
-        def _pace(self, full: Any, steps: int = 6) -> float:
-            paces.append(super()._pace(full, 4 + options.steps))
+        def _pace(self, steps: int = 6) -> float:
+            del steps
+            paces.append(super()._pace(4 + options.steps))
             print(f"full step: {1000 * paces[0]:.1f} ms")
             print(f"{'search space':16} {'candidate':40} {'declared':>8} {'measured':>8}")
             return paces[0]
