@@ -30,7 +30,8 @@ CLIP = (
 SMALL = [
     "model.scene.points=60", "model.human.points=40", "model.object.points=20",
     "model.human.deformation.resolution=8", "model.human.deformation.channels=2",
-    "model.object.deformation.keyframe_step=1", "train.log_every=1", "train.preview_every=0",
+    "model.object.deformation.keyframe_step=1", "model.object.deformation.opacity=keyed",
+    "train.log_every=1", "train.preview_every=0",
     "train.fill_unseen=[]", "train.steps=30", "train.checkpoint_every=100",
 ]  # fmt: skip
 PAGED = {

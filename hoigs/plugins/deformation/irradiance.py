@@ -5,17 +5,13 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
-from hoigs.core.maths.rotations import (
-    conjugate_quats,
-    multiply_quats,
-    normalize_quats,
-    quats_to_matrices,
-)
+from hoigs.core.cuda_graphs.device_constants import constant
+from hoigs.core.maths.rotations import conjugate_quats, multiply_quats, quats_to_matrices
 from hoigs.core.values.gaussians import SH_C0, Gaussians
 
 TERMS = 8  # spherical harmonics of degrees 1 and 2
+SQUARES = ((1.0, -1.0), (-1.0, -1.0), (0.0, 2.0))  # of x, y, z in x^2 - y^2 and 3 z^2 - 1
 
 
 class Irradiance(nn.Module):
@@ -37,30 +33,28 @@ class Irradiance(nn.Module):
         Args:
             moved: raw Gaussians. normals: in the world, unit, pointing outwards.
         """
-        gain = irradiance_basis(normals) @ self.light
-        return moved.replace(sh=moved.sh + gain[:, None] * above_black(moved.sh))
+        factors = 1 + irradiance_basis(normals) @ self.light
+        grey = mid_grey(moved.sh)
+        return moved.replace(sh=factors[:, None] * (moved.sh + grey) - grey)
 
 
 def irradiance_basis(normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 8"]:
     """Real spherical harmonics of degrees 1 and 2 at unit vectors, without their constants."""
-    x, y, z = normals.unbind(-1)
-    return torch.stack((x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1), -1)
+    mixed = normals * normals.roll(-1, -1)  # xy, yz, zx
+    return torch.cat((normals, mixed, normals.square() @ constant(SQUARES, normals)), -1)
 
 
-def above_black(sh: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:
-    """SH coefficients of the colours themselves: those of Gaussians are relative to 0.5."""
-    grey = sh.new_full((1, 1, 3), 0.5 / SH_C0)
-    return sh + pad(grey, (0, 0, 0, sh.shape[1] - 1))
+def mid_grey(sh: Float[Tensor, "N B 3"]) -> Float[Tensor, "B 1"]:
+    """SH coefficients of the colour 0.5, to which those of Gaussians are relative."""
+    return constant(((0.5 / SH_C0,), *((0.0,),) * (sh.shape[1] - 1)), sh)
 
 
 def turned_normals(
     normals: Float[Tensor, "N 3"], before: Float[Tensor, "N 4"], after: Float[Tensor, "N 4"]
 ) -> Float[Tensor, "N 3"]:
     """Normals turned as Gaussians are from rotation `before` to `after`, wxyz of any length."""
-    turns = normalize_quats(multiply_quats(after, conjugate_quats(before)))
-    w, axes = turns[:, :1], turns[:, 1:]
-    swept = 2 * torch.linalg.cross(axes, normals)
-    return normals + w * swept + torch.linalg.cross(axes, swept)
+    turns = quats_to_matrices(multiply_quats(after, conjugate_quats(before)))
+    return (turns @ normals[..., None]).squeeze(-1)
 
 
 def outward_normals(still: Gaussians) -> Float[Tensor, "N 3"]:

@@ -14,7 +14,7 @@ from hoigs.core.cuda_graphs.device_constants import Time
 from hoigs.core.maths.feature_planes import PairedPlanes
 from hoigs.core.maths.networks import dense, zeroed
 from hoigs.core.values.gaussians import SH_C0, GaussianDelta, Gaussians
-from hoigs.plugins.deformation.irradiance import above_black
+from hoigs.plugins.deformation.irradiance import mid_grey
 
 LEAST = 4  # cells along time
 UNIT = 0.1  # metres, of offsets: at the learning rate of networks, metres would diverge
@@ -114,5 +114,5 @@ class Shading(NonRigid):
         self, canonical: Gaussians, points: Float[Tensor, "N 3"], time: Time
     ) -> tuple[GaussianDelta, dict[str, Tensor]]:
         exponents = self.read(points, time)
-        sh = exponents.expm1()[..., None] * above_black(canonical.sh)
+        sh = exponents.expm1()[..., None] * (canonical.sh + mid_grey(canonical.sh))
         return GaussianDelta(sh=sh), {"shading": exponents}
