@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hoigs.core.cuda_graphs.device_constants import constant
+from hoigs.core.maths.nearest import surface_normals
 from hoigs.core.maths.rotations import conjugate_quats, multiply_quats, quats_to_matrices
 from hoigs.core.values.gaussians import SH_C0, Gaussians
 
@@ -58,7 +59,14 @@ def turned_normals(
 
 
 def outward_normals(still: Gaussians) -> Float[Tensor, "N 3"]:
-    """Normals of flat Gaussians, their z axes, each away from the centre of all of them."""
+    """Normals of a surface of Gaussians, each away from the centre of all of them.
+
+    Flat ones have it along z (`Gaussians.from_points`); of isotropic ones it is that of the plane
+    through their neighbours.
+    """
     normals = quats_to_matrices(still.quats)[:, :, 2]
+    flat = still.log_scales[:, 2:] < still.log_scales[:, :2].amin(1, keepdim=True)
+    if not flat.all():
+        normals = torch.where(flat, normals, surface_normals(still.means))
     outward = (normals * (still.means - still.means.mean(0))).sum(-1, keepdim=True)
     return torch.where(outward < 0, -normals, normals)

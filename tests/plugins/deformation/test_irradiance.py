@@ -80,6 +80,9 @@ def test_normals_of_a_closed_surface_point_outwards():
     flat = ball()
     moved = flat.replace(means=flat.means + torch.tensor([5.0, -2.0, 1.0]))
     torch.testing.assert_close(outward_normals(moved), flat.means, atol=1e-4, rtol=0)
+    points = sphere(2000)
+    round_ones = Gaussians.from_points(points, scales=0.02)
+    assert ((outward_normals(round_ones) * points).sum(-1) > 0.99).all()
 
 
 @torch.no_grad()
