@@ -64,6 +64,9 @@ PIVOTS = _table(
     ],
     9,
 )  # fmt: skip
+HAMILTON_OF_CONJUGATE = tuple(  # of a * conjugate(b); every first of four rows is of b's w
+    tuple(-value if row % 4 else value for value in values) for row, values in enumerate(HAMILTON)
+)
 UNIT_PIVOTS = (
     (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 )  # fmt: skip
@@ -94,6 +97,13 @@ def turned_quats(change: Float[Tensor, "N 4"], quats: Float[Tensor, "N 4"]) -> F
 def conjugate_quats(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
     """The inverses of unit quaternions."""
     return quats * constant((1.0, -1.0, -1.0, -1.0), quats)
+
+
+def relative_quats(
+    after: Float[Tensor, "*batch 4"], before: Float[Tensor, "*batch 4"]
+) -> Float[Tensor, "*batch 4"]:
+    """after * conjugate(before): the turn between them, times the product of their lengths."""
+    return _pairs(after, before) @ constant(HAMILTON_OF_CONJUGATE, after)
 
 
 def quats_to_matrices(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:

@@ -8,11 +8,16 @@ from torch import Tensor, nn
 
 from hoigs.core.cuda_graphs.device_constants import constant
 from hoigs.core.maths.nearest import surface_normals
-from hoigs.core.maths.rotations import conjugate_quats, multiply_quats, quats_to_matrices
+from hoigs.core.maths.rotations import quats_to_matrices, relative_quats
 from hoigs.core.values.gaussians import SH_C0, Gaussians
 
 TERMS = 8  # spherical harmonics of degrees 1 and 2
-SQUARES = ((1.0, -1.0), (-1.0, -1.0), (0.0, 2.0))  # of x, y, z in x^2 - y^2 and 3 z^2 - 1
+# xy, yz, zx, x^2 - y^2 and 3 z^2 - 1 (of unit vectors) from the products xx, xy, xz, yx, ... zz
+SECOND_DEGREE = (
+    (0.0, 0.0, 0.0, 1.0, -1.0), (1.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, -1.0, -1.0), (0.0, 1.0, 0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 2.0),
+)  # fmt: skip
 
 
 class Irradiance(nn.Module):
@@ -34,15 +39,15 @@ class Irradiance(nn.Module):
         Args:
             moved: raw Gaussians. normals: in the world, unit, pointing outwards.
         """
-        factors = 1 + irradiance_basis(normals) @ self.light
-        grey = mid_grey(moved.sh)
-        return moved.replace(sh=factors[:, None] * (moved.sh + grey) - grey)
+        gain = irradiance_basis(normals) @ self.light
+        colors = moved.sh + mid_grey(moved.sh)
+        return moved.replace(sh=torch.addcmul(moved.sh, gain[:, None], colors))
 
 
 def irradiance_basis(normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 8"]:
     """Real spherical harmonics of degrees 1 and 2 at unit vectors, without their constants."""
-    mixed = normals * normals.roll(-1, -1)  # xy, yz, zx
-    return torch.cat((normals, mixed, normals.square() @ constant(SQUARES, normals)), -1)
+    products = (normals[:, :, None] * normals[:, None]).flatten(1)
+    return torch.cat((normals, products @ constant(SECOND_DEGREE, normals)), -1)
 
 
 def mid_grey(sh: Float[Tensor, "N B 3"]) -> Float[Tensor, "B 1"]:
@@ -54,7 +59,7 @@ def turned_normals(
     normals: Float[Tensor, "N 3"], before: Float[Tensor, "N 4"], after: Float[Tensor, "N 4"]
 ) -> Float[Tensor, "N 3"]:
     """Normals turned as Gaussians are from rotation `before` to `after`, wxyz of any length."""
-    turns = quats_to_matrices(multiply_quats(after, conjugate_quats(before)))
+    turns = quats_to_matrices(relative_quats(after, before))
     return (turns @ normals[..., None]).squeeze(-1)
 
 

@@ -11,7 +11,6 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
-from torch.nn.functional import normalize
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.context import BuildContext
@@ -147,7 +146,7 @@ class Keyframed(Resizing, DeformationModel):
         """Gaussians that were turned from their canonical rotations, in the light there."""
         if self.irradiance is None:
             return moved
-        normals = normalize(self.normals, dim=-1)
+        normals = self.normals / self.normals.norm(dim=-1, keepdim=True)  # they start with length 1
         lit: Gaussians = self.irradiance(
             moved, turned_normals(normals, canonical.quats, moved.quats)
         )
