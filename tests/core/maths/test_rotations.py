@@ -186,3 +186,11 @@ def test_turned_quats_by_kernel_and_in_float64() -> None:
     turn = R.normalize_quats(change.double() + identity)
     plain = R.multiply_quats(turn, R.normalize_quats(quats.double()))
     torch.testing.assert_close(exact[0], plain)
+
+
+def test_the_relative_turn_takes_one_rotation_to_the_other():
+    before, after = (torch.randn(20, 4, dtype=torch.float64) for _ in range(2))
+    expected = R.multiply_quats(after, R.conjugate_quats(before))
+    torch.testing.assert_close(R.relative_quats(after, before), expected)
+    turned = R.multiply_quats(R.normalize_quats(expected), R.normalize_quats(before))
+    torch.testing.assert_close(turned, R.normalize_quats(after))
