@@ -2,7 +2,8 @@
 
 A capture stores every operation with its arguments and results; a replay repeats them and writes
 into those results. Numbers that Python passed stay as they were, as on a GPU. What would wait for
-a device, or copy numbers from the host, ends the capture with an error.
+a device, or copy numbers from the host, ends the capture with an error, and so does a tensor that is
+made without a device, which would be on the CPU.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
@@ -22,6 +24,14 @@ WAITING = frozenset(
     (
         "_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equal", "bincount",
         "lift_fresh", "lift_fresh_copy", "_unique2", "unique_dim", "repeat_interleave",
+    )
+)  # fmt: skip
+
+# makes a tensor on the CPU unless it gets a device; a graph on a GPU cannot bring it there
+MAKING = frozenset(
+    (
+        torch.arange, torch.as_tensor, torch.empty, torch.eye, torch.full, torch.linspace,
+        torch.ones, torch.tensor, torch.zeros,
     )
 )  # fmt: skip
 
@@ -73,6 +83,13 @@ class _Capture(TorchDispatchMode):
         return result
 
 
+class _Making(TorchFunctionMode):
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in MAKING and "device" not in (kwargs or {}):
+            raise RuntimeError(f"torch.{func.__name__} without a device, in a captured step")
+        return func(*args, **(kwargs or {}))
+
+
 class _Stream:
     def __init__(self, device: Any = None) -> None:
         self.device = device
@@ -84,7 +101,7 @@ class _Stream:
 @contextmanager
 def _capturing(graph: EmulatedGraph, **settings: Any) -> Iterator[None]:
     del settings
-    with _Capture(graph):
+    with _Capture(graph), _Making():
         yield
 
 

@@ -145,8 +145,9 @@ def nonrigid_part(
     offsets = offsets - offsets.mean(0, keepdim=True)
     arms = points - points.mean(0, keepdim=True)
     spread = arms.mT @ arms / len(arms)
-    inertia = torch.eye(3).to(spread) * spread.trace() - spread
-    inertia = inertia + (1e-6 * spread.trace() + 1e-12) * torch.eye(3).to(spread)  # a straight bar
+    unit = torch.eye(3, dtype=spread.dtype, device=spread.device)
+    inertia = spread.trace() * unit - spread
+    inertia = inertia + (1e-6 * spread.trace() + 1e-12) * unit  # a straight bar
     x, y, z = inertia  # its inverse by hand: recordings of a GPU's work take no solver
     adjugate = torch.stack([y.cross(z, dim=0), z.cross(x, dim=0), x.cross(y, dim=0)])
     moments = torch.linalg.cross(arms[:, None], offsets).mean(0)
