@@ -149,6 +149,9 @@ def _trained(
     session.train(on_step)
     for step, culprit in session.trainer.guard.skipped[:5]:
         report(f"skipped step {step}: {culprit} was not finite")
+    without = session.trainer.objective.graphed_scene.why_slower()
+    if without is not None:
+        report(f"trained without CUDA graphs, slower than it could be: {without}")
     path = session.run.path
     report(f"run: {path}")
     if not evaluate:

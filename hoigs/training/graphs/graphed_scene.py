@@ -81,7 +81,7 @@ class GraphedScene:
         kernel_by_kernel: bool = False,
     ) -> None:
         self._model, self._step = model, _ModelStep(model, weight_of, restrained)
-        self._required = graphs == "on"
+        self._wanted, self._required = graphs != "off", graphs == "on"
         self._graph_key: GraphKey | None = None
         self._graphed_step: GraphedStep | None = None
         self._compared: set[object] = set()
@@ -118,6 +118,11 @@ class GraphedScene:
         # not pinned: CUDA has read the source when this returns, so it may be freed
         self._moment_row.copy_(self._graph_key.layout.pack(moment), non_blocking=True)
         return self._assembled(self._graphed_step())
+
+    def why_slower(self) -> str | None:
+        """Why a GPU runs this scene without the graphs that were wanted; None otherwise."""
+        slower = self._wanted and self.mode == "plain" and self._model.device.type == "cuda"
+        return self.reason if slower else None
 
     def _release(self) -> None:
         """Free the graphs, once the device has finished with them."""

@@ -2,8 +2,8 @@
 
 A capture stores every operation with its arguments and results; a replay repeats them and writes
 into those results. Numbers that Python passed stay as they were, as on a GPU. What would wait for
-a device, or copy numbers from the host, ends the capture with an error, and so does a tensor that is
-made without a device, which would be on the CPU.
+a device, or copy numbers from the host, ends the capture with an error, and so does a tensor
+that is made without a device, which would be on the CPU.
 """
 
 from __future__ import annotations

@@ -233,6 +233,10 @@ def test_a_capture_that_fails_falls_back_to_eager_execution(
     with pytest.warns(UserWarning, match="not permitted when stream is capturing"):
         values = graphed(at(2)).state.joined().means
     assert graphed.mode == "plain" and torch.equal(values, model(at(2)).joined().means)
+    assert graphed.why_slower() is None  # on a CPU graphs would not be faster
+    monkeypatch.setattr(SceneModel, "device", torch.device("cuda"))
+    assert graphed.why_slower() == graphed.reason and "capturing" in graphed.reason
+    assert GraphedScene(model, "off", weight_of(model)).why_slower() is None
 
 
 @pytest.mark.gpu
