@@ -45,7 +45,7 @@ from hoigs.preparation.stages.plan import PLAN
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/preparation"))
 from tiny import FRAMES, landmarks, make_source, picture
-from tiny_mediapipe import FAKE
+from tiny_mediapipe import FAKE, FAKE_CV2, FAKE_LOOK
 
 NUMBERS = "report.json"  # compared without the seconds that stages took
 TIMED = {"report.md", "report.html"}  # the same numbers, seconds among them
@@ -226,7 +226,8 @@ def use_local_mediapipe(folder: Path) -> Path:
         wheels,
         {
             "mediapipe/__init__.py": FAKE.replace("KNOWN", str(known)),
-            "cv2.py": "BORDER_REPLICATE = 1\ncopyMakeBorder = GaussianBlur = lambda i, *a: i\n",
+            "cv2.py": FAKE_CV2,
+            "mediapipe_look.py": FAKE_LOOK.replace("PEOPLE", "[(0.9, 48.0, 32.0, 40.0)]"),
             "numpy.pth": f"{Path(np.__file__).parents[1]}\n",  # the running one
         },
     )
