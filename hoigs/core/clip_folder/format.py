@@ -222,6 +222,13 @@ OBJECT = FileSpec(
             "of an object in two parts: points of the moving one",
             optional=True,
         ),
+        ArraySpec(
+            "rotation_known",
+            (),
+            "bool",
+            "false: rotations are constant, or only the roll in the image; default true",
+            optional=True,
+        ),
         _PROVENANCE,
     ),
     "an object",

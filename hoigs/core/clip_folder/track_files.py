@@ -50,6 +50,8 @@ def save_object(path: Path, track: ObjectTrack) -> None:
     parts: dict[str, Any] = {}
     if track.moving is not None:
         parts["moving"] = as_array(track.moving, np.bool_)
+    if not track.rotation_known:
+        parts["rotation_known"] = np.array(False)
     np.savez_compressed(
         path,
         **parts,

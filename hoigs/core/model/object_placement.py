@@ -362,4 +362,5 @@ def placed_track(
         translations=torch.stack(places),
         observed=placement.observed,
         provenance=provenance,
+        rotation_known=rotations is not None,
     )

@@ -132,6 +132,8 @@ class ObjectTrack:
         moving: of an object in two parts, the points that belong to the moving one; None if
             that is not known, or there are no parts.
         times: of the frames, in [0, 1]; None if they are evenly spaced.
+        rotation_known: whether `rotations` are measured; False if they are constant (a ball), or
+            only the roll in the image.
     """
 
     points: Float[Tensor, "P 3"]
@@ -142,6 +144,7 @@ class ObjectTrack:
     provenance: str = "unknown"
     moving: Bool[Tensor, " P"] | None = None
     times: FrameTimes = None
+    rotation_known: bool = True
 
 
 @dataclass(frozen=True)

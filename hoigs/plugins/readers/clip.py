@@ -253,7 +253,7 @@ def _read_object(path: Path, times: FrameTimes) -> ObjectTrack:
     tensors = _tensors(path)
     return ObjectTrack(
         **{f: tensors[f] for f in fields}, provenance=provenance, moving=tensors.get("moving"),
-        times=times,
+        times=times, rotation_known=bool(tensors.get("rotation_known", True)),
     )  # fmt: skip
 
 

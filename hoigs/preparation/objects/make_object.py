@@ -116,6 +116,7 @@ def _sphere_track(
         translations=places,
         observed=torch.from_numpy(observed),
         provenance=provenance,
+        rotation_known=False,
     )
     return track, points / radius
 

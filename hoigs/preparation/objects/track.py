@@ -75,6 +75,7 @@ def held_object(
             f"rotation only the roll in the image; shape from the outline of frame {best}, half "
             "as thick as wide: a weak guess"
         ),
+        rotation_known=False,
     )
     return track, normals @ to_world.mT, spread
 

@@ -124,6 +124,16 @@ def test_write_clip_copies_any_clip(tmp_path: Path) -> None:
     torch.testing.assert_close(small.cameras[3].K, clip.resized(10).cameras[3].K)
 
 
+def test_an_object_whose_rotation_is_unknown_stays_so(tmp_path: Path) -> None:
+    write(tmp_path / "first")
+    clip = ClipFolderReader().read(tmp_path / "first")
+    (name, track), *_ = clip.objects.items()
+    assert track.rotation_known
+    outline = replace(track, rotation_known=False)
+    write_clip(replace(clip, objects={**clip.objects, name: outline}), tmp_path / "second")
+    assert not ClipFolderReader().read(tmp_path / "second").objects[name].rotation_known
+
+
 def test_replaces_an_older_clip_only(tmp_path: Path) -> None:
     write(tmp_path / "clip")
     write(tmp_path / "clip", name="again")

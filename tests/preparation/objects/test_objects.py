@@ -116,7 +116,7 @@ def test_held_object_projects_onto_its_mask() -> None:
         expected = torch.tensor([14.0 + 4 * i, 22, 30 + 4 * i, 38])
         torch.testing.assert_close(box_of(xy), expected, atol=1.5, rtol=0)
         assert float(depth.mean()) == pytest.approx(2.0, abs=0.02)
-    assert "a weak guess" in track.provenance
+    assert "a weak guess" in track.provenance and not track.rotation_known
 
 
 def test_size_corrects_hands_that_point_the_wrong_way() -> None:

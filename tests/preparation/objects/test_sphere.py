@@ -116,7 +116,7 @@ def test_limbs_give_the_radius_and_the_rotation_stays_unknown() -> None:
         way="auto", radius=None, count=200, fps=12.0, progress=lambda _: None,
     )  # fmt: skip
     assert made.confidence.way == "ball" and "no outline shows" in made.confidence.reason
-    assert "rotation is unknown" in made.track.provenance
+    assert "rotation is unknown" in made.track.provenance and not made.track.rotation_known
     assert torch.equal(made.track.rotations, torch.eye(3).expand(FRAMES, 3, 3))
     torch.testing.assert_close(
         made.track.points.norm(dim=-1), torch.full((200,), found[0]), atol=1e-5, rtol=0

@@ -28,8 +28,9 @@ from hoigs.plugins.deformation.splines.keyframed import Keyframed, KeyframedConf
 class CubicHermiteConfig(KeyframedConfig):
     """The paper's object motion and its ablations."""
 
-    opacity: Literal["keyed", "constant"] = "keyed"
-    """"keyed" over time, linear between knots (the paper), or "constant"."""
+    opacity: Literal["keyed", "constant", "auto"] = "keyed"
+    """"keyed" over time, linear between knots (the paper), or "constant"; "auto": constant, but
+    keyed where the track does not know how the object turns, so that sides come and go."""
 
 
 class CubicHermite(Keyframed):
@@ -67,6 +68,8 @@ class CubicHermite(Keyframed):
     def __init__(self, config: CubicHermiteConfig | None = None, **given: Any) -> None:
         super().__init__(config, **given)
         self.keyed = self.config.opacity == "keyed"
+        if self.config.opacity == "auto" and self._track is not None:
+            self.keyed = not self._track.rotation_known
         names = ["keyframe_means", "keyframe_quats"]
         names += ["tangents"] if self.learned else []
         names += ["opacity_logits"] if self.keyed else []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -210,3 +212,11 @@ def test_from_a_spec():
     assert model.input_space == "canonical" and model.keyframes == 5
     model = TrackedHermite.from_config(TrackedHermiteConfig(track=False, keyframes=3), context)
     assert model.input_space == "world" and model.carrier is None
+
+
+def test_opacities_are_keyed_where_nothing_says_how_the_object_turns():
+    track = jittering_track()
+    assert not entity_of(track, opacity="auto").deformation.keyed
+    outline = replace(track, rotation_known=False)
+    assert entity_of(outline, opacity="auto").deformation.keyed
+    assert not entity_of(outline, opacity="constant").deformation.keyed
