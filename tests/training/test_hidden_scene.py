@@ -46,6 +46,17 @@ def test_the_hidden_part_is_opaque_and_between_its_surroundings() -> None:
     torch.testing.assert_close(scene.means, before["means"])
 
 
+def test_one_that_stands_alone_before_the_others_stays_off_what_is_seen() -> None:
+    scene, hidden = wall()
+    alone = Gaussians.from_points(torch.tensor([[0.1, 0.0, 1.5]]), torch.zeros(1, 3), sh_degree=1)
+    joined = Gaussians.cat([scene.canonical.detach(), alone])
+    scene = Entity(joined, Static(), kind="scene")
+    hidden = torch.cat((hidden, torch.tensor([True])))
+    fill_hidden(scene, torch.where(hidden, 0.01, 1.0), torch.ones(len(scene)), CAMERA)
+    # the wall is seen from x = 0.5 at depth 3, which is 0.25 here; its neighbours are 1.5 away
+    assert 0.05 < float(scene.canonical.scales[-1].detach().amax()) < 0.09
+
+
 def test_what_some_frame_shows_stays_and_so_does_what_none_could() -> None:
     scene, hidden = wall()
     before = scene.sh.detach().clone()

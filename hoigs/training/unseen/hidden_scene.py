@@ -26,6 +26,7 @@ HIDDEN, SHOWN = 0.05, 0.15  # shares of the weight without anything in front; 0 
 MOST = 20_000  # Gaussians whose colours are solved for together; others take their neighbour's
 OPAQUE = 0.9
 SPACING = 3  # neighbours whose mean distance is the size, as at the start of a training (3DGS)
+REACH = 2  # standard deviations at which a Gaussian still counts in a picture
 FAINT = 1e-3  # of a common weight: less is in no picture, or behind the scene itself
 
 
@@ -62,8 +63,9 @@ def fill_hidden(
     if shapes:
         beside, apart = nearest(gaussians.means[hidden], NEIGHBOURS + 1, gaussians.means)
         within = (kept[beside] < 1).all(1)  # at the rim they reach into what is seen
-        size = apart[:, 1 : SPACING + 1].mean(1, keepdim=True).clamp_min(1e-6).log()
-        size = size.to(gaussians.log_scales).expand(-1, 3)
+        size = apart[:, 1 : SPACING + 1].mean(1)
+        size = size.minimum(room(gaussians.means[hidden], gaussians.means[known], centers))
+        size = size.clamp_min(1e-6).log()[:, None].to(gaussians.log_scales).expand(-1, 3)
         target["log_scales"] = torch.where(within[:, None], size, gaussians.log_scales[hidden])
         logits = gaussians.opacity_logits[hidden]
         target["opacity_logits"] = torch.where(within, _logit(OPAQUE), logits)
@@ -108,6 +110,25 @@ def _colors(
     if len(solved) == len(hidden):
         return values
     return values[nearest(means[hidden], 1, means[solved])[0][:, 0]]
+
+
+def room(
+    points: Float[Tensor, "H 3"],
+    seen: Float[Tensor, "N 3"],
+    centers: Sequence[Float[Tensor, " 3"]],
+) -> Float[Tensor, " H"]:
+    """How large a Gaussian at each point may be to stay off the others in the picture of every
+    camera: a standard deviation, metres, in float64.
+
+    Points are apart in depth, too: the distance to a neighbour in space says nothing of it.
+    """
+    most = torch.full((len(points),), torch.inf, dtype=torch.float64, device=points.device)
+    for center in torch.stack([c.to(points) for c in centers]).unique(dim=0):
+        rays, others = points - center, seen - center
+        distance = rays.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+        angle = nearest(rays / distance, 1, others / others.norm(dim=-1, keepdim=True))[1]
+        most = most.minimum((angle * distance)[:, 0] / REACH)
+    return most
 
 
 def _logit(share: float) -> float:
