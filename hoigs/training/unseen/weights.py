@@ -10,12 +10,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.maths.projection import project
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import SH_C0, Gaussians
 
 FRAMES = 16  # training frames in which weights are summed
+FAINTEST = -4.0  # opacity logit
 HALF_SEEN = 0.1  # confidence is 1/2 at this share of a well seen Gaussian's weight
 WELL_SEEN = 0.9  # quantile, among Gaussians with any weight, of a well seen one
 
@@ -29,10 +31,11 @@ def training_frames(clip: Clip, frames: int = FRAMES) -> Sequence[int]:
 def seen_weights(
     model: SceneModel, clip: Clip, frames: int = FRAMES
 ) -> dict[str, tuple[Float[Tensor, " N"], Float[Tensor, " N"]]]:
-    """Blending weights of each entity's Gaussians, summed over pixels and training frames.
+    """Blending weights of each entity's Gaussians, summed over pixels and training frames: as they
+    are, and as they would be with nothing before them, but of a scene without people and objects.
 
-    Of a person or an object those inside the entity's mask and those outside it; of a scene those
-    in the whole picture, and those that it would have there alone.
+    Gaussians of people and objects are drawn with FAINTEST opacity at least: a transparent one with
+    nothing before it is seen as well, to be transparent.
     """
     scenes, names = model.names("scene"), (*model.names("human"), *model.names("object"))
     sums: dict[str, tuple[Tensor, Tensor]] = {}
@@ -41,51 +44,70 @@ def seen_weights(
         moment, camera = frame.moment.to(model.device), frame.camera.to(model.device)
         with torch.no_grad():
             state = model(moment)
-        everywhere = torch.ones(camera.height, camera.width, device=model.device)
-        masks = [(frame.masks[n] > 0).to(everywhere) if n in frame.masks else everywhere
-                 for n in names]  # fmt: skip
         drawn, rows = state.joined().detach(), state.slices()
-        total, *within = blending_weights(model, drawn, camera, [everywhere, *masks])
-        found = {n: (w[rows[n]], (total - w)[rows[n]]) for n, w in zip(names, within, strict=True)}
+        logits = drawn.opacity_logits.clone()
+        for name in names:
+            logits[rows[name]] = logits[rows[name]].clamp_min(FAINTEST)
+        drawn = drawn.replace(opacity_logits=logits)
+        shown = blending_weights(model, drawn, camera)
+        alone = {name: footprints(model, drawn[rows[name]], camera) for name in names}
         for name in scenes:
-            own = state.gaussians[name].detach()
-            (alone,) = blending_weights(model, own, camera, [everywhere])
-            found[name] = (total[rows[name]], alone)
-        for name, (one, other) in found.items():
+            alone[name] = blending_weights(model, drawn[rows[name]], camera)
+        for name in (*names, *scenes):
             known = sums.get(name, (0.0, 0.0))
-            sums[name] = (known[0] + one, known[1] + other)
+            sums[name] = (known[0] + shown[rows[name]], known[1] + alone[name])
     return sums
 
 
-def blending_weights(
-    model: SceneModel, drawn: Gaussians, camera: Camera, maps: Sequence[Float[Tensor, "H W"]]
-) -> list[Float[Tensor, " N"]]:
-    """Blending weights of the Gaussians, summed over the pixels, which each of `maps` weighs.
+@torch.no_grad()
+def footprints(model: SceneModel, drawn: Gaussians, camera: Camera) -> Float[Tensor, " N"]:
+    """The weight of each Gaussian with nothing before it: the integral of its opacity over the
+    screen, square pixels; 0 where its centre is not in the picture."""
+    camera = camera.to(drawn.means.dtype)
+    shown = project(
+        drawn.means, drawn.quats, drawn.log_scales, drawn.opacity_logits,
+        camera.world_to_camera, camera.K, camera.width, camera.height,
+        low_pass=model.low_pass, antialiased=model.antialiased,
+    )  # fmt: skip
+    size = shown.means2d.new_tensor([camera.width, camera.height])
+    within = ((shown.means2d >= 0) & (shown.means2d <= size)).all(-1)
+    xx, xy, yy = shown.covs.unbind(-1)
+    areas = 2 * math.pi * shown.opacities * (xx * yy - xy * xy).clamp_min(0).sqrt()
+    return areas.new_zeros(len(drawn)).index_copy(0, shown.index, areas * within)
 
-    The derivative of a colour by its degree-0 coefficient is the weight times Y_00, and the three
-    channels have coefficients of their own: one backward gives the weights of three maps.
+
+def blending_weights(model: SceneModel, drawn: Gaussians, camera: Camera) -> Float[Tensor, " N"]:
+    """Blending weights of the Gaussians, summed over the pixels.
+
+    The derivative of a colour by its degree-0 coefficient is the weight times Y_00.
     """
     sh = torch.zeros(len(drawn), 1, 3, device=model.device, requires_grad=True)
-    found: list[Tensor] = []
     with torch.enable_grad():
         color = model.draw(drawn.replace(sh=sh), camera, RenderRequest()).color
-        for at in range(0, len(maps), 3):
-            some = torch.stack(list(maps[at : at + 3]), -1)
-            total = (color[..., : some.shape[-1]] * some).sum()
-            (gradient,) = torch.autograd.grad(total, sh, retain_graph=True)
-            found += (gradient[:, 0, : some.shape[-1]] / SH_C0).unbind(-1)
-    return found
+        (gradient,) = torch.autograd.grad(color[..., 0].sum(), sh)
+    return gradient[:, 0, 0] / SH_C0
 
 
 def confidence(
-    inside: Float[Tensor, " N"], outside: Float[Tensor, " N"]
+    shown: Float[Tensor, " N"], alone: Float[Tensor, " N"]
 ) -> Float[Tensor, " N"] | None:
-    """How well each Gaussian was seen, in [0, 1); None if none was seen at all.
+    """How well the training frames show each Gaussian, in [0, 1); None if none was seen at all.
 
-    Weight outside the mask counts against it: its colour is then somebody else's.
+    One is known from many pixels, or, if it is small or transparent, from a share of its few.
+
+    Args:
+        shown, alone: as `seen_weights` of one entity.
     """
-    weight = (inside - outside).clamp_min(0)
-    if not (weight > 0).any():
+    if not (shown > 0).any():
         return None
-    half = HALF_SEEN * torch.quantile(weight[weight > 0], WELL_SEEN)
-    return weight.square() / (weight.square() + half.square())
+    share = torch.where(alone > 0, shown / alone.clamp_min(1e-12), 0.0)
+    return 1 - (1 - _saturated(shown)) * (1 - _saturated(share))
+
+
+def _saturated(values: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """x^2 / (x^2 + h^2): 1/2 at HALF_SEEN of what is common."""
+    known = values[values > 0]
+    if not len(known):
+        return torch.zeros_like(values)
+    half = HALF_SEEN * torch.quantile(known, WELL_SEEN)
+    return values.square() / (values.square() + half.square())
