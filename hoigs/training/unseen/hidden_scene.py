@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from hoigs.core.maths.nearest import nearest
 from hoigs.core.maths.spherical_harmonics import mean_colors
@@ -124,9 +125,9 @@ def room(
     """
     most = torch.full((len(points),), torch.inf, dtype=torch.float64, device=points.device)
     for center in torch.stack([c.to(points) for c in centers]).unique(dim=0):
-        rays, others = points - center, seen - center
-        distance = rays.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-        angle = nearest(rays / distance, 1, others / others.norm(dim=-1, keepdim=True))[1]
+        rays, others = points - center, normalize(seen - center, dim=-1)
+        distance = rays.norm(dim=-1, keepdim=True)
+        angle = nearest(normalize(rays, dim=-1), 1, others)[1]
         most = most.minimum((angle * distance)[:, 0] / REACH)
     return most
 

@@ -17,7 +17,7 @@ from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import SH_C0, Gaussians
 
 FRAMES = 16  # training frames in which weights are summed
-FAINTEST = -4.0  # opacity logit
+FAINTEST = -4.0  # opacity logit, of 2 %
 HALF_SEEN = 0.1  # confidence is 1/2 at this share of a well seen Gaussian's weight
 WELL_SEEN = 0.9  # quantile, among Gaussians with any weight, of a well seen one
 
