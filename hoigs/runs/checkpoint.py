@@ -27,6 +27,7 @@ FORMAT = "hoigs-checkpoint"
 VERSION = 2
 MOST_GAUSSIANS = 10**8  # of an entity whose means are not stored, since spec and clip give them
 PIECE = 2**20  # numbers checked at a time, which takes memory for a few times as many
+FEW = 3  # names in a message
 ADVICE = "train again, or restore it from a copy"
 READABLE = (1, VERSION)  # spec keys of version 1 had other names, so its model hashes differ
 
@@ -263,9 +264,31 @@ def restore_model(
     try:
         model.load_state_dict(stored | kept)
     except RuntimeError as error:
-        raise CheckpointError(f"checkpoint does not fit the model: {error}") from error
+        raise CheckpointError(
+            f"checkpoint does not fit the model: {_differences(stored, composed)}. Settings that "
+            "are `auto` follow the clip, as whether its poses are exact and objects' rotations "
+            "known: a run can be used with another clip if that says the same of them"
+        ) from error
     for name, parameter in kept.items():
         parameter.data = stored[name].to(parameter.dtype)
+
+
+def _differences(stored: Mapping[str, torch.Tensor], composed: Mapping[str, torch.Tensor]) -> str:
+    """What a state and a model do not have in common, a few names of each kind."""
+    found = {
+        "it alone has": sorted(set(stored) - set(composed)),
+        "the model alone has": sorted(set(composed) - set(stored)),
+        "of other sizes are": [
+            f"{name} ({list(stored[name].shape)}, the model's {list(value.shape)})"
+            for name, value in composed.items()
+            if name in stored and stored[name].shape != value.shape
+        ],
+    }
+    parts = []
+    for what, names in found.items():
+        more = f" and {len(names) - FEW} more" if len(names) > FEW else ""
+        parts += [f"{what} {', '.join(names[:FEW])}{more}"] if names else []
+    return "; ".join(parts)
 
 
 def restore_cameras(cameras: nn.Module | None, checkpoint: Checkpoint) -> None:

@@ -68,7 +68,7 @@ DEEP = "[" * 100_000 + "]" * 100_000
 DAMAGES = {
     "NaN weights": (weights("model.entities.scene.means", torch.nan), "NaN or infinite"),
     "infinite weights": (weights("model.entities.scene.means", torch.inf), "NaN or infinite"),
-    "a tensor is gone": (weights("model.entities.scene.sh"), "does not fit the model"),
+    "a tensor is gone": (weights("model.entities.scene.sh"), "model alone has entities.scene.sh."),
     "cut weights": (lambda run: text(WEIGHTS, (run / WEIGHTS).read_bytes()[:400])(run), "damaged"),
     "huge count": (changed(META, counts={"scene": 10**12}), "counts.scene"),
     "large count": (changed(META, counts={"scene": 10**8}), "100000000 Gaussians of 'scene'"),
