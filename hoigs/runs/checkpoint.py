@@ -278,7 +278,7 @@ def _differences(stored: Mapping[str, torch.Tensor], composed: Mapping[str, torc
     found = {
         "it alone has": sorted(set(stored) - set(composed)),
         "the model alone has": sorted(set(composed) - set(stored)),
-        "of other sizes are": [
+        "they differ in the size of": [
             f"{name} ({list(stored[name].shape)}, the model's {list(value.shape)})"
             for name, value in composed.items()
             if name in stored and stored[name].shape != value.shape

@@ -18,7 +18,7 @@ from hoigs.core.values.gaussians import SH_C0, Gaussians
 
 FRAMES = 16  # training frames in which weights are summed
 FAINTEST = -4.0  # opacity logit, of 2 %
-HALF_SEEN = 0.1  # confidence is 1/2 at this share of a well seen Gaussian's weight
+HALF_SEEN = 0.1  # half is known at this part of a well seen Gaussian's weight, or of its share
 WELL_SEEN = 0.9  # quantile, among Gaussians with any weight, of a well seen one
 
 
