@@ -69,7 +69,13 @@ class JointObjective:
         faces: textures for L_face, by human. cameras: corrections, which are penalised.
         depth_scale: factor from the prior's units to metres in the world.
         graphs: `TrainSpec.graphs`.
+
+    Attributes:
+        settled: people, objects and the interaction get no gradients, and have no terms of their
+            own.
     """
+
+    settled = False
 
     def __init__(
         self,
@@ -105,7 +111,7 @@ class JointObjective:
             view = TrainingView.of(view, device)
         frame = view.frame
         deformed = self._deform(frame.moment)
-        state = deformed.state
+        state = self._settled(deformed.state) if self.settled else deformed.state
         offsets = torch.zeros(
             sum(len(g) for g in state.gaussians.values()), 2, device=device, requires_grad=True
         )
@@ -128,7 +134,7 @@ class JointObjective:
             )
             if depth is not None:
                 terms["depth"] = depth
-        for kind in ("human", "object"):
+        for kind in () if self.settled else ("human", "object"):
             for name in self.model.names(kind):
                 crop = view.crops.get(name)
                 if crop is None:  # not visible in this frame: it has no terms
@@ -139,12 +145,14 @@ class JointObjective:
                     terms |= self._human(name, frame, crop, camera, state, composite)
         weights = {name: self.weights[name.partition("/")[0]] for name in terms}
         for name in self.model.entities:
+            if self.settled and self.model.entity(name).kind != "scene":
+                continue
             own = None if deformed.penalties is None else deformed.penalties[name]
             self._regularize(name, state.gaussians[name], own, terms, weights)
         if self.cameras is not None:
             terms["regularizer/camera"] = self.cameras.penalty(frame.position)
             weights["regularizer/camera"] = self.spec.regularizers.get("camera", CAMERA_WEIGHT)
-        for name, residual in state.residuals.items():
+        for name, residual in () if self.settled else state.residuals.items():
             self._penalise_residual(name, residual, terms, weights)
         total = composite.color.new_zeros(())
         if terms:
@@ -153,6 +161,12 @@ class JointObjective:
         if not total.requires_grad:  # no term applies to this frame
             total = total + 0 * composite.color.sum()
         return ObjectiveResult(terms, total, state, composite, offsets, weights, absolutes)
+
+    def _settled(self, state: SceneState) -> SceneState:
+        """Without gradients but of scenes."""
+        scenes = self.model.names("scene")
+        kept = {n: g if n in scenes else g.detach() for n, g in state.gaussians.items()}
+        return SceneState(kept, state.residuals, state.tokens)
 
     def _deform(self, moment: Moment) -> Deformed:
         """A method of its own, so that benchmarks can time it."""

@@ -33,7 +33,7 @@ WARMUPS = {
     "shape": "poses",
     "camera": "cameras",
 }
-SETTLE_FROM = 0.8  # share of the run after which rates without a `_final` decay by `settle`
+SETTLE_FROM = 0.8  # share of a schedule after which rates without a `_final` decay by `settle`
 
 
 @dataclass(frozen=True)
@@ -41,18 +41,21 @@ class Schedule:
     """Learning rate of one group, log-linear from `start` to `final`.
 
     Attributes:
-        begin: share of the run before which the rate is zero. decay_from: share of the run before
-            which it is `start`, a warm-up aside.
+        end: share of the run at which it is `final`, and after which it is zero; the two below are
+            shares of that. begin: before which the rate is zero. decay_from: before which it is
+            `start`, a warm-up aside.
     """
 
     start: float
     final: float
     begin: float = 0.0
     decay_from: float = 0.0
+    end: float = 1.0
 
     def at(self, progress: float) -> float:
         """Rate at `progress` in [0, 1] of the run."""
-        if progress < self.begin or self.start == 0:
+        progress /= self.end
+        if progress < self.begin or progress > 1 or self.start == 0:
             return 0.0
         decayed = max(progress - self.decay_from, 0.0) / (1 - self.decay_from)
         return float(self.start * (max(self.final, 1e-12) / self.start) ** decayed)
@@ -64,6 +67,11 @@ def entity_extent(entity: Entity, scene_extent: float) -> float:
         return scene_extent
     means = entity.means.detach()
     return 1.1 * float((means - means.mean(0)).norm(dim=-1).max().clamp_min(1e-3))
+
+
+def trained_throughout(name: str, entity: Entity | None) -> bool:
+    """Whether a parameter is trained to the end: of a scene, or of the cameras."""
+    return name.startswith("cameras.") or (entity is not None and entity.kind == "scene")
 
 
 def named_rates(model: SceneModel) -> Iterator[tuple[str, nn.Parameter, str, Entity | None]]:
@@ -95,6 +103,7 @@ class GroupedAdam:
     Args:
         scene_extent: metres; see `entity_extent`.
         cameras: its parameters take the rate "camera" and are named "cameras.…".
+        steps: of the training. settled: after which people, objects and the interaction are done.
 
     Raises:
         ValueError: a component declares a rate that `train.rates` does not have.
@@ -108,6 +117,9 @@ class GroupedAdam:
         warmup: WarmupSpec,
         scene_extent: float,
         cameras: nn.Module | None = None,
+        *,
+        steps: int = 1,
+        settled: int | None = None,
     ) -> None:
         for named in rates.by_entity:
             known = [*model.entities, *get_args(EntityKind)]
@@ -134,12 +146,17 @@ class GroupedAdam:
             if rate in own.by_extent and entity is not None:
                 extent = entity_extent(entity, scene_extent)
                 start, final = start * extent, final * extent
+            lasts = steps if settled is None or trained_throughout(name, entity) else settled
+            if rate == "means" and own.means_steps is not None:
+                slower = min(1.0, own.means_steps / lasts)
+                start, final = start * slower, final * slower
             begin = getattr(warmup, WARMUPS[rate]) if rate in WARMUPS else 0.0
             # fused Adam on a CPU treats memory as dense, and would miss elements of a view
             parameter.data = parameter.data.contiguous()
             self.names[name] = parameter
             self.roles.append(rate)
-            self.schedules.append(Schedule(start, final, begin, SETTLE_FROM if settles else 0.0))
+            decay_from = SETTLE_FROM if settles else 0.0
+            self.schedules.append(Schedule(start, final, begin, decay_from, lasts / steps))
         groups: dict[Schedule, list[nn.Parameter]] = {}
         for parameter, schedule in zip(self.names.values(), self.schedules, strict=True):
             groups.setdefault(schedule, []).append(parameter)

@@ -45,7 +45,7 @@ from hoigs.training.optimizer import GroupedAdam, entity_extent
 from hoigs.training.sampler import EpochSampler
 from hoigs.training.stop_request import StopRequest, resume_command
 from hoigs.training.time_windows import TimeWindows
-from hoigs.training.unseen import fill_unseen, spare_hidden
+from hoigs.training.unseen import Filling
 from hoigs.training.views import TrainingViews
 
 
@@ -85,6 +85,7 @@ class Trainer:
 
     Attributes:
         viewed: write checkpoints for a viewer too (`CheckpointWriter`).
+        settled: the step after which people, objects and the interaction are done (`spec.passes`).
 
     Raises:
         SpecError: the rasterizer lacks a gradient that the density control or cameras need.
@@ -122,10 +123,16 @@ class Trainer:
             model, spec.loss, clip.depth_kind, lpips, density, faces, self.cameras, scale,
             spec.graphs if spec.chunk is None else "off",
         )  # fmt: skip
-        scene_extent = clip.extent()
-        self.optimizer = GroupedAdam(model, spec.rates, spec.warmup, scene_extent, self.cameras)
+        scene_extent, frames = clip.extent(), clip.split["train"]
+        self.settled = spec.steps
+        if spec.passes is not None:
+            self.settled = min(spec.steps, spec.passes * len(frames))
+        self.optimizer = GroupedAdam(
+            model, spec.rates, spec.warmup, scene_extent, self.cameras,
+            steps=spec.steps, settled=self.settled,
+        )  # fmt: skip
         self.windows = self._windows({n for n, c in (density or {}).items() if not c.keeps_all})
-        self.sampler = EpochSampler(clip.split["train"], self.generator)
+        self.sampler = EpochSampler(frames, self.generator)
         self.density = {
             name: EntityDensity(
                 model.entity(name), control, entity_extent(model.entity(name), scene_extent)
@@ -133,8 +140,7 @@ class Trainer:
             for name, control in (density or {}).items()
             if not control.keeps_all
         }
-        self._fills = {max(1, round(share * spec.steps)) for share in spec.fill_unseen}
-        self.hidden: dict[str, torch.Tensor] = {}  # of scenes, see `spare_hidden`
+        self.unseen = Filling(spec, self.settled)
         self.guard = NanGuard()
         self.viewed = False
         self.step = 0
@@ -217,7 +223,9 @@ class Trainer:
         """
         progress = self.step / self.spec.steps
         self.step += 1
-        self.model.interaction_enabled = progress >= self.spec.warmup.interaction
+        warming = self.spec.warmup.interaction * self.settled
+        self.model.interaction_enabled = self.step - 1 >= warming
+        self.objective.settled = self.step > self.settled
         self.optimizer.set_progress(progress)
         self.model.set_progress(progress)
         view = self.views[self.sampler.next()]
@@ -233,7 +241,7 @@ class Trainer:
             self.optimizer.zero_grad()
             return None
         self.guard.passed()
-        spare_hidden(self.model, self.hidden)
+        self.unseen.spare(self.model)
         interval = self.spec.sh_interval
         self.optimizer.step(None if interval is None else self.step // interval)
         if self.windows is not None:
@@ -241,11 +249,7 @@ class Trainer:
         fixed = replace(camera, world_to_camera=camera.world_to_camera.detach())
         self._evolve(result, view.frame.moment, fixed)
         self._refine(result, camera.width, camera.height)
-        if self.step in self._fills:
-            self.hidden = fill_unseen(
-                self.model, self.clip, shapes=self.step < self.spec.steps,
-                opposite=self.spec.unseen_sides == "opposite",
-            )  # fmt: skip
+        self.unseen.after(self.step, self.model, self.clip)
         terms = {**result.terms, "total": result.total}
         return {name: term.detach() for name, term in terms.items()}
 
@@ -259,7 +263,7 @@ class Trainer:
         gradient, radii = result.screen_offsets.grad, result.composite.info["radii"]
         for name, row in result.state.slices().items():
             entity = self.model.entity(name)
-            if type(entity.deformation).evolve is DeformationModel.evolve:
+            if type(entity.deformation).evolve is DeformationModel.evolve or self._done(name):
                 continue
             own = result.terms.get(f"{entity.kind}/{name}")
             if own is None:
@@ -283,6 +287,8 @@ class Trainer:
         radii = result.composite.info["radii"]
         rows = result.state.slices()
         for name, density in self.density.items():
+            if self._done(name):
+                continue
             row = rows[name]
             if gradient is not None:
                 mine = None if absolute is None else absolute[row]
@@ -290,6 +296,10 @@ class Trainer:
             density.refine(result.state.gaussians[name], self.optimizer, self.step, self.spec.steps)
             rate = self.optimizer.position_rate(name)
             density.perturb(self.step, self.spec.steps, rate)
+
+    def _done(self, name: str) -> bool:
+        """Whether an entity changes no more."""
+        return self.step > self.settled and self.model.entity(name).kind != "scene"
 
     def _report(self, terms: dict[str, torch.Tensor] | None) -> StepReport | None:
         last = self.step == self.spec.steps
@@ -342,7 +352,7 @@ class Trainer:
             tensors |= {f"cameras.{k}": v for k, v in self.cameras.state_dict().items()}
         if self.windows is not None:
             tensors |= {f"windows.{k}": v for k, v in self.windows.state().items()}
-        tensors |= {f"hidden.{k}": v for k, v in self.hidden.items()}
+        tensors |= {f"hidden.{k}": v for k, v in self.unseen.hidden.items()}
         tensors["rng.generator"] = self.generator.get_state()
         tensors["rng.torch"] = torch.get_rng_state()
         meta = {
@@ -387,7 +397,7 @@ class Trainer:
             for key, value in stored.items():
                 setattr(density.statistics, key, value.to(self.model.device).clone())
         hidden = checkpoint.part("hidden")
-        self.hidden = {name: kept.to(self.model.device) for name, kept in hidden.items()}
+        self.unseen.hidden = {name: kept.to(self.model.device) for name, kept in hidden.items()}
         self.generator.set_state(checkpoint.tensors["rng.generator"])
         torch.set_rng_state(checkpoint.tensors["rng.torch"])
         self.sampler.load(checkpoint.meta["sampler"])

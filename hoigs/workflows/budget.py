@@ -181,7 +181,9 @@ def _timed(
     clip = source if width >= source.cameras[0].width else source.resized(width)
     torch.manual_seed(spec.train.seed)
     density = compose_density(spec, clip, registry)
-    settings = spec.train.model_copy(update={"preview_every": 0, "fill_unseen": (), "steps": MOST})
+    settings = spec.train.model_copy(
+        update={"preview_every": 0, "fill_unseen": (), "steps": MOST, "passes": None}
+    )
     trainer = Trainer(
         compose(spec, clip, registry).to(device),
         clip,

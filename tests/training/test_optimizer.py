@@ -58,6 +58,44 @@ def test_rates_without_an_end_of_their_own_settle_in_the_last_fifth():
     assert {"opacity", "means"} <= {rate for _, _, rate, _ in named_rates(model)}
 
 
+def test_people_and_objects_are_done_before_the_scene():
+    model = make_model()
+    adam = GroupedAdam(
+        model, RatesSpec(settle=0.1), WarmupSpec(motion=0.2), 1.0, steps=1000, settled=250
+    )
+    alone = GroupedAdam(model, RatesSpec(settle=0.1), WarmupSpec(motion=0.2), 1.0)
+    for progress in (0.04, 0.1, 0.2, 0.24, 0.4, 0.9):
+        adam.set_progress(progress)
+        alone.set_progress(min(1.0, 4 * progress))
+        shorter = alone.learning_rates()
+        alone.set_progress(progress)
+        whole = alone.learning_rates()
+        for name, rate in adam.learning_rates().items():
+            if name.startswith("entities.scene."):
+                assert rate == whole[name]
+            else:
+                assert rate == (pytest.approx(shorter[name]) if progress <= 0.25 else 0.0)
+
+
+def test_means_travel_no_farther_in_longer_trainings():
+    points = torch.randn(4, 3)
+    entities = {
+        kind: Entity(Gaussians.from_points(points), Static(), kind=kind)
+        for kind in ("scene", "object")
+    }
+    model = SceneModel(entities, rasterizer=TorchRasterizer())
+
+    def means(steps: int, settled: int | None = None) -> list[float]:
+        rates = RatesSpec(means_steps=2000, by_extent=())
+        adam = GroupedAdam(model, rates, WarmupSpec(), 1.0, steps=steps, settled=settled)
+        return [adam.schedule_of(f"entities.{name}.means").start for name in entities]
+
+    usual = RatesSpec().means
+    assert means(1200) == [usual, usual]
+    assert means(30_000) == pytest.approx([usual / 15, usual / 15])
+    assert means(30_000, 4000) == pytest.approx([usual / 15, usual / 2])
+
+
 def test_every_trainable_parameter_has_a_known_rate():
     model = make_model()
     found = {name: rate for name, _, rate, _ in named_rates(model)}

@@ -14,13 +14,14 @@ from hoigs.core.model.compose import compose
 from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.schema import Spec
+from hoigs.core.spec.train_schema import TrainSpec
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.rasterizers.warp import WarpRasterizer
 from hoigs.synthesis import SceneConfig, builtin_clip
-from hoigs.training.unseen import fill_unseen
+from hoigs.training.unseen import fill_unseen, filling
 from hoigs.training.unseen.neighbours import opposite_points, spread
 from hoigs.training.unseen.weights import blending_weights, confidence, seen_weights
 
@@ -135,3 +136,27 @@ def test_colours_of_unseen_sides_change_and_images_of_training_frames_do_not(
     assert human.sh[back, 0].std(0).mean() < 0.5 * before[back].std(0).mean()
     assert (human.sh[seen > 0.95, 0] - before[seen > 0.95]).abs().mean() < 0.02
     assert (again - image).abs().mean() < 0.1 * image.abs().mean()
+
+
+def test_people_are_filled_in_by_their_own_steps_and_scenes_by_all(monkeypatch) -> None:
+    calls = []
+
+    def record(model, clip, **options) -> dict[str, torch.Tensor]:
+        calls.append((step, options["shapes"], options["own"], options["scenes"]))
+        return {"scene": torch.full((1,), float(step))}
+
+    monkeypatch.setattr(filling, "fill_unseen", record)
+    spec = TrainSpec(steps=30, fill_unseen=(0.5, 1.0))
+    made = filling.Filling(spec, settled=16)
+    for step in range(1, 31):
+        made.after(step, None, None)
+    assert calls == [
+        (8, True, True, False), (15, True, False, True),
+        (16, False, True, False), (30, False, False, True),
+    ]  # fmt: skip
+    assert float(made.hidden["scene"]) == 30
+    calls.clear()
+    made = filling.Filling(spec, settled=30)
+    for step in range(1, 31):
+        made.after(step, None, None)
+    assert calls == [(15, True, True, True), (30, False, True, True)]

@@ -106,6 +106,10 @@ class RatesSpec(_Strict):
 
     means: float = Field(default=2.4e-3, ge=0)
     means_final: float = Field(default=2.4e-5, ge=0)
+    means_steps: int | None = Field(default=None, ge=1)
+    """Steps over which Gaussians may travel as far as these two rates bring them: in a longer
+    training both are lower by as much as it is longer. 2000 are 3DGS's rates at its 30,000 steps.
+    None: the rates are the same at any length."""
     sh: float = Field(default=1e-2, ge=0)
     sh_rest: float = Field(default=1.0, ge=0, le=1)
     """Rate of the harmonics above the first, as a share of `sh` (3DGS: 1/20)."""
@@ -166,6 +170,11 @@ class TrainSpec(_Strict):
     """Optimizer steps, one frame each."""
     seed: int = Field(default=0, ge=0)
     """Seed of every random draw."""
+    passes: int | None = Field(default=None, ge=1)
+    """Passes over the training frames after which people, objects and the interaction are done:
+    their schedules end there, and the rest of a longer training changes the scene alone. More
+    passes fit them to the views of these few frames, and other views of them lose (docs/results).
+    None: they are trained to the end."""
     width: int | None = Field(default=None, ge=16)
     """Train and score at this image width, at most: frames are never enlarged. None is the clip's
     own."""

@@ -28,7 +28,13 @@ from hoigs.training.unseen.weights import confidence, seen_weights, training_fra
 
 
 def fill_unseen(
-    model: SceneModel, clip: Clip, *, shapes: bool = True, opposite: bool = False
+    model: SceneModel,
+    clip: Clip,
+    *,
+    shapes: bool = True,
+    opposite: bool = False,
+    own: bool = True,
+    scenes: bool = True,
 ) -> dict[str, Float[Tensor, " N"]]:
     """Fill in, in place, Gaussians by how little the training frames show of them.
 
@@ -36,6 +42,7 @@ def fill_unseen(
         opposite: people take patterns from the opposite side of their body (`opposite_points`).
         shapes: also opacity, size and, on a body's template, the distance from its surface; else
             colours alone.
+        own, scenes: fill people and objects, and scenes.
 
     Returns:
         Of each scene that hides in part, how much of its Gaussians is kept (see `spare_hidden`).
@@ -46,13 +53,13 @@ def fill_unseen(
     training = model.training
     model.eval()
     weights = seen_weights(model, clip)
-    for name in entities:
+    for name in entities if own else ():
         seen = confidence(*weights[name])
         if seen is not None:
             _fill(model.entity(name), seen, shapes, opposite)
     centers = [clip.cameras[p].center for p in training_frames(clip)]
     kept = {}
-    for name in model.names("scene"):
+    for name in model.names("scene") if scenes else ():
         share = fill_hidden(model.entity(name), *weights[name], centers, shapes)
         if share is not None:
             kept[name] = share
