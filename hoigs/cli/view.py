@@ -31,8 +31,8 @@ def view(
         typer.Option(
             "--max-mb",
             min=0.1,
-            help="Largest size of the file of --html, in megabytes: it then has fewer frames of what "
-            "moves, and if need be fewer Gaussians.",
+            help="Largest size of the file of --html, in megabytes: it then has fewer frames of "
+            "what moves, and if need be fewer Gaussians.",
         ),
     ] = None,
     entities: Annotated[

@@ -34,7 +34,7 @@ def test_bad_input_is_answered_and_leaves_nothing(hoigs, tmp_path):
     run = tiny_run()
     cases = (
         ([run, "--format", "pyl"], 'did you mean "ply"?'),
-        ([run, "--format", "ply", "--set", "ub=y"], 'did you mean "up"?'),
+        ([run, "--format", "ply", "--set", "ub=y"], "ub: unknown key (valid: up)"),
         ([run, "--format", "ply", "--entities", "hunan"], 'did you mean "human"?'),
         ([run, "--format", "ply", "--from", 8, "--to", 3], "--from 8 is behind --to 3"),
         ([run, "--format", "ply", "--slow", 0], "error: --slow 0: expected a positive number"),
