@@ -118,7 +118,7 @@ class Pipeline:
             )  # fmt: skip
             if len(frames) < 3:  # motion is judged by accelerations
                 raise SourceError(
-                    f"of the {frames.total} frames of {path} the options choose {len(frames)}: a "
+                    f"{path}: {len(frames)} of its frames would be used, as the options are; a "
                     "clip shows motion, and needs three or more"
                 )
             require_pictures(frames)
