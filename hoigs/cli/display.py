@@ -53,8 +53,9 @@ class Display:
             )
         typer.echo(
             f"training {session.spec.name} on {printable(session.clip.name)} ({session.reader}): "
-            f"{self._steps} steps, {len(session.clip.split['train'])} frames of "
-            f"{camera.width}x{camera.height}"
+            f"{self._steps} steps, {len(session.clip.split['train'])} of "
+            f"{session.clip.num_frames} frames, "
+            f"{camera.width}x{camera.height} pixels"
         )
         for change in session.changes:
             typer.echo(printable(f"changed on resuming: {change}"))
@@ -68,13 +69,13 @@ class Display:
         assert self._bar is not None
         self._psnr.update(report.psnr)
         score = f" test {self._psnr['test']:.2f} dB" if "test" in self._psnr else ""
-        splats = sum(report.counts.values())
-        self._bar.update(report.step, f"loss {report.loss:.4f}{score} {splats} splats")
+        gaussians = sum(report.counts.values())
+        self._bar.update(report.step, f"loss {report.loss:.4f}{score} {gaussians} Gaussians")
         if report.psnr:
             rest = (self._steps - report.step) * report.time_s / report.step
             typer.echo(
                 f"step {report.step:>6}  {report.time_s:7.1f} s  ETA {rest:6.0f} s  "
-                f"loss {report.loss:.4f} {score}  {splats} splats"
+                f"loss {report.loss:.4f} {score}  {gaussians} Gaussians"
             )
 
     def fraction(self, done: float, text: str) -> None:

@@ -36,7 +36,7 @@ SearchSpacesOption = Annotated[
 
 def needs(
     clip: Annotated[
-        Path, typer.Argument(help="Clip folder, as `hoigs prepare` makes it, or builtin:NAME.")
+        str, typer.Argument(help="Clip folder, as `hoigs prepare` makes it, or builtin:NAME.")
     ],
     spec: Annotated[
         str, typer.Option("--spec", help="The spec to reduce: a name or a file.")

@@ -15,7 +15,11 @@ def render(
     run: Annotated[Path, typer.Argument(help="Run folder.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="Video: .mp4, .webm, .mov or .gif; default RUN/renders/."),
+        typer.Option(
+            "--out",
+            help="Video: .mp4, .webm, .mov or .gif; default RUN/renders/PATH.mp4, with --compare "
+            "PATH-compare.mp4.",
+        ),
     ] = None,
     path: Annotated[
         str,
@@ -84,3 +88,5 @@ def render(
         )
     typer.echo(str(film))
     typer.echo(f"video: {film.path}")
+    if film.replaced:
+        typer.echo("an earlier video of this name was replaced")

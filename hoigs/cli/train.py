@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 def train(
     clip: Annotated[
-        Path | None,
+        str | None,
         typer.Argument(
             help="Clip folder, as `hoigs prepare` makes it, or builtin:NAME. Default with "
             "--resume: the run's."
@@ -81,8 +81,8 @@ def train(
         int | None,
         typer.Option(
             "--chunk",
-            help="For a long clip: of what grows with it, keep so many frames' part in memory "
-            "(16: short windows cost less time).",
+            help="For a long clip, to save memory: train in windows of this many frames, of which "
+            "one is in memory at a time. Short windows, of 16 frames, cost the least time.",
         ),
     ] = None,
     evaluate: Annotated[
@@ -124,8 +124,8 @@ def train(
 
 
 def _clip_for_auto(
-    clip: Path | None, reader: str | None, reader_set: list[str] | None, budget: str | None
-) -> Path:
+    clip: str | None, reader: str | None, reader_set: list[str] | None, budget: str | None
+) -> str:
     """The clip of `--auto`, which has to be there; --budget and --reader do not go with it."""
     from hoigs.core.errors import HoigsError
     from hoigs.runs.resuming import NO_CLIP

@@ -27,7 +27,13 @@ def view(
         typer.Option("--html", help="Write one file that plays the run without a server."),
     ] = None,
     max_mb: Annotated[
-        float | None, typer.Option("--max-mb", min=0.1, help="Thin the file of --html to this.")
+        float | None,
+        typer.Option(
+            "--max-mb",
+            min=0.1,
+            help="Largest size of the file of --html, in megabytes: it then has fewer frames of "
+            "what moves, and if need be fewer Gaussians.",
+        ),
     ] = None,
     entities: Annotated[
         list[str] | None,

@@ -47,6 +47,13 @@ class Interrupted(KeyboardInterrupt):
 
 
 def did_you_mean(name: str, valid: Iterable[str], count: int = 1) -> str:
-    """`; did you mean "x"?` with the nearest of `valid`, or "" when nothing is near."""
-    near = difflib.get_close_matches(name, list(valid), n=count, cutoff=0.5)
+    """`; did you mean "x"?` with the nearest of `valid`, or "" when nothing is near.
+
+    A kind that all have ("builtin:") is not compared: it would make any two of them alike.
+    """
+    valid, kind = list(valid), name[: name.rfind(":") + 1]
+    shared = kind if all(other.startswith(kind) for other in valid) else ""
+    rests = [other.removeprefix(shared) for other in valid]
+    found = difflib.get_close_matches(name.removeprefix(shared), rests, n=count, cutoff=0.6)
+    near = [shared + rest for rest in found]
     return "; did you mean " + " or ".join(f'"{n}"' for n in near) + "?" if near else ""

@@ -111,8 +111,6 @@ class PrepareOptions(ComponentConfig):
     body: str = Field(default="body:anny", description="key of the body model, for the clip")
     person_height: float | None = Field(
         default=None,
-        gt=0.4,
-        lt=2.6,
         description="of the person standing, metres; None: the body model's mean. A camera that "
         "stays in one place shows no size, and structure from motion none either: the unit of the "
         "world comes from it",
@@ -244,6 +242,13 @@ class PrepareOptions(ComponentConfig):
                 f"{len(value)} numbers; expected fx,fy,cx,cy or fx,fy,cx,cy,k1,k2,p1,p2 (for more "
                 "coefficients write a file for --calibration)"
             )
+        return value
+
+    @field_validator("person_height")
+    @classmethod
+    def _in_metres(cls, value: float | None) -> float | None:
+        if value is not None and not 0.4 < value < 2.6:
+            raise ValueError("must be between 0.4 and 2.6 metres")
         return value
 
     @model_validator(mode="after")

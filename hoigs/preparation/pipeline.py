@@ -116,10 +116,10 @@ class Pipeline:
                 path, options.width, options.every, options.max_frames, fps=options.fps,
                 pick=options.pick, rate=options.folder_fps, span=span,
             )  # fmt: skip
-            if len(frames) < 2:
+            if len(frames) < 3:  # motion is judged by accelerations
                 raise SourceError(
-                    f"one frame of {path} is chosen, of {frames.total}: a clip shows motion, and "
-                    "needs two or more"
+                    f"{path}: {len(frames)} of its frames would be used, as the options are; a "
+                    "clip shows motion, and needs three or more"
                 )
             require_pictures(frames)
             if path.is_file() and span.end is None and options.max_frames is None:

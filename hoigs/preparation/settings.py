@@ -17,6 +17,8 @@ from hoigs.core.spec.errors import explain
 from hoigs.core.spec.loader import Document, load_overrides, read_document
 from hoigs.preparation.options import Place, PrepareOptions
 
+_OPTIONS = {"preset": "estimators"}  # whose names on the command line are others
+
 
 def load_options(
     file: PrepareOptions | Path | str | None = None,
@@ -38,7 +40,10 @@ def load_options(
     else:
         document = Document("options") if file is None else read_document(Path(file))
     given = {name: value for name, value in (flags or {}).items() if value is not None}
-    document = document.merged(Document("command line", given))
+    places: dict[tuple[str | int, ...], str] = {
+        (name,): f"--{_OPTIONS.get(name, name).replace('_', '-')}" for name in given
+    }
+    document = document.merged(Document("command line", given, dict(places), dict(places)))
     if settings:
         document = document.merged(load_overrides(list(settings)))
     try:

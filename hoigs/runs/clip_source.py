@@ -26,8 +26,10 @@ def clip_folder(clip: str | Path, registry: Registry | None = None) -> Path:
             local copy then (`hoigs.core.storage`).
 
     Raises:
-        ClipError: there is no built-in clip of that name. Whether a folder exists is not checked.
+        ClipError: there is no built-in clip of that name, or the argument is empty. Whether a
+            folder exists is not checked.
     """
+    _refuse_empty(clip)
     if is_named(clip):
         return named_clip(str(clip), (registry or default_registry()).get("body:anny")())
     return local_path(clip)
@@ -61,15 +63,30 @@ def recorded_folder(run: Path, provenance: Mapping[str, Any], registry: Registry
 
 
 def clip_name(clip: str | Path) -> str:
-    """A short name for run folders: "carry" of "builtin:carry", else the folder's name."""
+    """A short name for run folders: "carry" of "builtin:carry", else the folder's name.
+
+    Raises:
+        ClipError: the argument is empty.
+    """
+    _refuse_empty(clip)
     if is_named(clip):
         short, _, query = str(clip).removeprefix(PREFIX).partition("?")
         return "-".join([short, *filter(None, query.replace("=", "-").split("&"))])
     return Path(clip).resolve().name
 
 
+def _refuse_empty(clip: str | Path) -> None:
+    if clip == "":  # as a path it would be the current folder
+        raise ClipError("the clip is an empty string; name a folder or builtin:NAME")
+
+
 def require_folder(folder: Path) -> None:
     """Raise ClipError unless the folder exists."""
+    if folder.is_file():
+        raise ClipError(
+            f"{folder}: is a file, expected a clip folder; if it is a video, "
+            f"`hoigs prepare {folder} --out clips/{folder.stem}` makes a clip of it"
+        )
     if not folder.is_dir():
         raise ClipError(f"{folder}: no such folder; `hoigs prepare VIDEO --out {folder}` makes one")
 

@@ -8,8 +8,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.errors import HoigsError, did_you_mean
-from hoigs.core.spec.loader import load_yaml
+from hoigs.core.errors import HoigsError
+from hoigs.core.spec.errors import explain
+from hoigs.core.spec.loader import Document, load_value
 
 
 def parse_settings(
@@ -28,8 +29,7 @@ def parse_settings(
         key, equals, value = text.partition("=")
         if not equals or not key:
             raise error(f"{option} {text}: expected key=value")
-        document = load_yaml(f"value: {value}", f"{option} {text}")
-        values[key] = document.data["value"]
+        values[key] = load_value(value, f"{option} {text}:")
     return values
 
 
@@ -45,11 +45,5 @@ def validated(
         checked: ComponentConfig = kind.model_validate(values)
         return checked
     except ValidationError as problems:
-        lines = []
-        for problem in problems.errors():
-            place = ".".join(map(str, problem["loc"]))
-            near = did_you_mean(place, kind.model_fields)
-            known = f" (known: {', '.join(kind.model_fields)})"
-            extra = problem["type"] == "extra_forbidden"
-            lines.append(f"{key}: {place}: {problem['msg']}{near + known if extra else ''}")
+        lines = explain(problems, kind, Document(f"{key}:", values), ())
         raise error("\n".join(lines)) from problems

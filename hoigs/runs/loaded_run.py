@@ -25,6 +25,7 @@ from hoigs.runs.checkpoint import (
 from hoigs.runs.choices import pick_device, with_rasterizer
 from hoigs.runs.clip_source import clip_folder, read_clip, recorded_folder
 from hoigs.runs.reader_choice import recorded_reader
+from hoigs.runs.resuming import load_spec
 from hoigs.runs.run_folder import RunFolder
 
 DRAWN = ("model", "cameras")  # what is read of a checkpoint: moments are three times as large
@@ -69,7 +70,7 @@ class LoadedRun:
         run.require()
         registry = default_registry(plugin_files=plugins)
         device, changes = pick_device(device), with_rasterizer((), rasterizer)
-        spec = Spec.load(run.spec, overrides=changes, registry=registry)
+        spec = load_spec(run.spec, changes, registry)
         provenance = run.read_provenance()
         if clip is None:
             folder = recorded_folder(path, provenance, registry)

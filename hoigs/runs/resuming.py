@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hoigs.core.errors import HoigsError
+from hoigs.core.errors import HoigsError, SpecError
 from hoigs.core.registry.registry import Registry
 from hoigs.core.spec.loader import load_yaml
 from hoigs.core.spec.older import with_present_names
@@ -41,6 +41,30 @@ def own_spec(path: Path) -> Path:
     run = RunFolder(path)
     run.require()
     return run.spec
+
+
+def load_spec(source: Path | str, overrides: Sequence[str], registry: Registry) -> Spec:
+    """`Spec.load`; of a run's spec an error names the plugin files that it was trained with.
+
+    Raises:
+        SpecError: as `Spec.load`.
+    """
+    try:
+        return Spec.load(source, overrides=overrides, registry=registry)
+    except SpecError as error:
+        run = RunFolder(Path(source).parent)
+        if Path(source) != run.spec or not run.provenance.is_file():
+            raise
+        parts = run.read_provenance().get("components", {}).values()
+        dists = {str(part.get("dist")) for part in parts if isinstance(part, dict)}
+        loaded = {plugin.dist for plugin in registry.manager.plugins}
+        files = sorted(dist for dist in dists - loaded if dist.endswith(".py"))
+        if not files:
+            raise
+        given = " ".join(f"--plugin {file}" for file in files)
+        raise SpecError(
+            f"{error}\nthis run was trained with {given}: give it again, or install the plugin"
+        ) from error
 
 
 def changes_of(stored: Path, spec: Spec) -> list[str]:

@@ -115,18 +115,22 @@ class RunFolder:
                 "`hoigs train CLIP --out RUN` makes one"
             )
 
-    def refuse_existing(self, overwrite: bool, inputs: Iterable[Path | str] = ()) -> None:
+    def refuse_existing(
+        self, overwrite: bool, inputs: Iterable[Path | str] = (), *, resumable: bool = False
+    ) -> None:
         """Raise HoigsError unless a run may be created here.
 
         Args:
             overwrite: allow an older run here, if it is complete and has no foreign files.
             inputs: sources of the new run, which must not be inside the old one.
+            resumable: whether the command has --resume, for the message.
         """
         refuse_unwritable(self.path)
         if not overwrite and self.path.is_dir() and any(self.path.iterdir()):
+            resume = " go on with --resume," if resumable else ""
             raise HoigsError(
-                f"{self.path}: already exists; choose another --out, go on with --resume, or "
-                "replace it with --overwrite"
+                f"{self.path}: already exists; choose another --out,{resume} or replace it with "
+                "--overwrite"
             )
         require_replaceable(self.path, RUN, inputs=map(Path, inputs))
 

@@ -10,6 +10,8 @@ from pydantic import ValidationError
 
 from hoigs.core.errors import ClipError, did_you_mean
 from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.spec.errors import explain
+from hoigs.core.spec.loader import Document
 from hoigs.synthesis.builtin import Progress, builtin_clip
 from hoigs.synthesis.clips import CLIPS
 from hoigs.synthesis.config import SceneConfig
@@ -55,26 +57,16 @@ def clip_config(name: str) -> SceneConfig:
             if not isinstance(place, dict):
                 raise ClipError(f"{name}: {group} has no settings of its own")
         place[last] = [v for v in value.split(",") if v] if "," in value else value
-    if "width" in settings and "height" not in settings:
+    square = "width" in settings and "height" not in settings
+    if square:
         settings["height"] = settings["width"]
     try:
         return SceneConfig.model_validate(settings)
     except ValidationError as error:
-        raise ClipError("\n".join(_messages(name, error))) from error
-
-
-def _messages(name: str, error: ValidationError) -> list[str]:
-    lines = []
-    for problem in error.errors():
-        place = [str(step) for step in problem["loc"]]
-        near = ""
-        if problem["type"] == "extra_forbidden":
-            model: Any = SceneConfig
-            for step in place[:-1]:
-                model = model.model_fields[step].annotation
-            near = did_you_mean(place[-1], model.model_fields)
-        lines.append(f"{name}: {'.'.join(place)}: {problem['msg']}{near}")
-    return lines
+        lines = explain(error, SceneConfig, Document(f"{name}:", settings), ())
+        same = f"{name}: height:" if square else None  # what is said of the width already
+        lines = [line for line in lines if same is None or not line.startswith(same)]
+        raise ClipError("\n".join(lines)) from error
 
 
 def named_clip(name: str, body: BodyModel, *, progress: Progress | None = None) -> Path:

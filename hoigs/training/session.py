@@ -25,6 +25,7 @@ from hoigs.runs.resuming import (
     changes_of,
     clip_and_reader,
     default_out,
+    load_spec,
     own_spec,
 )
 from hoigs.runs.run_folder import RunFolder, command_line, versions
@@ -84,7 +85,7 @@ class Session:
         if spec is None:
             spec = own_spec(out or default_out(clip, DEFAULT_SPEC)) if resume else DEFAULT_SPEC
         if not isinstance(spec, Spec):
-            spec = Spec.load(spec, overrides=overrides, registry=registry)
+            spec = load_spec(spec, overrides, registry)
         elif overrides:
             raise HoigsError(
                 f"overrides {overrides} expect a spec's name or file, not a Spec; "
@@ -97,7 +98,8 @@ class Session:
             run.require()
             earlier = run.read_provenance()
         else:
-            run.refuse_existing(overwrite, [clip] if clip is not None else [])
+            inputs = [clip] if clip is not None else []
+            run.refuse_existing(overwrite, inputs, resumable=True)
         run.lock("training")
         try:
             return cls._locked(

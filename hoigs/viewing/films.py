@@ -44,6 +44,7 @@ class Film:
         draw_s: seconds of rendering, without preparing Playback and without encoding.
         total_s: seconds of rendering and encoding.
         mode, reason: `Playback.mode` ("graph" if CUDA graphs rendered it) and `Playback.reason`.
+        replaced: whether there was an earlier video of this path.
     """
 
     path: Path
@@ -54,6 +55,7 @@ class Film:
     total_s: float
     mode: Mode
     reason: str
+    replaced: bool = False
 
     @property
     def fps(self) -> float:
@@ -61,10 +63,11 @@ class Film:
         return self.frames / self.draw_s
 
     def __str__(self) -> str:
-        how = "by CUDA graphs" if self.mode == "graph" else f"without CUDA graphs: {self.reason}"
+        without = f"; without CUDA graphs: {self.reason}"
+        how = {"graph": "; by CUDA graphs", "cached": ""}.get(self.mode, without)
         return (
             f"{self.frames} frames of {self.width}x{self.height}, {self.fps:.1f} frames/s drawn, "
-            f"{self.frames / self.total_s:.1f} with encoding; {how}"
+            f"{self.frames / self.total_s:.1f} with encoding{how}"
         )
 
 
@@ -94,7 +97,8 @@ def render(
     """Draw a run to a video.
 
     Args:
-        out: the video: .mp4, .webm, .mov (ProRes 4444) or .gif; by default RUN/renders/PATH.mp4.
+        out: the video: .mp4, .webm, .mov (ProRes 4444) or .gif; by default RUN/renders/PATH.mp4,
+            with `compare` PATH-compare.mp4.
         path: "video" follows the clip's cameras, "orbit" moves around while the clip plays,
             "bullet-time" stands still at a moment while the camera moves, "spiral" circles before
             the middle camera, "follow human" and "follow object" go along with it; or a JSON file
@@ -120,6 +124,7 @@ def render(
     run, chosen = Path(run), [*entities, *only]
     name = OLDER.get(path, path)
     stem = Path(name).stem if name.endswith(".json") else name.replace(" ", "-")
+    stem += "-compare" if compare else ""
     suffix = ".webm" if background == TRANSPARENT else ".mp4"
     target = Path(out) if out is not None else run / "renders" / f"{stem}{suffix}"
     _check_target(target, background)
@@ -128,7 +133,7 @@ def render(
     for entity in chosen:
         if entity not in names:
             raise HoigsError(
-                f"entity {entity!r}: this run has {names}{did_you_mean(entity, names)}"
+                f"--entities {entity}: this run has {', '.join(names)}{did_you_mean(entity, names)}"
             )
     numbers, rate = frame_numbers(loaded.clip, start, end, fps, slow)
     if name.endswith(".json") and fps is None:
@@ -187,14 +192,15 @@ def _draw(
                 release_time_rows(loaded.model)
             yield picture
 
-    began = time.perf_counter()
+    began, replaced = time.perf_counter(), target.exists()
     try:
         write_video(target, frames(), fps=fps)
     except OSError as error:
         raise HoigsError(f"{target} cannot be written: {error.strerror or error}") from error
     total_s = time.perf_counter() - began
     return Film(
-        target, drawn, camera.width, camera.height, draw_s, total_s, play.mode, play.reason
+        target, drawn, camera.width, camera.height, draw_s, total_s, play.mode, play.reason,
+        replaced,
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from hoigs.core.errors import HoigsError
 from hoigs.core.progress import Progress
 from hoigs.core.registry.registry import default_registry
-from hoigs.runs.clip_source import read_clip
+from hoigs.runs.clip_source import clip_folder, read_clip
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.html.page import Page, write_page
 from hoigs.viewing.splats import ClientScene
@@ -94,7 +94,13 @@ def view(
         drawings = [RunDrawing(run.loaded) for run in followed]
         bodies = bodies_of_run(followed[0].loaded.model, followed[0].loaded.clip)
     else:
-        source = read_clip(what, registry, allow_faults=True)
+        folder = clip_folder(what, registry)
+        if not folder.exists():
+            raise HoigsError(
+                f"{folder}: no such folder; `hoigs train CLIP --out {folder}` makes a run, and "
+                f"`hoigs prepare VIDEO --out {folder}` a clip"
+            )
+        source = read_clip(folder, registry, allow_faults=True)
         bodies, missing = bodies_of_clip(source, registry)
         for name, why in missing.items():
             report(f"{name}: {why}")

@@ -85,6 +85,10 @@ def export(
         bodies={n: b.to(loaded.model.device) for n, b in _bodies(loaded, registry).items()},
         fps=rate,
     )
+    if not any(request.of_kind(kind) for kind in exporter.kinds):
+        held = " and ".join(sorted(exporter.kinds))
+        there = ", ".join(f"{n} ({loaded.model.entity(n).kind})" for n in request.entities)
+        raise HoigsError(f"--format {name} exports entities of kind {held}; it was given {there}")
     try:
         with FolderLock(target, "hoigs export"):
             refuse_existing(target)  # another process may have written it meanwhile

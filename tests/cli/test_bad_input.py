@@ -124,3 +124,10 @@ def test_damaged_checkpoint(hoigs, tiny_clip, tmp_path):
     meta = newest.with_suffix(".json")
     meta.write_text(json.dumps({"format": "other"}))
     assert "format 'other'" in hoigs("eval", run).err
+
+
+def test_what_is_no_clip_folder(hoigs, tmp_path):
+    run, video = tmp_path / "run", tmp_path / "few.mp4"
+    video.touch()
+    refused(hoigs("train", video, "--out", run), run, f"`hoigs prepare {video} --out clips/few`")
+    refused(hoigs("train", "", "--out", run), run, "the clip is an empty string")

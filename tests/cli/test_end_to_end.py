@@ -56,7 +56,11 @@ def test_train_evaluate_and_render_from_python(hoigs, tiny_clip, tmp_path):
     drawn = hoigs("render", run, "--path", "orbit", "--out", video, "--device", "cpu")
     assert drawn.code == 0 and video.stat().st_size > 1000
     assert "12 frames of 64x64" in drawn.out and "frames/s" in drawn.out
-    assert "without CUDA graphs: CUDA graphs need a CUDA device" in drawn.out
+    assert "CUDA graphs" not in drawn.out and "replaced" not in drawn.out
+    beside = hoigs("render", run, "--compare", "--to", 1, "--device", "cpu")
+    assert f"video: {run / 'renders' / 'video-compare.mp4'}\n" in beside.out
+    again = hoigs("render", run, "--compare", "--to", 1, "--device", "cpu")
+    assert "an earlier video of this name was replaced" in again.out
     wrong = hoigs("render", run, "--only", "humn")
     assert wrong.code == 2 and '"human"' in wrong.err
 

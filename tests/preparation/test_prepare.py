@@ -277,3 +277,8 @@ def test_windows_that_cannot_be_joined_are_refused(tiny_source: Path, tmp_path: 
         with pytest.raises(SpecError, match=said):
             prepare(tiny_source, tmp_path / "clip", **settings)  # type: ignore[arg-type]
         assert not (tmp_path / "clip").exists()
+
+
+def test_two_frames_are_refused_at_once(tiny_source: Path, tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"mp4: 2 of its frames .* needs three or more"):
+        prepare(tiny_source, tmp_path / "clip", options=PrepareOptions(max_frames=2))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -9,9 +10,10 @@ import pytest
 from small_clip import small_clip
 
 from hoigs.core.clip_folder.write import write_clip
-from hoigs.core.errors import CheckpointError, HoigsError
+from hoigs.core.errors import CheckpointError, HoigsError, SpecError
+from hoigs.core.registry.registry import default_registry
 from hoigs.runs.loaded_run import LoadedRun
-from hoigs.runs.resuming import default_out
+from hoigs.runs.resuming import default_out, load_spec
 from hoigs.training.session import Session
 
 SETTINGS = ["train.steps=2", "train.log_every=1", "train.preview_every=0"]
@@ -83,3 +85,13 @@ def test_no_clip_and_no_run_is_answered(tmp_path: Path) -> None:
         with pytest.raises(HoigsError, match="name a clip"):
             Session.open(**wanted)
     assert not list(tmp_path.iterdir())
+
+
+def test_an_absent_plugin_file_is_named(tmp_path: Path) -> None:
+    spec = tmp_path / "spec.yaml"
+    spec.write_text("extends: hoigs\nrasterizer: {use: 'rasterizer:acme'}\n")
+    part = {"dist": "acme.py", "key": "rasterizer:acme@acme.py"}
+    record = {"clip": {"path": "clip"}, "components": {"rasterizer": part}}
+    (tmp_path / "provenance.json").write_text(json.dumps(record))
+    with pytest.raises(SpecError, match=r"\nthis run was trained with --plugin acme\.py: give it"):
+        load_spec(spec, (), default_registry())

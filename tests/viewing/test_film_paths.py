@@ -146,7 +146,9 @@ def test_bad_input_is_answered_and_leaves_nothing(hoigs, tmp_path):
         (["--background", "whiet"], "expected a colour"),
         (["--entities", "humn"], 'did you mean "human"?'),
         (["--width", "63"], "even number"),
-        (["--from", "40"], "expected 0 <= from <= to <= 11"),
+        (["--from", "40"], "error: --from 40: the clip has frames 0 to 11\n"),
+        (["--fps", "nan"], "error: --fps nan: expected a positive number\n"),
+        (["--entities", "foo"], "--entities foo: this run has scene, human, object\n"),
     ):
         done = hoigs("render", tiny_run(), "--out", out, *arguments)
         assert done.code == 2 and words in done.err, (arguments, done.err)

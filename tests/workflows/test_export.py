@@ -34,10 +34,14 @@ def test_bad_input_is_answered_and_leaves_nothing(hoigs, tmp_path):
     run = tiny_run()
     cases = (
         ([run, "--format", "pyl"], 'did you mean "ply"?'),
-        ([run, "--format", "ply", "--set", "ub=y"], 'did you mean "up"?'),
+        ([run, "--format", "ply", "--set", "ub=y"], "ub: unknown key (valid: up)"),
         ([run, "--format", "ply", "--entities", "hunan"], 'did you mean "human"?'),
-        ([run, "--format", "ply", "--from", 8, "--to", 3], "expected 0 <= from <= to <= 11"),
-        ([run, "--format", "ply", "--slow", 0], "expected positive numbers"),
+        ([run, "--format", "ply", "--from", 8, "--to", 3], "--from 8 is behind --to 3"),
+        ([run, "--format", "ply", "--slow", 0], "error: --slow 0: expected a positive number"),
+        (
+            [run, "--format", "bvh", "--entities", "object"],
+            "--format bvh exports entities of kind human; it was given object (object)",
+        ),
         ([tmp_path, "--format", "ply"], "not a run folder"),
     )
     for arguments, words in cases:

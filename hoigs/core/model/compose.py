@@ -122,8 +122,8 @@ class _Builder:
             found.append((name, kind, *block))
         if not found:
             raise SpecError(
-                f"{self.spec.at('entities')}: none of {list(self.spec.entities or ())} is in the "
-                f"clip, which has {', '.join(f'{n} ({k})' for n, k in kinds.items())}"
+                f"{self.spec.at('entities')}: none of {', '.join(self.spec.entities or ())} is in "
+                f"the clip, which has {', '.join(f'{n} ({k})' for n, k in kinds.items())}"
             )
         return found
 

@@ -58,7 +58,9 @@ class ExportRequest:
         for name in self.entities:
             if name not in known:
                 hint = did_you_mean(name, known)
-                raise ValueError(f'the scene has no entity "{name}"{hint} (it has {known})')
+                raise ValueError(
+                    f'the scene has no entity "{name}"{hint} (it has {", ".join(known)})'
+                )
         chosen = tuple(n for n in known if not self.entities or n in self.entities)
         object.__setattr__(self, "entities", chosen)
         if not self.fps > 0:

@@ -163,7 +163,8 @@ class Registry:
             return f'"{key}" is no component key, expected "kind:name"{hint}'
         if kind not in INTERFACES:
             return f'no component "{key}": unknown kind "{kind}"{did_you_mean(kind, KINDS)}'
-        hint = did_you_mean(key, self.keys(kind)) or did_you_mean(key, self.keys())
+        others = [k for k in self.keys() if not k.startswith(f"{kind}:")]
+        hint = did_you_mean(key, self.keys(kind)) or did_you_mean(key, others)
         known = ", ".join(self.keys(kind)) or "none"
         failed = [p for p in self.manager.plugins if p.status is not Status.OK]
         names = ", ".join(f"{p.dist} ({p.status})" for p in failed)

@@ -22,32 +22,67 @@ def explain(
         error: raised by validating the value at `place` with `model`.
         document: where the value came from.
     """
-    return [
-        _line(problem, model, document, place)
-        for problem in error.errors(include_url=False, include_context=False)
-    ]
+    found: dict[tuple[str, str], str] = {}
+    for problem in error.errors(include_url=False, include_context=False):
+        at, message, got = _parts(problem, model, document, place)
+        known = found.get((at, got), message)  # of another branch of a union
+        also = f", or {message.removeprefix('must be ')}" if known != message else ""
+        found[at, got] = known + also
+    return [f"{at}: {message}{got}" for (at, got), message in found.items()]
 
 
-def _line(problem: Any, model: type[BaseModel], document: Document, place: Place) -> str:
+def _parts(
+    problem: Any, model: type[BaseModel], document: Document, place: Place
+) -> tuple[str, str, str]:
+    """Where a problem is, what is wrong, and what came."""
     inside = _real_part(problem["loc"], _at(document.data, place), problem["type"])
     full = (*place, *inside)
-    path = ".".join(str(part) for part in full) or "the whole file"
+    path = ".".join(str(part) for part in full)
     if problem["type"] == "extra_forbidden":
         valid = list(_fields(model, inside[:-1]))
         key = str(inside[-1])
         present = FORMER_KEYS.get(key)
         near = f'; today it is "{present}"' if present in valid else did_you_mean(key, valid)
         hint = near or (f" (valid: {', '.join(valid)})" if valid else " (it has no settings)")
-        return f"{document.where(full, key=True)} {path}: unknown key{hint}"
+        return _named(document.where(full, key=True), path), f"unknown key{hint}", ""
     if problem["type"] == "missing":
-        return f"{document.where(full[:-1], key=True)} {path}: this key is missing"
+        at = document.where(full[:-1], key=True)
+        if at.startswith("--set") and len(full) > 1:
+            return _named(at, path), f"this key is missing{_new_block(document, full[:-1])}", ""
+        return _named(at, path), "this key is missing", ""
+    got, at = f", got {_short(problem['input'])}", document.where(full)
     if problem["type"] in ("model_type", "model_attributes_type", "dict_type"):
         fields = _fields(model, inside)
         keys = f" with {', '.join(fields)}" if fields else ""
         message = f"expected a block of keys{keys}"
+        if at.startswith("--set") and fields == ["use"] and isinstance(problem["input"], str):
+            kind, name = str(full[-1]), problem["input"].rpartition(":")[2]
+            short = f"--rasterizer {name} or " if kind == "rasterizer" else ""
+            got += f"; write {short}--set {path}.use={kind}:{name}"
     else:
         message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-    return f"{document.where(full)} {path}: {message}, got {_short(problem['input'])}"
+        message = message.partition(", unable to parse string")[0]
+        if problem["type"] == "value_error" and isinstance(problem["input"], dict):
+            got = ""  # of a block as a whole the message says enough
+    return _named(at, path), message, got
+
+
+def _named(at: str, path: str) -> str:
+    """A position and a dotted key; an option of the command line ("--focal") is named alone."""
+    option = at.startswith("--") and not at.endswith(":")
+    return f"{at} {path}" if path and not option else at
+
+
+def _new_block(document: Document, place: Place) -> str:
+    """What to say of a block that only `--set` has made."""
+    beside = _at(document.data, place[:-1])
+    known = [
+        name
+        for name in beside
+        if not document.where((*place[:-1], name), key=True).startswith("--set")
+    ]
+    near = did_you_mean(str(place[-1]), known)
+    return f'; the spec has no "{place[-1]}" there{near} (has: {", ".join(known)})'
 
 
 def _at(data: Any, place: Place) -> Any:

@@ -96,9 +96,11 @@ def _read_file(source: str | Path, folder: Path | None, chain: tuple[Path, ...])
 def _find(source: str | Path, folder: Path | None) -> Path:
     """The file that `source` means; relative ones start from `folder`, None allows names only."""
     text, _ = split_profile(source)
+    if isinstance(source, str) and text in builtin_specs():
+        return BUILTIN_SPECS / f"{text}.yaml"
+    if folder is not None and not text.endswith(SUFFIXES) and (folder / text).is_dir():
+        raise SpecError(f"{text}: is a folder, expected a YAML or TOML file")
     if isinstance(source, str) and "/" not in text and not text.endswith(SUFFIXES):
-        if text in builtin_specs():
-            return BUILTIN_SPECS / f"{text}.yaml"
         raise SpecError(
             f'no spec "{text}"{did_you_mean(text, builtin_specs())} (built in: '
             f"{', '.join(builtin_specs())}; a file ends in {', '.join(SUFFIXES)})"

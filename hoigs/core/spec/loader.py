@@ -258,7 +258,7 @@ def load_overrides(settings: list[str]) -> Document:
         source = f"--set {setting}:"
         if not equals or not all(place):
             raise SpecError(f"{source} expected KEY.KEY=VALUE, for example train.steps=500")
-        value = load_yaml(f"value: {text}" if text.strip() else "value: null", source).data["value"]
+        value = load_value(text if text.strip() else "null", source)
         node = result.data
         for depth, part in enumerate(place[:-1], 1):
             child = node.setdefault(part, {})
@@ -269,6 +269,19 @@ def load_overrides(settings: list[str]) -> Document:
         for depth in range(1, len(place) + 1):
             result.keys[place[:depth]] = result.values[place[:depth]] = source
     return result
+
+
+def load_value(text: str, source: str) -> Any:
+    """The value of a KEY=VALUE setting: a YAML scalar or flow collection.
+
+    Raises:
+        SpecError: it is not YAML.
+    """
+    try:
+        return load_yaml(f"value: {text}", "").data["value"]
+    except SpecError as error:
+        why = str(error).partition(": ")[2] or error
+        raise SpecError(f"{source} {text!r} is not a valid YAML value: {why}") from error
 
 
 def dump_yaml(data: dict[str, Any]) -> str:
@@ -329,6 +342,8 @@ def read_document(path: Path) -> Document:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise SpecError(f"{path}: no such file") from error
+    except IsADirectoryError as error:
+        raise SpecError(f"{path}: is a folder, expected a YAML or TOML file") from error
     except (OSError, UnicodeDecodeError) as error:
         raise SpecError(f"{path}: cannot be read as UTF-8 text: {error}") from error
     return load_toml(text, str(path)) if path.suffix == ".toml" else load_yaml(text, str(path))

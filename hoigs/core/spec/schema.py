@@ -287,7 +287,8 @@ def _settings(
         config_class = registry.config_class(part.use)
         registry.get(part.use)
     except PluginError as error:
-        return {}, [f"{at} {path}.use: {error}"]
+        known = "" if ":" in part.use else f" (known: {', '.join(registry.keys(kind))})"
+        return {}, [f"{at} {path}.use: {error}{known}"]
     try:
         return config_class.model_validate(part.settings).model_dump(mode="json"), []
     except ValidationError as error:

@@ -168,7 +168,7 @@ class TrainSpec(_Strict):
 
     steps: int = Field(default=2000, ge=1)
     """Optimizer steps, one frame each."""
-    seed: int = Field(default=0, ge=0)
+    seed: int = Field(default=0, ge=0, le=2**63 - 1)
     """Seed of every random draw."""
     passes: int | None = Field(default=None, ge=1)
     """Passes over the training frames after which people, objects and the interaction are done:

@@ -50,7 +50,7 @@ def fetched(url: str) -> Path:
     with named_failures(url, "read"):
         files = _files(fs, path)
     if not files:
-        raise HoigsError(f"{url}: there is no such file or folder, or it is empty")
+        raise HoigsError(f"{url}: {_why_nothing(fs, path)}")
     root = cache_folder() / "urls"
     key = hashlib.sha256(json.dumps([url, files], sort_keys=True).encode()).hexdigest()[:32]
     entry = root / key
@@ -69,6 +69,17 @@ def _files(fs: Any, path: str) -> dict[str, tuple[int, str]]:
     found = fs.find(path, detail=True) if fs.exists(path) else {}
     start = len(path.rstrip("/")) + 1
     return {name[start:]: _version(info) for name, info in found.items() if name[start:]}
+
+
+def _why_nothing(fs: Any, path: str) -> str:
+    """Why there are no files: fsspec takes what it cannot reach for absent, and keeps the cause."""
+    try:
+        fs.info(path)
+    except Exception as error:  # as `named_failures`
+        cause = error.__cause__
+        if isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError):
+            return f"the address cannot be reached ({cause}); check it and the network"
+    return "there is no such file or folder, or it is empty"
 
 
 def _version(info: dict[str, Any]) -> tuple[int, str]:

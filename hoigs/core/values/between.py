@@ -43,11 +43,15 @@ def frame_numbers(
     """
     last = clip.num_frames - 1
     first, final = (0.0 if start is None else start), (float(last) if end is None else end)
-    if not 0 <= first <= final <= last:
-        raise HoigsError(f"frames {first:g} to {final:g}: expected 0 <= from <= to <= {last}")
+    for option, frame in (("--from", first), ("--to", final)):
+        if not 0 <= frame <= last:
+            raise HoigsError(f"{option} {frame:g}: the clip has frames 0 to {last}")
+    if first > final:
+        raise HoigsError(f"--from {first:g} is behind --to {final:g}: no frame is left")
     rate = clip.fps if fps is None else fps
-    if not (0 < rate < math.inf and 0 < slow < math.inf):
-        raise HoigsError(f"fps {rate:g} and slow {slow:g}: expected positive numbers")
+    for option, value in (("--fps", rate), ("--slow", slow)):
+        if not 0 < value < math.inf:
+            raise HoigsError(f"{option} {value:g}: expected a positive number")
     step = clip.fps / (rate * slow)
     count, times = clip.num_frames, clip.frame_times
     # in mean gaps between frames: the frame numbers themselves, where frames are evenly spaced
@@ -56,7 +60,7 @@ def frame_numbers(
         begin, finish = first, final
     found = math.floor((finish - begin) / step + 1e-6) + 1
     if found > MOST_MOMENTS:
-        raise HoigsError(f"{found} moments are more than {MOST_MOMENTS}; lower fps or slow")
+        raise HoigsError(f"{found} moments are more than {MOST_MOMENTS}; lower --fps or --slow")
     places = [begin + i * step for i in range(found)]
     if times is not None:
         places = [float(frame_at(place / last, count, times)) for place in places]

@@ -88,7 +88,7 @@ def auto(
         _require_unfinished(path, answer)
     else:
         for folder in (path, compact):  # before the search, which may take hours
-            RunFolder(folder).refuse_existing(overwrite, [clip])
+            RunFolder(folder).refuse_existing(overwrite, [clip], resumable=True)
         found = needs(
             clip, name, out=answer, overrides=overrides, rasterizer=rasterizer, device=device,
             overwrite=overwrite, allow_faults=allow_faults, plugins=plugins, report=report,

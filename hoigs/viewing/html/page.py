@@ -92,7 +92,7 @@ def collect(loaded: LoadedRun, entities: Sequence[str], report: Progress) -> lis
     for name in entities:
         if name not in drawing.names:
             near = did_you_mean(name, drawing.names)
-            raise HoigsError(f"entity {name!r}: this run has {drawing.names}{near}")
+            raise HoigsError(f"--entities {name}: this run has {', '.join(drawing.names)}{near}")
     chosen = [name for name in drawing.names if not entities or name in entities]
     rows = drawing.rows()
     every = max(1, len(clip) // EYES)

@@ -314,7 +314,7 @@ def test_only_some_entities(parse, registry, clip):
         assert set(compose(spec, clip, registry).entities) == expected
         assert set(compose_density(spec, clip, registry)) == expected
     message = refusal(parse(TEXT + "entities: [dog]\n"), clip, registry)
-    assert message.startswith("my.yaml:17:11 entities: none of ['dog'] is in the clip")
+    assert message.startswith("my.yaml:17:11 entities: none of dog is in the clip")
 
 
 def test_an_exact_name_wins_and_unused_blocks_are_ignored(parse, registry, clip):

@@ -158,8 +158,8 @@ def test_how_a_step_is_computed_changes_no_hash(parse):
 
 AT_LEAST_1 = "must be greater than or equal to 1, got 0"
 NAME_RULE = "use letters, digits, _, - and . , a letter or digit first, got "
-NO_INT = "must be a valid integer, unable to parse string as an integer, got "
-NO_NUMBER = "must be a valid number, unable to parse string as a number, got "
+NO_INT = "must be a valid integer, got "
+NO_NUMBER = "must be a valid number, got "
 
 # what is put in the place of what, where the complaint stands, and what it says;
 # "D" is model.object.deformation
@@ -173,7 +173,8 @@ MISTAKES = [
      'unknown key; did you mean "depth"?'),
     ("keyframe_step: 3", "nested: {depth: x}", "9:60 D.nested.depth", NO_INT + "'x'"),
     ("keyframe_step: 3", "rates: [1, x]", "9:55 D.rates.1", NO_NUMBER + "'x'"),
-    ("keyframe_step: 3", "size: x", "9:50 D.size", NO_INT + "'x'"),
+    ("keyframe_step: 3", "size: x", "9:50 D.size",
+     "must be a valid integer, or 'all', got 'x'"),
     ("keyframe_step: 3", "nested: 4", "9:52 D.nested",
      "expected a block of keys with depth, got 4"),
     ('"features:plain"', '"features:plain", x: 1', "10:39 model.object.features.x",
@@ -321,6 +322,12 @@ def test_overrides(registry, tmp_path):
     )
     (line,) = complaints(load, "train.steps=0")
     assert line.startswith("--set train.steps=0: train.steps: must be greater than")
+    (line,) = complaints(load, "rasterizer=torch")
+    assert line.endswith("write --rasterizer torch or --set rasterizer.use=rasterizer:torch")
+    (line,) = complaints(load, "model.objct.points=3")
+    assert '"objct" there; did you mean "object"? (has: ' in line
+    (line,) = complaints(load, f"train.seed={2**63}")
+    assert "train.seed: must be less than or equal to" in line
 
 
 @pytest.mark.parametrize(

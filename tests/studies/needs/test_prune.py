@@ -182,7 +182,7 @@ def test_tuning_settles_and_leaves_the_spec_as_it_was(clip, monkeypatch, settle)
     pruning = Pruning(trained, validator_of(clip))
     pruning.tune()
     assert not seen  # nothing was pruned
-    pruning.cuts = [Cut("splats", "Gaussians", 2, 1, 0.0, "")]
+    pruning.cuts = [Cut("Gaussians", "Gaussians", 2, 1, 0.0, "")]
     pruning.tune()
     assert seen == [rates.model_copy(update={"settle": min(settle, prune.SETTLE)})]
     assert trained.spec.train.rates == rates
@@ -268,7 +268,7 @@ def test_a_pruned_run_is_a_run(run, tmp_path):
     add_to_answer(after, answer)
     add_to_answer(after, answer)
     text = (answer / "needs.md").read_text()
-    assert text.count("## After the training") == 1 and "splats of scene" in text
+    assert text.count("## After the training") == 1 and "Gaussians of scene" in text
     assert "full trainings" in text
     assert json.loads((answer / "needs.json").read_text())["after"]["bytes"][1] > 0
 

@@ -216,7 +216,7 @@ class Pruning:
         frames = _spread(self.trained.clip.split["train"], VIEWS)
         views = min(len(frames), int(self.validator.budget.left / 3))
         if views < 2:
-            self.report("splats: not tried, as the budget is spent")
+            self.report("Gaussians: not tried, as the budget is spent")
             return
         self.validator.budget.spend("sensitivities", views)
         model = self.trained.model
@@ -237,7 +237,7 @@ class Pruning:
             if not len(rows):
                 why = "removing any of them is visible"
             self._record(
-                Cut(f"splats of {name}", "Gaussians", before, before - len(rows), cost, why)
+                Cut(f"Gaussians of {name}", "Gaussians", before, before - len(rows), cost, why)
             )
 
     def tune(self) -> None:
