@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from contextlib import ExitStack
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -15,6 +17,14 @@ if TYPE_CHECKING:
     from hoigs.training.session import Session
     from hoigs.training.trainer import StepReport
     from hoigs.workflows.evaluate_run import EvaluatedRun
+
+
+def say(text: str) -> None:
+    """A line on stdout; a reader that has left (`hoigs train … | head`) does not end the work."""
+    try:
+        typer.echo(text)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Display:
@@ -40,7 +50,7 @@ class Display:
     def line(self, text: str) -> None:
         """`report`: a line on stdout."""
         self._end_bar()
-        typer.echo(printable(text))
+        say(printable(text))
 
     def started(self, session: Session) -> None:
         """`on_start`: print the training and the faults of the clip, and start a bar."""
@@ -48,17 +58,15 @@ class Display:
         self._steps, width = session.spec.train.steps, session.spec.train.width
         camera = session.clip.cameras[0]
         if width is not None and camera.width < width:
-            typer.echo(
-                f"train.width={width} is wider than the clip: its {camera.width} pixels are kept"
-            )
-        typer.echo(
+            say(f"train.width={width} is wider than the clip: its {camera.width} pixels are kept")
+        say(
             f"training {session.spec.name} on {printable(session.clip.name)} ({session.reader}): "
             f"{self._steps} steps, {len(session.clip.split['train'])} of "
             f"{session.clip.num_frames} frames, "
             f"{camera.width}x{camera.height} pixels"
         )
         for change in session.changes:
-            typer.echo(printable(f"changed on resuming: {change}"))
+            say(printable(f"changed on resuming: {change}"))
         for fault in session.faults:
             typer.echo(printable(f"warning: {fault}"), err=True)
         self._psnr = {}
@@ -73,7 +81,7 @@ class Display:
         self._bar.update(report.step, f"loss {report.loss:.4f}{score} {gaussians} Gaussians")
         if report.psnr:
             rest = (self._steps - report.step) * report.time_s / report.step
-            typer.echo(
+            say(
                 f"step {report.step:>6}  {report.time_s:7.1f} s  ETA {rest:6.0f} s  "
                 f"loss {report.loss:.4f} {score}  {gaussians} Gaussians"
             )

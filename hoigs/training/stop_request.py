@@ -1,7 +1,8 @@
-"""StopRequest: Ctrl-C and SIGTERM end a training after its present step, not within it."""
+"""StopRequest: Ctrl-C, SIGTERM and a closed terminal end a training after its present step."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
 import signal
@@ -11,12 +12,14 @@ from typing import Any
 
 from hoigs.runs.run_folder import RunFolder
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
 NOTICE = b"\nstopping after this step, with a checkpoint; once more to stop at once\n"
 
 
 class StopRequest:
-    """Inside, the first SIGINT or SIGTERM is kept in `signal`; a second one acts as usual.
+    """Inside, the first SIGINT, SIGTERM or SIGHUP is kept in `signal`; a second one acts as usual.
 
     Python handles signals in the main thread alone; in another one nothing changes.
 
@@ -44,7 +47,8 @@ class StopRequest:
     def _request(self, number: int, _: FrameType | None) -> None:
         self.signal = number
         self._restore()
-        os.write(2, NOTICE)  # print may be interrupted in the middle of its own buffer
+        with contextlib.suppress(OSError):  # the terminal may be gone
+            os.write(2, NOTICE)  # print may be interrupted in the middle of its own buffer
 
     def _restore(self) -> None:
         for number, before in self._before.items():

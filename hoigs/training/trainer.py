@@ -159,7 +159,7 @@ class Trainer:
     ) -> None:
         """Train to `spec.steps`, writing metrics and checkpoints.
 
-        With a run folder, the first Ctrl-C or SIGTERM ends the present step and writes a
+        With a run folder, the first Ctrl-C, SIGTERM or SIGHUP ends the present step and writes a
         checkpoint; a second one stops at once.
 
         Args:

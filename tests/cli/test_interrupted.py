@@ -1,9 +1,11 @@
-"""Ctrl-C and SIGTERM: the step is finished, a checkpoint written, and the next command printed."""
+"""Signals: the step is finished, a checkpoint written, and the next command printed."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
+import sys
 
 import pytest
 from small_clip import small_clip
@@ -25,7 +27,9 @@ def clip(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
 def test_a_stopped_training_keeps_its_steps(hoigs, clip, tmp_path, monkeypatch, number, code):
     run, before = tmp_path / "run", signal.getsignal(number)
     monkeypatch.setattr(
@@ -39,6 +43,15 @@ def test_a_stopped_training_keeps_its_steps(hoigs, clip, tmp_path, monkeypatch, 
     assert signal.getsignal(number) is before
     assert hoigs("train", "--resume", "--out", run, "--no-eval", "--device", "cpu").code == 0
     assert (run / "checkpoints" / "step_000009.json").is_file()
+
+
+def test_a_reader_that_left_does_not_end_a_command(monkeypatch):
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as left:
+        monkeypatch.setattr(sys, "stdout", left)
+        Display().line("nobody reads this")
+        Display().line("nor this")
 
 
 def test_a_second_signal_stops_within_the_step(hoigs, clip, tmp_path, monkeypatch):

@@ -31,6 +31,7 @@ from hoigs.core.clip_folder.format import (
 from hoigs.core.diagnostics import Severity
 from hoigs.core.npz import array_headers, load_arrays
 
+TAIL = 1024  # bytes in which an image file ends, whatever a program wrote after it
 MOST_ABSENT = 10_000  # images; where more are absent, the number of frames is wrong
 
 
@@ -103,11 +104,22 @@ def _image_problem(path: Path, view: View) -> str | None:
     try:
         with Image.open(path) as image:
             size, mode = image.size, image.mode
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
+            if not _ends(path):
+                image.load()
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         return f"not a readable image ({error})"
     if size != (view.width, view.height):
         return f"is {size[0]}x{size[1]}, expected {view.width}x{view.height}"
     return None if mode in ("RGB", "L", "1", "P", "RGBA") else f"has mode {mode}, expected 8 bit"
+
+
+def _ends(path: Path) -> bool:
+    """Whether a PNG or JPEG has its last marker, which a half-copied file lacks: far quicker than
+    decoding all frames."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - TAIL))
+        tail = file.read()
+    return b"IEND" in tail or b"\xff\xd9" in tail
 
 
 def _mask_problem(path: Path, view: View) -> str | None:

@@ -198,6 +198,16 @@ def test_truncated_npz(clip: Path) -> None:
     assert "points.npz: not a readable npz" in lines_of(clip)[0]
 
 
+@pytest.mark.parametrize("name", ["images/00003.png", "masks/ann/00003.png"])
+def test_half_copied_images_are_faults_like_absent_ones(clip: Path, name: str) -> None:
+    """Training leaves their frames out, if it may."""
+    content = (clip / name).read_bytes()
+    (clip / name).write_bytes(content[: len(content) // 2])
+    (problem,) = check_clip(clip)
+    assert str(problem).startswith(f"{name}: not a readable image (")
+    assert problem.severity == "fair"
+
+
 def test_no_such_folder(tmp_path: Path) -> None:
     with pytest.raises(ClipError, match="is not a folder"):
         require_clip(tmp_path / "nowhere")
