@@ -56,8 +56,10 @@ class Entity(nn.Module):
         if features is not None and not features.requires <= deformation.provides:
             missing = sorted(features.requires - deformation.provides)
             raise ValueError(
-                f"{type(features).__name__} requires {missing}, but {type(deformation).__name__} "
-                f"provides {sorted(deformation.provides) or 'nothing'}"
+                f"{type(features).__name__} requires {', '.join(missing)}, but "
+                f"{type(deformation).__name__} provides "
+                f"{', '.join(sorted(deformation.provides)) or 'nothing'}: leave the features out "
+                "(features: null), or take a deformation that provides it"
             )
         self.kind: EntityKind = kind or self._infer_kind()
         for name in FIELDS:
