@@ -66,7 +66,7 @@ def test_an_empty_part_is_told():
 
 
 def test_body_parts_need_a_field():
-    with pytest.raises(ValueError, match=r"requires \['field'\], but Static provides nothing"):
+    with pytest.raises(ValueError, match=r"requires field, but Static provides nothing"):
         Entity(Gaussians.from_points(torch.randn(4, 3)), Static(), BodyPartFeatures())
 
 
