@@ -47,6 +47,7 @@ COST = (
     Axis("parameters", "parameters", "lower", 0),
     Axis("megabytes", "size (MB)", "lower", 2),
     Axis("joules", "training (J)", "lower", 0, timed=True),
+    Axis("memory_mb", "peak memory of training (MB)", "lower", 0, timed=True),
 )
 AXES = {axis.name: axis for axis in (*ACCURACY, *COST)}
 

@@ -58,7 +58,7 @@ def measured(job: Job) -> dict[str, Any]:
     absent = NotComputed("this evaluation has no such score")
     found = measures_of(scores)
     values: dict[str, Value] = {name: found.get(key, absent) for name, key in MEASURES.items()}
-    values |= {"train_s": cost.train_s, "joules": cost.joules}
+    values |= {"train_s": cost.train_s, "joules": cost.joules, "memory_mb": cost.memory_mb}
     return {
         "machine": " and ".join(cost.machines) or "a machine that is not on record",
         "values": values,

@@ -65,8 +65,8 @@ def machine_sentences(points: Sequence[Point]) -> list[str]:
     if len(found) == 1:
         return [f"Measured on {found[0]}."]
     each = [f"machine {letter(i)}: {words}" for i, words in enumerate(found)]
-    return [f"Points of {len(found)} machines; times and joules cannot be compared between them.",
-            *each]  # fmt: skip
+    differ = "times, joules and memory cannot be compared between them"
+    return [f"Points of {len(found)} machines; {differ}.", *each]
 
 
 def letter(index: int) -> str:

@@ -129,8 +129,8 @@ def machine_lines(points: Sequence[Point]) -> list[str]:
     if len(found) == 1:
         return [f"Measured on {found[0]}."]
     each = [f"- machine {letter(i)}: {words}" for i, words in enumerate(found)]
-    return [f"**Points of {len(found)} machines**, whose times and joules cannot be compared:",
-            "", *each]  # fmt: skip
+    differ = "whose times, joules and memory cannot be compared"
+    return [f"**Points of {len(found)} machines**, {differ}:", "", *each]
 
 
 def _numbers(points: Sequence[Point]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ from hoigs.evaluation.protocol import NotComputed, Value
 from hoigs.studies.jobs.energy import EnergyMeter, energy_meter, spent
 from hoigs.studies.jobs.job import Job
 from hoigs.studies.jobs.machine import Machine
+from hoigs.studies.jobs.memory import peak_memory, start_peak
 
 if TYPE_CHECKING:
     from hoigs.training.session import Session
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 STUDY = "study.json"
 OLD = "this run was made before costs were kept; delete its folder to train it again"
 INTERRUPTED = "the training was interrupted, and what its lost part took is not known"
+NO_MEMORY = "this run was made before peak memory was kept; delete its folder to train it again"
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,8 @@ class Cost:
     Attributes:
         train_s: seconds of all steps, checkpoints on the way included, previews and scoring not.
         joules: from the first step to the last, previews included. source: what they measure.
+        memory_mb: peak in MB, of the GPU where there is one; previews included.
+        memory_source: what that measures.
         machines: fingerprint of each; more than one if the run was moved.
         runs_at_once: how many runs shared the machine, this one included.
     """
@@ -35,6 +40,8 @@ class Cost:
     train_s: Value
     joules: Value
     source: str
+    memory_mb: Value
+    memory_source: str
     machines: tuple[str, ...]
     runs_at_once: int
 
@@ -55,14 +62,15 @@ def train_measured(session: Session, job: Job, runs_at_once: int = 1) -> None:
         }
         parts.append(part)
         _write(path, record)
+        start_peak(job.device)
         meter = energy_meter(job.device)
         session.train(lambda _: meter.sample() if isinstance(meter, EnergyMeter) else None)
         joules = spent(meter)
         part["to_step"] = trainer.step
-        part["joules"] = (
-            {"not_computed": joules.reason} if isinstance(joules, NotComputed) else joules
-        )
+        part["joules"] = _plain(joules)
         part["source"] = meter.source if isinstance(meter, EnergyMeter) else ""
+        memory, part["memory_source"] = peak_memory(job.device)
+        part["memory_mb"] = _plain(memory)
     record["train_s"] = trainer.elapsed
     _write(path, record)
 
@@ -79,21 +87,40 @@ def read_cost(folder: Path) -> Cost:
     study = read_study(folder)
     parts = study["parts"]
     if "train_s" not in study:
-        return Cost(NotComputed(OLD), NotComputed(OLD), "", (), 1)
+        return Cost(NotComputed(OLD), NotComputed(OLD), "", NotComputed(OLD), "", (), 1)
     joules: Value
     if len(parts) != 1 or "joules" not in parts[0]:
         joules = NotComputed(INTERRUPTED)
-    elif isinstance(parts[0]["joules"], dict):
-        joules = NotComputed(parts[0]["joules"]["not_computed"])
     else:
-        joules = float(parts[0]["joules"])
+        joules = _value(parts[0]["joules"])
     return Cost(
         train_s=float(study["train_s"]),
         joules=joules,
         source=parts[-1].get("source", "") if parts else "",
+        memory_mb=_most(parts) if parts else NotComputed(NO_MEMORY),
+        memory_source=parts[-1].get("memory_source", "") if parts else "",
         machines=tuple(dict.fromkeys(Machine(**p["machine"]).words for p in parts)),
         runs_at_once=max((p["runs_at_once"] for p in parts), default=1),
     )
+
+
+def _most(parts: Sequence[Mapping[str, Any]]) -> Value:
+    """The highest peak of all parts."""
+    values = [_value(part.get("memory_mb")) for part in parts]
+    reasons = [v for v in values if isinstance(v, NotComputed)]
+    if reasons:
+        return NotComputed(INTERRUPTED) if len(parts) > 1 else reasons[0]
+    return max(v for v in values if not isinstance(v, NotComputed))
+
+
+def _plain(value: Value) -> float | dict[str, str]:
+    return {"not_computed": value.reason} if isinstance(value, NotComputed) else value
+
+
+def _value(stored: float | dict[str, str] | None) -> Value:
+    if stored is None:
+        return NotComputed(NO_MEMORY)
+    return NotComputed(stored["not_computed"]) if isinstance(stored, dict) else float(stored)
 
 
 def _write(path: Path, record: dict[str, Any]) -> None:

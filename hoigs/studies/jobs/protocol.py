@@ -28,4 +28,6 @@ def protocol_of(scores: Mapping[str, Any], cost: Cost) -> tuple[str, ...]:
     )
     if cost.source:
         sentences.append(f"Joules: {cost.source}; previews included.")
+    if cost.memory_source:
+        sentences.append(f"Memory: {cost.memory_source}; previews included.")
     return tuple(sentences)

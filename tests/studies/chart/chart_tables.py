@@ -70,6 +70,6 @@ def study(
                                 else NotComputed("no LPIPS weights"),
                                 render_ms=4 + parameters / 1e6 * noise.gauss(1, 0.02),
                                 parameters=parameters, megabytes=parameters * 4e-6,
-                                joules=NO_JOULES,
+                                joules=NO_JOULES, memory_mb=600 + parameters * 4e-5,
                             ))  # fmt: skip
     return found

@@ -47,7 +47,7 @@ def test_every_series_looks_different() -> None:
 def test_title_legend_notes_and_panels_do_not_overlap() -> None:
     points = points_of(study(seeds=2, lpips=False))
     drawn, curves = accuracy_chart(points, "carry"), curve_chart(points, "carry")
-    assert drawn is not None and len(drawn.axes) == 2 * 4, "two accuracies, four costs"
+    assert drawn is not None and len(drawn.axes) == 2 * 5, "two accuracies, five costs"
     assert curves is not None and len(curves.axes) == 2
     for figure in (drawn, curves):
         figure.canvas.draw()
@@ -70,7 +70,7 @@ def test_two_machines_are_named_and_their_times_refused() -> None:
     apart = accuracy_chart(points, "carry")
     mixed = accuracy_chart(points, "carry", mix_machines=True)
     assert apart is not None and mixed is not None
-    assert len(apart.axes) == 2 * 2 and len(mixed.axes) == 2 * 4
+    assert len(apart.axes) == 2 * 2 and len(mixed.axes) == 2 * 5
     for figure in (apart, mixed):
         text = _texts(figure)
         assert "carry: points of 2 machines" in text and f"machine B: {max(A, B)}" in text
@@ -165,7 +165,7 @@ def _figures(tags: Tags) -> list[tuple[go.Figure, dict[str, object]]]:
 def test_every_menu_entry_draws_what_it_names(written: Path) -> None:
     (figure, _), *_ = _figures(Tags((written / "chart.html").read_text()))
     axes, scale, curves = figure.layout.updatemenus
-    assert len(axes.buttons) == 2 * 4 and len(scale.buttons) == len(curves.buttons) == 2
+    assert len(axes.buttons) == 2 * 5 and len(scale.buttons) == len(curves.buttons) == 2
     points = by_clip(load_chart(written / "chart.json")[0])["carry"]
     best, *others = (next(p for p in points if (p.spec, p.steps) == ("hoigs", s))
                      for s in (1000, 200))  # fmt: skip

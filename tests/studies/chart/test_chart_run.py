@@ -86,7 +86,7 @@ def test_a_killed_chart_goes_on_and_a_cell_is_reproduced(tmp_path: Path) -> None
     sizes = {c["spec"]: c["values"]["parameters"] for c in cells}
     assert sizes["few"] < sizes["static"]
     rows = list(csv.DictReader(io.StringIO((out / "chart.csv").read_text())))
-    assert len(rows) == 2 * 9 and all(row["protocol"] for row in rows)
+    assert len(rows) == 2 * 10 and all(row["protocol"] for row in rows)
     figures = sorted(p.suffix for p in out.glob("chart-carry*"))
     assert figures == [".png", ".png", ".svg", ".svg"]
 

@@ -6,9 +6,10 @@ import json
 from pathlib import Path
 
 from hoigs.evaluation.protocol import NotComputed
-from hoigs.studies.jobs.cost import INTERRUPTED, OLD, read_cost
+from hoigs.studies.jobs.cost import INTERRUPTED, NO_MEMORY, OLD, read_cost
 from hoigs.studies.jobs.energy import EnergyMeter, rapl_meter, spent
 from hoigs.studies.jobs.machine import Machine, cpu_model
+from hoigs.studies.jobs.memory import peak_memory
 
 MACHINE = Machine("Xeon", 2, None, "2.13", "1.19")
 
@@ -48,6 +49,7 @@ def _study(folder: Path, *parts: dict[str, object]) -> None:
 def test_an_interrupted_training_has_seconds_but_no_joules(tmp_path: Path) -> None:
     whole = {"from_step": 0, "to_step": 9, "joules": 80.0, "source": "RAPL"}
     _study(tmp_path, whole)
+    assert read_cost(tmp_path).memory_mb == NotComputed(NO_MEMORY)
     assert read_cost(tmp_path).joules == 80.0 and read_cost(tmp_path).source == "RAPL"
     moved = MACHINE.to_dict() | {"cpu": "Ryzen"}
     _study(tmp_path, {"from_step": 0}, whole | {"from_step": 5, "machine": moved})
@@ -56,6 +58,26 @@ def test_an_interrupted_training_has_seconds_but_no_joules(tmp_path: Path) -> No
     assert [m.partition(",")[0] for m in cost.machines] == ["Xeon", "Ryzen"]
     (tmp_path / "study.json").unlink()
     assert read_cost(tmp_path).train_s == NotComputed(OLD)
+
+
+def test_memory_is_the_highest_of_all_parts_or_says_why_not(tmp_path: Path) -> None:
+    first = {"from_step": 0, "to_step": 5, "memory_mb": 900.0, "memory_source": "GPU"}
+    last = {"from_step": 5, "to_step": 9, "memory_mb": 700.0, "memory_source": "GPU"}
+    _study(tmp_path, first, last)
+    assert read_cost(tmp_path).memory_mb == 900.0 and read_cost(tmp_path).memory_source == "GPU"
+    _study(tmp_path, {"from_step": 0}, last)  # its first part was killed before it wrote its peak
+    assert read_cost(tmp_path).memory_mb == NotComputed(INTERRUPTED)
+    _study(tmp_path, last | {"memory_mb": {"not_computed": "no /proc"}})
+    assert read_cost(tmp_path).memory_mb == NotComputed("no /proc")
+
+
+def test_peak_memory_is_what_the_system_reports(tmp_path: Path) -> None:
+    status = tmp_path / "status"
+    assert "has no" in str(peak_memory("cpu", status)[0])
+    status.write_text("Name:\tpython\nVmPeak:\t 9000000 kB\nVmHWM:\t  500000 kB\n")
+    assert peak_memory("cpu", status)[0] == 512.0
+    status.write_text("Name:\tpython\n")
+    assert "VmHWM" in str(peak_memory("cpu", status)[0])
 
 
 def test_a_fingerprint_names_what_decides_a_time(tmp_path: Path) -> None:
