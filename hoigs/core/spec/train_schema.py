@@ -100,7 +100,7 @@ class RatesSpec(_Strict):
     because runs here take thousands of steps, not tens of thousands: means 8e-4, sh 1e-2, planes
     1e-2, networks 2e-3 gain 0.7 dB (full frame) and 0.4 dB (human and object) over the published
     in 1500 steps on the built-in clip; means 2.4e-3 up to 0.1 dB on real clips and cost no more
-    than that on the built-in one (docs/results/README.md).
+    than that on the built-in one (docs/results).
     `*_final` rates are reached log-linearly at the last step.
     """
 
