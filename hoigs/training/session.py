@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from hoigs.core.clip_folder.health import examine
+from hoigs.core.clip_folder.health import examine, require_useful
 from hoigs.core.diagnostics import Diagnostic
 from hoigs.core.errors import HoigsError
 from hoigs.core.model.compose import compose, compose_density
@@ -133,6 +133,8 @@ class Session:
             folder, registry, spec.train.width, allow_faults=allow_faults, reader=choice
         )
         faults = examine(source)
+        if not allow_faults:
+            require_useful(source, faults)
         model = compose(spec, source, registry).to(device)
         trainer = Trainer(
             model,
