@@ -268,7 +268,8 @@ def _resolve(document: Document, registry: Registry) -> Spec:
         node[place[-1]] = {"use": part.use, **settings}
     if not problems:
         for name, block in spec.model.items():
-            problems += misfits(name, block, document, registry)
+            features = None if block.features is None else block.features.use
+            problems += misfits(name, block.deformation.use, features, document, registry)
     if problems:
         raise SpecError("\n".join(problems))
     resolved = Spec.model_validate(data)

@@ -365,7 +365,9 @@ def test_an_interaction_that_refuses_its_tokens(parse, registry, clip, monkeypat
 
     meet = registry.get("interaction:meet")
     monkeypatch.setattr(meet, "forward", forward)
-    with pytest.raises(PluginError, match=r"interaction: fake_doll\.Meet raised ValueError: no cup"):
+    with pytest.raises(
+        PluginError, match=r"interaction: fake_doll\.Meet raised ValueError: no cup"
+    ):
         compose(parse(), clip, registry)
     monkeypatch.setattr(meet, "__module__", "hoigs.doll")
     assert refusal(parse(), clip, registry) == "my.yaml:3:14 interaction: no cup"
