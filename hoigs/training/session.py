@@ -14,6 +14,7 @@ from hoigs.core.diagnostics import Diagnostic
 from hoigs.core.errors import HoigsError
 from hoigs.core.model.compose import compose, compose_density
 from hoigs.core.registry.registry import Registry, default_registry
+from hoigs.core.safe_replace import refuse_within
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
 from hoigs.metrics.lpips import Lpips, find_weights
@@ -100,6 +101,8 @@ class Session:
         else:
             inputs = [clip] if clip is not None else []
             run.refuse_existing(overwrite, inputs, resumable=True)
+            if clip:
+                refuse_within(run.path, Path(clip))
         run.lock("training")
         try:
             return cls._locked(
