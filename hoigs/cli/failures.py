@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, NoReturn
@@ -50,6 +50,29 @@ class GuardedGroup(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         with failures_as_messages():
             return super().invoke(ctx)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name, command, words = super().resolve_command(ctx, args)
+        refuse_empty(command, words)
+        return name, command, words
+
+
+def refuse_empty(command: Any, words: Sequence[str]) -> None:
+    """Raise HoigsError where a word of the command line is empty, as `"$CLIP"` is without a CLIP:
+    as a path it would be the current folder."""
+    arguments = [p for p in command.params if p.param_type_name == "argument"]
+    for before, word in zip(["", *words], words):
+        option, equals, value = word.partition("=")
+        if word == "":
+            named = [(p.metavar or p.name).upper().strip("[]") for p in arguments] or [
+                "an argument"
+            ]
+            who = before if before.startswith("--") else " or ".join(named)
+        elif option.startswith("--") and equals and not value:
+            who = option
+        else:
+            continue
+        raise HoigsError(f"{who} is an empty text; give it a value, or leave it out")
 
 
 @contextmanager

@@ -83,6 +83,15 @@ def refuse_place(
             raise error(f"{folder} is or holds the input {path}; {advice}")
 
 
+def refuse_within(folder: Path, source: Path) -> None:
+    """Raise HoigsError where `folder`, made from `source`, would be written inside of it."""
+    if folder.resolve().is_relative_to(source.resolve()):
+        raise HoigsError(
+            f"{folder} lies inside of {source}, which it is made from and which would change by "
+            "it; name a folder outside: --out"
+        )
+
+
 def refuse_unwritable(folder: Path, *, error: type[HoigsError] = HoigsError) -> None:
     """Raise where no folder of this name can be made: found out before work, not after it.
 

@@ -91,12 +91,15 @@ class EstimatorPlan:
         choices: what gives each kind of estimate.
         frames: of the video, about; None: unknown. notes: sentences about what was found.
         cameras: the file or folder beside the video that has them; "": none.
+        counted: whether frames were counted, and not read from the header of a video, of which a
+            part may be missing.
     """
 
     choices: dict[Place, Choice]
     frames: int | None = None
     notes: tuple[str, ...] = ()
     cameras: str = ""
+    counted: bool = False
 
     def specs(self) -> dict[Place, ComponentSpec]:
         """Estimators of the preset."""
@@ -158,7 +161,8 @@ def plan_estimators(
     cameras = "" if known is None else _cameras(known)
     offline = options.preset == "auto" and any(c.spec is not None for c in found.values())
     notes = (OFFLINE_NOTE,) if offline else ()
-    return EstimatorPlan(found, _frames(source.video, options), notes, cameras)
+    frames, counted = _frames(source.video, options), source.video.is_dir()
+    return EstimatorPlan(found, frames, notes, cameras, counted)
 
 
 def _cameras(path: Path) -> str:

@@ -9,11 +9,12 @@ from typing import Any
 
 import torch
 
-from hoigs.core.clip_folder.health import examine
+from hoigs.core.clip_folder.health import examine, require_useful
 from hoigs.core.diagnostics import Diagnostic
 from hoigs.core.errors import HoigsError
 from hoigs.core.model.compose import compose, compose_density
 from hoigs.core.registry.registry import Registry, default_registry
+from hoigs.core.safe_replace import refuse_within
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
 from hoigs.metrics.lpips import Lpips, find_weights
@@ -100,6 +101,8 @@ class Session:
         else:
             inputs = [clip] if clip is not None else []
             run.refuse_existing(overwrite, inputs, resumable=True)
+            if clip:
+                refuse_within(run.path, Path(clip))
         run.lock("training")
         try:
             return cls._locked(
@@ -133,6 +136,8 @@ class Session:
             folder, registry, spec.train.width, allow_faults=allow_faults, reader=choice
         )
         faults = examine(source)
+        if not allow_faults:
+            require_useful(source, faults)
         model = compose(spec, source, registry).to(device)
         trainer = Trainer(
             model,

@@ -22,6 +22,7 @@ from hoigs.viewing.viewer.server import LOCAL, is_loopback, open_server, stop
 from hoigs.viewing.viewer.viewer import Viewer
 
 Report = Callable[[str], None]
+PORT, WIDTH = 8090, 1280
 
 
 def view(
@@ -29,11 +30,11 @@ def view(
     second: Path | str | None = None,
     *,
     host: str = LOCAL,
-    port: int = 8090,
+    port: int = PORT,
     html: Path | str | None = None,
     max_mb: float | None = None,
     entities: Sequence[str] = (),
-    width: int = 1280,
+    width: int = WIDTH,
     client: bool = False,
     clip: Path | str | None = None,
     rasterizer: str | None = None,
@@ -73,6 +74,11 @@ def view(
     if html is not None:
         if len(runs) != 1 or second is not None:
             raise HoigsError(f"--html writes one run, and {what} is none; `hoigs train` makes one")
+        if (host, port, width, client) != (LOCAL, PORT, WIDTH, False):
+            raise HoigsError(
+                "host, port, width and client are of a page that is served, and --html writes a "
+                "file: leave them out"
+            )
         loaded = LoadedRun.open(
             runs[0], clip=clip, rasterizer=rasterizer, device=device, plugins=plugins
         )

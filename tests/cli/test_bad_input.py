@@ -130,4 +130,26 @@ def test_what_is_no_clip_folder(hoigs, tmp_path):
     run, video = tmp_path / "run", tmp_path / "few.mp4"
     video.touch()
     refused(hoigs("train", video, "--out", run), run, f"`hoigs prepare {video} --out clips/few`")
-    refused(hoigs("train", "", "--out", run), run, "the clip is an empty string")
+
+
+def test_a_run_within_its_clip(hoigs, tiny_clip, monkeypatch):
+    words = f"lies inside of {tiny_clip}, which it is made from"
+    out = tiny_clip / "runs" / "x"
+    refused(hoigs("train", tiny_clip, "--out", out), tiny_clip / "runs", words)
+    monkeypatch.chdir(tiny_clip)
+    refused(hoigs("train", ".", "--spec", "static"), tiny_clip / "runs", "lies inside of .,")
+
+
+@pytest.mark.parametrize(
+    ("words", "who"),
+    [
+        (("train", ""), "CLIP"), (("refine", "", "--out", "x"), "CLIP"), (("eval", ""), "RUN"),
+        (("view", ""), "RUN|CLIP or RUN2"), (("prepare", "", "--out", "x"), "SOURCE"),
+        (("train", "clip", "--out", ""), "--out"), (("export", "run", "--out="), "--out"),
+        (("render", "run", "--path", "", "--fps", "3"), "--path"), (("spec", "check", ""), "an"),
+    ],
+)  # fmt: skip
+def test_an_empty_word_is_not_the_current_folder(hoigs, words, who):
+    outcome = hoigs(*words)
+    assert outcome.code == 2 and outcome.err.startswith(f"error: {who}"), outcome.err
+    assert "is an empty text" in outcome.err

@@ -8,6 +8,8 @@ import sys
 import pytest
 
 from hoigs.cli.common import print_table
+from hoigs.cli.prepare import _announce
+from hoigs.preparation.estimator_plan import Choice, EstimatorPlan
 
 WIDE = [f"a column with a long title, number {i}" for i in range(9)]
 
@@ -73,3 +75,15 @@ def test_a_narrow_table_breaks_lines_between_words(
     columns = [[line.split("│")[k].strip() for line in lines] for k in range(1, 5)]
     assert [" ".join(column).strip() for column in columns] == rows[0]
     assert len(lines) > 1 and all(len(line) <= 44 for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("counted", "words"), [(True, "for 7 frames,"), (False, "for at most 7 frames, by the video's")]
+)
+def test_a_plan_says_where_its_number_of_frames_is_from(
+    capsys: pytest.CaptureFixture[str], counted: bool, words: str
+) -> None:
+    """A video that is cut off has fewer than its header says."""
+    choice = Choice("depth", "none", "no network", 0.0)
+    _announce(EstimatorPlan({"depth": choice}, 7, counted=counted))
+    assert words in capsys.readouterr().out

@@ -35,6 +35,26 @@ def test_check(hoigs, tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("block", "words"),
+    [
+        ('human: {deformation: {use: "deformation:chs"}}',
+         "3:30 model.human.deformation.use: BodyPartFeatures requires field, but CubicHermite"),
+        ('human: {features: {use: "features:spline-motion"}}',
+         "3:27 model.human.features.use: SplineMotionFeatures requires velocity, but HexPlane"),
+        ('object: {deformation: {use: "deformation:hexplane-skinning"}}',
+         "3:31 model.object.deformation.use: HexPlaneSkinning deforms entities of kind human, not"),
+        ('scene: {deformation: {use: "deformation:rigid-frames"}}',
+         "3:30 model.scene.deformation.use: RigidFrames deforms entities of kind object, not"),
+    ],
+)  # fmt: skip
+def test_parts_that_do_not_fit(hoigs, tmp_path, block, words):
+    path = tmp_path / "my.yaml"
+    path.write_text(f"extends: hoigs\nmodel:\n  {block}\n")
+    outcome = hoigs("spec", "check", path)
+    assert outcome.code == 2 and outcome.err.startswith(f"error: {path}:{words}"), outcome.err
+
+
 @pytest.mark.parametrize("verb", ["check", "show"])
 def test_an_unknown_name(hoigs, verb):
     outcome = hoigs("spec", verb, "statik")

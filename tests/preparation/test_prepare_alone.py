@@ -115,6 +115,7 @@ def test_a_video_alone_becomes_a_clip_of_a_person(
     rows = {row[0]: row[1] for row in plans[0].rows()}
     assert rows["person's mask"] == rows["person's landmarks"] == "mediapipe"
     assert rows["object's mask"] == "none" and plans[0].frames == FRAMES
+    assert not plans[0].counted
     assert check_clip(out) == [] and report.object_observed is None
     clip = ClipFolderReader().read(out)
     assert len(clip) == FRAMES and not clip.objects and set(clip.bodies) == {"human"}

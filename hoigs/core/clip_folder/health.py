@@ -10,13 +10,17 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from hoigs.core.clip_folder.sight import unseen
 from hoigs.core.diagnostics import Diagnostic, ranges
+from hoigs.core.errors import ClipError
 from hoigs.core.maths.rotations import axis_angle_to_quats, turn_between
 from hoigs.core.values.clip import Clip
 
 MOST_FRAMES = 600  # examined in long clips, evenly spaced: each takes milliseconds to decode
 DEPTH_FRAMES, DEPTH_POINTS = 12, 20_000
 STEADY = 12  # median deviations of a track's steps beyond which it shows a gap by itself
+LEAST_AREA = 200  # pixels of a mask: a smaller one is mostly edge, whether it is ragged or not
+LEAST_POSES = 12  # of fewer, a fast motion cannot be told from noise
 FULL, RAGGED, JITTER_DEGREES, UNLIKE, HOLES, GAP = 0.98, 0.12, 1.5, 0.07, 0.3, 1.6
 
 
@@ -32,7 +36,14 @@ def examine(clip: Clip) -> list[Diagnostic]:
     found += _depth(clip)
     for name, body in clip.bodies.items():
         found += _jitter(name, body.poses.rotations[:, :22])
-    return [*found, *_gaps(clip)]
+    return [*found, *_gaps(clip), *unseen(clip)]
+
+
+def require_useful(clip: Clip, found: Sequence[Diagnostic]) -> None:
+    """Raise ClipError when a diagnostic is "bad": training would learn nothing of something."""
+    if bad := [f"  {fault}" for fault in found if fault.severity == "bad"]:
+        bad.append("or train all the same: --allow-faults (docs/reference/clip.md)")
+        raise ClipError(f"clip {clip.name} cannot be trained on:\n" + "\n".join(bad))
 
 
 def raggedness(mask: Bool[Tensor, "H W"]) -> float:
@@ -55,15 +66,16 @@ def _masks(clip: Clip, name: str, pool: ThreadPoolExecutor) -> Iterator[Diagnost
     step = -(-len(clip) // MOST_FRAMES)
     positions = [p for p in range(0, len(clip), step) if clip.store.mask_known(name, p)]
 
-    def look(position: int) -> tuple[float, float]:
+    def look(position: int) -> tuple[float, float | None]:
         mask = clip.store.mask(name, position)
-        return float(mask.float().mean()), raggedness(mask)
+        rough = raggedness(mask) if int(mask.sum()) >= LEAST_AREA else None
+        return float(mask.float().mean()), rough
 
     seen = list(pool.map(look, positions))
     number = {p: clip.moments[p].index for p in positions}
     empty = [number[p] for p, (area, _) in zip(positions, seen) if area == 0]
     full = [number[p] for p, (area, _) in zip(positions, seen) if area > FULL]
-    edges = sorted(rough for area, rough in seen if 0 < area <= FULL)
+    edges = sorted(rough for area, rough in seen if area <= FULL and rough is not None)
     if empty:
         yield Diagnostic(
             "empty-masks",
@@ -171,7 +183,7 @@ def _jitter(name: str, rotations: Float[Tensor, "F J 3"]) -> Iterator[Diagnostic
     is as large there as noise. And of the quarter of joints that are least off: noise is on all of
     them, while a body that moves fast moves some.
     """
-    if len(rotations) < 5:
+    if len(rotations) < LEAST_POSES:
         return
     quats = axis_angle_to_quats(rotations)
     around = [turn_between(quats[2:-2], quats[i : len(quats) - 4 + i]) for i in (0, 1, 3, 4)]

@@ -17,7 +17,7 @@ from hoigs.core.time_rows import TimeRows
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
-from hoigs.core.values.tokens import Residual
+from hoigs.core.values.tokens import EntityKind, Residual
 from hoigs.core.values.topology import AxisChange, TopologyChange, reindex
 
 
@@ -50,6 +50,8 @@ class DeformationModel(Configurable, nn.Module, ABC):
     `axis_changes` and `on_topology` if density control changes the number of Gaussians.
 
     Attributes:
+        kinds: kinds of entities that it can move. Specs are checked by what a class declares here
+            and in `provides`.
         provides: capabilities that feature extractors may require: "velocity" (ProvidesVelocity),
             "field" (ProvidesField), "skeleton" (ProvidesSkeleton), "face" (ProvidesFace).
         owns: fields of Gaussians that this model computes from parameters of its own; the entity
@@ -74,6 +76,7 @@ class DeformationModel(Configurable, nn.Module, ABC):
         progress: done share of the training run, in [0, 1]; see `set_progress`.
     """
 
+    kinds: frozenset[EntityKind] = frozenset({"scene", "human", "object"})
     provides: frozenset[str] = frozenset()
     owns: frozenset[str] = frozenset()
     per_gaussian: tuple[str, ...] = ()

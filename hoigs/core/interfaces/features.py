@@ -57,6 +57,24 @@ class FeatureExtractor(Configurable, nn.Module, ABC):
         reindex((self.get_parameter(name) for name in self.per_gaussian), change)
 
 
+def check_provided(
+    features: FeatureExtractor | type[FeatureExtractor],
+    deformation: DeformationModel | type[DeformationModel],
+) -> None:
+    """Raise ValueError when `features` require a capability that `deformation` lacks."""
+    missing = features.requires - deformation.provides
+    if missing:
+        raise ValueError(
+            f"{_name(features)} requires {', '.join(sorted(missing))}, but {_name(deformation)} "
+            f"provides {', '.join(sorted(deformation.provides)) or 'nothing'}: leave the features "
+            "out (features: null), or take a deformation that provides it"
+        )
+
+
+def _name(part: object) -> str:
+    return part.__name__ if isinstance(part, type) else type(part).__name__
+
+
 @runtime_checkable
 class ReadsKnots(Protocol):
     """Extractors whose tokens depend on the knots of the deformation (`HasKnots`)."""

@@ -51,13 +51,25 @@ def compose(spec: Spec, clip: Clip, registry: Registry | None = None) -> SceneMo
         }
         interaction = builder.part(("interaction",), spec.interaction, context)
         with _errors_at(spec, "interaction"):
-            return SceneModel(
+            model = SceneModel(
                 entities,
                 interaction=interaction,
                 rasterizer=rasterizer,
                 low_pass=spec.low_pass,
                 antialiased=spec.antialiased,
             )
+        _try_interaction(model, spec, clip)
+        return model
+
+
+def _try_interaction(model: SceneModel, spec: Spec, clip: Clip) -> None:
+    """Raise SpecError where it refuses the entities' tokens: now, not when its warm-up is over."""
+    try:
+        with torch.no_grad():
+            model.eval()(clip.moments[0], only=())
+    except ValueError as error:
+        raise SpecError(f"{spec.at('interaction')}: {error}") from error
+    model.train()
 
 
 def compose_bodies(

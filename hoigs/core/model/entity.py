@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hoigs.core.interfaces.deformation import DeformationModel, ProvidesSkeleton
-from hoigs.core.interfaces.features import FeatureExtractor
+from hoigs.core.interfaces.features import FeatureExtractor, check_provided
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import EntityKind, Residual, Role, Tokens
@@ -53,14 +53,8 @@ class Entity(nn.Module):
         super().__init__()
         self.deformation = deformation
         self.features = features
-        if features is not None and not features.requires <= deformation.provides:
-            missing = sorted(features.requires - deformation.provides)
-            raise ValueError(
-                f"{type(features).__name__} requires {', '.join(missing)}, but "
-                f"{type(deformation).__name__} provides "
-                f"{', '.join(sorted(deformation.provides)) or 'nothing'}: leave the features out "
-                "(features: null), or take a deformation that provides it"
-            )
+        if features is not None:
+            check_provided(features, deformation)
         self.kind: EntityKind = kind or self._infer_kind()
         for name in FIELDS:
             value = getattr(canonical, name).detach().clone()

@@ -115,7 +115,8 @@ class CrossAttention(InteractionModule):
             if len(tokens[name].features) != len(PART_NAMES):
                 raise ValueError(
                     f'"{name}" has {len(tokens[name].features)} tokens; a human needs '
-                    f"{len(PART_NAMES)}, one for each body part"
+                    f"{len(PART_NAMES)}, one for each body part: take features:body-parts, or "
+                    "leave its features out (features: null)"
                 )
         projected = {n: self._project(roles[n].kind, tokens[n]) for n in humans + objects}
         log_gates = {

@@ -36,6 +36,8 @@ from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind
 from hoigs.plugins.readers.common.config import ReaderConfig
 
+LEAST_BRIGHT = 16  # of a mask's brightest pixel, unless it is empty
+
 
 class ClipFolderReaderConfig(ReaderConfig):
     """Settings of reader:clip."""
@@ -164,7 +166,7 @@ class FolderStore(FrameStore):
         if not self.mask_known(entity, position):
             return torch.zeros(self.size, dtype=torch.bool)
         path = mask_path(self.root, entity, position)
-        return self.cache.get(path, lambda: _decode(path, "L") > 127)
+        return self.cache.get(path, lambda: _decode_mask(path))
 
     def mask_known(self, entity: str, position: int) -> bool:
         return not self._is_unusable(mask_path(self.root, entity, position))
@@ -193,6 +195,16 @@ def _decode(path: Path, mode: str) -> Tensor:
             return torch.from_numpy(np.array(image.convert(mode)))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ClipError(f"{path} cannot be decoded ({error}); write it again") from error
+
+
+def _decode_mask(path: Path) -> Bool[Tensor, "H W"]:
+    grey = _decode(path, "L")
+    if 0 < (brightest := int(grey.max())) < LEAST_BRIGHT:  # labels; nothing would count as seen
+        raise ClipError(
+            f"{path}: its brightest pixel is {brightest}, but a mask has 255 where the entity is "
+            "seen and 0 elsewhere; write it again (docs/reference/clip.md)"
+        )
+    return grey > 127
 
 
 def _read_depth(path: Path) -> Tensor:

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from hoigs.core.clip_folder.health import examine
 from hoigs.core.clip_folder.write import ClipWriter, write_clip
 from hoigs.core.errors import ClipError
 from hoigs.core.values.camera import Camera
@@ -223,3 +225,17 @@ def test_ignored_pixels_travel_with_their_frames(tmp_path: Path) -> None:
     (folder / "ignored" / "00003.png").write_bytes(b"no picture")
     with pytest.raises(ClipError, match=r"ignored/00003.png: not a readable image"):
         ClipFolderReader().read(folder)
+
+
+def test_a_mask_of_ones_is_not_taken_for_an_empty_one(tmp_path: Path) -> None:
+    write(tmp_path / "clip")
+    path = tmp_path / "clip/masks/ann/00003.png"
+    Image.new("L", (WIDTH, HEIGHT), 1).save(path)
+    clip = ClipFolderReader().read(tmp_path / "clip")
+    assert clip[2].masks["ann"].any()
+    with pytest.raises(
+        ClipError, match=r"00003\.png: its brightest pixel is 1, but a mask has 255"
+    ):
+        examine(clip)
+    Image.new("L", (WIDTH, HEIGHT), 0).save(path)
+    assert "empty-masks" in [fault.kind for fault in examine(clip)]

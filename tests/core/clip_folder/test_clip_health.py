@@ -10,8 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from hoigs.core.clip_folder import health
 from hoigs.core.clip_folder.health import depth_factor, examine, raggedness
 from hoigs.core.diagnostics import Diagnostic, ranges
+from hoigs.core.errors import ClipError
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment
@@ -60,7 +62,7 @@ def clip_at(times: Tensor) -> Clip:
     points = torch.rand(3000, 3, generator=generator) * torch.tensor([3.0, 3.0, 0.0])
     points += torch.tensor([-1.5, -1.5, 4.0])
     box = ObjectTrack(
-        torch.zeros(1, 3),
+        torch.ones(1, 3),
         torch.zeros(1, 3),
         torch.eye(3).repeat(frames, 1, 1),
         torch.stack((times, 0.3 * torch.cos(2 * times), times * 0), 1),
@@ -179,6 +181,34 @@ def test_a_body_filmed_at_few_frames_a_second_does_not_jitter() -> None:
     off = wide[1:-1] - 0.5 * (wide[2:] + wide[:-2])
     assert float(torch.rad2deg(off.norm(dim=-1).median())) > 4
     assert "pose-noise" not in kinds(replace(clip, bodies={"ann": moving}))
+
+
+def test_small_masks_and_few_poses_are_not_judged(clip: Clip) -> None:
+    clip.store.masks = [m & (torch.rand(m.shape) < 0.2) for m in clip.store.masks]  # 120 pixels
+    assert examine(clip) == []
+    noise = 0.2 * torch.randn(40, 22, 3, generator=torch.Generator().manual_seed(0))
+    assert list(health._jitter("ann", noise)) and not list(health._jitter("ann", noise[:11]))
+
+
+@pytest.mark.parametrize(
+    ("part", "who"), [("points", "the scene"), ("body", '"ann"'), ("box", '"box"')]
+)
+def test_what_no_camera_sees(clip: Clip, part: str, who: str) -> None:
+    """1,000 km away; behind all cameras, or beside their pictures, is alike."""
+    body, box = clip.bodies["ann"], clip.objects["box"]
+    for shift in ((0.0, 0.0, 1e6), (0.0, 0.0, -9.0), (40.0, 0.0, 4.0)):
+        away = torch.tensor(shift)
+        poses = body.poses.replace(transl=body.poses.transl + away)
+        moved = {
+            "points": {"points": clip.points * torch.tensor([1.0, 1.0, -1.0])},
+            "body": {"bodies": {"ann": replace(body, poses=poses)}},
+            "box": {"objects": {"box": replace(box, translations=box.translations + away)}},
+        }[part]
+        broken = replace(clip, depth_kind="none", **moved)
+        fault = only(broken)
+        assert fault.kind == "unseen" and f"no camera sees {who}" in fault.what
+        with pytest.raises(ClipError, match=f"wall cannot be trained on:\n.*{who}.*\n.*--allow-f"):
+            health.require_useful(broken, [fault])
 
 
 @pytest.mark.parametrize("lost", [[7], [7, 9], [5, 20, 31]])

@@ -10,7 +10,7 @@ import pytest
 import torch
 from fake_plugins import PluginFolder
 
-from hoigs.core.errors import SpecError
+from hoigs.core.errors import PluginError, SpecError
 from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.maths.rotations import quats_to_matrices
 from hoigs.core.model.compose import compose, compose_density
@@ -359,9 +359,18 @@ def test_a_component_that_cannot_be_built(parse, registry, clip):
     )
 
 
-def test_features_that_ask_for_too_much(parse, registry, clip):
-    message = refusal(parse(TEXT.replace("features:centre", "features:speed")), clip, registry)
-    assert message.startswith("my.yaml:13:5 model.object: Speed requires velocity, but")
+def test_an_interaction_that_refuses_its_tokens(parse, registry, clip, monkeypatch):
+    def forward(self, tokens, roles):
+        raise ValueError(f"no {' and '.join(tokens)}")
+
+    meet = registry.get("interaction:meet")
+    monkeypatch.setattr(meet, "forward", forward)
+    with pytest.raises(
+        PluginError, match=r"interaction: fake_doll\.Meet raised ValueError: no cup"
+    ):
+        compose(parse(), clip, registry)
+    monkeypatch.setattr(meet, "__module__", "hoigs.doll")
+    assert refusal(parse(), clip, registry) == "my.yaml:3:14 interaction: no cup"
 
 
 def test_an_interaction_that_cannot_be_bound(parse, registry, clip):

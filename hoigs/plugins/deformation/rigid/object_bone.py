@@ -77,6 +77,7 @@ class ObjectBone(DeformationModel):
     """
 
     Config: ClassVar = ObjectBoneConfig
+    kinds = frozenset({"object"})
     rates: ClassVar[Mapping[str, str]] = {
         "offset_quats": "keyframe_rotation",
         "offset_translations": "keyframes",

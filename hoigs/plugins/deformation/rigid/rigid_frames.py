@@ -37,6 +37,7 @@ class RigidFrames(DeformationModel):
     """
 
     Config: ClassVar = RigidFramesConfig
+    kinds = frozenset({"object"})
     rates: ClassVar[Mapping[str, str]] = {
         "corrections.turns": "pose",
         "corrections.shifts": "pose",

@@ -85,6 +85,7 @@ class SkinnedBody(DeformationModel):
     """
 
     Config: ClassVar = SkinnedBodyConfig
+    kinds = frozenset({"human"})
     provides = frozenset({"skeleton"})
     residuals = frozenset({"means", "pose"})
     input_space = "canonical"
