@@ -14,8 +14,13 @@ import jaxtyping
 import pytest
 import torch
 from browser import chromium, window
+from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 from shapecheck import only_arrays
+
+# a timing never gates a test: hypothesis has a deadline, and a check of slow machines
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 __all__ = ["chromium", "window"]  # fixtures: one browser a worker, whoever needs it
 
