@@ -47,6 +47,7 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=1200)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--width", type=int, help="of training, pixels; default the clip's")
+    parser.add_argument("--ways", nargs="+", choices=SPECS, default=list(SPECS))
     parser.add_argument("--set", action="append", default=[], help="KEY=VALUE of the spec")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--json", type=Path, help="written after each training; rows are added")
@@ -61,7 +62,7 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as scratch:
             clip = sparse(folder_of(name, options.clip_query), options.every, Path(scratch))
             for seed in options.seeds:
-                for way in SPECS:
+                for way in options.ways:
                     record["rows"].append(trained(clip, name, way, seed, options))
                     write(record, options.json)
     print(table(record["rows"]))
