@@ -36,10 +36,13 @@ def list_specs() -> None:
 @app.command()
 def check(spec: NameOrFile, settings: SetOption = None, plugin: PluginOption = None) -> None:
     """Check a spec and all its profiles, and list its components."""
+    from hoigs.core.registry.registry import default_registry
+    from hoigs.core.spec.fits import require_fitting
     from hoigs.core.spec.schema import spec_profiles
 
     profiles = [f"{spec}@{profile}" for profile in spec_profiles(spec)[1:]]
     for loaded in [_load(one, settings, plugin) for one in (spec, *profiles)]:
+        require_fitting(loaded, default_registry(plugin or ()))
         typer.echo(f"{loaded.name}: ok")
         for place, key in loaded.components().items():
             typer.echo(f"  {place:<28} {key}")

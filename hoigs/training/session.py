@@ -15,6 +15,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.model.compose import compose, compose_density
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.safe_replace import refuse_within
+from hoigs.core.spec.fits import require_fitting
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
 from hoigs.metrics.lpips import Lpips, find_weights
@@ -92,6 +93,7 @@ class Session:
                 f"overrides {overrides} expect a spec's name or file, not a Spec; "
                 "change the Spec itself: spec.model_copy(update=...)"
             )
+        require_fitting(spec, registry)
         torch.manual_seed(spec.train.seed)
         run = RunFolder(out or default_out(clip, spec.name))
         earlier: dict[str, Any] = {}  # provenance of the resumed run

@@ -4,39 +4,41 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from hoigs.core.errors import SpecError
 from hoigs.core.registry.registry import Registry
 from hoigs.core.spec.files import BUILTIN_SPECS
-from hoigs.core.spec.loader import Document
+from hoigs.core.spec.schema import Spec
 
 KINDS = ("scene", "human", "object")  # blocks of other names are of one entity, of any kind
 
 
-def misfits(
-    name: str, moves: str, describes: str | None, document: Document, registry: Registry
-) -> Iterator[str]:
-    """A deformation of other kinds of entity, and features that require what it does not provide; a
-    line each, with its position.
+def require_fitting(spec: Spec, registry: Registry) -> None:
+    """Refuse a deformation of other kinds of entity, and features that require what it lacks.
 
-    Args:
-        name: of the block. moves, describes: keys of its deformation and of its features.
+    `compose` refuses both, too; here no clip is needed. A spec is not checked when it is loaded: a
+    search changes one component after the other.
+
+    Raises:
+        SpecError: a line for each, with its position.
     """
+    if found := [line for name in spec.model for line in _misfits(spec, name, registry)]:
+        raise SpecError("\n".join(found))
+
+
+def _misfits(spec: Spec, name: str, registry: Registry) -> Iterator[str]:
     from hoigs.core.interfaces.features import check_provided
 
-    deformation = registry.get(moves)
+    block = spec.model[name]
+    deformation = registry.get(block.deformation.use)
+    places = [spec.at("model", name, part, "use") for part in ("deformation", "features")]
     if name in KINDS and name not in deformation.kinds:
         yield (
-            f"{_at(document, name, 'deformation')}: {deformation.__name__} deforms entities of "
-            f"kind {' or '.join(sorted(deformation.kinds))}, not {name}"
+            f"{places[0]}: {deformation.__name__} deforms entities of kind "
+            f"{' or '.join(sorted(deformation.kinds))}, not {name}"
         )
-    elif describes is not None:
+    elif block.features is not None:
         try:
-            check_provided(registry.get(describes), deformation)
+            check_provided(registry.get(block.features.use), deformation)
         except ValueError as error:
-            places = [_at(document, name, part) for part in ("deformation", "features")]
             # of the two, the one that a user wrote
             yield f"{min(places, key=lambda at: at.startswith(str(BUILTIN_SPECS)))}: {error}"
-
-
-def _at(document: Document, name: str, part: str) -> str:
-    place = ("model", name, part, "use")
-    return f"{document.where(place)} {'.'.join(place)}"

@@ -33,7 +33,6 @@ from hoigs.core.spec.files import (
     read_spec,
     spec_profiles,
 )
-from hoigs.core.spec.fits import misfits
 from hoigs.core.spec.loader import Document, Place, dump_yaml, load_overrides, load_yaml
 from hoigs.core.spec.older import with_present_names
 from hoigs.core.spec.train_schema import EvaluationSpec, TrainSpec
@@ -266,10 +265,6 @@ def _resolve(document: Document, registry: Registry) -> Spec:
         for step in place[:-1]:
             node = node[step]
         node[place[-1]] = {"use": part.use, **settings}
-    if not problems:
-        for name, block in spec.model.items():
-            features = None if block.features is None else block.features.use
-            problems += misfits(name, block.deformation.use, features, document, registry)
     if problems:
         raise SpecError("\n".join(problems))
     resolved = Spec.model_validate(data)

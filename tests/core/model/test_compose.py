@@ -359,6 +359,11 @@ def test_a_component_that_cannot_be_built(parse, registry, clip):
     )
 
 
+def test_features_that_ask_for_too_much(parse, registry, clip):
+    message = refusal(parse(TEXT.replace("features:centre", "features:speed")), clip, registry)
+    assert message.startswith("my.yaml:13:5 model.object: Speed requires velocity, but")
+
+
 def test_an_interaction_that_refuses_its_tokens(parse, registry, clip, monkeypatch):
     def forward(self, tokens, roles):
         raise ValueError(f"no {' and '.join(tokens)}")
