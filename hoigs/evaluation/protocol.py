@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -21,6 +22,16 @@ class NotComputed:
 
 
 Value = float | NotComputed
+
+
+def to_json(value: Value) -> float | dict[str, str]:
+    """A value as JSON files have it."""
+    return {"not_computed": value.reason} if isinstance(value, NotComputed) else value
+
+
+def from_json(stored: float | Mapping[str, str]) -> Value:
+    """The value of `to_json`."""
+    return float(stored) if isinstance(stored, int | float) else NotComputed(stored["not_computed"])
 
 
 @dataclass(frozen=True)

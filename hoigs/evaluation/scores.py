@@ -13,7 +13,7 @@ from hoigs.core.values.clip import Clip
 from hoigs.core.whole_files import write_whole
 from hoigs.evaluation.geometry import GEOMETRY
 from hoigs.evaluation.geometry import NOTES as GEOMETRY_NOTES
-from hoigs.evaluation.protocol import NotComputed, Protocol, Value
+from hoigs.evaluation.protocol import NotComputed, Protocol, Value, to_json
 from hoigs.metrics.regions import REGIONS
 
 METRICS = ("psnr", "ssim", "lpips", "depth")
@@ -249,4 +249,4 @@ def size_table(parts: Sequence[PartSize]) -> Table:
 
 
 def _plain(value: Value) -> float | dict[str, str]:
-    return {"not_computed": value.reason} if isinstance(value, NotComputed) else round(value, 6)
+    return to_json(value if isinstance(value, NotComputed) else round(value, 6))

@@ -23,7 +23,7 @@ DO = (
 
 
 def unseen(clip: Clip) -> Iterator[Diagnostic]:
-    """Diagnostics of severity "bad"."""
+    """A diagnostic of severity "bad" for each of scene, people and objects that no camera sees."""
     points = clip.points[:: max(1, len(clip.points) // MOST_POINTS)]
     if len(points) and not any(c.shows(*c.project(points)).any() for c in clip.cameras):
         middle = clip.cameras[0].to_camera(points).median(0).values
@@ -41,8 +41,12 @@ def unseen(clip: Clip) -> Iterator[Diagnostic]:
 
 
 def _in_sight(clip: Clip, places: Float[Tensor, "F 3"], reach: float) -> bool:
-    """Whether what reaches so far about a place, in the coordinates of each frame's camera, is in
-    the picture of any."""
+    """Whether a ball lies at least partly in the picture of any frame.
+
+    Args:
+        places: its centre in the coordinates of each frame's camera, metres.
+        reach: its radius, metres.
+    """
     K = torch.stack([c.K for c in clip.cameras])
     size = torch.tensor([[c.width, c.height] for c in clip.cameras])
     radius = K[:, 0, 0] * reach / places[:, 2].clamp_min(1e-6)

@@ -10,7 +10,7 @@ from statistics import mean
 from typing import Any, Literal
 
 from hoigs.core.errors import HoigsError
-from hoigs.evaluation.protocol import NotComputed, Value
+from hoigs.evaluation.protocol import NotComputed, Value, from_json, to_json
 from hoigs.studies.jobs.results import ALL_CLIPS, Spread
 
 FORMAT, VERSION = "hoigs-chart", 1
@@ -81,19 +81,13 @@ class Cell:
     missing: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        plain = {
-            name: {"not_computed": v.reason} if isinstance(v, NotComputed) else v
-            for name, v in self.values.items()
-        }
+        plain = {name: to_json(v) for name, v in self.values.items()}
         return vars(self) | {"values": plain, "protocol": list(self.protocol),
                              "curve": [list(p) for p in self.curve]}  # fmt: skip
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> Cell:
-        values = {
-            name: NotComputed(v["not_computed"]) if isinstance(v, dict) else float(v)
-            for name, v in data["values"].items()
-        }
+        values = {name: from_json(v) for name, v in data["values"].items()}
         curve = tuple((int(s), float(t), float(q)) for s, t, q in data["curve"])
         return Cell(**{**data, "values": values, "protocol": tuple(data["protocol"]),
                        "curve": curve})  # fmt: skip

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hoigs.core.whole_files import write_whole
-from hoigs.evaluation.protocol import NotComputed, Value
+from hoigs.evaluation.protocol import NotComputed, Value, from_json, to_json
 from hoigs.studies.jobs.energy import EnergyMeter, energy_meter, spent
 from hoigs.studies.jobs.job import Job
 from hoigs.studies.jobs.machine import Machine
@@ -67,10 +67,10 @@ def train_measured(session: Session, job: Job, runs_at_once: int = 1) -> None:
         session.train(lambda _: meter.sample() if isinstance(meter, EnergyMeter) else None)
         joules = spent(meter)
         part["to_step"] = trainer.step
-        part["joules"] = _plain(joules)
+        part["joules"] = to_json(joules)
         part["source"] = meter.source if isinstance(meter, EnergyMeter) else ""
         memory, part["memory_source"] = peak_memory(job.device)
-        part["memory_mb"] = _plain(memory)
+        part["memory_mb"] = to_json(memory)
     record["train_s"] = trainer.elapsed
     _write(path, record)
 
@@ -92,7 +92,7 @@ def read_cost(folder: Path) -> Cost:
     if len(parts) != 1 or "joules" not in parts[0]:
         joules = NotComputed(INTERRUPTED)
     else:
-        joules = _value(parts[0]["joules"])
+        joules = from_json(parts[0]["joules"])
     return Cost(
         train_s=float(study["train_s"]),
         joules=joules,
@@ -106,21 +106,12 @@ def read_cost(folder: Path) -> Cost:
 
 def _most(parts: Sequence[Mapping[str, Any]]) -> Value:
     """The highest peak of all parts."""
-    values = [_value(part.get("memory_mb")) for part in parts]
+    unknown = to_json(NotComputed(NO_MEMORY))
+    values = [from_json(part.get("memory_mb", unknown)) for part in parts]
     reasons = [v for v in values if isinstance(v, NotComputed)]
     if reasons:
         return NotComputed(INTERRUPTED) if len(parts) > 1 else reasons[0]
     return max(v for v in values if not isinstance(v, NotComputed))
-
-
-def _plain(value: Value) -> float | dict[str, str]:
-    return {"not_computed": value.reason} if isinstance(value, NotComputed) else value
-
-
-def _value(stored: float | dict[str, str] | None) -> Value:
-    if stored is None:
-        return NotComputed(NO_MEMORY)
-    return NotComputed(stored["not_computed"]) if isinstance(stored, dict) else float(stored)
 
 
 def _write(path: Path, record: dict[str, Any]) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from statistics import mean, stdev
 from typing import Any
 
-from hoigs.evaluation.protocol import NotComputed, Value
+from hoigs.evaluation.protocol import NotComputed, Value, from_json
 from hoigs.studies.jobs.rows import Row, TableSet
 
 Measure = tuple[str, str, str]  # view or "geometry", "time", "size"; region or part; metric
@@ -67,10 +67,10 @@ class TableResult:
 def measures_of(scores: Mapping[str, Any]) -> dict[Measure, Value]:
     """Every number of an evaluation.json, or why there is none."""
     found: dict[Measure, Value] = {
-        (s["view"], s["region"], s["metric"]): _value(s["value"]) for s in scores["scores"]
+        (s["view"], s["region"], s["metric"]): from_json(s["value"]) for s in scores["scores"]
     }
     for name, value in scores["geometry"].items():
-        found["geometry", "", name] = _value(value)
+        found["geometry", "", name] = from_json(value)
     timing = scores["timing"]
     for name in ("deform_ms", "raster_ms", "total_ms"):
         reason = timing.get("not_computed")
@@ -78,10 +78,6 @@ def measures_of(scores: Mapping[str, Any]) -> dict[Measure, Value]:
     for name in ("gaussians", "parameters", "megabytes"):
         found["size", "", name] = float(sum(part[name] for part in scores["size"]))
     return found
-
-
-def _value(stored: Any) -> Value:
-    return NotComputed(stored["not_computed"]) if isinstance(stored, dict) else float(stored)
 
 
 def mean_of_clips(rows: Sequence[RowResult]) -> RowResult:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from hoigs.evaluation.protocol import NotComputed, Value
+from hoigs.evaluation.protocol import NotComputed, Value, from_json
 from hoigs.studies.jobs.results import Measure, measures_of
 
 STRESS = "stress"  # in evaluation.json, beside the evaluation's own
@@ -59,6 +59,5 @@ def scored_values(evaluation: Mapping[str, Any]) -> dict[str, Value]:
         if measure.place is not None:
             found[name] = usual.get(measure.place, absent)
             continue
-        value = own[name]
-        found[name] = NotComputed(value["not_computed"]) if isinstance(value, dict) else value
+        found[name] = from_json(own[name])
     return found
