@@ -88,7 +88,7 @@ def chart(
         _rerun(out, rerun, where)
         return
     from hoigs.core.errors import HoigsError
-    from hoigs.studies.chart.data import load_chart
+    from hoigs.studies.chart.data import load_chart, merged_about
     from hoigs.studies.chart.interactive import require_plotly
     from hoigs.studies.chart.plan import ChartStudy
     from hoigs.studies.chart.run import run_chart
@@ -121,8 +121,7 @@ def chart(
     cells = run_chart(study, executor=where, limit_s=limit, report=report)
     about = _about(study.settings, study.device, jobs, each)
     if not clips:  # nothing was run
-        about = {k if len(loaded) == 1 else f"{k} ({path})": v
-                 for path, (_, made) in loaded.items() for k, v in made.items()}  # fmt: skip
+        about = merged_about({path: made for path, (_, made) in loaded.items()})
     for path in write_chart([*cells, *others], study.out, about, mix_machines=mix_machines):
         typer.echo(f"wrote {path}")
     if any(cell.missing for cell in cells):

@@ -241,3 +241,16 @@ def _plain_point(point: Point) -> dict[str, Any]:
         "curve": [list(p) for p in point.curve],
         "missing": {str(seed): why for seed, why in point.missing.items()},
     }  # fmt: skip
+
+
+def merged_about(abouts: Mapping[Path, Mapping[str, Any]]) -> dict[str, Any]:
+    """How the added charts were made: once what all share, with the file's path what differs."""
+    kinds = list(dict.fromkeys(kind for about in abouts.values() for kind in about))
+    merged: dict[str, Any] = {}
+    for kind in kinds:
+        found = {path: about[kind] for path, about in abouts.items() if kind in about}
+        if len(found) == len(abouts) and len({str(value) for value in found.values()}) == 1:
+            merged[kind] = next(iter(found.values()))
+        else:
+            merged |= {f"{kind} ({path})": value for path, value in found.items()}
+    return merged

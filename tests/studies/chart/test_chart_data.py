@@ -10,7 +10,14 @@ from chart_tables import NO_JOULES, A, B, cell, study
 
 from hoigs.core.errors import HoigsError
 from hoigs.evaluation.protocol import NotComputed
-from hoigs.studies.chart.data import AXES, all_clips, dump_cells, load_chart, points_of
+from hoigs.studies.chart.data import (
+    AXES,
+    all_clips,
+    dump_cells,
+    load_chart,
+    merged_about,
+    points_of,
+)
 from hoigs.studies.chart.pareto import dominances, dominates, front, usable_axes
 from hoigs.studies.jobs.results import ALL_CLIPS, Spread
 from hoigs.studies.jobs.variants import definition, parse_variants
@@ -111,6 +118,19 @@ def test_json_comes_back_as_it_went(tmp_path: Path) -> None:
         load_chart(path)
     with pytest.raises(HoigsError, match=r"expected the chart.json"):
         load_chart(tmp_path / "none.json")
+
+
+def test_what_all_added_charts_share_is_said_once() -> None:
+    one, other = Path("a.json"), Path("b.json")
+    made = {one: {"date": "2026-11-27", "settings": "none"},
+            other: {"date": "2026-11-28", "settings": "none", "versions": "1"}}  # fmt: skip
+    assert merged_about(made) == {
+        "date (a.json)": "2026-11-27",
+        "date (b.json)": "2026-11-28",
+        "settings": "none",
+        "versions (b.json)": "1",
+    }
+    assert merged_about({one: made[one]}) == made[one]
 
 
 def test_specs_are_parsed_with_labels_and_settings() -> None:
