@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -13,6 +13,12 @@ CameraPathName = Literal["orbit", "pan", "static"]
 ObjectMotionName = Literal[
     "held", "thrown", "pushed", "bending", "static", "carried", "gliding", "figure-eight"
 ]
+
+OF_ONE_MOTION: dict[str, ObjectMotionName] = {
+    "cycles": "figure-eight", "throw_turns": "thrown", "throw_height": "thrown",
+    "hidden_share": "carried", "regrips": "pushed", "jolt_metres": "pushed",
+    "bend_degrees": "bending",
+}  # fmt: skip
 
 
 class CameraConfig(ComponentConfig):
@@ -99,6 +105,17 @@ class ObjectConfig(ComponentConfig):
     bend_degrees: float = Field(
         default=70.0, ge=0, le=150, description="of a bending bar, end to end"
     )
+
+    @model_validator(mode="after")
+    def _moves_as_set(self) -> Self:
+        """A setting of another motion would change nothing, without a word."""
+        for name, motion in OF_ONE_MOTION.items():
+            changed = getattr(self, name) != type(self).model_fields[name].default
+            if changed and self.motion != motion:
+                raise ValueError(
+                    f'{name} is of motion "{motion}" alone, and this object\'s is "{self.motion}"'
+                )
+        return self
 
 
 class LightConfig(ComponentConfig):

@@ -36,6 +36,7 @@ def test_settings_follow_a_question_mark() -> None:
         ("builtin:carry?camera.distanc=3", ["camera.distanc", 'did you mean "distance"?']),
         ("builtin:carry?width=3", ["width", "greater than or equal to 16"]),
         ("builtin:carry?width", ["is not setting=value"]),
+        ("builtin:jolted-push?object.hidden_share=0.5", ["hidden_share", '"carried"', '"pushed"']),
         ("builtin:carry?frames.of=3", ["frames has no settings"]),
     ],
 )

@@ -66,7 +66,7 @@ def test_a_pushed_box_stays_on_the_table() -> None:
 
 def test_only_a_bending_bar_bends() -> None:
     for motion in MOTIONS:
-        bend = MOTIONS[motion](_config(motion, bend_degrees=60)).script().bend
+        bend = MOTIONS[motion](_config(motion)).script().bend
         assert (np.abs(bend).max() > np.radians(50)) == (motion == "bending")
 
 
