@@ -8,7 +8,7 @@
 Each clip is trained by `hoigs` and by `hoigs-no-interaction`. With `--every N` its objects'
 poses are known in every N-th frame only; between these they are interpolated (straight lines and
 slerp), as a user who placed the object by hand in every N-th frame would have them. `--clip-query`
-is added to the names of built-in clips: `object.hidden_share=0.5` hides hands and object in half of
+is added to the names of built-in clips: `object.hidden_share=0.5` turns the back of carry in half of
 the frames.
 """
 
@@ -28,8 +28,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.at_size import machine, write
+from hoigs.core.files.npz import load_arrays
 from hoigs.core.maths.rotations import matrices_to_quats, quats_to_matrices, slerp
-from hoigs.core.npz import load_arrays
 from hoigs.evaluation.evaluate import evaluate
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.synthesis.named import named_clip
