@@ -26,8 +26,8 @@ from PIL import Image
 from hoigs.evaluation.orbits import orbit_cameras
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.runs.run_folder import versions
-from hoigs.viewing.viewer.drawing import Look, RunDrawing
-from hoigs.viewing.viewer.resolution import BUDGET_S, Resolution
+from hoigs.viewing.viewer.pictures.resolution import BUDGET_S, Resolution
+from hoigs.viewing.viewer.pictures.run_drawing import Look, RunDrawing
 
 WIDTHS = (256, 640, 1280)
 QUALITY = 80

@@ -81,7 +81,7 @@ _PUBLIC = {
     "work": "hoigs.studies.batch.batch",
     "LoadedRun": "hoigs.runs.loaded_run",
     "Playback": "hoigs.viewing.playback",
-    "PrepareOptions": "hoigs.preparation.options",
+    "PrepareOptions": "hoigs.preparation.options.prepare_options",
     "Session": "hoigs.training.session",
     "TrainSpec": "hoigs.core.spec.train_schema",
     "Trainer": "hoigs.training.trainer",

@@ -43,7 +43,7 @@ from hoigs.plugins.features.body_parts import BodyPartFeatures as BodyPartFeatur
 from hoigs.plugins.features.embedding import EmbeddingFeatures as EmbeddingFeatures
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures as SplineMotionFeatures
 from hoigs.plugins.interaction.cross_attention import CrossAttention as CrossAttention
-from hoigs.preparation.options import PrepareOptions as PrepareOptions
+from hoigs.preparation.options.prepare_options import PrepareOptions as PrepareOptions
 from hoigs.preparation.prepare import prepare as prepare
 from hoigs.preparation.prepare import prepare_until as prepare_until
 from hoigs.rasterizers.gsplat import GsplatRasterizer as GsplatRasterizer

@@ -14,7 +14,7 @@ World = tuple[np.ndarray, np.ndarray]  # rotation and shift from the clip's worl
 
 def object_figures(made: Any, truth: Any, truth_folder: Path, world: World) -> dict[str, Any]:
     """Rotation, place and shape of the object; degrees and millimetres."""
-    from hoigs.core.npz import load_arrays
+    from hoigs.core.files.npz import load_arrays
 
     arrays = load_arrays(truth_folder / "truth.npz")
     track = made.objects["object"]

@@ -9,8 +9,8 @@ from pathlib import Path
 from hoigs.annotation.server import PageServer
 from hoigs.annotation.session import Session
 from hoigs.core.names import name_from
-from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.settings import load_options
+from hoigs.preparation.options.option_files import load_options
+from hoigs.preparation.options.prepare_options import PrepareOptions
 from hoigs.preparation.video.source import find_source
 
 

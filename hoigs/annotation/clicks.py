@@ -13,16 +13,16 @@ from jaxtyping import Bool, Float
 
 from hoigs.annotation.video import ScrubbedVideo
 from hoigs.core.interfaces.estimator import FramePrompt, LazyFrames, PromptPoint, VideoRequest
-from hoigs.plugins.estimators.object_tracker.camera_motion import is_static
-from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage
-from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, prompted_mask
-from hoigs.plugins.estimators.object_tracker.scene import (
+from hoigs.plugins.estimators.object_tracker.pixels.camera_motion import is_static
+from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage, read_footage
+from hoigs.plugins.estimators.object_tracker.pixels.scene import (
     NEIGHBOURS,
     Scene,
     StaticScene,
     moving_scene,
     static_scene,
 )
+from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, prompted_mask
 from hoigs.plugins.estimators.object_tracker.tracker import color_model
 from hoigs.preparation.video.resizing import resized_mask
 

@@ -10,9 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from hoigs.core.errors import SpecError
 from hoigs.core.interfaces.estimator import FramePrompt, PromptPoint
 from hoigs.core.names import NAME
-from hoigs.preparation.options import PromptAt
-from hoigs.preparation.prompt_file import StoredPrompts
-from hoigs.preparation.prompts import parse_prompts, split_name
+from hoigs.preparation.options.prepare_options import PromptAt
+from hoigs.preparation.options.prompt_file import StoredPrompts
+from hoigs.preparation.options.prompts import parse_prompts, split_name
 
 Kind = Literal["object", "person"]
 DEFAULT: dict[Kind, str] = {"object": "object", "person": "human"}

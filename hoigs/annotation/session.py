@@ -20,8 +20,8 @@ from hoigs.annotation.tracked import TrackedMasks
 from hoigs.annotation.video import ScrubbedVideo
 from hoigs.core.clip_folder.format import is_clip_folder
 from hoigs.core.errors import HoigsError
-from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.prompt_file import (
+from hoigs.preparation.options.prepare_options import PrepareOptions
+from hoigs.preparation.options.prompt_file import (
     StoredPrompts,
     prompt_file,
     read_prompts,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from hoigs.preparation.estimates import FoundObject, RawEstimates
+from hoigs.preparation.estimates.reader import FoundObject, RawEstimates
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.prepare import work_folder
 from hoigs.preparation.saved import from_result

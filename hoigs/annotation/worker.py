@@ -14,8 +14,8 @@ from typing import Any
 from hoigs.core.clip_folder.format import is_clip_folder
 from hoigs.core.environments.managed import EnvironmentAbsentError
 from hoigs.core.errors import HoigsError
-from hoigs.preparation.estimator_plan import EstimatorPlan
-from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.estimates.plan import EstimatorPlan
+from hoigs.preparation.options.prepare_options import PrepareOptions
 from hoigs.preparation.prepare import prepare, prepare_until
 from hoigs.preparation.stages.plan import PLAN
 

@@ -14,8 +14,8 @@ from hoigs.cli.common import Bar, print_table, progress_bar
 from hoigs.core.names import printable
 
 if TYPE_CHECKING:
+    from hoigs.training.reports import StepReport
     from hoigs.training.session import Session
-    from hoigs.training.trainer import StepReport
     from hoigs.workflows.evaluate_run import EvaluatedRun
 
 

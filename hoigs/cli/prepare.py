@@ -13,8 +13,8 @@ from hoigs.cli.display import Display
 from hoigs.core.names import printable
 
 if TYPE_CHECKING:
-    from hoigs.preparation.estimator_plan import EstimatorPlan
-    from hoigs.preparation.readiness import Consent
+    from hoigs.preparation.estimates.plan import EstimatorPlan
+    from hoigs.preparation.estimates.readiness import Consent
 
 
 def prepare(
@@ -155,9 +155,9 @@ def prepare(
     ] = None,
 ) -> None:
     """Make a clip folder from a video with the given estimators, and a report."""
+    from hoigs.preparation.options.option_files import load_options
     from hoigs.preparation.prepare import prepare as run
     from hoigs.preparation.prepare import prepare_until, work_folder
-    from hoigs.preparation.settings import load_options
 
     flags = {
         "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,

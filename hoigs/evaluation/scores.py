@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import did_you_mean
+from hoigs.core.files.whole_files import write_whole
 from hoigs.core.values.clip import Clip
-from hoigs.core.whole_files import write_whole
 from hoigs.evaluation.geometry import GEOMETRY
 from hoigs.evaluation.geometry import NOTES as GEOMETRY_NOTES
 from hoigs.evaluation.protocol import NotComputed, Protocol, Value, to_json

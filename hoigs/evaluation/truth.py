@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Int
 
 from hoigs.core.errors import ClipError
+from hoigs.core.files.npz import load_arrays
 from hoigs.core.maths.skinning import skin
-from hoigs.core.npz import load_arrays
 from hoigs.core.values.clip import Clip
 from hoigs.evaluation.protocol import NotComputed
 

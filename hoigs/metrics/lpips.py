@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.npz import load_arrays
+from hoigs.core.files.npz import load_arrays
 
 Net = Literal["alex", "vgg"]
 VARIABLE = "HOIGS_LPIPS_WEIGHTS"

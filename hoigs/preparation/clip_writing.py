@@ -16,8 +16,8 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import POSES_ESTIMATED
 from hoigs.preparation.cameras.camera_track import parallax
 from hoigs.preparation.cameras.multiview import angular_factor, full_factor
+from hoigs.preparation.entities.person import FittedBody
 from hoigs.preparation.objects.make_object import MadeObject
-from hoigs.preparation.person import FittedBody
 from hoigs.preparation.pipeline import Pipeline
 from hoigs.preparation.report.object_picture import save_object_picture, shown_frame
 from hoigs.preparation.report.overlay import OverlayVideo, several

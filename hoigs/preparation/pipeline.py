@@ -15,11 +15,18 @@ from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.clip import BodyTrack
 from hoigs.preparation.bodies.file_body import FileBody
 from hoigs.preparation.body.silhouette import silhouette
-from hoigs.preparation.cameras.calibration import calibration_file
 from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras, known_lens
-from hoigs.preparation.choose_people import chosen_people
-from hoigs.preparation.entity_masks import EntityMasks
-from hoigs.preparation.estimates import (
+from hoigs.preparation.cameras.known.calibration import calibration_file
+from hoigs.preparation.choose_frames import choose_frames, stored_width
+from hoigs.preparation.entities.choose_people import chosen_people
+from hoigs.preparation.entities.entity_masks import EntityMasks
+from hoigs.preparation.entities.final_masks import blank_warning, final_masks
+from hoigs.preparation.entities.fit_people import fit_people
+from hoigs.preparation.entities.nobody import nobody
+from hoigs.preparation.entities.person import FittedPeople
+from hoigs.preparation.entities.place_objects import place_objects
+from hoigs.preparation.estimates.given import GivenMasks
+from hoigs.preparation.estimates.reader import (
     EstimateReader,
     Estimators,
     FoundObject,
@@ -29,18 +36,12 @@ from hoigs.preparation.estimates import (
     identity,
     paths_of,
 )
-from hoigs.preparation.final_masks import blank_warning, final_masks
-from hoigs.preparation.fit_people import fit_people
-from hoigs.preparation.given import GivenMasks
 from hoigs.preparation.kept_stages import KeptStages
 from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.nobody import nobody
-from hoigs.preparation.objects.ball import BallTrack, load_ball, refine_ball
+from hoigs.preparation.objects.ball.track import BallTrack, load_ball, refine_ball
 from hoigs.preparation.objects.make_object import MadeObject
-from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.person import FittedPeople
-from hoigs.preparation.place_objects import place_objects
-from hoigs.preparation.prompts import check_prompts, placed_prompts
+from hoigs.preparation.options.prepare_options import PrepareOptions
+from hoigs.preparation.options.prompts import check_prompts, placed_prompts
 from hoigs.preparation.saved import from_result, load_cameras, save_cameras, to_result
 from hoigs.preparation.scene.depth import POOR, DepthFit, DepthSource
 from hoigs.preparation.scene.metres import depth_in_metres, find_scene
@@ -48,13 +49,9 @@ from hoigs.preparation.scene.scene_points import ScenePoints
 from hoigs.preparation.stages.plan import PLAN
 from hoigs.preparation.stages.progress import Stages
 from hoigs.preparation.stages.work_folder import Result, WorkFolder, fingerprint
-from hoigs.preparation.video.blank import require_pictures
 from hoigs.preparation.video.frames import FrameList, open_frames
-from hoigs.preparation.video.header import missing_frames
 from hoigs.preparation.video.source import NobodyFoundError, Source, SourceError
-from hoigs.preparation.video.span import Span
 
-LARGEST, REDUCED = 1920, 1280  # longer sides, pixels: of frames that are kept, and of smaller ones
 T = TypeVar("T")
 
 
@@ -109,48 +106,21 @@ class Pipeline:
 
     def _frames(self) -> None:
         options, path = self.options, self.source.video
-        span = Span.of(options.start, options.end)
 
         def make() -> FrameList:
-            frames = open_frames(
-                path, options.width, options.every, options.max_frames, fps=options.fps,
-                pick=options.pick, rate=options.folder_fps, span=span,
-            )  # fmt: skip
-            if len(frames) < 3:  # motion is judged by accelerations
-                raise SourceError(
-                    f"{path}: {len(frames)} of its frames would be used, as the options are; a "
-                    "clip shows motion, and needs three or more"
-                )
-            require_pictures(frames)
-            if path.is_file() and span.end is None and options.max_frames is None:
-                self.warnings += missing_frames(path, frames.total)
-            if frames.uneven:
-                self.warnings.append(
-                    f"the chosen frames are not evenly spaced (a variable frame rate, or the "
-                    f"sharpest of each few): the clip keeps their true times, {frames.fps:.4g} a "
-                    "second on average"
-                )
-            self.warnings += frames.notes
-            return frames.list
+            found, notes = choose_frames(path, options)
+            self.warnings += notes
+            return found
 
         found = self._stage("frames", make, fingerprint([path]))
         self.options = placed_prompts(options, found)
         check_prompts(self.options, found)
-        width = options.width or self._smaller_width(found)
+        width = options.width
+        if width is None:
+            width, notes = stored_width(found)
+            self.warnings += notes
         self.video = open_frames(path, width, known=found)
         known_lens(self.options, self.video)  # before anything slow
-
-    def _smaller_width(self, found: FrameList) -> int | None:
-        """Of frames that are larger than what can be seen of them in a clip."""
-        longest = max(found.native_width, found.native_height)
-        if longest <= LARGEST:
-            return None
-        width = round(found.native_width * REDUCED / longest)
-        self.warnings.append(
-            f"frames of {found.native_width}x{found.native_height} are stored at a width of {width}"
-            " (--width keeps more)"
-        )
-        return width
 
     def _evidence(self) -> None:
         # all estimates before the slow stages, so that errors in them are reported at once

@@ -22,15 +22,19 @@ from hoigs.core.storage.fetch import local_path
 from hoigs.preparation.bodies.as_landmarks import BodyFileEstimator
 from hoigs.preparation.bodies.body_file import body_beside
 from hoigs.preparation.clip_writing import write_clip_folder
-from hoigs.preparation.estimates import Estimators
-from hoigs.preparation.estimator_plan import EstimatorPlan, plan_estimators
-from hoigs.preparation.options import PrepareOptions, Preset
+from hoigs.preparation.estimates.plan import EstimatorPlan, plan_estimators
+from hoigs.preparation.estimates.reader import Estimators
+from hoigs.preparation.estimates.readiness import Consent, agree, get_ready
+from hoigs.preparation.options.option_files import (
+    installed_estimators,
+    load_options,
+    refuse_commands,
+)
+from hoigs.preparation.options.prepare_options import PrepareOptions, Preset
+from hoigs.preparation.options.prompt_file import with_stored
+from hoigs.preparation.options.prompts import with_prompts
 from hoigs.preparation.pipeline import Pipeline
-from hoigs.preparation.prompt_file import with_stored
-from hoigs.preparation.prompts import with_prompts
-from hoigs.preparation.readiness import Consent, agree, get_ready
 from hoigs.preparation.report.report import PrepareReport
-from hoigs.preparation.settings import installed_estimators, load_options, refuse_commands
 from hoigs.preparation.stages.cleanup import Cleanup
 from hoigs.preparation.stages.plan import PLAN, check_stage, with_dependents
 from hoigs.preparation.stages.progress import Stages

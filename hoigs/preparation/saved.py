@@ -23,21 +23,21 @@ from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.cameras.choose import ChosenCameras
-from hoigs.preparation.entity_masks import EntityMasks
-from hoigs.preparation.estimates import (
+from hoigs.preparation.entities.entity_masks import EntityMasks
+from hoigs.preparation.entities.nobody import Nobody
+from hoigs.preparation.entities.person import FittedBody, FittedPeople
+from hoigs.preparation.estimates.given import GivenMasks, RawLandmarks
+from hoigs.preparation.estimates.reader import (
     FoundObject,
     RawEstimates,
     RawPerson,
     UndistortedEstimates,
     UndistortedPerson,
 )
-from hoigs.preparation.given import GivenMasks, RawLandmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.nobody import Nobody
-from hoigs.preparation.objects.ball import BallTrack
+from hoigs.preparation.objects.ball.track import BallTrack
 from hoigs.preparation.objects.make_object import MadeObject
 from hoigs.preparation.objects.tracked import ObjectConfidence
-from hoigs.preparation.person import FittedBody, FittedPeople
 from hoigs.preparation.scene.depth import DepthFit
 from hoigs.preparation.scene.scene_points import ScenePoints
 from hoigs.preparation.stages.work_folder import Result

@@ -16,11 +16,11 @@ from torch import nn
 from hoigs.compression.compact import COMPOSED, read_compact
 from hoigs.compression.compact import FORMAT as COMPACT
 from hoigs.core.errors import CheckpointError
-from hoigs.core.json_file import read_json, short, validated
+from hoigs.core.files.json_file import read_json, short, validated
+from hoigs.core.files.whole_files import write_whole, written_whole
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.storage.tensor_files import TensorFile, save_tensors
 from hoigs.core.time_rows import timed_parameters
-from hoigs.core.whole_files import write_whole, written_whole
 from hoigs.runs.records import CheckpointRecord, CompactRecord
 
 FORMAT = "hoigs-checkpoint"

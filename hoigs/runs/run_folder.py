@@ -17,16 +17,16 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.folder_lock import FolderLock
-from hoigs.core.json_file import read_json, validated
-from hoigs.core.safe_replace import (
+from hoigs.core.files.folder_lock import FolderLock
+from hoigs.core.files.json_file import read_json, validated
+from hoigs.core.files.safe_replace import (
     Layout,
     one_of,
     put_in_place,
     refuse_unwritable,
     require_replaceable,
 )
-from hoigs.core.whole_files import failures_named, write_whole
+from hoigs.core.files.whole_files import failures_named, write_whole
 from hoigs.runs.records import MetricsRecord, Provenance, StepRecord
 
 PACKAGES = ("hoigs", "torch", "warp-lang", "kornia", "pluggy", "numpy")

@@ -12,9 +12,9 @@ import torch
 from hoigs.core.clip_folder.health import examine, require_useful
 from hoigs.core.diagnostics import Diagnostic
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.safe_replace import refuse_within
 from hoigs.core.model.compose import compose, compose_density
 from hoigs.core.registry.registry import Registry, default_registry
-from hoigs.core.safe_replace import refuse_within
 from hoigs.core.spec.fits import require_fitting
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
@@ -31,7 +31,8 @@ from hoigs.runs.resuming import (
     own_spec,
 )
 from hoigs.runs.run_folder import RunFolder, command_line, versions
-from hoigs.training.trainer import StepReport, Trainer
+from hoigs.training.reports import StepReport
+from hoigs.training.trainer import Trainer
 
 
 @dataclass

@@ -5,15 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
 
 import torch
 
 from hoigs.core.clip_folder.health import depth_factor
-from hoigs.core.errors import CheckpointError, Interrupted
+from hoigs.core.errors import Interrupted
 from hoigs.core.interfaces.deformation import DeformationModel, StepStatistics
-from hoigs.core.interfaces.density import DensityControl, DensityStatistics, check_rasterizer
+from hoigs.core.interfaces.density import DensityControl, check_rasterizer
 from hoigs.core.machine.busy import short_waits_when_busy
 from hoigs.core.model.camera_refinement import CameraRefinement, check_camera_gradients
 from hoigs.core.model.scene import SceneModel
@@ -22,14 +21,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip, Frame
 from hoigs.core.values.moment import Moment
 from hoigs.metrics.lpips import Lpips
-from hoigs.metrics.psnr import psnr, region_psnr
-from hoigs.runs.checkpoint import (
-    FORMAT,
-    VERSION,
-    Checkpoint,
-    restore_cameras,
-    restore_model,
-)
+from hoigs.runs.checkpoint import Checkpoint
 from hoigs.runs.run_folder import RunFolder
 from hoigs.training.checkpointing import CheckpointWriter
 from hoigs.training.density_update import EntityDensity, evolve
@@ -42,34 +34,13 @@ from hoigs.training.nan_guard import (
 )
 from hoigs.training.objective import JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
+from hoigs.training.reports import StepReport, preview_scores
 from hoigs.training.sampler import EpochSampler
 from hoigs.training.stop_request import StopRequest, resume_command
 from hoigs.training.time_windows import TimeWindows
+from hoigs.training.training_state import checkpoint_of, restore
 from hoigs.training.unseen import Filling
 from hoigs.training.views import TrainingViews
-
-
-@dataclass(frozen=True)
-class StepReport:
-    """One logged step: a line of `metrics.jsonl`, and the argument of `on_step`.
-
-    Attributes:
-        time_s: of training since the run began, previews aside. loss: the weighted sum.
-        losses: unweighted terms. counts: Gaussians by entity. psnr: of previews by split, dB.
-    """
-
-    step: int
-    time_s: float
-    loss: float
-    losses: dict[str, float]
-    counts: dict[str, int]
-    psnr: dict[str, float] = field(default_factory=dict)
-
-    def record(self) -> dict[str, Any]:
-        record = dict(vars(self))
-        if not self.psnr:
-            del record["psnr"]
-        return record
 
 
 class Trainer:
@@ -320,88 +291,23 @@ class Trainer:
             psnr=self._preview() if scored else {},
         )
 
-    @torch.no_grad()
-    def _preview(self, frames: int = 4) -> dict[str, float]:
-        """PSNR on a few frames of each split, for the curves of the report."""
-        scores = {}
-        for split, positions in self.clip.split.items():
-            stride = max(1, len(positions) // frames)
-            values = []
-            for position in list(positions)[::stride][:frames]:
-                frame = self.clip[position]
-                moment = frame.moment.to(self.model.device)
-                color = self.model.render(moment, self._camera(frame)).color
-                color = color.cpu().clamp(0, 1)
-                if frame.ignored is None:
-                    values.append(float(psnr(color, frame.rgb)))
-                elif not frame.ignored.all():
-                    values.append(float(region_psnr(color, frame.rgb, ~frame.ignored)))
-            if values:
-                scores[split] = sum(values) / len(values)
-        return scores
+    def _preview(self) -> dict[str, float]:
+        return preview_scores(self.clip, self._draw)
+
+    def _draw(self, frame: Frame) -> torch.Tensor:
+        moment = frame.moment.to(self.model.device)
+        return self.model.render(moment, self._camera(frame)).color
 
     def checkpoint(self) -> Checkpoint:
         """The complete state of training; see Checkpoint."""
-        finished = self.step == self.spec.steps
-        files = {} if self.windows is None else self.windows.files(finished)
-        tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
-        tensors |= {f"optimizer.{k}": v for k, v in self.optimizer.tensors().items()}
-        for name, density in self.density.items():
-            tensors |= {f"density.{name}.{k}": v for k, v in vars(density.statistics).items()}
-        if self.cameras is not None:
-            tensors |= {f"cameras.{k}": v for k, v in self.cameras.state_dict().items()}
-        if self.windows is not None:
-            tensors |= {f"windows.{k}": v for k, v in self.windows.state().items()}
-        tensors |= {f"hidden.{k}": v for k, v in self.unseen.hidden.items()}
-        tensors["rng.generator"] = self.generator.get_state()
-        tensors["rng.torch"] = torch.get_rng_state()
-        meta = {
-            "format": FORMAT,
-            "version": VERSION,
-            "step": self.step,
-            "time_s": self.elapsed,
-            "counts": self.model.count(),
-            "sampler": self.sampler.state(),
-            "skipped": self.guard.skipped,
-            **self.identity,
-        }
-        return Checkpoint(tensors, meta, files)
+        return checkpoint_of(self, finished=self.step == self.spec.steps)
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Restore a checkpoint; the rest of the run then equals an unbroken one.
 
         Raises:
-            CheckpointError: it belongs to another spec or clip, or holds a model alone.
+            CheckpointError: it belongs to another spec or clip, is damaged, or holds a model alone.
         """
-        if not checkpoint.part("optimizer"):
-            raise CheckpointError(
-                f"the checkpoint of step {checkpoint.meta['step']} was pruned or compressed: it "
-                "has a model, but no optimizer state to resume with"
-            )
-        try:
-            self._restore(checkpoint)
-        except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
-            raise CheckpointError(
-                f"the checkpoint of step {checkpoint.meta['step']} is damaged: {error}"
-            ) from error
+        restore(self, checkpoint)
         if self.run is not None:
             self.run.cut_metrics(self.step)
-
-    def _restore(self, checkpoint: Checkpoint) -> None:
-        restore_model(self.model, checkpoint, self.hashes)
-        restore_cameras(self.cameras, checkpoint)
-        self.optimizer.load_tensors(checkpoint.part("optimizer"))
-        for name, density in self.density.items():
-            stored = checkpoint.part(f"density.{name}")
-            density.statistics = DensityStatistics.zeros(len(density.entity), self.model.device)
-            for key, value in stored.items():
-                setattr(density.statistics, key, value.to(self.model.device).clone())
-        hidden = checkpoint.part("hidden")
-        self.unseen.hidden = {name: kept.to(self.model.device) for name, kept in hidden.items()}
-        self.generator.set_state(checkpoint.tensors["rng.generator"])
-        torch.set_rng_state(checkpoint.tensors["rng.torch"])
-        self.sampler.load(checkpoint.meta["sampler"])
-        if self.windows is not None:
-            self.windows.load(checkpoint.part("windows"))
-        self.step = checkpoint.meta["step"]
-        self.elapsed = checkpoint.meta["time_s"]

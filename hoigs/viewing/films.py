@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.files.video_files import SUFFIXES, WITH_ALPHA, write_video
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.machine.busy import short_waits_when_busy
 from hoigs.core.machine.pages import PIECE, release_time_rows
@@ -22,7 +23,6 @@ from hoigs.core.values.between import frame_numbers
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.moment import Moment
-from hoigs.core.video_files import SUFFIXES, WITH_ALPHA, write_video
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.camera_files import rate_of
 from hoigs.viewing.frames import dithered, fitted, read_background, source_frame

@@ -11,7 +11,7 @@ import torch
 from hoigs.core.maths.rotations import normalize_quats, quats_to_matrices
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.viewing.html.tracks import RIGID_M, STEADY, pose_of, remaining, rgba_of
-from hoigs.viewing.viewer.drawing import RunDrawing
+from hoigs.viewing.viewer.pictures.run_drawing import RunDrawing
 from hoigs.viewing.viewer.settings import Settings
 
 GROWN = 50.0  # viser keeps covariances in float16, in which those of millimetres would be lost

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import hoigs
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.safe_replace import refuse_unwritable
+from hoigs.core.files.whole_files import written_whole
 from hoigs.core.registry.registry import default_registry
-from hoigs.core.safe_replace import refuse_unwritable
-from hoigs.core.whole_files import written_whole
 from hoigs.runs.run_folder import RunFolder
 from hoigs.workflows.doctor import doctor
 

@@ -175,7 +175,7 @@ def codec_rows() -> list[Inspected]:
     """The encoders that films need, and the decoders of usual videos, in this build of PyAV."""
     import av
 
-    from hoigs.core.video_files import ENCODERS
+    from hoigs.core.files.video_files import ENCODERS
 
     rows = []
     wanted: list[tuple[str, Literal["r", "w"], str]]

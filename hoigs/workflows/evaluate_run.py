@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from hoigs.core.errors import HoigsError, did_you_mean
-from hoigs.core.folder_lock import FolderLock
+from hoigs.core.files.folder_lock import FolderLock
 from hoigs.core.progress import Progress
 from hoigs.core.spec.train_schema import EvaluationSpec
 from hoigs.evaluation.evaluate import evaluate

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import HoigsError, did_you_mean
-from hoigs.core.folder_lock import FolderLock
+from hoigs.core.files.folder_lock import FolderLock
 from hoigs.core.model.compose import compose_bodies
 from hoigs.core.model.exporter import SHEET, Exported, Exporter, ExportRequest
 from hoigs.core.progress import Progress, no_progress

@@ -20,6 +20,7 @@ from hoigs.core.clip_folder.format import HEADER, is_clip_folder
 from hoigs.core.clip_folder.track_files import save_body
 from hoigs.core.clip_folder.write import refuse_to_overwrite, replace_folder
 from hoigs.core.errors import ClipError, SpecError
+from hoigs.core.files.whole_files import write_whole
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.machine.busy import short_waits_when_busy
 from hoigs.core.model.compose import compose, compose_density
@@ -27,7 +28,6 @@ from hoigs.core.progress import Progress, no_progress
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import POSES_EXACT, BodyTrack, Clip
-from hoigs.core.whole_files import write_whole
 from hoigs.plugins.deformation.avatars.body.skinned_body import SkinnedBody
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_folder, read_clip, require_folder

@@ -14,8 +14,8 @@ from hoigs.core.errors import HoigsError, Interrupted
 from hoigs.core.progress import Progress
 from hoigs.core.spec.schema import Spec
 from hoigs.evaluation.report.sections import clock
+from hoigs.training.reports import StepReport
 from hoigs.training.session import Session
-from hoigs.training.trainer import StepReport
 from hoigs.viewing.live import LiveView
 from hoigs.viewing.viewer.server import LOCAL
 from hoigs.workflows.budget import plan_budget

@@ -9,7 +9,7 @@ import pytest
 
 from hoigs.cli.common import print_table
 from hoigs.cli.prepare import _announce
-from hoigs.preparation.estimator_plan import Choice, EstimatorPlan
+from hoigs.preparation.estimates.plan import Choice, EstimatorPlan
 
 WIDE = [f"a column with a long title, number {i}" for i in range(9)]
 

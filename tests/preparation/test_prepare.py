@@ -20,7 +20,7 @@ from hoigs.core.errors import ClipError, HoigsError, SpecError
 from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.preparation import place_objects
+from hoigs.preparation.entities import place_objects
 from hoigs.preparation.objects.make_object import MadeObject, make_object
 from hoigs.preparation.prepare import PrepareOptions, PrepareReport, prepare
 from hoigs.preparation.video.frames import VideoFrames

@@ -27,10 +27,10 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.estimators.common.environments import MEDIAPIPE
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.preparation.estimator_plan import EstimatorPlan, plan_estimators
-from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.estimates.plan import EstimatorPlan, plan_estimators
+from hoigs.preparation.options.prepare_options import PrepareOptions
+from hoigs.preparation.options.prompts import with_prompts
 from hoigs.preparation.prepare import prepare, work_folder
-from hoigs.preparation.prompts import with_prompts
 from hoigs.preparation.stages.plan import PLAN
 from hoigs.preparation.video.source import SourceError, find_source
 

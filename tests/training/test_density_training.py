@@ -22,7 +22,8 @@ from hoigs.plugins.density.budget import BudgetDensity
 from hoigs.plugins.density.mcmc import McmcDensity
 from hoigs.plugins.density.none import NoDensity
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.training.trainer import StepReport, Trainer
+from hoigs.training.reports import StepReport
+from hoigs.training.trainer import Trainer
 
 STEPS, SHORT, CAP = 60, 20, 150
 # several times the usual rates, so that tens of steps tell

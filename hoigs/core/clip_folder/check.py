@@ -22,7 +22,7 @@ from hoigs.core.clip_folder.format import (
 )
 from hoigs.core.diagnostics import ranges
 from hoigs.core.errors import ClipError
-from hoigs.core.npz import array_headers
+from hoigs.core.files.npz import array_headers
 
 RATE_TOLERANCE = 0.01  # of fps, against the mean rate of times
 _HEADER_FROM = "clip.json comes from `hoigs prepare VIDEO --out FOLDER` or ClipWriter"

@@ -10,7 +10,7 @@ import numpy as np
 from hoigs.core.clip_folder.diagnostics import FileDiagnostic, absent, wrong
 from hoigs.core.clip_folder.format import FileSpec
 from hoigs.core.diagnostics import ranges
-from hoigs.core.npz import ArrayHeader, array_headers, load_arrays
+from hoigs.core.files.npz import ArrayHeader, array_headers, load_arrays
 
 ROTATION_TOLERANCE = 1e-3  # of R R^T - I, generous to float16 and text files
 LARGEST = 1e7  # absolute value of any number: float32 has no centimetres left there

@@ -29,7 +29,7 @@ from hoigs.core.clip_folder.format import (
     mask_path,
 )
 from hoigs.core.diagnostics import Severity
-from hoigs.core.npz import array_headers, load_arrays
+from hoigs.core.files.npz import array_headers, load_arrays
 
 TAIL = 1024  # bytes in which an image file ends, whatever a program wrote after it
 MOST_ABSENT = 10_000  # images; where more are absent, the number of frames is wrong

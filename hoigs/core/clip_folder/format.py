@@ -11,9 +11,9 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from hoigs.core.json_file import parse_json, short
+from hoigs.core.files.json_file import parse_json, short
+from hoigs.core.files.safe_replace import Layout, one_of
 from hoigs.core.names import NAME, RULE
-from hoigs.core.safe_replace import Layout, one_of
 
 FORMAT, VIEWS_FORMAT, VERSION = "hoigs-clip", "hoigs-views", 1
 HEADER, VIEWS = "clip.json", "held_out/views.json"

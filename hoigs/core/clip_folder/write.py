@@ -37,10 +37,10 @@ from hoigs.core.clip_folder.frame_files import (
 )
 from hoigs.core.clip_folder.track_files import save_body, save_object
 from hoigs.core.errors import ClipError
-from hoigs.core.safe_replace import refuse_unwritable, require_replaceable
+from hoigs.core.files.safe_replace import refuse_unwritable, require_replaceable
+from hoigs.core.files.whole_files import failures_named
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, ObjectTrack, uniform_test_split
-from hoigs.core.whole_files import failures_named
 
 
 class ClipWriter:

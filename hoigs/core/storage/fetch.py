@@ -15,7 +15,7 @@ from typing import Any
 
 from hoigs.core.environments.cache import cache_folder
 from hoigs.core.errors import HoigsError
-from hoigs.core.json_file import read_json
+from hoigs.core.files.json_file import read_json
 from hoigs.core.storage.publish import COMPLETE, digest_of
 from hoigs.core.storage.urls import as_url, file_system, named_failures
 

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from hoigs.core.errors import ClipError
-from hoigs.core.npz import MOST_RATIO, SMALL_BYTES
+from hoigs.core.files.npz import MOST_RATIO, SMALL_BYTES
 from hoigs.core.unpickling.pickles import refuse_unknown, storage
 
 WRAPPER = ("joblib.numpy_pickle", "NumpyArrayWrapper")

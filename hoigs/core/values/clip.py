@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from hoigs.core.diagnostics import Diagnostic
+from hoigs.core.files.pixel_cache import PixelCache
 from hoigs.core.maths.frame_times import FrameTimes
-from hoigs.core.pixel_cache import PixelCache
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind

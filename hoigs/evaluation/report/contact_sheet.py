@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from hoigs.core.files.whole_files import written_whole
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.clip import Clip
-from hoigs.core.whole_files import written_whole
 from hoigs.evaluation.report.draw import draw, picture
 
 INK, PAPER, QUIET = (28, 30, 34), (250, 249, 246), (120, 120, 118)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.npz import plain_reason
+from hoigs.core.files.npz import plain_reason
 from hoigs.core.values.clip import BodyTrack
 
 Layout = Mapping[str, tuple[int | str, ...]]

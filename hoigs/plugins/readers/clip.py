@@ -26,10 +26,10 @@ from hoigs.core.clip_folder.format import (
     parse_header,
 )
 from hoigs.core.errors import ClipError
+from hoigs.core.files.npz import load_arrays
+from hoigs.core.files.pixel_cache import PixelCache
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.frame_times import FrameTimes, time_of
-from hoigs.core.npz import load_arrays
-from hoigs.core.pixel_cache import PixelCache
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment

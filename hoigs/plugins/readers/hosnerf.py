@@ -15,10 +15,10 @@ from pydantic import Field
 from torch import Tensor
 
 from hoigs.core.errors import ClipError
+from hoigs.core.files.npz import load_array
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.core.model.smpl_params import betas_of_joints, pose_from_smpl
-from hoigs.core.npz import load_array
 from hoigs.core.unpickling.pickles import load_pickle
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, uniform_test_split
 from hoigs.core.values.lens import Lens

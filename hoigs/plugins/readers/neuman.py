@@ -13,8 +13,8 @@ from jaxtyping import Float
 from pydantic import Field
 
 from hoigs.core.errors import ClipError
+from hoigs.core.files.json_file import short
 from hoigs.core.interfaces.reader import ClipReader
-from hoigs.core.json_file import short
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.core.model.smpl_params import pose_from_smpl
 from hoigs.core.unpickling.joblib_file import load_joblib

@@ -12,16 +12,16 @@ from torch import Tensor
 
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.camera import Camera, pinhole_pixels
-from hoigs.preparation.body.fit_start import Start, first_guess
 from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Found, Unknowns
 from hoigs.preparation.body.ground_scale import ground_scale
 from hoigs.preparation.body.kinematics import Kinematics, Posed, nearest_turn
 from hoigs.preparation.body.landmarks import FEET, TORSO, LandmarkPoints, LandmarkTrack, points_of
 from hoigs.preparation.body.mask_fit import MaskFit, Masks, Project
-from hoigs.preparation.body.motion_prior import MotionPrior
-from hoigs.preparation.body.noise import Noise, robust_weights
 from hoigs.preparation.body.normal_equations import REACH, NormalEquations
-from hoigs.preparation.body.pose_prior import LASTS, PosePrior
+from hoigs.preparation.body.priors.motion import MotionPrior
+from hoigs.preparation.body.priors.noise import Noise, robust_weights
+from hoigs.preparation.body.priors.pose import LASTS, PosePrior
+from hoigs.preparation.body.start.torso import Start, first_guess
 
 GAP = 12  # frames between landmarks that smoothness carries a pose across
 CARRIED = 0.6  # of the steps, in which frames farther off begin one after another

@@ -16,13 +16,13 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.core.windows import Chunking
 from hoigs.preparation.body.fit_problem import FitProblem
-from hoigs.preparation.body.fit_start import first_guess
 from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Found, Joint, Unknowns
 from hoigs.preparation.body.gauss_newton import solve
 from hoigs.preparation.body.kinematics import nearest_turn
 from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.body.mask_fit import Masks
 from hoigs.preparation.body.normal_equations import REACH
+from hoigs.preparation.body.start.torso import first_guess
 
 STRETCHES, SHORTEST = 10, 8  # in which frames that stand for all are taken; frames of one, at least
 

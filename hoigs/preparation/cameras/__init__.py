@@ -2,9 +2,10 @@
 
 - `choose`: `choose_cameras`, the entry.
 - `camera_track`: CameraTrack, from a COLMAP model or of a static camera.
-- `given_cameras`, `megasam`: cameras from files beside the video.
+- `known`: lenses and cameras from files beside the video, one format a module.
 - `sfm`, `colmap_log`: structure from motion by COLMAP.
+- `turning`, `turning_cameras`: a camera that only turns on its spot.
 - `motion`: whether the camera moves.
-- `static_focal`, `focal`, `focal_metadata`: the focal length of a static camera.
+- `focal`: the focal length of a static camera.
 - `multiview`: DyCheck's effective multi-view factors.
 """

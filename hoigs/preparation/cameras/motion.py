@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from hoigs.preparation.cameras.colmap_log import quiet_colmap
 from hoigs.preparation.cameras.turning import SHARE, Pair, turn_share
-from hoigs.preparation.given import GivenMasks
+from hoigs.preparation.estimates.given import GivenMasks
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.resizing import shrink, shrink_mask
 

@@ -16,7 +16,7 @@ from hoigs.core.values.lens import Lens
 from hoigs.preparation.cameras.camera_track import ASSUMED_FOCAL
 from hoigs.preparation.cameras.colmap_log import quiet_colmap
 from hoigs.preparation.cameras.motion import grown
-from hoigs.preparation.given import GivenMasks
+from hoigs.preparation.estimates.given import GivenMasks
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import SourceError
 

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from hoigs.core.diagnostics import ranges
 from hoigs.core.values.lens import Lens
 from hoigs.preparation.cameras.camera_track import CameraTrack, pinhole, static_cameras
+from hoigs.preparation.cameras.focal.still_camera import StaticFocal
 from hoigs.preparation.cameras.motion import (
     ENOUGH,
     WIDTH,
@@ -25,9 +26,8 @@ from hoigs.preparation.cameras.motion import (
     background_features,
     paired,
 )
-from hoigs.preparation.cameras.static_focal import StaticFocal
 from hoigs.preparation.cameras.turning import NEAR, best_turn, degrees, nearest_rotation
-from hoigs.preparation.given import GivenMasks
+from hoigs.preparation.estimates.given import GivenMasks
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import SourceError
 

@@ -1,11 +1,10 @@
 """The object's track and points.
 
 - `make_object`: `make_object`, the entry.
-- `ball`: a tracked ball of known radius. `sphere`: a ball that is known by its round masks.
+- `ball`: balls, by a track or by their masks alone.
 - `tracked`: a held object, from hands, outlines and texture: `hands` (grasps and rests), `crops`
-  (small images), `surface` (the hull), `alignment` (all frames at once), `search`
-  (grasps) and `flights` (throws).
+  (small images), `alignment` (all frames at once), `search` (grasps) and `flights` (throws).
 - `doubts`: what the report warns of, and the overlap of outline and mask.
-- `track`: a held object, from its mask and the hands alone.
-- `shape`: points of a sphere or of an inflated outline, and their colours.
+- `track`, `rests`: a held object, from its mask and the hands alone.
+- `shape`: the points and the surface that an object starts from.
 """

@@ -17,10 +17,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.masks.separate import Images
-from hoigs.preparation.objects.ball import BallTrack, ball_centers
-from hoigs.preparation.objects.doubts import silhouette_ious
-from hoigs.preparation.objects.shape import ColorSampler, sphere_points
-from hoigs.preparation.objects.sphere import (
+from hoigs.preparation.objects.ball.sphere import (
     Cones,
     NoBallError,
     ball_cones,
@@ -28,6 +25,9 @@ from hoigs.preparation.objects.sphere import (
     contact_radius,
     require_round,
 )
+from hoigs.preparation.objects.ball.track import BallTrack, ball_centers
+from hoigs.preparation.objects.doubts import silhouette_ious
+from hoigs.preparation.objects.shape.first_points import ColorSampler, sphere_points
 from hoigs.preparation.objects.track import held_object
 from hoigs.preparation.objects.tracked import ObjectConfidence, UntrackableError, tracked_object
 

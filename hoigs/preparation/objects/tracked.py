@@ -29,8 +29,8 @@ from hoigs.preparation.objects.crops import Crops, make_crops
 from hoigs.preparation.objects.flights import flights_by_texture
 from hoigs.preparation.objects.hands import HandMotion, along_bones, hand_motion, no_hands
 from hoigs.preparation.objects.search import grasps_by_texture
-from hoigs.preparation.objects.surface import hull, with_samples
-from hoigs.preparation.objects.unseen_side import completed
+from hoigs.preparation.objects.shape.surface import hull, with_samples
+from hoigs.preparation.objects.shape.unseen_side import completed
 
 FEWEST = 8  # frames that show the object whole
 SMALLEST = 10  # pixels across, median

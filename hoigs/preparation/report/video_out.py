@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from hoigs.core.video_files import coded, declare_colors
+from hoigs.core.files.video_files import coded, declare_colors
 
 
 class VideoWriter:

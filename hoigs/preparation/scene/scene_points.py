@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.values.camera import Camera
-from hoigs.preparation.entity_masks import EntityMasks
+from hoigs.preparation.entities.entity_masks import EntityMasks
 from hoigs.preparation.masks.separate import Images
 from hoigs.preparation.scene.background_points import (
     PLATE_FRAMES,

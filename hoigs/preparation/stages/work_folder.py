@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from hoigs.core.errors import ClipError
-from hoigs.core.folder_lock import FolderLock
-from hoigs.core.npz import load_arrays
-from hoigs.core.whole_files import failures_named
+from hoigs.core.files.folder_lock import FolderLock
+from hoigs.core.files.npz import load_arrays
+from hoigs.core.files.whole_files import failures_named
 
 TEMPORARY = "."  # names that begin with it are not read, and are removed at the start
 UNFINISHED = "unfinished-"

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.npz import holds
 from hoigs.core.interfaces.estimator import EstimateKind
-from hoigs.core.npz import holds
 from hoigs.core.spec.schema import ComponentSpec
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")

@@ -1,7 +1,7 @@
 """The driver of a batch: runs the stages of rows that no other driver works on.
 
 Any number of drivers may work on one folder, on one machine or on many: the lock of a row's folder
-(`hoigs.core.folder_lock`) admits one of them, and what is done is what lies on disk.
+(`hoigs.core.files.folder_lock`) admits one of them, and what is done is what lies on disk.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.folder_lock import FolderLock
+from hoigs.core.files.folder_lock import FolderLock
 from hoigs.studies.batch.folder import BatchFolder, TakenError
 from hoigs.studies.batch.manifest import Row
 from hoigs.studies.batch.stages import Stage, stages_of

@@ -12,8 +12,8 @@ from itertools import chain
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.folder_lock import FolderLock
-from hoigs.core.whole_files import written_whole
+from hoigs.core.files.folder_lock import FolderLock
+from hoigs.core.files.whole_files import written_whole
 from hoigs.studies.batch.manifest import Row
 
 BATCH = "batch.jsonl"

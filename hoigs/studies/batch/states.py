@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.whole_files import write_whole
+from hoigs.core.files.whole_files import write_whole
 from hoigs.studies.batch.stages import Stage
 
 STATE = "state.json"

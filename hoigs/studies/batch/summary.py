@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from hoigs.core.whole_files import written_whole
+from hoigs.core.files.whole_files import written_whole
 from hoigs.studies.batch.folder import BatchFolder, in_turn
 from hoigs.studies.batch.manifest import Row
 from hoigs.studies.batch.stages import stages_of

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hoigs.core.whole_files import write_whole
+from hoigs.core.files.whole_files import write_whole
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.studies.chart.data import (
     ACCURACY,

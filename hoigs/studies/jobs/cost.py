@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hoigs.core.whole_files import write_whole
+from hoigs.core.files.whole_files import write_whole
 from hoigs.evaluation.protocol import NotComputed, Value, from_json, to_json
 from hoigs.studies.jobs.energy import EnergyMeter, energy_meter, spent
 from hoigs.studies.jobs.job import Job

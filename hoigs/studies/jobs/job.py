@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from hoigs.core.errors import CheckpointError, SpecError
+from hoigs.core.files.whole_files import write_whole
 from hoigs.core.spec.schema import Spec
-from hoigs.core.whole_files import write_whole
 
 RECORD = "job.json"
 SCORES = "evaluation.json"

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.folder_lock import FolderLock
+from hoigs.core.files.folder_lock import FolderLock
 from hoigs.studies.execution.executor import (
     LOST_RETRIES,
     Executor,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from hoigs.core.whole_files import write_whole
+from hoigs.core.files.whole_files import write_whole
 from hoigs.studies.jobs.job import SCORES
 from hoigs.studies.jobs.worker import main, train_job
 from hoigs.studies.stress.job import StressJob

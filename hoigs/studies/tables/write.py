@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from hoigs.core.whole_files import write_whole
+from hoigs.core.files.whole_files import write_whole
 from hoigs.evaluation.geometry import GEOMETRY
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.evaluation.scores import DIGITS, TITLES

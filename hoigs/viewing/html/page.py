@@ -14,12 +14,12 @@ from typing import Any
 import torch
 
 from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.files.whole_files import write_whole
 from hoigs.core.progress import Progress, no_progress
-from hoigs.core.whole_files import write_whole
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.html.packing import packed
 from hoigs.viewing.html.tracks import Track, track_of
-from hoigs.viewing.viewer.drawing import RunDrawing
+from hoigs.viewing.viewer.pictures.run_drawing import RunDrawing
 from hoigs.viewing.viewer.takes import distance_to_subject
 
 EYES = 8  # cameras whose views of a colour are averaged

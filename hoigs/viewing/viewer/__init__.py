@@ -1,6 +1,6 @@
 """The viewer in the browser, on viser.
 
 - `viewer.Viewer`: the server's panel and the loop that draws for every browser.
-- `drawing.RunDrawing`, `clip_drawing.ClipDrawing`: what is drawn.
+- `pictures`: what is drawn, of a run or of a clip.
 - `hoigs.viewing.view.view`: opens all of it.
 """

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from hoigs.viewing.viewer.clock import Clock
-from hoigs.viewing.viewer.drawing import Drawing
-from hoigs.viewing.viewer.panes import Layout
+from hoigs.viewing.viewer.pictures.panes import Layout
+from hoigs.viewing.viewer.pictures.run_drawing import Drawing
 from hoigs.viewing.viewer.settings import Settings
 
 COMPARE: dict[str, tuple[Layout, str]] = {

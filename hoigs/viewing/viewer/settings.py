@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from hoigs.viewing.viewer.drawing import Look
-from hoigs.viewing.viewer.panes import Layout
+from hoigs.viewing.viewer.pictures.panes import Layout
+from hoigs.viewing.viewer.pictures.run_drawing import Look
 
 
 @dataclass

@@ -15,8 +15,8 @@ from jaxtyping import UInt8
 from hoigs.core.maths.rotations import matrices_to_quats, quats_to_matrices, slerp
 from hoigs.core.values.clip import Clip
 from hoigs.viewing.films import write_video
-from hoigs.viewing.viewer.drawing import Drawing, RunDrawing
-from hoigs.viewing.viewer.fitting import nearest_position
+from hoigs.viewing.viewer.pictures.fitting import nearest_position
+from hoigs.viewing.viewer.pictures.run_drawing import Drawing, RunDrawing
 from hoigs.viewing.viewer.views import Vector, View
 
 FILM_FPS = 30

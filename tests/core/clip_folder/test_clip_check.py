@@ -16,7 +16,7 @@ from hoigs.core.clip_folder.check import check_clip, require_clip
 from hoigs.core.clip_folder.diagnostics import summarize, wrong
 from hoigs.core.clip_folder.docs import with_tables
 from hoigs.core.errors import ClipError
-from hoigs.core.npz import load_arrays
+from hoigs.core.files.npz import load_arrays
 
 PAGE = Path(__file__).parents[3] / "docs/reference/clip.md"
 

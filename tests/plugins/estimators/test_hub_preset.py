@@ -22,10 +22,10 @@ from hoigs.core.environments import hub
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import EntityRequest
 from hoigs.core.progress import no_progress
-from hoigs.preparation.estimator_plan import HUB_LICENCES, EstimatorPlan, plan_estimators
-from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.readiness import agree, get_ready
-from hoigs.preparation.settings import installed_estimators
+from hoigs.preparation.estimates.plan import HUB_LICENCES, EstimatorPlan, plan_estimators
+from hoigs.preparation.estimates.readiness import agree, get_ready
+from hoigs.preparation.options.option_files import installed_estimators
+from hoigs.preparation.options.prepare_options import PrepareOptions
 from hoigs.preparation.video.source import find_source
 
 pytest.importorskip("transformers", reason="the extra hoigs[estimators]")

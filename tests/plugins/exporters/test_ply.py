@@ -10,8 +10,7 @@ import torch
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.maths.rotations import axis_angle_to_matrices
-from hoigs.core.maths.sh_rotation import rotate_sh
-from hoigs.core.maths.spherical_harmonics import sh_basis
+from hoigs.core.maths.spherical_harmonics import rotate_sh, sh_basis
 from hoigs.plugins.exporters.common.ply_file import parse_ply, ply_bytes, read_ply
 from hoigs.plugins.exporters.common.world import world_turn
 from hoigs.plugins.exporters.ply import PlyConfig, PlyExporter

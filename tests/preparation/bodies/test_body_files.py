@@ -19,8 +19,8 @@ from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.bodies.as_landmarks import BodyFileEstimator
 from hoigs.preparation.bodies.body_file import body_beside, read_bodies
 from hoigs.preparation.bodies.programs import SMPL_PELVIS, SMPLX_PELVIS
-from hoigs.preparation.body.joint_limits import beyond
-from hoigs.preparation.body.pose_prior import PosePrior
+from hoigs.preparation.body.priors.joint_limits import beyond
+from hoigs.preparation.body.priors.pose import PosePrior
 from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until
 from hoigs.preparation.video.source import SourceError
 

@@ -25,11 +25,11 @@ from hoigs.preparation.body.fit import fit_body
 from hoigs.preparation.body.fit_problem import FitProblem
 from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Unknowns
 from hoigs.preparation.body.ground_scale import ground_scale
-from hoigs.preparation.body.joint_limits import beyond
 from hoigs.preparation.body.landmarks import LandmarkTrack, points_of
-from hoigs.preparation.body.limb_start import limb_pose
 from hoigs.preparation.body.normal_equations import NormalEquations
-from hoigs.preparation.person import stature
+from hoigs.preparation.body.priors.joint_limits import beyond
+from hoigs.preparation.body.start.limbs import limb_pose
+from hoigs.preparation.entities.person import stature
 from hoigs.preparation.report.mesh_overlay import overlay_frame
 
 FRAMES, WIDTH, HEIGHT, FOCAL = 9, 640, 480, 600.0

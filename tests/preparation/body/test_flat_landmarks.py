@@ -19,9 +19,9 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.preparation.body.fit import fit_body
 from hoigs.preparation.body.fit_values import BodyFit
-from hoigs.preparation.body.flat_start import flat_start, relaxed
 from hoigs.preparation.body.landmarks import ENOUGH, SOLID, USED, LandmarkTrack
-from hoigs.preparation.body.placing import place
+from hoigs.preparation.body.start.flat import flat_start, relaxed
+from hoigs.preparation.body.start.placing import place
 
 
 def flat(targets: tuple[int, ...]) -> LandmarkTrack:

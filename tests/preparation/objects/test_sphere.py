@@ -8,8 +8,7 @@ import torch
 
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.objects.make_object import make_object
-from hoigs.preparation.objects.sphere import (
+from hoigs.preparation.objects.ball.sphere import (
     FLESH,
     NoBallError,
     ball_cones,
@@ -18,6 +17,7 @@ from hoigs.preparation.objects.sphere import (
     fit_cone,
     require_round,
 )
+from hoigs.preparation.objects.make_object import make_object
 
 FRAMES, WIDTH, HEIGHT, F, RADIUS = 12, 160, 120, 110.0, 0.11
 CAMERA = Camera(torch.tensor([[F, 0, 80], [0, F, 60], [0, 0, 1]]), torch.eye(4), WIDTH, HEIGHT)

@@ -20,14 +20,14 @@ from hoigs.preparation.objects.crops import make_crops
 from hoigs.preparation.objects.flights import ballistic, flights_by_texture
 from hoigs.preparation.objects.hands import hand_motion, upward
 from hoigs.preparation.objects.make_object import ObjectWay, make_object
-from hoigs.preparation.objects.surface import hull, with_samples
+from hoigs.preparation.objects.shape.surface import hull, with_samples
+from hoigs.preparation.objects.shape.unseen_side import completed
 from hoigs.preparation.objects.tracked import (
     ObjectConfidence,
     UntrackableError,
     between,
     tracked_object,
 )
-from hoigs.preparation.objects.unseen_side import completed
 
 FRAMES, SIZE, FPS = 12, 96, 12.0
 PARENTS = (-1, *range(51))

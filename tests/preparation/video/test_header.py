@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from tiny import FRAMES
 
-from hoigs.preparation.pipeline import Pipeline
+from hoigs.preparation.choose_frames import stored_width
 from hoigs.preparation.video.frames import FrameList
 from hoigs.preparation.video.header import missing_frames, video_header
 
@@ -30,8 +29,8 @@ def test_a_file_that_is_no_video_has_no_header(tmp_path: Path) -> None:
     ("size", "width"), [((3840, 2160), 1280), ((2160, 3840), 720), ((1920, 1080), None)]
 )
 def test_large_frames_are_stored_smaller(size: tuple[int, int], width: int | None) -> None:
-    run = SimpleNamespace(warnings=[])
     found = FrameList(*size, 60.0, 60.0, 3, [0, 1, 2], [1.0] * 3)
-    assert Pipeline._smaller_width(run, found) == width
-    assert bool(run.warnings) == (width is not None)
-    assert all(f"frames of {size[0]}x{size[1]} are stored at a width of" in w for w in run.warnings)
+    stored, notes = stored_width(found)
+    assert stored == width
+    assert len(notes) == (width is not None)
+    assert all(f"frames of {size[0]}x{size[1]} are stored at a width of" in n for n in notes)

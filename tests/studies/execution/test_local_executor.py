@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.folder_lock import FolderLock
+from hoigs.core.files.folder_lock import FolderLock
 from hoigs.studies.execution.executor import Needs, Process, make_executor, stop_all, why_failed
 from hoigs.studies.execution.local import LocalExecutor, visible_gpus
 
@@ -143,7 +143,7 @@ def test_a_process_ends_when_its_lease_is_anothers(tmp_path, monkeypatch):
 HOLDER = """
 import sys, time
 from pathlib import Path
-from hoigs.core.folder_lock import FolderLock
+from hoigs.core.files.folder_lock import FolderLock
 lock = FolderLock(Path(sys.argv[1]), "hoigs batch").acquire()
 print(lock.lease, flush=True)
 time.sleep(60)

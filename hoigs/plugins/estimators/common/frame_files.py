@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.files.npz import plain_reason
 from hoigs.core.interfaces.estimator import VideoRequest
-from hoigs.core.npz import plain_reason
 
 _NUMBER = re.compile(r"\d+")
 SHOWN = 8  # frames or files named in a message; the rest are counted

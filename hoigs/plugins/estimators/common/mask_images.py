@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int
 from PIL import Image
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.npz import load_array
+from hoigs.core.files.npz import load_array
 from hoigs.plugins.estimators.common.frame_files import FileDiagnostics
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 from PIL import Image
 
+from hoigs.core.files.whole_files import written_whole
 from hoigs.core.interfaces.estimator import LazyFrames, VideoRequest
-from hoigs.core.whole_files import written_whole
 from hoigs.plugins.estimators.common import steady_masks
 
 

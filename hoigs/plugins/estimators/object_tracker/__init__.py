@@ -2,13 +2,11 @@
 
 Entry point: `estimator`. In the order in which they work:
 
-- `footage`: the frames, reduced. `camera_motion`: how the picture of the scene moves.
-- `scene`: which pixels differ from the scene behind.
-- `proposal`: what moves and is not the person, where nothing was clicked.
-- `prompts`: the mask in a clicked frame. `colors`, `walker`: what it is made with.
-- `path`: where the object is in each frame. `propagation`: its masks there, by `transfer` of labels
-  between `windows`. `tracker`: both, and again by what is `behind` it, or from `anchors`, frames
-  in which it was found best.
+- `pixels`: the frames, how the picture of the scene moves, and what single pixels say.
+- `proposal`: what moves and is not the person, where nothing was clicked, by `likeness`.
+- `prompts`: the mask in a clicked frame.
+- `path`: where the object is in each frame. `propagation`: its masks there. `tracker`: both, and
+  again by what is `behind` it, or from `anchors`, frames in which it was found best.
 - `alike`: objects of which two tracks claim the same pixels. `notes`: what is doubtful.
 - `tracks_file`: the result, kept.
 """

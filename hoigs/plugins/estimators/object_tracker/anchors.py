@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hoigs.plugins.estimators.object_tracker.colors import bins_of
-from hoigs.plugins.estimators.object_tracker.footage import Footage
+from hoigs.plugins.estimators.object_tracker.pixels.colors import bins_of
+from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, set_off
 from hoigs.plugins.estimators.object_tracker.propagation import Track, window_of
 

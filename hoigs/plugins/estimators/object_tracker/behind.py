@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from hoigs.plugins.estimators.object_tracker.colors import bins_of, histogram
-from hoigs.plugins.estimators.object_tracker.footage import Footage
+from hoigs.plugins.estimators.object_tracker.pixels.colors import bins_of, histogram
+from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage
+from hoigs.plugins.estimators.object_tracker.pixels.scene import StaticScene, scene_behind
+from hoigs.plugins.estimators.object_tracker.pixels.walker import walked
+from hoigs.plugins.estimators.object_tracker.pixels.windows import Window
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
-from hoigs.plugins.estimators.object_tracker.scene import StaticScene, scene_behind
-from hoigs.plugins.estimators.object_tracker.walker import walked
-from hoigs.plugins.estimators.object_tracker.windows import Window
 
 UNKNOWN = 0.3  # share of the object's pixels of which the scene without people says nothing
 AROUND = 0.8  # of the object's radius: so much beside its mask may be its own

@@ -23,10 +23,11 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.core.progress import Progress, no_progress
 from hoigs.plugins.estimators.common.subprocess import settings_key
 from hoigs.plugins.estimators.object_tracker.alike import told_apart
-from hoigs.plugins.estimators.object_tracker.camera_motion import is_static
-from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage
-from hoigs.plugins.estimators.object_tracker.held import skeletons
 from hoigs.plugins.estimators.object_tracker.notes import doubts, nothing_there
+from hoigs.plugins.estimators.object_tracker.pixels.camera_motion import is_static
+from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage, read_footage
+from hoigs.plugins.estimators.object_tracker.pixels.held import skeletons
+from hoigs.plugins.estimators.object_tracker.pixels.scene import Scene, moving_scene, static_scene
 from hoigs.plugins.estimators.object_tracker.prompts import (
     PromptedMask,
     looks_like_person,
@@ -34,7 +35,6 @@ from hoigs.plugins.estimators.object_tracker.prompts import (
 )
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.proposal import proposed
-from hoigs.plugins.estimators.object_tracker.scene import Scene, moving_scene, static_scene
 from hoigs.plugins.estimators.object_tracker.tracker import at_rest, color_model, followed
 from hoigs.plugins.estimators.object_tracker.tracks_file import read_tracks, write_tracks
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from hoigs.core.interfaces.estimator import EntityRequest, FramePrompt
-from hoigs.plugins.estimators.object_tracker.footage import Footage
+from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 
 WEAK = 0.6  # confidence below which a frame is named in a note

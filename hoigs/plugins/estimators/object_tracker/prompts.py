@@ -9,11 +9,16 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from hoigs.core.interfaces.estimator import FramePrompt
-from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram, odds_of
-from hoigs.plugins.estimators.object_tracker.footage import Footage
-from hoigs.plugins.estimators.object_tracker.scene import Scene, median_of
-from hoigs.plugins.estimators.object_tracker.walker import walked
-from hoigs.plugins.estimators.object_tracker.windows import Window
+from hoigs.plugins.estimators.object_tracker.pixels.colors import (
+    ColorModel,
+    bins_of,
+    histogram,
+    odds_of,
+)
+from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage
+from hoigs.plugins.estimators.object_tracker.pixels.scene import Scene, median_of
+from hoigs.plugins.estimators.object_tracker.pixels.walker import walked
+from hoigs.plugins.estimators.object_tracker.pixels.windows import Window
 
 RADII = (0.025, 0.04, 0.06, 0.09, 0.13, 0.19)  # of the object, in diagonals of the image
 ROUNDS = 4

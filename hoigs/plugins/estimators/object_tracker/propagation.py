@@ -9,14 +9,14 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.behind import Behind
-from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram
-from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
 from hoigs.plugins.estimators.object_tracker.path import Path, center_of, found_path
+from hoigs.plugins.estimators.object_tracker.pixels.colors import ColorModel, bins_of, histogram
+from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage, to_features
+from hoigs.plugins.estimators.object_tracker.pixels.scene import Scene
+from hoigs.plugins.estimators.object_tracker.pixels.transfer import shift_of, transferred
+from hoigs.plugins.estimators.object_tracker.pixels.walker import walked
+from hoigs.plugins.estimators.object_tracker.pixels.windows import Window
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
-from hoigs.plugins.estimators.object_tracker.scene import Scene
-from hoigs.plugins.estimators.object_tracker.transfer import shift_of, transferred
-from hoigs.plugins.estimators.object_tracker.walker import walked
-from hoigs.plugins.estimators.object_tracker.windows import Window
 
 AGAIN, AHEAD = 6, 14  # frames after which the path is found anew, and how far
 SURE = 0.35  # confidence below which the object counts as not seen

@@ -11,12 +11,17 @@ from jaxtyping import Bool, Float
 
 from hoigs.plugins.estimators.object_tracker.anchors import anchors
 from hoigs.plugins.estimators.object_tracker.behind import Behind
-from hoigs.plugins.estimators.object_tracker.colors import ColorModel, bins_of, histogram
-from hoigs.plugins.estimators.object_tracker.footage import Footage
 from hoigs.plugins.estimators.object_tracker.path import Path, found_path, path_of
+from hoigs.plugins.estimators.object_tracker.pixels.colors import ColorModel, bins_of, histogram
+from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage
+from hoigs.plugins.estimators.object_tracker.pixels.scene import (
+    MovingScene,
+    Scene,
+    StaticScene,
+    median_of,
+)
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overlap
 from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Track
-from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, StaticScene, median_of
 
 SAME = 0.7  # intersection over union from which two passes agree on a frame
 

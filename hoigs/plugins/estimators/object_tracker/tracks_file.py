@@ -16,7 +16,7 @@ from hoigs.core.interfaces.estimator import (
     PromptPoint,
     VideoRequest,
 )
-from hoigs.plugins.estimators.object_tracker.footage import Footage
+from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 
 

@@ -13,7 +13,7 @@ from hoigs.core.maths.rotations import (
     matrices_to_quats,
     multiply_quats,
 )
-from hoigs.core.maths.sh_rotation import rotate_sh
+from hoigs.core.maths.spherical_harmonics import rotate_sh
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import Gaussians
 

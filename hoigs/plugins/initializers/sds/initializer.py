@@ -21,10 +21,10 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.npz import load_arrays
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.initializer import ObjectInitializer
 from hoigs.core.interfaces.rasterizer import Rasterizer
-from hoigs.core.npz import load_arrays
 from hoigs.core.values.clip import Clip, ObjectTrack
 from hoigs.plugins.initializers.alignment import AlignmentConfig, PlacingConfig, align, most_seen
 from hoigs.plugins.initializers.sds.diffusion import Denoiser

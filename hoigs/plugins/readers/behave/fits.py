@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.errors import ClipError
-from hoigs.core.npz import load_arrays
+from hoigs.core.files.npz import load_arrays
 from hoigs.core.unpickling.pickles import load_pickle
 from hoigs.plugins.readers.common.listing import Need
 from hoigs.plugins.readers.common.numbers import entry, numbers

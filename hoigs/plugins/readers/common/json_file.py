@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from hoigs.core.errors import ClipError
-from hoigs.core.json_file import read_json
+from hoigs.core.files.json_file import read_json
 
 Model = TypeVar("Model", bound=BaseModel)
 SHOWN = 6  # problems listed for one file

@@ -13,8 +13,8 @@ from PIL import Image
 from torch import Tensor
 
 from hoigs.core.errors import ClipError
-from hoigs.core.npz import load_array, load_arrays
-from hoigs.core.pixel_cache import PixelCache
+from hoigs.core.files.npz import load_array, load_arrays
+from hoigs.core.files.pixel_cache import PixelCache
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import FrameStore
 from hoigs.core.values.lens import Lens

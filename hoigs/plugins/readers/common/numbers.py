@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hoigs.core.errors import ClipError
-from hoigs.core.json_file import short
+from hoigs.core.files.json_file import short
 
 
 def numbers(value: Any, where: str, *shape: int, flat: bool = False) -> np.ndarray:

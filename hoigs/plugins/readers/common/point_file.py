@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.errors import ClipError
-from hoigs.core.npz import load_array
+from hoigs.core.files.npz import load_array
 
 Points = tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]
 GREY = 0.5  # of points whose file has no colours

@@ -12,7 +12,7 @@ import torch
 from pydantic import BaseModel, Field
 
 from hoigs.core.errors import ClipError
-from hoigs.core.json_file import short
+from hoigs.core.files.json_file import short
 from hoigs.core.values.lens import Lens
 from hoigs.plugins.readers.common.colmap_model import View, model_folder, read_sparse, sparse_needs
 from hoigs.plugins.readers.common.frame_order import IMAGE_SUFFIXES

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.safe_replace import Layout, one_of, require_replaceable
 from hoigs.core.registry.registry import Registry
-from hoigs.core.safe_replace import Layout, one_of, require_replaceable
 from hoigs.studies.needs.refit import UNSEEN
 from hoigs.studies.needs.report.plot import draw
 from hoigs.studies.needs.report.spec import checked_spec, spec_text

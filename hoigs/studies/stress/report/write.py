@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from hoigs.core.whole_files import write_whole
+from hoigs.core.files.whole_files import write_whole
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.studies.stress.capability import MEANING as HAS
 from hoigs.studies.stress.case import Case

@@ -1,0 +1,1 @@
+"""The focal length of a still camera: `still_camera.py` chooses."""

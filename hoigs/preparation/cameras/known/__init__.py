@@ -1,0 +1,1 @@
+"""Cameras and lenses that others have found: one file format a module."""

@@ -1,0 +1,4 @@
+"""Balls.
+
+- `track`: an image disc a frame, of known radius. `sphere`: known by its round masks alone.
+"""

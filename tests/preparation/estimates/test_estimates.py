@@ -1,0 +1,208 @@
+"""Estimators by options stand in for the files beside a video; folders of frames for the video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny import FRAMES, HEIGHT, WIDTH, landmarks, masks, picture
+
+from hoigs.core.clip_folder.check import check_clip
+from hoigs.core.errors import HoigsError, SpecError
+from hoigs.core.interfaces.estimator import Estimates, Estimator, Landmarks
+from hoigs.plugins.bodies.anny import AnnyBody
+from hoigs.plugins.readers.clip import ClipFolderReader
+from hoigs.preparation.options.option_files import load_options
+from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until, work_folder
+from hoigs.preparation.video.frames import FolderFrames, VideoFrames, open_frames
+from hoigs.preparation.video.source import SourceError, find_source, numbered_frames
+
+QUICK = ["fit_steps=3", "overlay_width=0"]
+
+
+@pytest.fixture
+def bare_frames(tmp_path: Path) -> Path:
+    """A folder of frames alone, and evidence somewhere else."""
+    frames, other = tmp_path / "bare", tmp_path / "estimators"
+    frames.mkdir()
+    for name in ("human", "object"):
+        (other / "sam2" / name).mkdir(parents=True)
+    for i in range(FRAMES):
+        Image.fromarray(picture(i)).save(frames / f"frame_{i}.png")
+        for name, mask in zip(("human", "object"), masks(i), strict=True):
+            Image.fromarray(mask).save(other / f"sam2/{name}/{i:05d}.png")
+    np.savez(other / "pose.npz", **landmarks())
+    return frames
+
+
+def test_frames_alone_with_priors_by_options(bare_frames: Path, tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(
+        "estimators:\n  masks: {use: 'estimator:masks-files', path: ../estimators/sam2}\n"
+        "folder_fps: 12\n"
+    )
+    settings = [
+        "estimators.landmarks.use=estimator:landmarks-files",
+        "estimators.landmarks.path=../estimators/pose.npz",
+    ]
+    options = load_options(file, settings + QUICK, {"max_frames": 8, "every": None})
+    out = tmp_path / "clip"
+    report = prepare(bare_frames, out, body=AnnyBody(), options=options)
+    assert check_clip(out) == [] and report.frames == 8 and report.fps == 12
+    clip = ClipFolderReader().read(out)
+    for i in (0, 7):
+        for name, mask in zip(("human", "object"), masks(i), strict=True):
+            found = clip[i].masks[name].numpy()
+            assert (found == mask).mean() > 0.999
+    # edited masks are seen by the next run
+    (bare_frames.parent / "estimators/sam2/object/00003.png").unlink()
+    with pytest.raises(HoigsError, match="lacks 1 of 8 frames: 3"):
+        prepare(bare_frames, out, body=AnnyBody(), options=options, redo=["writing"])
+
+
+def test_frames_are_ordered_by_number(bare_frames: Path) -> None:
+    names = [p.name for p in numbered_frames(bare_frames)]
+    assert names[:3] == ["frame_0.png", "frame_1.png", "frame_2.png"] and len(names) == FRAMES
+    frames = open_frames(bare_frames, every=4, rate=12)
+    assert isinstance(frames, FolderFrames) and frames.fps == 3 and frames.indices == [0, 4, 8]
+    for i, image in zip(frames.indices, frames, strict=True):
+        np.testing.assert_array_equal(image, picture(i))
+    np.testing.assert_array_equal(frames.read(5), picture(5))
+    Image.new("RGB", (8, 8)).save(bare_frames / "frame_99.png")
+    with pytest.raises(SourceError, match="frame 12 is 8x8, the first 96x64"):
+        open_frames(bare_frames)
+
+
+def test_a_folder_may_keep_frames_inside(bare_frames: Path, tmp_path: Path) -> None:
+    inside = tmp_path / "folder/frames"
+    inside.parent.mkdir()
+    bare_frames.rename(inside)
+    found = find_source(inside.parent, given={"masks", "landmarks"})
+    assert found.video == inside and found.folder == inside.parent
+    assert not found.beside
+
+
+def test_the_sharpest_of_each_window(tmp_path: Path) -> None:
+    from scipy import ndimage
+
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    sharp = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+    best = {1, 3, 8}
+    for i in range(9):
+        image = sharp if i in best else ndimage.gaussian_filter(sharp, (2, 2, 0))
+        Image.fromarray(image).save(folder / f"{i}.png")
+    assert open_frames(folder, every=3, pick="sharpest").indices == [1, 3, 8]
+    assert open_frames(folder, every=3).indices == [0, 3, 6]
+    at_ten = open_frames(folder, fps=10, rate=30, pick="sharpest", max_frames=2)
+    assert at_ten.indices == [1, 3] and at_ten.fps == 10
+    with pytest.raises(SourceError, match="more than the video's 30"):
+        open_frames(folder, fps=31, rate=30)
+
+
+def test_a_video_reads_any_frame(tiny_video: Path) -> None:
+    video = VideoFrames(tiny_video, width=48, max_frames=2)
+    assert video.count() == FRAMES
+    for number in (3, 7, 2):
+        image = video.read(number)
+        assert np.abs(image.astype(int) - picture(number)).mean() < 6
+    with pytest.raises(SourceError, match="12 frames, none of number 40"):
+        video.read(40)
+
+
+def test_wrong_settings_are_named_with_their_place(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("estimators:\n  masks: {use: 'estimator:masks-files', pth: sam2}\n")
+    with pytest.raises(
+        SpecError, match=r"mine\.yaml:2:.* estimators\.masks\.pth.*did you mean .path"
+    ):
+        load_options(file)
+    with pytest.raises(
+        SpecError, match=r"estimators\.depth\.use: .initializer:sfm. gives no depth"
+    ):
+        load_options(None, ["estimators.depth.use=initializer:sfm"])
+    with pytest.raises(SpecError, match=r"evry: unknown key; did you mean .every"):
+        load_options(None, ["evry=2"])
+
+
+class FlatPrior(Estimator):
+    """Landmarks in the image alone."""
+
+    provides = frozenset({"landmarks"})
+
+    def estimate(self, video, progress=lambda done, text: None) -> Estimates:
+        track = Landmarks(landmarks()["image_xyzv"], None, "flat")
+        return Estimates(landmarks={"human": track})
+
+
+def test_landmarks_without_space_are_enough(tiny_source: Path, tmp_path: Path) -> None:
+    report = prepare(
+        tiny_source, tmp_path / "clip", body=AnnyBody(),
+        options=PrepareOptions(fit_steps=30, overlay_width=0),
+        estimators={"landmarks": FlatPrior()},
+    )  # fmt: skip
+    assert check_clip(tmp_path / "clip") == [] and report.body_residual_px < 4
+    assert "known in the image only" in " ".join(report.warnings)
+
+
+def test_a_prior_of_other_evidence_is_refused(tiny_source: Path, tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="FlatPrior provides landmarks, not masks"):
+        prepare_until(
+            "evidence", tiny_source, tmp_path / "clip", body=AnnyBody(),
+            options=PrepareOptions(fit_steps=3), estimators={"masks": FlatPrior()},
+        )  # fmt: skip
+
+
+def test_depth_beside_the_video_says_what_it_is_or_is_left_out(
+    tiny_source: Path, tmp_path: Path
+) -> None:
+    (tiny_source / "depth").mkdir()
+    options = PrepareOptions(fit_steps=3, overlay_width=0)
+    for name, used in (("values", False), ("metric_depth", True)):
+        for i in range(FRAMES):
+            depth = np.full((HEIGHT, WIDTH), 2.8, np.float32)
+            np.savez(tiny_source / f"depth/{i:05d}.npz", **{name: depth})
+        out = tmp_path / name
+        report = prepare(tiny_source, out, body=AnnyBody(), options=options)
+        left_out = [
+            w for w in report.warnings if w.startswith("depth/ beside the video is not used")
+        ]
+        assert (report.depth_residual is not None) == used and len(left_out) == (not used)
+        assert used or "does not declare whether it holds metres or disparity" in left_out[0]
+        assert ClipFolderReader().read(out).depth_kind == ("metric" if used else "none")
+
+
+COMMAND = """
+estimators:
+  masks: {{use: "estimator:command", command: "touch {mark}", masks: {{path: .}}}}
+  landmarks: {{use: "estimator:mediapipe", python: env/bin/python}}
+"""
+
+
+def test_commands_of_options_need_permission(tiny_source: Path, tmp_path: Path) -> None:
+    file, mark = tmp_path / "theirs.yaml", tmp_path / "ran"
+    file.write_text(COMMAND.format(mark=mark))
+    options = load_options(file)
+    for run in (
+        lambda: prepare(tiny_source, tmp_path / "clip", body=AnnyBody(), options=options),
+        lambda: prepare_until(
+            "evidence", tiny_source, tmp_path / "clip", body=AnnyBody(), options=options
+        ),
+    ):
+        with pytest.raises(SpecError) as refused:
+            run()
+        message = str(refused.value)
+        assert f"estimators.masks: touch {mark}" in message and "--allow-commands" in message
+        assert "estimators.landmarks: env/bin/python -I mediapipe_script.py" in message
+    assert not mark.exists() and not work_folder(tmp_path / "clip").exists()
+    # allowed, it runs: what it wrote is looked for
+    settings = [f"estimators.masks.command=touch {mark}", "estimators.masks.use=estimator:command",
+                "estimators.masks.masks.path=."]  # fmt: skip
+    with pytest.raises(HoigsError, match="exited with 0, but its files are unusable"):
+        prepare(
+            tiny_source, tmp_path / "clip", body=AnnyBody(), options=load_options(None, settings),
+            allow_commands=True,
+        )  # fmt: skip
+    assert mark.exists()

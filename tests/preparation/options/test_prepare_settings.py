@@ -1,0 +1,25 @@
+"""Options of `prepare` from files."""
+
+from __future__ import annotations
+
+import pytest
+
+from hoigs.core.errors import SpecError
+from hoigs.preparation.options.option_files import load_options
+
+
+def test_a_former_key_names_the_present_one(tmp_path) -> None:
+    file = tmp_path / "options.yaml"
+    file.write_text("priors:\n  masks: {use: 'estimator:masks-files'}\n")
+    with pytest.raises(SpecError, match='priors: unknown key; today it is "estimators"'):
+        load_options(file)
+
+
+def test_options_of_the_command_line_are_named_as_there():
+    with pytest.raises(SpecError) as caught:
+        load_options(flags={"person_height": 170.0, "preset": "web"})
+    height, estimators = sorted(str(caught.value).splitlines(), reverse=True)
+    assert height == "--person-height: must be between 0.4 and 2.6 metres, got 170.0"
+    assert estimators.startswith("--estimators: must be")
+    with pytest.raises(SpecError, match=r"^command line: --end 2 s .* no frame is left$"):
+        load_options(flags={"start": "5", "end": "2"})

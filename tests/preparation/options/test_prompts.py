@@ -1,0 +1,117 @@
+"""--object: points, boxes and words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from hoigs.core.errors import SpecError
+from hoigs.preparation.options.prepare_options import PrepareOptions
+from hoigs.preparation.options.prompts import (
+    check_prompts,
+    parse_prompts,
+    placed_prompts,
+    with_prompts,
+)
+from hoigs.preparation.video.frames import FrameList
+
+FOUND = FrameList(64, 48, 30.0, 30.0, 10, list(range(10)), [1.0] * 10)
+
+
+def test_clicks_by_frame() -> None:
+    prompt = parse_prompts(["30,20", "-10, 5", "!11,6", "12.5,7@4", "1,2,30,40@4"])
+    assert prompt.frame is None and prompt.box is None
+    assert prompt.points == [(30, 20, True), (10, 5, False), (11, 6, False)]
+    (other,) = prompt.further
+    assert other.frame == 4 and other.points == [(12.5, 7, True)] and other.box == (1, 2, 30, 40)
+    assert parse_prompts(["football"]).text == "football"
+    assert parse_prompts(["1,2@3"]).frame == 3
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["1,2,3"], "neither a point nor a box"),
+        (["-1,2,3,4"], "neither a point nor a box"),
+        (["9,9,3,3"], "x0 < x1"),
+        (["640;402"], "neither a point, a box nor words"),
+        (["ball@3"], "neither a point, a box nor words"),
+        (["ball", "football"], "described twice"),
+        (["-3,4"], "only points that are not on it"),
+        (["0,0,3,4", "0,0,5,6"], "has a box already"),
+        (["none", "3,4"], "leave the others out"),
+        (["kettle=none"], "leave the others out, and names"),
+        (["human=1,2"], "human is the person's name"),
+        (["kettle="], "neither a point, a box nor words"),
+    ],
+)
+def test_what_is_wrong_is_named(texts: list[str], message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        with_prompts(PrepareOptions(), texts)
+
+
+def test_prompts_become_options() -> None:
+    options = with_prompts(PrepareOptions(), "3,4@2", "offline")
+    assert options.prompts["object"].frame == 2 and options.preset == "offline"
+    assert with_prompts(PrepareOptions(), ["none"]).find_object is False
+    named = with_prompts(PrepareOptions(), ["kettle=3,4", " kettle = -5,6@7"])
+    assert named.object == "kettle" and [at.frame for at in named.prompts["kettle"].places()] == [
+        None,
+        7,
+    ]
+    both = with_prompts(PrepareOptions(), ["kettle=3,4", "5,6@7", "kettle=7,8@9"])
+    assert both.objects == ("kettle", "object") and set(both.prompts) == set(both.objects)
+    assert len(both.prompts["kettle"].places()) == 2
+    untouched = PrepareOptions()
+    assert with_prompts(untouched, (), {"masks": object()}) is untouched
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("64.5,3", r"64\.5,3 in frame 0, is outside of the picture, which is 64x48"),
+        ("1,1,20,60@2", "1,1,20,60|20,60 in frame 2, is outside"),
+        ("3,4@10", "is in frame 10; .* 0 to 9"),
+    ],
+)
+def test_prompts_outside_of_the_video(text: str, message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        check_prompts(placed_prompts(with_prompts(PrepareOptions(), text), FOUND), FOUND)
+    check_prompts(with_prompts(PrepareOptions(), ["64,48", "3,4@9"]), FOUND)
+
+
+def test_prompts_count_frames_of_the_video_wherever_it_is_started() -> None:
+    late = replace(FOUND, first=4, indices=[4, 6, 8])
+    options = with_prompts(PrepareOptions(), ["3,4", "9,9@8", "-1,1@4"])
+    prompt = placed_prompts(options, late).prompts["object"]
+    assert [at.frame for at in prompt.places()] == [4, 8]
+    assert prompt.points == [(3, 4, True), (1, 1, False)]
+    with pytest.raises(SpecError, match=r"in frame 2; .* are 4 to 9 .* whatever --start is"):
+        check_prompts(with_prompts(PrepareOptions(), "3,4@2"), late)
+    with pytest.raises(SpecError, match="frame 4 has two boxes"):
+        placed_prompts(with_prompts(PrepareOptions(), ["0,0,3,4", "0,0,5,6@4"]), late)
+
+
+def test_a_person_is_chosen_as_an_object_is() -> None:
+    options = with_prompts(PrepareOptions(), "640,402", person=["320,210@3", "-500,200@3"])
+    (at,) = options.prompts["human"].places()
+    assert at.frame == 3 and at.points == [(320, 210, True), (500, 200, False)]
+    assert options.prompts["object"].points == [(640, 402, True)]
+    assert with_prompts(PrepareOptions(), (), person="anna=320,210").human == "anna"
+    alone = with_prompts(PrepareOptions(), "ball=3,4", person="none")
+    assert alone.people == () and alone.objects == ("ball",)
+    with pytest.raises(SpecError, match="leave nothing to fit"):
+        with_prompts(PrepareOptions(), "none", person="none")
+    with pytest.raises(SpecError, match="leave the others out"):
+        with_prompts(PrepareOptions(), person=["none", "3,4"], texts=())
+
+
+def test_several_people_have_names() -> None:
+    options = with_prompts(PrepareOptions(), "9,9", person=["anna=3,2", "ben=5,2", "anna=4,2@7"])
+    assert options.people == ("anna", "ben") and len(options.prompts["anna"].places()) == 2
+    assert set(options.prompts) == {"object", "anna", "ben"}
+    both = with_prompts(PrepareOptions(), (), person=["3,2", "anna=5,2"])
+    assert both.people == ("human", "anna")
+    with pytest.raises(SpecError, match="ball is an object's name"):
+        with_prompts(PrepareOptions(), "ball=3,4", person="ball=3,2")
