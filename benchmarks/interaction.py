@@ -8,8 +8,8 @@
 Each clip is trained by `hoigs` and by `hoigs-no-interaction`. With `--every N` its objects'
 poses are known in every N-th frame only; between these they are interpolated (straight lines and
 slerp), as a user who placed the object by hand in every N-th frame would have them. `--clip-query`
-is added to the names of built-in clips: `object.hidden_share=0.5` turns the back of carry in half of
-the frames.
+is added to the names of built-in clips: `object.hidden_share=0.5` turns the back of carry's
+person in half of the frames.
 """
 
 from __future__ import annotations
