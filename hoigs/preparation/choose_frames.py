@@ -18,6 +18,9 @@ FEWEST = 3  # motion is judged by accelerations
 def choose_frames(path: Path, options: PrepareOptions) -> tuple[FrameList, list[str]]:
     """The chosen frames, and what is to be said of them.
 
+    Args:
+        path: a video, or a folder of images. options: how many, how dense and from when to when.
+
     Raises:
         SourceError: fewer than three are left, or they have nothing in them.
     """
