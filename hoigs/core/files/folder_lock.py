@@ -18,6 +18,7 @@ import os
 import socket
 import tempfile
 import threading
+import time
 import uuid
 import weakref
 from pathlib import Path
@@ -28,6 +29,7 @@ from hoigs.core.errors import HoigsError
 
 HEARTBEAT_S = 15.0
 STALE_S = 120.0
+WRITTEN_S = 0.2  # a record is written within this time after its file is made
 SUFFIX = ".lock"
 
 _HELD: set[str] = set()  # tokens of this process
@@ -105,7 +107,7 @@ class FolderLock:
 
     def holder(self) -> str:
         """Who holds it and is alive, as text; "" if it is free."""
-        record, age = _read(self.path), _age(self.path)
+        record, age = _read_whole(self.path), _age(self.path)
         if age is None or _is_stale(record, age):
             return ""
         here = record.get("token") in _HELD
@@ -149,7 +151,7 @@ class FolderLock:
         Raises:
             HoigsError: it is not stale.
         """
-        token = _read(self.path).get("token")  # first: a later one is another holder's
+        token = _read_whole(self.path).get("token")  # first: a later one is another holder's
         if who := self.holder():
             raise self.error(
                 f"{self.folder} is being written by {who}: wait for it, stop it, or name another "
@@ -232,6 +234,14 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
+
+
+def _read_whole(path: Path) -> dict[str, Any]:
+    """The record of a lock, also where its file was made just now and is still empty."""
+    until = time.monotonic() + WRITTEN_S
+    while not (found := _read(path)) and path.exists() and time.monotonic() < until:
+        time.sleep(0.005)
+    return found
 
 
 def _age(path: Path) -> float | None:

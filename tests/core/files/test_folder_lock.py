@@ -129,6 +129,19 @@ def test_threads_of_one_process_exclude_each_other(tmp_path):
     assert any("by this process itself (training, pid" in text for text in refused)
 
 
+def test_a_lock_whose_record_is_still_being_written_names_its_holder(tmp_path):
+    path = tmp_path / ".run.lock"
+    with FolderLock(tmp_path / "other", "training") as other:
+        record = other.path.read_text()
+        path.touch()
+        writing = threading.Timer(0.05, path.write_text, [record])
+        writing.start()
+        with pytest.raises(HoigsError, match=r"this process itself \(training, pid"):
+            FolderLock(tmp_path / "run", "scoring").acquire()
+        writing.join()
+    path.unlink()
+
+
 def test_work_inside_a_lock_names_its_token(tmp_path):
     with FolderLock(tmp_path / "run", "training") as outer:
         with pytest.raises(HoigsError, match="this process itself"):
