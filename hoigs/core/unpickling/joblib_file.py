@@ -1,8 +1,7 @@
 """Files of joblib.dump, read without joblib and without running any code in them.
 
 joblib writes a pickle in which each array is a small wrapper (shape, order, type), followed at once
-by the array's bytes (joblib/numpy_pickle.py). Python's own unpickler does not expect such bytes, so
-its pure-Python version is extended here to read them.
+by the array's bytes (joblib/numpy_pickle.py), which are read where they stand.
 """
 
 from __future__ import annotations
@@ -11,64 +10,43 @@ import io
 import pickle
 import zlib
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import IO, Any, ClassVar
 
 import numpy as np
 
 from hoigs.core.errors import ClipError
 from hoigs.core.files.npz import MOST_RATIO, SMALL_BYTES
-from hoigs.core.unpickling.pickles import refuse_unknown, storage
-
-WRAPPER = ("joblib.numpy_pickle", "NumpyArrayWrapper")
-
-
-class _Wrapper:
-    """What joblib writes in place of an array; its attributes come from the file."""
-
-    shape: tuple[int, ...]
-    order: str
-    dtype: np.dtype
+from hoigs.core.unpickling.pickles import (
+    ALLOWED,
+    PlainUnpickler,
+    Unfinished,
+    array_of,
+    checked_count,
+    checked_type,
+)
 
 
-_PythonUnpickler: Any = pickle._Unpickler  # the C version cannot be extended
+class _Wrapper(Unfinished):
+    """What joblib writes in place of an array, whose bytes follow."""
 
-
-class _Unpickler(_PythonUnpickler):  # type: ignore[misc]  # which is Any
-    dispatch: ClassVar = dict(_PythonUnpickler.dispatch)
-
-    def __init__(self, file: io.BytesIO) -> None:
-        super().__init__(file, encoding="latin1")
-        self.file = file
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) == WRAPPER:
-            return _Wrapper
-        if (module, name) == ("torch.storage", "_load_from_bytes"):
-            return storage
-        refuse_unknown(module, name)
-        return super().find_class(module, name)
-
-    def load_build(self) -> None:
-        super().load_build()
-        if isinstance(self.stack[-1], _Wrapper):
-            self.stack.append(self._array(self.stack.pop()))
-
-    dispatch[pickle.BUILD[0]] = load_build
-
-    def _array(self, wrapper: _Wrapper) -> np.ndarray:
-        if wrapper.dtype.hasobject:
+    def build(self, state: Any, file: IO[bytes]) -> np.ndarray:
+        if not isinstance(state, dict):
+            raise pickle.UnpicklingError("an array of joblib has no shape")
+        dtype, shape = checked_type(state.get("dtype")), state.get("shape")
+        if dtype.hasobject:
             raise pickle.UnpicklingError("it holds arrays of Python objects; save numbers")
-        if getattr(wrapper, "numpy_array_alignment_bytes", None) is not None:  # joblib 1.2 on
-            self.file.read(self.file.read(1)[0])
-        count = int(np.prod(wrapper.shape, dtype=np.int64))
-        size = count * wrapper.dtype.itemsize
-        content = self.file.read(size)
-        if len(content) != size:
+        size = checked_count(shape) * dtype.itemsize
+        if state.get("numpy_array_alignment_bytes") is not None:  # joblib 1.2 on
+            file.read(file.read(1)[0])
+        start, end = file.tell(), file.seek(0, io.SEEK_END)
+        if size > end - start:
             raise EOFError("the file ends within an array")
-        values = np.frombuffer(content, dtype=wrapper.dtype).copy()
-        if wrapper.order == "F":
-            return values.reshape(wrapper.shape[::-1]).T
-        return values.reshape(wrapper.shape)
+        file.seek(start)
+        return array_of(file.read(size), dtype, shape, "F" if state.get("order") == "F" else "C")
+
+
+class _JoblibUnpickler(PlainUnpickler):
+    names: ClassVar = ALLOWED | {"joblib.numpy_pickle": {"NumpyArrayWrapper": _Wrapper}}
 
 
 def _decompressed(content: bytes) -> bytes:
@@ -95,6 +73,6 @@ def load_joblib(path: Path) -> Any:
         content = path.read_bytes()
         if content[:2] == b"\x1f\x8b" or content[:1] == b"\x78":
             content = _decompressed(content)
-        return _Unpickler(io.BytesIO(content)).load()
+        return _JoblibUnpickler(content).plain()
     except Exception as error:  # a damaged pickle raises anything
         raise ClipError(f"{path} cannot be read: {error or type(error).__name__}") from error
