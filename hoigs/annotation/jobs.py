@@ -32,7 +32,7 @@ class Job:
             "whole": self.whole, "state": "running", "done": 0.0, "text": "starting",
         }  # fmt: skip
         self._stopped = False
-        command = [sys.executable, "-m", "hoigs.annotation.worker", json.dumps(settings)]
+        command = [sys.executable, "-P", "-m", "hoigs.annotation.worker", json.dumps(settings)]
         self._process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             text=True, start_new_session=True,

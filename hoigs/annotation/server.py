@@ -87,7 +87,7 @@ class _Handler(BaseHTTPRequestHandler):
             except ValidationError as error:
                 wrong = "; ".join(e["msg"] for e in error.errors())
                 found = _text(HTTPStatus.BAD_REQUEST, wrong)
-            except (ValueError, IndexError) as error:
+            except (ValueError, IndexError, RecursionError) as error:
                 self.close_connection = True  # its body may not have been read
                 found = _text(HTTPStatus.BAD_REQUEST, str(error))
             except HoigsError as error:

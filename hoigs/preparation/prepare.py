@@ -46,7 +46,7 @@ __all__ = ["PrepareOptions", "PrepareReport", "prepare", "prepare_until", "work_
 
 def work_folder(out: str | Path) -> Path:
     """Where the stages of the clip `out` keep their results: `out`.prepare, beside it."""
-    out = Path(out).absolute()
+    out = Path(out).resolve()
     return out.with_name(out.name + ".prepare")
 
 

@@ -188,11 +188,11 @@ class NoiseConfig(ComponentConfig):
 class SceneConfig(ComponentConfig):
     """A synthetic clip: one person, one object, one room, one moving camera, known truth."""
 
-    frames: int = Field(default=64, ge=2)
+    frames: int = Field(default=64, ge=2, le=100_000)
     """Of the whole clip."""
-    width: int = Field(default=256, ge=16)
+    width: int = Field(default=256, ge=16, le=16_384)
     """Pixels."""
-    height: int = Field(default=256, ge=16)
+    height: int = Field(default=256, ge=16, le=16_384)
     """Pixels."""
     fps: float = Field(default=16.0, gt=0)
     """So that frames / fps is its length in seconds."""

@@ -47,7 +47,7 @@ class LiveView:
     def start(self, run: Path) -> None:
         """Show a run, once it has a checkpoint."""
         self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__, str(run), str(self.port), *self._options],
+            [sys.executable, "-P", "-m", __name__, str(run), str(self.port), *self._options],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             start_new_session=True,

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from hoigs.core.files.whole_files import regular
 from hoigs.core.errors import HoigsError
 
 MOST_BYTES = 64 * 2**20  # of a file that hoigs writes; one of this size is not ours
@@ -26,7 +27,7 @@ def parse_json(path: Path) -> Any:
     try:
         if (size := path.stat().st_size) > MOST_BYTES:
             raise ValueError(f"{size} bytes, at most {MOST_BYTES} are read")
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(regular(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise
     except RecursionError as error:

@@ -12,6 +12,8 @@ from typing import IO, NamedTuple
 import numpy as np
 from numpy.lib import format as npy
 
+from hoigs.core.files.whole_files import regular
+
 # numpy parses the header of an array with `ast`, whose recursion depth CPython counts for all
 # threads together in 3.11 (python/cpython#106905): reading in a pool failed once in a while.
 _header_lock = threading.Lock()
@@ -93,7 +95,7 @@ def load_array(path: Path) -> np.ndarray:
         ValueError: not an npy, damaged, or holding pickled objects.
     """
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             return _array(file, path.name, path.stat().st_size)
     except FileNotFoundError:
         raise

@@ -16,6 +16,7 @@ from typing import Any
 
 import yaml
 
+from hoigs.core.files.whole_files import regular
 from hoigs.core.errors import SpecError
 
 Place = tuple[str | int, ...]
@@ -339,7 +340,7 @@ def read_document(path: Path) -> Document:
         SpecError: absent, not text, or as `load_yaml` and `load_toml`.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = regular(path).read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise SpecError(f"{path}: no such file") from error
     except IsADirectoryError as error:

@@ -11,6 +11,12 @@ from typing import Any
 from hoigs.core.errors import HoigsError, did_you_mean
 
 _URL = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]+):/+(.+)$", re.DOTALL)
+# file systems that only read and write files: others of fsspec unpack archives, run templates that
+# a file holds ("reference"), or chain file systems ("::")
+SCHEMES = (
+    "s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "http", "https", "file", "memory", "sftp",
+    "ssh", "ftp", "hf", "hdfs", "webhdfs", "oss", "oci",
+)  # fmt: skip
 EXTRA = "pip install 'hoigs[storage]' (and s3fs for s3://, gcsfs for gs://, adlfs for az://)"
 
 
@@ -27,8 +33,13 @@ def file_system(url: str) -> tuple[Any, str]:
     """fsspec's file system of a URL, and the path in it.
 
     Raises:
-        HoigsError: there is no such scheme, or its package is not installed.
+        HoigsError: the scheme is none of `SCHEMES`, or its package is not installed.
     """
+    scheme = url.partition(":")[0].lower()
+    if scheme not in SCHEMES or "::" in url:
+        what = "chains of file systems (::)" if scheme in SCHEMES else f"{scheme}://"
+        hint = did_you_mean(scheme, SCHEMES) if scheme not in SCHEMES else ""
+        raise HoigsError(f"{url}: {what} cannot be read{hint}; there are {', '.join(SCHEMES)}")
     try:
         import fsspec
     except ImportError as error:
@@ -38,9 +49,7 @@ def file_system(url: str) -> tuple[Any, str]:
     except ImportError as error:
         raise HoigsError(f"{url}: {error}; {EXTRA}") from error
     except ValueError as error:
-        scheme = url.partition(":")[0]
-        hint = did_you_mean(scheme, fsspec.available_protocols())
-        raise HoigsError(f"{url}: {error}{hint}") from error
+        raise HoigsError(f"{url}: {error}") from error
 
 
 @contextmanager

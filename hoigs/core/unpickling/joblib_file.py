@@ -14,6 +14,7 @@ from typing import IO, Any, ClassVar
 
 import numpy as np
 
+from hoigs.core.files.whole_files import regular
 from hoigs.core.errors import ClipError
 from hoigs.core.files.npz import MOST_RATIO, SMALL_BYTES
 from hoigs.core.unpickling.pickles import (
@@ -70,7 +71,7 @@ def load_joblib(path: Path) -> Any:
         ClipError: it is damaged, or holds anything else; no code in it is run.
     """
     try:
-        content = path.read_bytes()
+        content = regular(path).read_bytes()
         if content[:2] == b"\x1f\x8b" or content[:1] == b"\x78":
             content = _decompressed(content)
         return _JoblibUnpickler(content).plain()

@@ -21,6 +21,7 @@ from typing import IO, Any, ClassVar
 
 import numpy as np
 
+from hoigs.core.files.whole_files import regular
 from hoigs.core.errors import ClipError
 from hoigs.core.files.npz import MOST_RATIO, SMALL_BYTES
 
@@ -213,7 +214,7 @@ _BUILTINS: dict[str, Any] = {
     "frozenset": lambda *args: frozenset(_items(*args)),
     "complex": lambda real=0.0, imag=0.0: complex(float(real), float(imag)),
     "bytearray": _byte_array,
-    "slice": lambda *ends: slice(*ends),
+    "slice": slice,
     "range": _range,
 }
 # module of the pickle (numpy 1 and 2 name the same functions differently) -> name -> what is called
@@ -390,7 +391,7 @@ def load_pickle(path: Path) -> Any:
     Raises:
         ClipError: it is damaged, or holds anything else; no code in it is run.
     """
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         return _load(file, path)
 
 
@@ -402,7 +403,7 @@ def load_pickled_npy(path: Path) -> Any:
     Raises:
         ClipError: as `load_pickle`.
     """
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         try:
             version = np.lib.format.read_magic(file)
             read = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}

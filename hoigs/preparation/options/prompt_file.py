@@ -29,6 +29,7 @@ class StoredPrompts:
 
 def prompt_file(video: Path) -> Path:
     """Where the clicks in a video, or a folder of frames, are kept."""
+    video = video.absolute() if video.name else video.resolve()
     return video.with_name((video.name if video.is_dir() else video.stem) + ENDING)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from hoigs.core.files.whole_files import regular
 from hoigs.core.errors import HoigsError
 from hoigs.core.files.npz import holds
 from hoigs.core.interfaces.estimator import EstimateKind
@@ -92,6 +93,10 @@ def find_source(
         raise SourceError(f"{path} does not exist; expected a video, or a folder with one")
     folder = path if path.is_dir() else path.parent
     missing: list[str] = []
+    try:
+        regular(path)
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; expected a video file or a folder") from error
     video = path if path.is_file() else _find_video(folder, missing)
     if video is not None and video.is_file() and not video.stat().st_size:
         raise SourceError(f"{video} is empty: 0 bytes; copy it again")

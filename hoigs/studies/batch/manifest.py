@@ -6,15 +6,24 @@ import csv
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Annotated, Any, TextIO
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    ValidationError,
+    field_validator,
+)
 
+from hoigs.core.files.whole_files import regular
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.spec.loader import load_yaml
 from hoigs.core.storage.urls import as_url
 
 NAMES = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}$"  # of rows, as they name folders
+FORMATS = r"^[a-z][a-z0-9-]{0,39}$"  # of exports, as they name folders and logs
 LISTS = ("set", "prepare", "object", "export")  # in CSV, texts with ";" between
 
 
@@ -43,7 +52,9 @@ class Row(BaseModel):
     object: tuple[str, ...] = Field(
         default=(), description="the object, as `hoigs prepare --object`"
     )
-    export: tuple[str, ...] = Field(default=("ply",), description="formats to export")
+    export: tuple[Annotated[str, StringConstraints(pattern=FORMATS)], ...] = Field(
+        default=("ply",), description="formats to export"
+    )
     publish: str = Field(
         default="", description="URL of a folder, where run and exports are written under the name"
     )
@@ -52,6 +63,13 @@ class Row(BaseModel):
         default=None, ge=0, le=1, description="share of a GPU; default by --jobs and the GPUs"
     )
     memory_gb: float = Field(default=0.0, ge=0, description="memory to set aside while it runs, GB")
+
+    @field_validator("video", "clip", "spec", "device")
+    @classmethod
+    def _is_no_option(cls, value: str) -> str:
+        if value.startswith("-") or not value.isprintable():
+            raise ValueError("expected a name or a path: no leading - and no control characters")
+        return value
 
     @field_validator("publish")
     @classmethod
@@ -116,11 +134,11 @@ def _rows_and_places(path: Path, defaults: Mapping[str, Any] | None) -> Iterator
     if read is None:
         raise ManifestError(f"{path}: expected a file that ends with .yaml, .yml or .csv")
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with regular(path).open(encoding="utf-8-sig", newline="") as file:
             for values, at in read(file, path):
                 row = _row({**(defaults or {}), **values}, at, path.parent)
                 yield row, at.get("name", at.get("", str(path)))
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ManifestError(f"{path}: cannot be read ({error}); name a YAML or CSV file") from error
 
 

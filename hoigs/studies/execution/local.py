@@ -16,7 +16,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.machine.cpus import available_cpus
 from hoigs.studies.execution.executor import Needs, Process
 
-PROGRAM = (sys.executable, "-m", "hoigs.studies.execution.command")
+PROGRAM = (sys.executable, "-P", "-m", "hoigs.studies.execution.command")
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 ROUNDING = 1e-6  # of sums of shares of a GPU
 

@@ -147,7 +147,7 @@ def run_process(
         program: arguments of Python. words: those after the number of the parent.
         folder: where it starts, if that exists here.
     """
-    command = [sys.executable, *program, str(os.getpid()), *words]
+    command = [sys.executable, "-P", *program, str(os.getpid()), *words]
     here = folder if Path(folder).is_dir() else None
     process = start_process(command, Path(log), settings, here)
     try:
