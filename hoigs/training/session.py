@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,14 @@ from hoigs.runs.resuming import (
 from hoigs.runs.run_folder import RunFolder, command_line, versions
 from hoigs.training.reports import StepReport
 from hoigs.training.trainer import Trainer
+
+
+@contextmanager
+def random_state_kept() -> Iterator[None]:
+    """The random numbers of torch that the caller draws afterwards are those without the block."""
+    devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
+    with torch.random.fork_rng(devices=devices):
+        yield
 
 
 @dataclass

@@ -31,6 +31,7 @@ from hoigs.core.values.clip import POSES_EXACT, BodyTrack, Clip
 from hoigs.plugins.deformation.avatars.body.skinned_body import SkinnedBody
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_folder, read_clip, require_folder
+from hoigs.training.session import random_state_kept
 from hoigs.training.trainer import Trainer
 
 WIDTH = 256  # pixels: landmarks are off by one or two of a larger picture
@@ -71,6 +72,7 @@ class RefinedPoses:
 
 
 @short_waits_when_busy()
+@random_state_kept()
 def refine_poses(
     clip: Path | str,
     out: Path | str,

@@ -15,7 +15,7 @@ from hoigs.core.progress import Progress
 from hoigs.core.spec.schema import Spec
 from hoigs.evaluation.report.sections import clock
 from hoigs.training.reports import StepReport
-from hoigs.training.session import Session
+from hoigs.training.session import Session, random_state_kept
 from hoigs.viewing.live import LiveView
 from hoigs.viewing.viewer.server import LOCAL
 from hoigs.workflows.budget import plan_budget
@@ -44,6 +44,7 @@ class TrainedRun:
     evaluated: EvaluatedRun | None
 
 
+@random_state_kept()
 def train(
     clip: Path | str | None = None,
     spec: str | Path | Spec | None = None,

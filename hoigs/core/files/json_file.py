@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from hoigs.core.files.whole_files import regular
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.whole_files import regular
 
 MOST_BYTES = 64 * 2**20  # of a file that hoigs writes; one of this size is not ours
 SHOWN, VALUE = 5, 60  # problems of one file, and characters of a wrong value, in a message

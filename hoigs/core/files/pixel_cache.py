@@ -27,6 +27,12 @@ class PixelCache:
         self._kept: OrderedDict[Hashable, Tensor] = OrderedDict()
         self._lock = threading.Lock()
 
+    def __getstate__(self) -> int:
+        return self.budget // 2**20  # a copy decodes its own
+
+    def __setstate__(self, cache_mb: int) -> None:
+        self.__init__(cache_mb)  # type: ignore[misc]
+
     def get(self, key: Hashable, load: Callable[[], Tensor]) -> Tensor:
         """What is kept under `key`, or what `load` returns."""
         with self._lock:

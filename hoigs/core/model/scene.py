@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from hoigs.core.errors import PluginError
 from hoigs.core.interfaces.interaction import InteractionModule
 from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
-from hoigs.core.model.blame import call
+from hoigs.core.model.blame import call, name_of
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
@@ -67,7 +68,7 @@ class SceneModel(nn.Module):
         interaction_enabled: False during the warm-up of the interaction.
 
     Raises:
-        ValueError: there are no entities.
+        ValueError: there are no entities, or one has a name that cannot be a module's.
     """
 
     def __init__(
@@ -82,6 +83,12 @@ class SceneModel(nn.Module):
         super().__init__()
         if not entities:
             raise ValueError("SceneModel needs at least one entity")
+        for name in entities:
+            if "." in name or not name:
+                raise ValueError(
+                    f"SceneModel: an entity named {name!r}: names have letters, digits, - and _, "
+                    "but no dots, as parameters are named ENTITY.FIELD"
+                )
         self.entities = nn.ModuleDict(entities)
         self.interaction = interaction
         self.interaction_enabled = True
@@ -128,12 +135,33 @@ class SceneModel(nn.Module):
                 if described is not None:
                     tokens[name] = described
             roles = {name: self.entity(name).role(moment) for name in self.entities}
-            residuals = call(module, "interaction", module, tokens, roles)
+            residuals = self._fitting(call(module, "interaction", module, tokens, roles), tokens)
         gaussians = {}
         for name in names:
             entity, role = self.entity(name), f"deformation of {name!r}"
             gaussians[name] = call(entity.deformation, role, entity, moment, residuals.get(name))
         return SceneState(gaussians, residuals, tokens)
+
+    def _fitting(
+        self, residuals: Mapping[str, Residual], tokens: Mapping[str, Tokens]
+    ) -> Mapping[str, Residual]:
+        """The residuals, which have the rows of what they correct: nothing is broadcast.
+
+        Raises:
+            PluginError: they do not; it names the interaction and the features.
+        """
+        for name, residual in residuals.items():
+            count = len(self.entity(name)) if name in self.entities else None
+            if residual.means is None or residual.means.shape == (count, 3):
+                continue
+            features, read = self.entity(name).features, tokens.get(name)
+            raise PluginError(
+                f"interaction: {name_of(self.interaction)} gives {name!r} displacements of shape "
+                f"{list(residual.means.shape)} for {count} Gaussians, expected [{count}, 3]; its "
+                f"features {name_of(features)} give {0 if read is None else len(read.features)} "
+                "tokens, and this interaction needs one token a Gaussian, or has to spread fewer"
+            )
+        return residuals
 
     def render(
         self,
@@ -151,6 +179,11 @@ class SceneModel(nn.Module):
             background: RGB in [0, 1], [3]; in place of `request.background`.
             request: as for `draw`.
         """
+        if not isinstance(moment, Moment) or not isinstance(camera, Camera):
+            raise TypeError(
+                "SceneModel.render(moment, camera): expected a Moment and a Camera, got "
+                f"{type(moment).__name__} and {type(camera).__name__}"
+            )
         state = self(moment, only)
         request = request or RenderRequest()
         if background is not None:

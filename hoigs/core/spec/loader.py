@@ -16,8 +16,8 @@ from typing import Any
 
 import yaml
 
-from hoigs.core.files.whole_files import regular
 from hoigs.core.errors import SpecError
+from hoigs.core.files.whole_files import regular
 
 Place = tuple[str | int, ...]
 MAX_BYTES = 1_000_000  # a spec is a page of text; a file of this size is a mistake

@@ -14,9 +14,9 @@ from typing import IO, Any, ClassVar
 
 import numpy as np
 
-from hoigs.core.files.whole_files import regular
 from hoigs.core.errors import ClipError
 from hoigs.core.files.npz import MOST_RATIO, SMALL_BYTES
+from hoigs.core.files.whole_files import regular
 from hoigs.core.unpickling.pickles import (
     ALLOWED,
     PlainUnpickler,

@@ -21,9 +21,9 @@ from typing import IO, Any, ClassVar
 
 import numpy as np
 
-from hoigs.core.files.whole_files import regular
 from hoigs.core.errors import ClipError
 from hoigs.core.files.npz import MOST_RATIO, SMALL_BYTES
+from hoigs.core.files.whole_files import regular
 
 NUMBERS = re.compile(r"[<>=|]?(\?|[biufcSU]\d{0,7}|O8?)")  # types that an array may have
 DEEPEST = 100  # levels of containers in containers

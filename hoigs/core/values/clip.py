@@ -6,8 +6,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -185,7 +186,28 @@ class Clip:
     def __len__(self) -> int:
         return len(self.cameras)
 
-    def __getitem__(self, position: int) -> Frame:
+    def __repr__(self) -> str:
+        camera = self.cameras[0] if self.cameras else None
+        size = f" of {camera.width}x{camera.height}" if camera is not None else ""
+        kinds = ", ".join(f"{name} ({kind})" for name, kind in self.kinds.items())
+        beside = f", {len(self.held_out)} held-out views" if self.held_out else ""
+        return f"Clip({self.name!r}: {len(self)} frames{size}; {kinds or 'scene alone'}{beside})"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: what there is, by entity."""
+        rows = [("frames", f"{len(self)}, {len(self.split.get('test', ()))} of them test frames")]
+        rows += [(name, kind) for name, kind in self.kinds.items()]
+        rows += [("scene points", str(len(self.points))), ("depth", self.depth_kind)]
+        cells = "".join(f"<tr><th>{escape(a)}</th><td>{escape(b)}</td></tr>" for a, b in rows)
+        return f"<table><caption>{escape(repr(self))}</caption>{cells}</table>"
+
+    @overload
+    def __getitem__(self, position: int) -> Frame: ...
+    @overload
+    def __getitem__(self, position: slice) -> Clip: ...
+    def __getitem__(self, position: int | slice) -> Frame | Clip:
+        if isinstance(position, slice):
+            return self.subset(range(len(self))[position])
         if not -len(self) <= position < len(self):
             raise IndexError(f"frame {position} of a clip with {len(self)} frames")
         position %= len(self)
@@ -201,7 +223,7 @@ class Clip:
         )
 
     def __iter__(self) -> Iterator[Frame]:
-        return (self[i] for i in range(len(self)))
+        return (self.frame(i) for i in range(len(self)))
 
     @property
     def num_frames(self) -> int:
@@ -224,7 +246,28 @@ class Clip:
         return tuple(every.tolist()) if (np.diff(every) > 0).all() else None
 
     def frame(self, position: int) -> Frame:
-        return self[position]
+        found = self[position]
+        assert isinstance(found, Frame)
+        return found
+
+    def subset(self, positions: Sequence[int]) -> Clip:
+        """The frames at these positions as a clip. Times, frame numbers, bodies and objects stay
+        those of the whole video; of the held-out views, those of the same frames stay."""
+        place = {old: new for new, old in enumerate(positions)}
+        kept = {self.moments[i].index for i in positions}
+        held_out = self.held_out
+        if held_out is not None:
+            held_out = held_out.subset(
+                [i for i, moment in enumerate(held_out.moments) if moment.index in kept]
+            )
+        return replace(
+            self,
+            store=SubsetStore(self.store, positions),
+            cameras=[self.cameras[i] for i in positions],
+            moments=[self.moments[i] for i in positions],
+            split={n: [place[i] for i in part if i in place] for n, part in self.split.items()},
+            held_out=held_out if held_out else None,
+        )
 
     def resized(self, width: int) -> Clip:
         """This clip at another width, aspect kept; pixels are resampled on demand."""
@@ -253,6 +296,28 @@ class Clip:
         depth = self.cameras[0].to_camera(self.points)[:, 2]
         ahead = depth[depth > 0]
         return max(spread, 0.5 * float(ahead.median()) if len(ahead) else 1.0)
+
+
+class SubsetStore(FrameStore):
+    """Some frames of another store."""
+
+    def __init__(self, base: FrameStore, positions: Sequence[int]) -> None:
+        self.base, self.positions, self.root = base, list(positions), base.root
+
+    def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
+        return self.base.image(self.positions[position])
+
+    def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
+        return self.base.mask(entity, self.positions[position])
+
+    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
+        return self.base.depth(self.positions[position])
+
+    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
+        return self.base.ignored(self.positions[position])
+
+    def mask_known(self, entity: str, position: int) -> bool:
+        return self.base.mask_known(entity, self.positions[position])
 
 
 class ResizedStore(FrameStore):

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hoigs.core.files.whole_files import regular
 from hoigs.core.errors import HoigsError
 from hoigs.core.files.npz import holds
+from hoigs.core.files.whole_files import regular
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
 

@@ -17,8 +17,8 @@ from pydantic import (
     field_validator,
 )
 
-from hoigs.core.files.whole_files import regular
 from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.files.whole_files import regular
 from hoigs.core.spec.loader import load_yaml
 from hoigs.core.storage.urls import as_url
 

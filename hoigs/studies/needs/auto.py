@@ -16,6 +16,7 @@ from hoigs.studies.needs.after_training import After, add_to_answer, finish
 from hoigs.studies.needs.needs import needs
 from hoigs.studies.needs.pruning.compact_run import compact_of
 from hoigs.studies.needs.result import Needs
+from hoigs.training.session import random_state_kept
 from hoigs.workflows.evaluate_run import evaluate_run
 from hoigs.workflows.train import OnStart, OnStep, Report, TrainedRun, silent, train
 
@@ -37,6 +38,7 @@ class AutoRun:
     after: After
 
 
+@random_state_kept()
 def auto(
     clip: Path | str,
     spec: str | Path | None = None,

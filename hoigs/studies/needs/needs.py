@@ -15,6 +15,7 @@ from hoigs.studies.needs.report.write import require_new, write_needs
 from hoigs.studies.needs.result import Needs, Settings
 from hoigs.studies.needs.search import Search
 from hoigs.studies.needs.search_space import load_search_spaces
+from hoigs.training.session import random_state_kept
 from hoigs.workflows.train import Report, silent
 
 
@@ -23,6 +24,7 @@ def needs_folder(clip: Path | str) -> Path:
     return Path("runs") / f"needs-{clip_name(clip)}"
 
 
+@random_state_kept()
 def needs(
     clip: Path | str,
     spec: str | Path = "hoigs",

@@ -55,8 +55,11 @@ def same_seed_same_model(subject: DeformationSubject) -> None:
 
 @CHECKS.check("D17")
 def a_deep_copy_is_independent(subject: DeformationSubject) -> None:
-    """A deep copy is equal and independent."""
+    """A deep copy is equal and independent, also in the midst of training."""
     entity = subject.entity()
+    subject.draw(entity.train(), 0.4)  # what it leaves has a graph
+    copy.deepcopy(entity)
+    entity.eval()
     before = subject.draw(entity, 0.4).detach().clone()
     twin = copy.deepcopy(entity)
     require_same("a deep copy", subject.draw(twin, 0.4), before, atol=0.0)

@@ -193,7 +193,9 @@ def test_any_arguments_give_a_plain_value_or_an_error(
                 found = load_pickle(path)
             except ClipError:
                 continue
-            assert isinstance(found, plain) and getattr(found, "dtype", None) is not np.dtype(object)
+            assert isinstance(found, plain) and getattr(found, "dtype", None) is not np.dtype(
+                object
+            )
         assert tracemalloc.get_traced_memory()[1] < 2**25
     finally:
         tracemalloc.stop()
