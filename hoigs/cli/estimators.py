@@ -29,7 +29,7 @@ def list_environments() -> None:
     print_table("environments of estimators", ("name", "state", "what", "folder"), rows)
 
 
-@app.command()
+@app.command("install")
 def install(name: Name) -> None:
     """Make an environment: download its packages, check their hashes, try it."""
     from hoigs.core.registry.environments import environment_named
@@ -42,7 +42,7 @@ def install(name: Name) -> None:
         typer.echo(f"warning: {file}: {why}", err=True)
 
 
-@app.command()
+@app.command("remove")
 def remove(name: Name) -> None:
     """Remove an environment and its downloads."""
     from hoigs.core.registry.environments import environment_named

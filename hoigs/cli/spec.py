@@ -33,7 +33,7 @@ def list_specs() -> None:
         )
 
 
-@app.command()
+@app.command("check")
 def check(spec: NameOrFile, settings: SetOption = None, plugin: PluginOption = None) -> None:
     """Check a spec and all its profiles, and list its components."""
     from hoigs.core.registry.registry import default_registry
@@ -48,7 +48,7 @@ def check(spec: NameOrFile, settings: SetOption = None, plugin: PluginOption = N
             typer.echo(f"  {place:<28} {key}")
 
 
-@app.command()
+@app.command("show")
 def show(spec: NameOrFile, settings: SetOption = None, plugin: PluginOption = None) -> None:
     """Print a spec with all defaults; the output is a spec."""
     typer.echo(_load(spec, settings, plugin).dump(), nl=False)

@@ -26,12 +26,20 @@ class CheckpointError(HoigsError):
     """A checkpoint that is damaged or belongs to another spec."""
 
 
+class CameraError(HoigsError):
+    """A camera that is no pinhole: NaN, skew, or a pose that is not rigid; names the entry."""
+
+
 class RenderError(HoigsError):
     """Gaussians, a camera or a request that a rasterizer cannot draw."""
 
 
 class NotFiniteError(HoigsError):
     """A tensor holds NaN or infinity; the message names it."""
+
+
+class DerivativeError(HoigsError):
+    """A second derivative of kernels that have the first only; the message names what has both."""
 
 
 class Interrupted(KeyboardInterrupt):

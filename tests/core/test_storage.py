@@ -140,7 +140,10 @@ def test_the_cache_keeps_to_its_bound_but_for_what_is_in_use(
     ("url", "message"),
     [
         ("memory://lab/gone", "there is no such file or folder"),
-        ("memry://lab/gone", 'Protocol not known: memry.*did you mean "memory"'),
+        ("memry://lab/gone", 'memry.*did you mean "memory"'),
+        ("reference://clip::memory://lab/ref.json", "reference://"),
+        ("zip://a::memory://lab/a.zip", "zip://"),
+        ("s3://lab::memory://lab", "::"),
         ("http://127.0.0.1:9/a", r"http://127\.0\.0\.1:9/a: "),
     ],
 )

@@ -55,7 +55,7 @@ def _with_settings(own: Callable[..., None]) -> Callable[..., None]:
     """A constructor that also takes the fields of `Config` as keywords."""
 
     @functools.wraps(own)
-    def __init__(self: Any, config: Any = None, *others: Any, **given: Any) -> None:
+    def constructor(self: Any, config: Any = None, *others: Any, **given: Any) -> None:
         kind = type(self)
         if config is not None and not isinstance(config, ComponentConfig):
             raise TypeError(
@@ -77,7 +77,7 @@ def _with_settings(own: Callable[..., None]) -> Callable[..., None]:
             config = kind.Config(**settings)
         own(self, config, *others, **given)
 
-    return __init__
+    return constructor
 
 
 def _arguments(kind: type) -> dict[str, inspect.Parameter]:
