@@ -7,6 +7,7 @@ import stat
 from pathlib import Path
 from typing import TypeVar
 
+AnyPath = TypeVar("AnyPath", str, Path)
 OTHER = {
     stat.S_IFIFO: "a FIFO",
     stat.S_IFSOCK: "a socket",
@@ -14,7 +15,12 @@ OTHER = {
     stat.S_IFBLK: "a device",
 }
 
-AnyPath = TypeVar("AnyPath", str, Path)
+
+class NotRegularError(OSError):
+    """A FIFO, a socket or a device; `strerror` says which, `filename` is the path."""
+
+    def __str__(self) -> str:
+        return str(self.strerror)  # messages have the path before it
 
 
 def regular_file(path: AnyPath) -> AnyPath:
@@ -22,9 +28,9 @@ def regular_file(path: AnyPath) -> AnyPath:
 
     Raises:
         FileNotFoundError: there is nothing.
-        OSError: a FIFO, a socket or a device; `strerror` says which, `filename` is the path.
+        NotRegularError: a FIFO, a socket or a device.
     """
     mode = Path(path).stat().st_mode
     if kind := OTHER.get(stat.S_IFMT(mode)):
-        raise OSError(errno.EINVAL, f"is {kind}, expected a regular file", str(path))
+        raise NotRegularError(errno.EINVAL, f"is {kind}, expected a regular file", str(path))
     return path

@@ -7,7 +7,7 @@ import socket
 
 import pytest
 
-from hoigs.core.files.regular_file import regular_file
+from hoigs.core.files.regular_file import NotRegularError, regular_file
 
 
 def test_what_is_no_file_of_bytes_is_named(tmp_path):
@@ -16,10 +16,10 @@ def test_what_is_no_file_of_bytes_is_named(tmp_path):
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(tmp_path / "socket"))
     for name, kind in (("fifo", "FIFO"), ("link", "FIFO"), ("socket", "socket")):
-        with pytest.raises(OSError, match=kind) as caught:
+        with pytest.raises(NotRegularError, match=kind) as caught:
             regular_file(tmp_path / name)
         assert caught.value.filename == str(tmp_path / name)
-    with pytest.raises(OSError, match="device"):
+    with pytest.raises(NotRegularError, match="device"):
         regular_file("/dev/zero")
 
 
