@@ -17,6 +17,7 @@ import numpy as np
 
 from hoigs.core.errors import ClipError
 from hoigs.core.files.npz import MOST_RATIO, SMALL_BYTES
+from hoigs.core.files.regular_file import regular_file
 from hoigs.core.unpickling.pickles import refuse_unknown, storage
 
 WRAPPER = ("joblib.numpy_pickle", "NumpyArrayWrapper")
@@ -92,7 +93,7 @@ def load_joblib(path: Path) -> Any:
         ClipError: it is damaged, or holds anything else; no code in it is run.
     """
     try:
-        content = path.read_bytes()
+        content = regular_file(path).read_bytes()
         if content[:2] == b"\x1f\x8b" or content[:1] == b"\x78":
             content = _decompressed(content)
         return _Unpickler(io.BytesIO(content)).load()

@@ -15,6 +15,7 @@ from typing import IO, Any
 import numpy as np
 
 from hoigs.core.errors import ClipError
+from hoigs.core.files.regular_file import regular_file
 
 # module of the pickle (numpy 1 and 2 name the same functions differently) -> names
 _NUMPY = ("_reconstruct", "scalar")
@@ -65,7 +66,7 @@ def load_pickle(path: Path) -> Any:
     Raises:
         ClipError: it is damaged, or holds anything else; no code in it is run.
     """
-    with path.open("rb") as file:
+    with regular_file(path).open("rb") as file:
         return _load(file, path)
 
 
@@ -77,7 +78,7 @@ def load_pickled_npy(path: Path) -> Any:
     Raises:
         ClipError: as `load_pickle`.
     """
-    with path.open("rb") as file:
+    with regular_file(path).open("rb") as file:
         try:
             version = np.lib.format.read_magic(file)
             read = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
