@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.machine.python import PYTHON
 
 
 class Job:
@@ -32,7 +32,7 @@ class Job:
             "whole": self.whole, "state": "running", "done": 0.0, "text": "starting",
         }  # fmt: skip
         self._stopped = False
-        command = [sys.executable, "-P", "-m", "hoigs.annotation.worker", json.dumps(settings)]
+        command = [*PYTHON, "-m", "hoigs.annotation.worker", json.dumps(settings)]
         self._process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             text=True, start_new_session=True,

@@ -22,6 +22,7 @@ from pydantic import ValidationError
 
 from hoigs.annotation.session import Session
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.json_file import json_value
 
 LOCAL = "127.0.0.1"
 LARGEST = 4_000_000  # bytes of a request
@@ -159,7 +160,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not 0 < length <= LARGEST:
             self.close_connection = True
             raise ValueError(f"a body of {length} bytes; expected 1 to {LARGEST}")
-        return json.loads(self.rfile.read(length))
+        return json_value(self.rfile.read(length))
 
     def _send(self, status: HTTPStatus, kind: str, body: bytes, note: str) -> None:
         secure = (

@@ -139,7 +139,7 @@ def is_out_of_memory(error: Exception) -> bool:
 
 def _of_system(error: OSError) -> str:
     number = error.errno or 0
-    reason = ADVICE.get(number, os.strerror(number))
+    reason = ADVICE.get(number, error.strerror or os.strerror(number))
     places = [os.fsdecode(p) if isinstance(p, bytes) else str(p)
               for p in (error.filename, error.filename2) if p is not None]  # fmt: skip
     return f"{' -> '.join(places) or 'a file'}: {reason} ({os.strerror(number)})"

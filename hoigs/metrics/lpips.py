@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.files.npz import load_arrays
+from hoigs.core.files.regular_file import regular_file
 
 Net = Literal["alex", "vgg"]
 VARIABLE = "HOIGS_LPIPS_WEIGHTS"
@@ -213,7 +214,7 @@ def _read_tensors(file: Path) -> dict[str, Tensor]:
     """A .pth of other libraries: these files are what users have. Tensors only, no code is run;
     onto the CPU, since they may have been saved from a GPU that is not here."""
     try:
-        return torch.load(file, map_location="cpu", weights_only=True)
+        return torch.load(regular_file(file), map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
         raise HoigsError(f"LPIPS weights {file} cannot be read: {error}") from error
 

@@ -17,6 +17,7 @@ from hoigs.compression.compact import COMPOSED, read_compact
 from hoigs.compression.compact import FORMAT as COMPACT
 from hoigs.core.errors import CheckpointError
 from hoigs.core.files.json_file import read_json, short, validated
+from hoigs.core.files.regular_file import regular_file
 from hoigs.core.files.whole_files import write_whole, written_whole
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.storage.tensor_files import TensorFile, save_tensors
@@ -188,7 +189,7 @@ def load_checkpoint(meta_path: Path, parts: Collection[str] | None = None) -> Ch
 
 
 def _read(path: Path, parts: Collection[str] | None) -> dict[str, torch.Tensor]:
-    with safe_open(path, framework="pt") as file:
+    with safe_open(regular_file(path), framework="pt") as file:
         names = [n for n in file.keys() if parts is None or n.partition(".")[0] in parts]  # noqa: SIM118
         return {name: file.get_tensor(name) for name in names}
 

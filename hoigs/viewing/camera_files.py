@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.json_file import parse_json
 from hoigs.core.values.between import blend_cameras, moment_between
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
@@ -102,7 +102,7 @@ def rate_of(path: Path) -> float | None:
 
 def _read(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parse_json(path)
     except (OSError, ValueError) as error:
         raise HoigsError(f"{path}: expected a JSON file of cameras: {error}") from error
 

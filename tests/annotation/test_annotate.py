@@ -165,6 +165,7 @@ def test_only_its_own_page_is_answered(video: Path) -> None:
         assert status(f"/{token}/prompts", b"[]", Content_Type="text/plain") == 400
         assert status(f"/{token}/prompts", b"[]", **kind) == 200
         assert status(f"/{token}/prompts", b'[{"kind": "object", "name": "../x"}]', **kind) == 400
+        assert status(f"/{token}/prompts", b"[" * 200_000, **kind) == 400
         assert status(f"/{token}/frame/99/96") == 409
         assert status(f"/{token}/report/..%2Fsource%2Fmy.mp4") == 404
         assert not video.with_name("my.prompts.json").exists()

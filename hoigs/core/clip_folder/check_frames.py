@@ -30,6 +30,7 @@ from hoigs.core.clip_folder.format import (
 )
 from hoigs.core.diagnostics import Severity
 from hoigs.core.files.npz import array_headers, load_arrays
+from hoigs.core.files.regular_file import regular_file
 
 TAIL = 1024  # bytes in which an image file ends, whatever a program wrote after it
 MOST_ABSENT = 10_000  # images; where more are absent, the number of frames is wrong
@@ -102,7 +103,7 @@ def _each_frame(
 
 def _image_problem(path: Path, view: View) -> str | None:
     try:
-        with Image.open(path) as image:
+        with Image.open(regular_file(path)) as image:
             size, mode = image.size, image.mode
             if not _ends(path):
                 image.load()
@@ -135,7 +136,7 @@ def _check_mask_content(root: Path, view: View, entity: str) -> list[FileDiagnos
     brightest = 0
     for frame in range(view.count):
         try:
-            with Image.open(mask_path(root, entity, frame)) as image:
+            with Image.open(regular_file(mask_path(root, entity, frame))) as image:
                 brightest = max(brightest, int(np.asarray(image.convert("L")).max()))
         except (OSError, ValueError, SyntaxError) as error:
             name = f"{view.folder}masks/{entity}/{frame:05d}.png"

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.files.whole_files import regular
+from hoigs.core.files.regular_file import regular_file
 
 MOST_BYTES = 64 * 2**20  # of a file that hoigs writes; one of this size is not ours
 SHOWN, VALUE = 5, 60  # problems of one file, and characters of a wrong value, in a message
@@ -17,7 +17,7 @@ SHOWN, VALUE = 5, 60  # problems of one file, and characters of a wrong value, i
 Record = TypeVar("Record", bound=BaseModel)
 
 
-def parse_json(path: Path) -> Any:
+def parse_json(path: Path, most_bytes: int = MOST_BYTES) -> Any:
     """The content of a JSON file.
 
     Raises:
@@ -25,17 +25,27 @@ def parse_json(path: Path) -> Any:
         ValueError: it cannot be read, is not JSON, too large, or nested too deeply.
     """
     try:
-        if (size := path.stat().st_size) > MOST_BYTES:
-            raise ValueError(f"{size} bytes, at most {MOST_BYTES} are read")
-        return json.loads(regular(path).read_text(encoding="utf-8"))
+        if (size := regular_file(path).stat().st_size) > most_bytes:
+            raise ValueError(f"{size} bytes, at most {most_bytes} are read")
+        return json_value(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise
-    except RecursionError as error:
-        raise ValueError("nested too deeply") from error
     except UnicodeDecodeError as error:
         raise ValueError("not text in UTF-8") from error
     except OSError as error:
         raise ValueError(error.strerror or str(error)) from error
+
+
+def json_value(text: str | bytes) -> Any:
+    """The value that a text is.
+
+    Raises:
+        ValueError: it is not JSON, or nested too deeply.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
 
 
 def read_json(path: Path, *, error: type[HoigsError], advice: str) -> Any:
@@ -89,4 +99,6 @@ def short(value: object) -> str:
         text = repr(value)
     except RecursionError:
         return f"a deep {type(value).__name__}"
+    except ValueError:  # Python writes no integer of more than 4300 digits
+        return f"a {type(value).__name__} of very many digits"
     return text if len(text) <= VALUE else f"{text[:VALUE]}…"

@@ -12,7 +12,7 @@ from typing import IO, NamedTuple
 import numpy as np
 from numpy.lib import format as npy
 
-from hoigs.core.files.whole_files import regular
+from hoigs.core.files.regular_file import regular_file
 
 # numpy parses the header of an array with `ast`, whose recursion depth CPython counts for all
 # threads together in 3.11 (python/cpython#106905): reading in a pool failed once in a while.
@@ -44,7 +44,7 @@ def array_headers(path: Path) -> dict[str, ArrayHeader]:
         ValueError: not an npz, damaged, or holding pickled objects.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(regular_file(path)) as archive:
             found = {}
             for name in archive.namelist():
                 with archive.open(name) as file:
@@ -75,7 +75,7 @@ def load_arrays(path: Path, only: Collection[str] | None = None) -> dict[str, np
         ValueError: not an npz, damaged, holding pickled objects, or far larger than its file.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(regular_file(path)) as archive:
             names = [
                 n for n in archive.namelist() if only is None or n.removesuffix(".npy") in only
             ]
@@ -95,7 +95,7 @@ def load_array(path: Path) -> np.ndarray:
         ValueError: not an npy, damaged, or holding pickled objects.
     """
     try:
-        with regular(path).open("rb") as file:
+        with regular_file(path).open("rb") as file:
             return _array(file, path.name, path.stat().st_size)
     except FileNotFoundError:
         raise

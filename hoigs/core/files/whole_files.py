@@ -1,9 +1,7 @@
-"""Files that appear whole or not at all, and files that can be read to an end."""
+"""Files that appear whole or not at all."""
 
 from __future__ import annotations
 
-import errno
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -42,18 +40,3 @@ def write_whole(path: Path, content: str | bytes, temporary: Path | None = None)
     """Write a file through a temporary name; text as UTF-8."""
     with written_whole(path, temporary) as part:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
-
-
-def regular(path: Path) -> Path:
-    """`path`, unless it is a pipe, a socket or a device, which may never end, or never begin.
-
-    Raises:
-        OSError: it is one of them. What is absent, or a folder, is for the caller to find.
-    """
-    try:
-        mode = path.stat().st_mode
-    except OSError:
-        return path
-    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-        raise OSError(errno.EINVAL, "no regular file but a pipe, a socket or a device", str(path))
-    return path

@@ -8,6 +8,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from hoigs.core.errors import did_you_mean
+from hoigs.core.files.json_file import short
 from hoigs.core.spec.loader import Document, Place
 
 FORMER_KEYS = {"priors": "estimators"}  # of options files, before they were renamed
@@ -50,15 +51,15 @@ def _parts(
         if at.startswith("--set") and len(full) > 1:
             return _named(at, path), f"this key is missing{_new_block(document, full[:-1])}", ""
         return _named(at, path), "this key is missing", ""
-    got, at = f", got {_short(problem['input'])}", document.where(full)
+    got, at = f", got {short(problem['input'])}", document.where(full)
     if problem["type"] in ("model_type", "model_attributes_type", "dict_type"):
         fields = _fields(model, inside)
         keys = f" with {', '.join(fields)}" if fields else ""
         message = f"expected a block of keys{keys}"
         if at.startswith("--set") and fields == ["use"] and isinstance(problem["input"], str):
             kind, name = str(full[-1]), problem["input"].rpartition(":")[2]
-            short = f"--rasterizer {name} or " if kind == "rasterizer" else ""
-            got += f"; write {short}--set {path}.use={kind}:{name}"
+            brief = f"--rasterizer {name} or " if kind == "rasterizer" else ""
+            got += f"; write {brief}--set {path}.use={kind}:{name}"
     else:
         message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
         message = message.partition(", unable to parse string")[0]
@@ -121,8 +122,3 @@ def _models(annotation: Any) -> Iterator[type[BaseModel]]:
         yield annotation
     for argument in get_args(annotation):
         yield from _models(argument)
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

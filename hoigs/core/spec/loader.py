@@ -17,9 +17,10 @@ from typing import Any
 import yaml
 
 from hoigs.core.errors import SpecError
-from hoigs.core.files.whole_files import regular
+from hoigs.core.files.regular_file import regular_file
 
 Place = tuple[str | int, ...]
+LONGEST_INTEGER = 1000  # digits; Python writes no number of more than 4300, as messages have to
 MAX_BYTES = 1_000_000  # a spec is a page of text; a file of this size is a mistake
 
 
@@ -127,12 +128,11 @@ _CORE_SCHEMA = (
         list("-+0123456789."),
     ),
 )
+_PATTERNS = {tag: re.compile(f"(?:{pattern})\\Z") for tag, pattern, _ in _CORE_SCHEMA}
 for _class in (Loader, Dumper):
     _class.yaml_implicit_resolvers = {}
-    for _tag, _pattern, _first in _CORE_SCHEMA:
-        _class.add_implicit_resolver(
-            f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), _first
-        )
+    for _tag, _, _first in _CORE_SCHEMA:
+        _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", _PATTERNS[_tag], _first)
 
 
 def load_yaml(text: str, source: str) -> Document:
@@ -178,7 +178,12 @@ class _Builder:
         if isinstance(node, yaml.SequenceNode) and tag == "seq":
             return [self.build(item, (*place, i)) for i, item in enumerate(node.value)]
         if isinstance(node, yaml.ScalarNode) and tag in _SCALARS:
-            return _SCALARS[tag](node.value)
+            text = node.value
+            if (pattern := _PATTERNS.get(tag)) and not pattern.match(text):  # of `!!int a`
+                raise SpecError(f"{at}: {text[:40]!r} is no {tag}")
+            if tag == "int" and len(text) > LONGEST_INTEGER:
+                raise SpecError(f"{at}: a number of {len(text)} digits")
+            return _SCALARS[tag](text)
         raise SpecError(f"{at}: the tag {node.tag} is not supported")
 
     def _mapping(self, node: yaml.MappingNode, place: Place) -> dict[str, Any]:
@@ -227,7 +232,9 @@ def load_toml(text: str, source: str) -> Document:
     _check_size(text, source)
     try:
         data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError as error:
+        raise SpecError(f"{source}: nested too deeply") from error
+    except ValueError as error:  # TOMLDecodeError, or a number of too many digits
         where = re.search(r"\(at line (\d+), column (\d+)\)", str(error))
         at = f"{source}:{where[1]}:{where[2]}" if where else source
         raise SpecError(f"{at}: {str(error).partition(' (at ')[0]}") from error
@@ -340,7 +347,7 @@ def read_document(path: Path) -> Document:
         SpecError: absent, not text, or as `load_yaml` and `load_toml`.
     """
     try:
-        text = regular(path).read_text(encoding="utf-8")
+        text = regular_file(path).read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise SpecError(f"{path}: no such file") from error
     except IsADirectoryError as error:

@@ -51,6 +51,7 @@ __all__ = [
 MODEL_SECTIONS = ("interaction", "entities", "model")
 # settings of an entity that decide no tensor's existence: how training changes the count, and where
 # opacities start. `points` is not among them: penalties between neighbours depend on first points.
+OF_AN_ENTITY = ("deformation", "features", "density", "body", "initializer")  # components
 TRAINING_ONLY = ("density", "opacity", "thickness")
 
 
@@ -192,7 +193,7 @@ class Spec(_Strict):
         yield ("rasterizer",), self.rasterizer
         yield ("interaction",), self.interaction
         for name, block in self.model.items():
-            for field in ("deformation", "features", "density", "body", "initializer"):
+            for field in OF_AN_ENTITY:
                 part = getattr(block, field)
                 if part is not None:
                     yield ("model", name, field), part
@@ -255,7 +256,10 @@ def _resolve(document: Document, registry: Registry) -> Spec:
     try:
         spec = Spec.model_validate(document.data)
     except ValidationError as error:
-        raise SpecError("\n".join(explain(error, Spec, document, ()))) from error
+        lines = explain(error, Spec, document, ())
+        for place, part in _written_components(document.data):  # their mistakes at once, too
+            lines += _settings(part, place, document, registry)[1]
+        raise SpecError("\n".join(lines)) from error
     problems: list[str] = []
     data = spec.model_dump()
     for place, part in spec.component_specs():
@@ -270,6 +274,20 @@ def _resolve(document: Document, registry: Registry) -> Spec:
     resolved = Spec.model_validate(data)
     resolved._document = document
     return resolved
+
+
+def _written_components(data: dict[str, Any]) -> Iterator[tuple[Place, ComponentSpec]]:
+    """The components of a tree that is no spec as a whole, where each stands."""
+    places: list[Place] = [("rasterizer",), ("interaction",)]
+    model = data.get("model")
+    for name in model if isinstance(model, dict) else ():
+        places += [("model", name, field) for field in OF_AN_ENTITY]
+    for place in places:
+        block: Any = data
+        for step in place:
+            block = block.get(step) if isinstance(block, dict) else None
+        if isinstance(block, dict) and isinstance(block.get("use"), str):
+            yield place, ComponentSpec.model_validate(block)
 
 
 def _settings(

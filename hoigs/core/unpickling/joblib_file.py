@@ -1,7 +1,8 @@
 """Files of joblib.dump, read without joblib and without running any code in them.
 
 joblib writes a pickle in which each array is a small wrapper (shape, order, type), followed at once
-by the array's bytes (joblib/numpy_pickle.py), which are read where they stand.
+by the array's bytes (joblib/numpy_pickle.py). Python's own unpickler does not expect such bytes, so
+its pure-Python version is extended here to read them.
 """
 
 from __future__ import annotations
@@ -10,44 +11,53 @@ import io
 import pickle
 import zlib
 from pathlib import Path
-from typing import IO, Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from hoigs.core.errors import ClipError
 from hoigs.core.files.npz import MOST_RATIO, SMALL_BYTES
-from hoigs.core.files.whole_files import regular
-from hoigs.core.unpickling.pickles import (
-    ALLOWED,
-    PlainUnpickler,
-    Unfinished,
-    array_of,
-    checked_count,
-    checked_type,
-)
+from hoigs.core.files.regular_file import regular_file
+from hoigs.core.unpickling.calls import Named, refused
+from hoigs.core.unpickling.pickles import Opcodes, Unpickler
+
+WRAPPER = Named("joblib.numpy_pickle.NumpyArrayWrapper", None)
 
 
-class _Wrapper(Unfinished):
-    """What joblib writes in place of an array, whose bytes follow."""
+class _Wrapper:
+    """What joblib writes in place of an array, until its state is read."""
 
-    def build(self, state: Any, file: IO[bytes]) -> np.ndarray:
-        if not isinstance(state, dict):
-            raise pickle.UnpicklingError("an array of joblib has no shape")
-        dtype, shape = checked_type(state.get("dtype")), state.get("shape")
-        if dtype.hasobject:
-            raise pickle.UnpicklingError("it holds arrays of Python objects; save numbers")
-        size = checked_count(shape) * dtype.itemsize
+
+class _Unpickler(Unpickler):
+    dispatch: ClassVar[Opcodes] = Opcodes(Unpickler.dispatch)
+
+    def find_class(self, module: str, name: str) -> Any:
+        return WRAPPER if f"{module}.{name}" == WRAPPER.name else super().find_class(module, name)
+
+    def load_newobj(self) -> None:
+        arguments, kind = self.stack.pop(), self.stack.pop()
+        if kind is not WRAPPER or arguments != ():
+            raise refused("it makes an object of a class; only numbers and arrays are read")
+        self.append(_Wrapper())
+
+    def load_build(self) -> None:
+        if type(self.stack[-2]) is not _Wrapper:
+            return super().load_build()
+        state = self.stack.pop()
+        self.stack[-1] = self._array(state)
+
+    def _array(self, state: dict[str, Any]) -> np.ndarray:
+        """The array whose bytes follow now."""
         if state.get("numpy_array_alignment_bytes") is not None:  # joblib 1.2 on
-            file.read(file.read(1)[0])
-        start, end = file.tell(), file.seek(0, io.SEEK_END)
-        if size > end - start:
-            raise EOFError("the file ends within an array")
-        file.seek(start)
-        return array_of(file.read(size), dtype, shape, "F" if state.get("order") == "F" else "C")
+            self.content.read(self.content.read(1)[0])
+        shape, dtype = state["shape"], state["dtype"]
+        content = self.content.read(self.calls.nbytes(shape, dtype))
+        order: Literal["C", "F"] = "F" if state["order"] == "F" else "C"
+        return self.calls.array(shape, dtype, bytearray(content), order)
 
 
-class _JoblibUnpickler(PlainUnpickler):
-    names: ClassVar = ALLOWED | {"joblib.numpy_pickle": {"NumpyArrayWrapper": _Wrapper}}
+_Unpickler.dispatch[pickle.NEWOBJ[0]] = _Unpickler.load_newobj
+_Unpickler.dispatch[pickle.BUILD[0]] = _Unpickler.load_build
 
 
 def _decompressed(content: bytes) -> bytes:
@@ -71,9 +81,9 @@ def load_joblib(path: Path) -> Any:
         ClipError: it is damaged, or holds anything else; no code in it is run.
     """
     try:
-        content = regular(path).read_bytes()
+        content = regular_file(path).read_bytes()
         if content[:2] == b"\x1f\x8b" or content[:1] == b"\x78":
             content = _decompressed(content)
-        return _JoblibUnpickler(content).plain()
+        return _Unpickler(io.BytesIO(content), len(content)).load()
     except Exception as error:  # a damaged pickle raises anything
         raise ClipError(f"{path} cannot be read: {error or type(error).__name__}") from error

@@ -1,20 +1,19 @@
-"""Pickles of data sets and programs, read as plain values: no code of a file is run.
+"""Pickled dictionaries of data sets and programs, read without running any code in them.
 
-Python's own loader calls whatever a pickle names, with whatever arguments it gives, and lets it
-write into any object. Here a name stands for a function of this module that makes one plain value
-and checks its arguments; items are added to lists, sets and dictionaries only; and an array is made
-from bytes of exactly its size. So a file can ask for no more memory than a small multiple of its
-own length.
+Python's own loader calls any function that a pickle names, and gives any object a state, items or
+attributes. Here a pickle makes numbers, texts, arrays, lists and dictionaries: `calls` has the
+functions that it may name, and of the opcodes only those are done that such values are written
+with. What comes out is looked through once more.
 """
 
 from __future__ import annotations
 
 import io
 import pickle
-import re
-import zipfile
-from collections import OrderedDict
-from collections.abc import Callable
+import pickletools
+import sys
+from collections.abc import Callable, Iterable
+from itertools import chain
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO, Any, ClassVar
@@ -22,376 +21,206 @@ from typing import IO, Any, ClassVar
 import numpy as np
 
 from hoigs.core.errors import ClipError
-from hoigs.core.files.npz import MOST_RATIO, SMALL_BYTES
-from hoigs.core.files.whole_files import regular
+from hoigs.core.files.npz import load_array, read_header
+from hoigs.core.files.regular_file import regular_file
+from hoigs.core.unpickling.calls import DEEPEST, Calls, Named, is_key, refused
 
-NUMBERS = re.compile(r"[<>=|]?(\?|[biufcSU]\d{0,7}|O8?)")  # types that an array may have
-DEEPEST = 100  # levels of containers in containers
-MOST_ITEMS = 20_000_000  # a container counts anew wherever it stands
-LONGEST_RANGE = 1_000_000
+_PythonUnpickler: Any = pickle._Unpickler  # the C version cannot be extended
+# Opcodes that Python's unpickler may do as it does.
+_PLAIN = (
+    "PROTO", "STOP", "MARK", "POP", "POP_MARK", "DUP", "GET", "BINGET", "LONG_BINGET", "PUT",
+    "BINPUT", "LONG_BINPUT", "MEMOIZE", "NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1",
+    "BININT2", "FLOAT", "BINFLOAT", "STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE",
+    "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8",
+    "EMPTY_LIST", "LIST", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_DICT",
+    "EMPTY_SET", "GLOBAL", "STACK_GLOBAL",
+)  # fmt: skip
+# Those that are done here; all others are refused.
+_OWN = (
+    "FRAME", "INT", "LONG", "LONG1", "LONG4", "BYTEARRAY8", "APPEND", "APPENDS", "SETITEM",
+    "SETITEMS", "DICT", "ADDITEMS", "FROZENSET", "REDUCE", "BUILD",
+)  # fmt: skip
 
 
-class Unfinished:
-    """A value whose content follows in a later instruction (BUILD).
+class Opcodes(dict[int, Callable[[Any], None]]):
+    """What is done for each opcode; UnpicklingError for others."""
 
-    Attributes:
-        keys: of the memo, where it stands until it is replaced by the value.
+    def __missing__(self, code: int) -> Callable[[Any], None]:
+        known = next((op for op in pickletools.opcodes if ord(op.code) == code), None)
+        what = f"the opcode {known.name}" if known else f"the byte {code}, which is no opcode,"
+        raise refused(f"it holds {what} where numbers, arrays, lists or dictionaries are expected")
+
+
+class Unpickler(_PythonUnpickler):  # type: ignore[misc]  # which is Any
+    """Reads one pickle of plain values and arrays.
+
+    Args:
+        size: of the whole file, bytes; what it makes is in proportion.
     """
 
-    def __init__(self) -> None:
-        self.keys: list[int] = []
+    dispatch: ClassVar[Opcodes] = Opcodes()
 
-    def build(self, state: Any, file: IO[bytes]) -> Any:
-        """The value; `file` stands behind the instruction."""
-        raise NotImplementedError
+    def __init__(self, content: io.BytesIO, size: int) -> None:
+        super().__init__(content, encoding="latin1")
+        self.content = content
+        self.calls = Calls(size)
 
-
-class _Type(Unfinished):
-    """numpy's dtype; its byte order follows."""
-
-    def __init__(self, code: Any, align: Any = False, copy: Any = False) -> None:
-        super().__init__()
-        del align, copy
-        if not isinstance(code, str) or not NUMBERS.fullmatch(code):
-            raise _refused(f"arrays of type {code!r:.40}")
-        self.value = np.dtype(code)
-
-    def build(self, state: Any, file: IO[bytes]) -> np.dtype:
-        del file
-        if not isinstance(state, tuple) or len(state) < 5 or any(x is not None for x in state[2:5]):
-            raise _refused("arrays of records")
-        order = state[1]
-        if not isinstance(order, str) or order not in "<>=|":
-            raise _refused(f"the byte order {order!r:.20}")
-        return self.value if order == "|" else self.value.newbyteorder(order)
-
-
-class _Array(Unfinished):
-    """An array; its shape, type and bytes follow."""
-
-    def __init__(self, kind: Any, shape: Any, code: Any) -> None:
-        super().__init__()
-        del shape, code  # of an empty one, which is thrown away
-        if kind is not NDARRAY:
-            raise _refused("a subclass of numpy's array")
-
-    def build(self, state: Any, file: IO[bytes]) -> np.ndarray:
-        del file
-        if not isinstance(state, tuple) or len(state) != 5:
-            raise _refused("an array without its state")
-        _, shape, dtype, columns, content = state
-        return array_of(content, dtype, shape, "F" if columns else "C")
-
-
-def array_of(content: Any, dtype: Any, shape: Any, order: str) -> np.ndarray:
-    """The array [*shape] of these bytes, or of a list of Python values (type "O").
-
-    Raises:
-        UnpicklingError: the bytes are not as many as type and shape need.
-    """
-    count = checked_count(shape)
-    dtype = checked_type(dtype)
-    if isinstance(content, str):  # Python 2
-        content = content.encode("latin1")
-    if dtype.hasobject:
-        if type(content) is not list or len(content) != count:
-            raise _refused("an array of Python objects that are not listed")
-        values = np.empty(count, dtype=object)
-        for i, value in enumerate(content):
-            values[i] = value
-    elif not isinstance(content, bytes | bytearray):
-        raise _refused("an array whose content is not bytes")
-    elif len(content) != count * dtype.itemsize:
-        raise _refused(f"an array {shape} of {dtype} in {len(content)} bytes")
-    elif dtype.itemsize == 0:  # texts that are all empty
-        if count > LONGEST_RANGE:
-            raise _refused(f"{count} empty texts")
-        values = np.zeros(count, dtype)
-    else:
-        values = np.frombuffer(content, dtype).copy()
-    return values.reshape(shape[::-1]).T if order == "F" else values.reshape(shape)
-
-
-def checked_count(shape: Any) -> int:
-    """How many numbers an array of this shape has."""
-    if not isinstance(shape, tuple) or len(shape) > 32:
-        raise _refused("an array without a shape")
-    count = 1
-    for size in shape:
-        if type(size) is not int or size < 0:
-            raise _refused(f"an array of shape {shape!r:.60}")
-        count *= size
-    return count
-
-
-def checked_type(dtype: Any) -> np.dtype:
-    found = dtype.value if isinstance(dtype, _Type) else dtype
-    if not isinstance(found, np.dtype) or not NUMBERS.fullmatch(found.str):
-        raise _refused(f"an array of type {found!r:.60}")
-    return found
-
-
-def _from_buffer(content: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) -> np.ndarray:
-    if checked_type(dtype).hasobject or axes is not None:
-        raise _refused("an array of Python objects")
-    return array_of(content, dtype, shape, "F" if order == "F" else "C")
-
-
-def _scalar(dtype: Any, content: Any = b"") -> Any:
-    return _from_buffer(content, dtype, (1,), "C")[0]
-
-
-def _encoded(text: Any, encoding: Any = "latin1") -> bytes:
-    if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
-        raise _refused("encoded text")
-    return text.encode("latin1")
-
-
-def _items(values: Any = ()) -> list[Any]:
-    if not isinstance(values, list | tuple | set | frozenset):
-        raise _refused(f"a set of {type(values).__name__}")
-    return list(values)
-
-
-def _pairs(values: Any = ()) -> list[tuple[Any, Any]]:
-    return [(k, v) for k, v in _items(values)]
-
-
-def _byte_array(content: Any = b"", encoding: Any = None) -> bytearray:
-    if isinstance(content, str):
-        content = _encoded(content, encoding)
-    if not isinstance(content, bytes):
-        raise _refused("a bytearray of something else than bytes")
-    return bytearray(content)
-
-
-def _range(*ends: Any) -> range:
-    found = range(*ends)
-    if len(found) > LONGEST_RANGE:
-        raise _refused(f"a range of {len(found)} numbers")
-    return found
-
-
-def storage(content: Any) -> Any:
-    """The numbers of a tensor; torch's own function would unpickle them without any check.
-
-    Onto the CPU: the authors may have saved them from a GPU that is not here.
-    """
-    import torch
-
-    if not isinstance(content, bytes):
-        raise _refused("a tensor without bytes")
-    file = io.BytesIO(content)
-    if zipfile.is_zipfile(file):
-        with zipfile.ZipFile(file) as packed:
-            size = sum(entry.file_size for entry in packed.infolist())
-        if size > max(SMALL_BYTES, MOST_RATIO * len(content)):
-            raise _refused(f"a tensor whose {len(content)} bytes unfold to {size}")
-    return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-
-
-def _tensor(numbers: Any, start: Any, size: Any, stride: Any, *others: Any) -> Any:
-    """torch's `_rebuild_tensor_v2`, within what the storage holds."""
-    import torch
-
-    if not isinstance(numbers, torch.storage.TypedStorage):
-        raise _refused("a tensor without its storage")
-    checked_count(size), checked_count(stride)
-    if type(start) is not int or start < 0 or len(size) != len(stride) or any(others[1:2]):
-        raise _refused("a tensor that torch does not write")
-    last = start + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
-    flat = torch.empty(0, dtype=numbers.dtype).set_(numbers._untyped_storage)
-    if 0 not in size and last >= len(flat):
-        raise _refused("a tensor larger than its storage")
-    return flat.as_strided(size, stride, start) if 0 not in size else flat[:0].reshape(size)
-
-
-NDARRAY = object()  # numpy.ndarray as an argument; it cannot be called
-_NUMPY: dict[str, Any] = {"_reconstruct": _Array, "scalar": _scalar}
-_BUILTINS: dict[str, Any] = {
-    "dict": lambda *args: dict(_pairs(*args)),
-    "set": lambda *args: set(_items(*args)),
-    "frozenset": lambda *args: frozenset(_items(*args)),
-    "complex": lambda real=0.0, imag=0.0: complex(float(real), float(imag)),
-    "bytearray": _byte_array,
-    "slice": slice,
-    "range": _range,
-}
-# module of the pickle (numpy 1 and 2 name the same functions differently) -> name -> what is called
-ALLOWED: dict[str, dict[str, Any]] = {
-    "numpy": {"ndarray": NDARRAY, "dtype": _Type},
-    "numpy.core.multiarray": _NUMPY,
-    "numpy._core.multiarray": _NUMPY,
-    "numpy.core.numeric": {"_frombuffer": _from_buffer},
-    "numpy._core.numeric": {"_frombuffer": _from_buffer},
-    "collections": {
-        "OrderedDict": lambda *args: OrderedDict(_pairs(*args)),
-        "defaultdict": lambda *factory: {},  # WHAM: a defaultdict of dict; it is only read here
-    },
-    "_codecs": {"encode": _encoded},  # how protocol 2 spells bytes
-    "torch._utils": {"_rebuild_tensor_v2": _tensor},  # HOLD saves some arrays as tensors
-    "torch.storage": {"_load_from_bytes": storage},
-    "builtins": _BUILTINS,
-    "__builtin__": _BUILTINS,  # Python 2
-}
-
-
-class _Memo(dict[int, Any]):
-    """Values that a pickle refers back to; unfinished ones learn where they stand."""
-
-    def __setitem__(self, key: int, value: Any) -> None:
-        if isinstance(value, Unfinished):
-            value.keys.append(key)
-        super().__setitem__(key, value)
-
-
-_PythonUnpickler: Any = pickle._Unpickler  # the C version cannot be held to these rules
-
-
-class PlainUnpickler(_PythonUnpickler):  # type: ignore[misc]  # which is Any
-    """Reads one value; `names` are the functions it may call."""
-
-    dispatch: ClassVar[dict[int, Callable[..., None]]] = dict(_PythonUnpickler.dispatch)
-    names: ClassVar[dict[str, dict[str, Any]]] = ALLOWED
-
-    def __init__(self, content: bytes, start: int = 0) -> None:
-        self.file = io.BytesIO(content)
-        self.file.seek(start)
-        self.length = len(content)
-        super().__init__(self.file, encoding="latin1")
-        self.memo = _Memo()
-
-    def find_class(self, module: str, name: str) -> Any:
-        found = self.names.get(module, {}).get(name)
-        if found is None:
-            raise _refused(f"{module}.{name}")
+    def load(self) -> Any:
+        found = super().load()
+        _weigh(found, self.calls.most)
         return found
 
-    def _call(self, function: Any, args: Any) -> None:
-        known = any(function is f for names in self.names.values() for f in names.values())
-        if not known or function is NDARRAY or not isinstance(args, tuple):
-            raise _refused("a call of something that is no function")
-        self.stack.append(function(*args))
+    def find_class(self, module: str, name: str) -> Any:
+        return self.calls.named(module, name)
 
-    def load_reduce(self) -> None:
-        args = self.stack.pop()
-        self._call(self.stack.pop(), args)
+    def load_frame(self) -> None:
+        self.read(8)  # its size, which says how much to read ahead; all of it is in memory
 
-    def load_newobj_ex(self) -> None:
-        named = self.stack.pop()
-        if named:
-            raise _refused("arguments by name")
-        self.load_reduce()
+    def load_int(self) -> None:
+        super().load_int()
+        self._check_bits()
 
-    def load_inst(self) -> None:
-        module, name = (self.readline()[:-1].decode("ascii") for _ in range(2))
-        self._call(self.find_class(module, name), tuple(self.pop_mark()))
+    def load_long(self) -> None:
+        super().load_long()
+        self._check_bits()
 
-    def load_obj(self) -> None:
-        function, *args = self.pop_mark()
-        self._call(function, tuple(args))
+    def load_long1(self) -> None:
+        super().load_long1()
+        self._check_bits()
 
-    def load_build(self) -> None:
-        state = self.stack.pop()
-        unfinished = self.stack[-1]
-        if not isinstance(unfinished, Unfinished):
-            raise _refused(f"attributes of a {type(unfinished).__name__}")
-        value = self.stack[-1] = unfinished.build(state, self.file)
-        for key in unfinished.keys:
-            self.memo[key] = value
+    def load_long4(self) -> None:
+        super().load_long4()
+        self._check_bits()
 
-    def load_append(self) -> None:
-        value = self.stack.pop()
-        self._only(list).append(value)
-
-    def load_appends(self) -> None:
-        values = self.pop_mark()
-        self._only(list).extend(values)
-
-    def load_setitem(self) -> None:
-        value, key = self.stack.pop(), self.stack.pop()
-        self._only(dict, OrderedDict)[key] = value
-
-    def load_setitems(self) -> None:
-        values = self.pop_mark()
-        self._only(dict, OrderedDict).update(zip(values[::2], values[1::2], strict=True))
-
-    def load_additems(self) -> None:
-        values = self.pop_mark()
-        self._only(set).update(values)
-
-    def _only(self, *kinds: type) -> Any:
-        if type(self.stack[-1]) not in kinds:
-            raise _refused(f"items of a {type(self.stack[-1]).__name__}")
-        return self.stack[-1]
+    def _check_bits(self) -> None:
+        """Longer ones are no numbers of an array, and collide in dictionaries."""
+        if (bits := self.stack[-1].bit_length()) > 64:
+            raise refused(f"it holds an integer of {bits} bits; expected at most 64")
 
     def load_bytearray8(self) -> None:
         size = int.from_bytes(self.read(8), "little")
-        if size > self.length:
-            raise EOFError("the file ends within bytes")
-        self.stack.append(bytearray(self.read(size)))
+        self.append(bytearray(self.read(size)))  # Python takes memory for `size` first
 
-    def load_refused(self) -> None:
-        raise _refused("an object from outside of the file")
+    def load_append(self) -> None:
+        value = self.stack.pop()
+        self._last(list).append(value)
 
-    for _name, _method in {
-        "REDUCE": load_reduce, "NEWOBJ": load_reduce, "NEWOBJ_EX": load_newobj_ex,
-        "INST": load_inst, "OBJ": load_obj, "BUILD": load_build,
-        "APPEND": load_append, "APPENDS": load_appends, "SETITEM": load_setitem,
-        "SETITEMS": load_setitems, "ADDITEMS": load_additems, "BYTEARRAY8": load_bytearray8,
-        "PERSID": load_refused, "BINPERSID": load_refused, "EXT1": load_refused,
-        "EXT2": load_refused, "EXT4": load_refused, "NEXT_BUFFER": load_refused,
-        "READONLY_BUFFER": load_refused,
-    }.items():  # fmt: skip
-        dispatch[getattr(pickle, _name)[0]] = _method
+    def load_appends(self) -> None:
+        items = self.pop_mark()
+        self._last(list).extend(items)
 
-    def plain(self) -> Any:
-        """The value of the file, whose containers hold plain values and no end of items.
+    def load_setitem(self) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        self._set_items([key, value])
 
-        Raises:
-            UnpicklingError: it holds anything else.
-        """
-        value = self.load()
-        _count(value, {}, 0)
+    def load_setitems(self) -> None:
+        self._set_items(self.pop_mark())
+
+    def load_dict(self) -> None:
+        items = self.pop_mark()
+        self.append({})
+        self._set_items(items)
+
+    def _set_items(self, items: list[Any]) -> None:
+        keys, values = items[::2], items[1::2]
+        if len(keys) != len(values) or not all(map(is_key, keys)):
+            raise refused("a dictionary has keys that are no text or number, or lacks a value")
+        self._last(dict).update(zip(keys, values))
+
+    def load_additems(self) -> None:
+        items = self.pop_mark()
+        self._last(set).update(self.calls.make_set(items))
+
+    def load_frozenset(self) -> None:
+        items = self.pop_mark()
+        self.append(frozenset(self.calls.make_set(items)))
+
+    def load_reduce(self) -> None:
+        arguments = self.stack.pop()
+        self.stack[-1] = self.calls.call(self.stack[-1], arguments)
+
+    def load_build(self) -> None:
+        state = self.stack.pop()
+        self.calls.build(self.stack[-1], state)
+
+    def _last(self, kind: type) -> Any:
+        """What items are put into, which is just such a thing: to others they do more."""
+        last = self.stack[-1]
+        if type(last) is not kind:
+            raise refused(f"it puts items into a {type(last).__name__} as into a {kind.__name__}")
+        return last
+
+
+for _name in _PLAIN:
+    _code = getattr(pickle, _name)[0]
+    Unpickler.dispatch[_code] = _PythonUnpickler.dispatch[_code]
+for _name in _OWN:
+    Unpickler.dispatch[getattr(pickle, _name)[0]] = getattr(Unpickler, f"load_{_name.lower()}")
+
+
+def _weigh(value: Any, most: int) -> None:
+    """UnpicklingError for what is no number, text, array or holder of these, or is too large.
+
+    What is held in many places counts in each: a few bytes make lists of lists of lists, each a
+    thousand times the same, which no program ends to go through.
+    """
+    known: dict[int, tuple[int, int]] = {}  # of holders by id: bytes, and levels below
+
+    def weight(value: Any, depth: int) -> tuple[int, int]:
+        if (size := _size(value)) is not None:
+            return size, 0
+        if id(value) in known:
+            size, below = known[id(value)]
+        else:
+            size, below = 8, 0
+            for item in _items(value) if depth < DEEPEST else ():
+                more, levels = weight(item, depth + 1)
+                size, below = size + more, max(below, levels + 1)
+                if size > most:
+                    raise refused(f"its values unfold to more than {most / 2**30:.2g} GiB")
+            known[id(value)] = size, below
+        if depth + below >= DEEPEST:
+            raise refused(f"its lists are nested {DEEPEST} deep, or hold themselves")
+        return size, below
+
+    weight(value, 0)
+
+
+def _size(value: Any) -> int | None:
+    """Bytes of a number, text or array; None of what may hold some."""
+    kind = type(value)
+    if value is None or kind in (bool, int, float, complex):
+        return 8
+    if kind in (str, bytes, bytearray):
+        return 8 + len(value)
+    if (kind is np.ndarray and not value.dtype.hasobject) or isinstance(value, np.generic):
+        return int(value.nbytes)
+    torch = sys.modules.get("torch")  # which `Calls` has loaded if there is a tensor
+    if torch is not None and kind is torch.Tensor:
+        return int(value.nbytes)
+    return None
+
+
+def _items(value: Any) -> Iterable[Any]:
+    if type(value) in (list, tuple, set, frozenset):
         return value
-
-
-def _count(value: Any, counts: dict[int, int], depth: int) -> int:
-    """How many values a value holds, where one that stands in several places counts in each."""
-    if depth > DEEPEST:
-        raise _refused(f"containers more than {DEEPEST} deep")
-    if isinstance(value, Unfinished) or value is NDARRAY or callable(value):
-        raise _refused("a function in place of a value")
-    if isinstance(value, np.ndarray) and value.dtype.hasobject:
-        inside: Any = value.flat
-    elif isinstance(value, dict):
-        inside = (x for pair in value.items() for x in pair)
-    elif isinstance(value, list | tuple | set | frozenset):
-        inside = value
-    else:
-        return 1
-    if id(value) not in counts:
-        counts[id(value)] = MOST_ITEMS  # what holds itself has no end
-        counts[id(value)] = 1 + sum(_count(x, counts, depth + 1) for x in inside)
-    if counts[id(value)] >= MOST_ITEMS:
-        raise _refused(f"more than {MOST_ITEMS} values")
-    return counts[id(value)]
-
-
-def _refused(what: str) -> pickle.UnpicklingError:
-    return pickle.UnpicklingError(
-        f"it contains {what}; only numbers, texts, arrays of numbers, lists and dictionaries are "
-        "allowed, so save only these"
-    )
+    if type(value) is dict:
+        return chain(value, value.values())
+    if type(value) is np.ndarray:  # of objects
+        return value.ravel()
+    name = value.name if type(value) is Named else type(value).__name__
+    raise refused(f"it holds {name} as a value; save numbers, arrays, lists and dictionaries")
 
 
 def load_pickle(path: Path) -> Any:
     """The content of a .pkl of plain values and numpy arrays, written by Python 2 or 3.
 
+    Dictionaries of every class come as `dict`.
+
     Raises:
         ClipError: it is damaged, or holds anything else; no code in it is run.
     """
-    with regular(path).open("rb") as file:
+    with regular_file(path).open("rb") as file:
         return _load(file, path)
 
 
@@ -403,25 +232,24 @@ def load_pickled_npy(path: Path) -> Any:
     Raises:
         ClipError: as `load_pickle`.
     """
-    with regular(path).open("rb") as file:
+    with regular_file(path).open("rb") as file:
         try:
-            version = np.lib.format.read_magic(file)
-            read = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
-            shape, _, dtype = read[version[0]](file)
-            if not dtype.hasobject:
-                file.seek(0)
-                return np.load(file, allow_pickle=False)
+            header = read_header(file, path.name)
+            if not header.dtype.hasobject:
+                return load_array(path)
         # numpy reads a header that is no literal token by token, as Python 2 wrote it
         except (ValueError, KeyError, EOFError, OverflowError, TokenError) as error:
             raise ClipError(f"{path} is not a readable .npy file ({error})") from error
         array = _load(file, path)
-    if not isinstance(array, np.ndarray) or array.shape != shape:
-        raise ClipError(f"{path} is not a readable .npy file (its header says {shape})")
-    return array.item() if shape == () else array
+    if type(array) is not np.ndarray or array.shape != header.shape:
+        found = type(array).__name__
+        raise ClipError(f"{path} holds a {found}, expected an array of shape {header.shape}")
+    return array.item() if header.shape == () else array
 
 
 def _load(file: IO[bytes], path: Path) -> Any:
     try:
-        return PlainUnpickler(file.read()).plain()
+        content = file.read()
+        return Unpickler(io.BytesIO(content), len(content)).load()
     except Exception as error:  # a damaged pickle raises anything
         raise ClipError(f"{path} cannot be read: {error or type(error).__name__}") from error

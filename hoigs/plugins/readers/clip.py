@@ -28,6 +28,7 @@ from hoigs.core.clip_folder.format import (
 from hoigs.core.errors import ClipError
 from hoigs.core.files.npz import load_arrays
 from hoigs.core.files.pixel_cache import PixelCache
+from hoigs.core.files.regular_file import regular_file
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.frame_times import FrameTimes, time_of
 from hoigs.core.values.camera import Camera
@@ -191,7 +192,7 @@ class FolderStore(FrameStore):
 
 def _decode(path: Path, mode: str) -> Tensor:
     try:
-        with Image.open(path) as image:
+        with Image.open(regular_file(path)) as image:
             return torch.from_numpy(np.array(image.convert(mode)))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ClipError(f"{path} cannot be decoded ({error}); write it again") from error

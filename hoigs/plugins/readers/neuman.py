@@ -14,6 +14,7 @@ from pydantic import Field
 
 from hoigs.core.errors import ClipError
 from hoigs.core.files.json_file import short
+from hoigs.core.files.regular_file import regular_file
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.core.model.smpl_params import pose_from_smpl
@@ -240,7 +241,7 @@ def read_mvs_depth(path: Path) -> Float[Array, "H W"]:
     Raises:
         ClipError: it cannot be read.
     """
-    content = path.read_bytes()
+    content = regular_file(path).read_bytes()
     header = content[:64].split(b"&", 3)
     try:
         width, height, channels = (int(part) for part in header[:3])

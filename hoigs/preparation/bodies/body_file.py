@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from hoigs.core.errors import ClipError
+from hoigs.core.files.regular_file import regular_file
 from hoigs.core.unpickling.joblib_file import load_joblib
 from hoigs.core.unpickling.pickles import load_pickled_npy
 from hoigs.preparation.bodies.file_body import FileBody
@@ -79,7 +80,8 @@ def _recognised(path: Path) -> FileBody | None:
     """The body in a file, or None if its content is not that of a known program."""
     if path.suffix == ".pt":
         try:
-            content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+            file = regular_file(path)
+            content = torch.load(file, map_location="cpu", weights_only=True, mmap=True)
         except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
             reason = str(error).strip().splitlines() or [type(error).__name__]
             raise SourceError(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import SpecError
+from hoigs.core.files.json_file import parse_json
 from hoigs.preparation.options.prepare_options import PrepareOptions
 from hoigs.preparation.options.prompts import named_objects, named_people, split_name
 
@@ -41,10 +42,10 @@ def read_prompts(video: Path) -> StoredPrompts | None:
     """
     path = prompt_file(video)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise SpecError(f"{path} is not readable as JSON ({error}); {_REMEDY}") from error
     version = content.get("version") if isinstance(content, dict) else None
     if version != VERSION:

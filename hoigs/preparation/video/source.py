@@ -9,7 +9,7 @@ from typing import Any
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.files.npz import holds
-from hoigs.core.files.whole_files import regular
+from hoigs.core.files.regular_file import regular_file
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
 
@@ -94,7 +94,7 @@ def find_source(
     folder = path if path.is_dir() else path.parent
     missing: list[str] = []
     try:
-        regular(path)
+        regular_file(path)
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; expected a video file or a folder") from error
     video = path if path.is_file() else _find_video(folder, missing)

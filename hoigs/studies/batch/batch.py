@@ -79,7 +79,7 @@ def batch(
 
 
 def _chosen(rows: Iterable[Row], folder: BatchFolder, only_failed: bool) -> Iterator[Row]:
-    return (row for row in rows if not only_failed or State.known(folder.of(row)).failed)
+    return (row for row in rows if not only_failed or State.known(folder.of(row)).failed.why)
 
 
 def work(

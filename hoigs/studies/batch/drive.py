@@ -169,8 +169,8 @@ class _Driver:
         if not work.todo:
             self.report(work, "done before")
             return True
-        if work.state.failed.get("when", 0.0) > self.began:
-            return self._failed(work, work.state.failed["why"])
+        if work.state.failed.when > self.began:
+            return self._failed(work, work.state.failed.why)
         return False
 
     def _failed(self, work: Work, why: str) -> bool:

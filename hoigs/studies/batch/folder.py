@@ -13,6 +13,8 @@ from pathlib import Path
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.files.folder_lock import FolderLock
+from hoigs.core.files.json_file import json_value
+from hoigs.core.files.regular_file import regular_file
 from hoigs.core.files.whole_files import written_whole
 from hoigs.studies.batch.manifest import Row
 
@@ -53,7 +55,7 @@ class BatchFolder:
         Raises:
             HoigsError: the list is damaged.
         """
-        with (self.path / BATCH).open(encoding="utf-8") as file:
+        with regular_file(self.path / BATCH).open(encoding="utf-8") as file:
             next(file)
             for number, line in enumerate(file, 2):
                 try:
@@ -110,8 +112,8 @@ class BatchFolder:
             HoigsError: there is none, or its list of rows is damaged.
         """
         try:
-            with (path / BATCH).open(encoding="utf-8") as file:
-                return cls(path, bool(json.loads(file.readline())["fan_out"]))
+            with regular_file(path / BATCH).open(encoding="utf-8") as file:
+                return cls(path, bool(json_value(file.readline())["fan_out"]))
         except FileNotFoundError:
             raise HoigsError(
                 f"{path}: no batch; `hoigs batch MANIFEST --out {path}` begins one"

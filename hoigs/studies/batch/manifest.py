@@ -4,26 +4,31 @@ from __future__ import annotations
 
 import csv
 import json
+import re
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import Any, Self, TextIO
 
 from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    StringConstraints,
     ValidationError,
     field_validator,
+    model_validator,
 )
 
 from hoigs.core.errors import HoigsError, did_you_mean
-from hoigs.core.files.whole_files import regular
-from hoigs.core.spec.loader import load_yaml
+from hoigs.core.files.json_file import short
+from hoigs.core.files.regular_file import regular_file
+from hoigs.core.spec.loader import MAX_BYTES, load_yaml
 from hoigs.core.storage.urls import as_url
 
-NAMES = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}$"  # of rows, as they name folders
-FORMATS = r"^[a-z][a-z0-9-]{0,39}$"  # of exports, as they name folders and logs
+NAMES = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")  # of rows, as they name folders
+FORMATS = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:@-]{0,79}")  # likewise, with kind: and @distribution
+CONTROL = ("Cc", "Cs")  # Unicode's categories of control characters and of halves of characters
+ONE_SOURCE = "a row has either a video or a clip"
 LISTS = ("set", "prepare", "object", "export")  # in CSV, texts with ";" between
 
 
@@ -32,13 +37,16 @@ class ManifestError(HoigsError):
 
 
 class Row(BaseModel):
-    """One video or clip of a batch. Relative paths are from the manifest's folder."""
+    """One video or clip of a batch. Relative paths are from the manifest's folder.
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    Checked when it is read from a manifest and when it is read back from the batch's own folder,
+    which other users may write to: names become folders, some of which are removed, and all texts
+    become words of command lines.
+    """
 
-    name: str = Field(
-        default="", pattern=NAMES, description="folder of the row; default: the file's name"
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    name: str = Field(description="folder of the row; default: the file's name")
     video: str = Field(default="", description="a video or a folder, for `hoigs prepare`; or a URL")
     clip: str = Field(
         default="", description="a clip folder, its URL, or builtin:NAME, in place of a video"
@@ -52,9 +60,7 @@ class Row(BaseModel):
     object: tuple[str, ...] = Field(
         default=(), description="the object, as `hoigs prepare --object`"
     )
-    export: tuple[Annotated[str, StringConstraints(pattern=FORMATS)], ...] = Field(
-        default=("ply",), description="formats to export"
-    )
+    export: tuple[str, ...] = Field(default=("ply",), description="formats to export")
     publish: str = Field(
         default="", description="URL of a folder, where run and exports are written under the name"
     )
@@ -64,12 +70,45 @@ class Row(BaseModel):
     )
     memory_gb: float = Field(default=0.0, ge=0, description="memory to set aside while it runs, GB")
 
-    @field_validator("video", "clip", "spec", "device")
+    @field_validator("*")
+    @classmethod
+    def _has_no_control_characters(cls, value: Any) -> Any:
+        for text in value if isinstance(value, tuple) else (value,):
+            if isinstance(text, str) and any(unicodedata.category(c) in CONTROL for c in text):
+                raise ValueError("a text without control characters is expected")
+        return value
+
+    @field_validator("name")
+    @classmethod
+    def _names_a_folder(cls, value: str) -> str:
+        if not NAMES.fullmatch(value):
+            raise ValueError(
+                "a row's name has 1 to 80 letters, digits, _, - and . , a letter, digit or _ first"
+            )
+        return value
+
+    @field_validator("video", "clip", "spec")
     @classmethod
     def _is_no_option(cls, value: str) -> str:
-        if value.startswith("-") or not value.isprintable():
-            raise ValueError("expected a name or a path: no leading - and no control characters")
+        if value.startswith("-"):
+            raise ValueError("it begins with -, as an option does; write ./ before it")
         return value
+
+    @field_validator("export")
+    @classmethod
+    def _names_formats(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for name in value:
+            if not FORMATS.fullmatch(name):
+                raise ValueError(
+                    f"{short(name)} is no name of a format, such as ply; `hoigs plugins` lists them"
+                )
+        return value
+
+    @model_validator(mode="after")
+    def _has_one_source(self) -> Self:
+        if bool(self.video) == bool(self.clip):
+            raise ValueError(ONE_SOURCE)
+        return self
 
     @field_validator("publish")
     @classmethod
@@ -134,11 +173,11 @@ def _rows_and_places(path: Path, defaults: Mapping[str, Any] | None) -> Iterator
     if read is None:
         raise ManifestError(f"{path}: expected a file that ends with .yaml, .yml or .csv")
     try:
-        with regular(path).open(encoding="utf-8-sig", newline="") as file:
+        with regular_file(path).open(encoding="utf-8-sig", newline="") as file:
             for values, at in read(file, path):
                 row = _row({**(defaults or {}), **values}, at, path.parent)
                 yield row, at.get("name", at.get("", str(path)))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, UnicodeDecodeError) as error:
         raise ManifestError(f"{path}: cannot be read ({error}); name a YAML or CSV file") from error
 
 
@@ -146,7 +185,7 @@ Read = Iterable[tuple[dict[str, Any], dict[str, str]]]  # values, and where each
 
 
 def _yaml(file: TextIO, path: Path) -> Read:
-    document = load_yaml(file.read(), str(path))
+    document = load_yaml(file.read(MAX_BYTES + 1), str(path))
     _known(
         document.data,
         ("rows", "defaults"),
@@ -172,12 +211,15 @@ def _yaml(file: TextIO, path: Path) -> Read:
 
 def _csv(file: TextIO, path: Path) -> Read:
     reader = csv.DictReader(file, skipinitialspace=True)
-    for values in reader:
-        at = f"{path}:{reader.line_num}"
-        if None in values:
-            raise ManifestError(f"{at}: has more cells than the first line has columns")
-        given = {k: v.strip() for k, v in values.items() if v is not None and v.strip()}
-        yield given, dict.fromkeys(("", *given), at)
+    try:
+        for values in reader:
+            at = f"{path}:{reader.line_num}"
+            if None in values:
+                raise ManifestError(f"{at}: has more cells than the first line has columns")
+            given = {k: v.strip() for k, v in values.items() if v is not None and v.strip()}
+            yield given, dict.fromkeys(("", *given), at)
+    except csv.Error as error:
+        raise ManifestError(f"{path}:{reader.line_num + 1}: is not CSV: {error}") from error
 
 
 def _known(data: Mapping[str, Any], names: Sequence[str], at: Mapping[str, str]) -> None:
@@ -194,29 +236,44 @@ def _row(values: Mapping[str, Any], at: Mapping[str, str], folder: Path) -> Row:
     _known(values, tuple(Row.model_fields), at)
     place = at.get("", "")
     if bool(values.get("video")) == bool(values.get("clip")):
-        raise ManifestError(f"{place}: a row has either a video or a clip")
+        raise ManifestError(f"{place}: {ONE_SOURCE}")
     key = "video" if values.get("video") else "clip"
-    source = str(values[key])
+    given = {**values, "name": values.get("name") or _name_of(str(values[key]))}
+    row = _checked(given, at)  # before its texts are looked up as paths
+    source, spec = getattr(row, key), row.spec
     if not source.startswith("builtin:") and as_url(source) is None:
         path = (folder / source).absolute()
-        if not path.exists():
-            near = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+        if not _there(path):
+            near = _names_in(path.parent)
             raise ManifestError(
                 f"{at.get(key, place)}: {key}: {path} does not exist{did_you_mean(path.name, near)}"
             )
         source = str(path)
-    spec = str(values.get("spec", "hoigs"))
-    if (folder / spec.partition("@")[0]).is_file():
+    if _there(file := folder / spec.partition("@")[0]) and not file.is_dir():
         spec = str((folder / spec).absolute())
-    name = values.get("name") or _name_of(source)
+    return _checked({**given, key: source, "spec": spec}, at)
+
+
+def _checked(values: Mapping[str, Any], at: Mapping[str, str]) -> Row:
     try:
-        return Row.model_validate({**values, key: source, "spec": spec, "name": name})
+        return Row.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
-        wrong = str(first["loc"][0])
-        raise ManifestError(
-            f"{at.get(wrong, place)}: {wrong}: {first['msg']}, got {first['input']!r}"
-        ) from error
+        wrong = str(first["loc"][0]) if first["loc"] else ""
+        why = f"{first['msg'].removeprefix('Value error, ')}, got {short(first['input'])}"
+        raise ManifestError(f"{at.get(wrong, at.get('', ''))}: {wrong}: {why}") from error
+
+
+def _there(path: Path) -> bool:
+    """Whether a path exists; one that the system refuses, as for its length, does not."""
+    try:
+        return path.exists()
+    except OSError:
+        return False
+
+
+def _names_in(folder: Path) -> list[str]:
+    return [p.name for p in folder.iterdir()] if _there(folder) and folder.is_dir() else []
 
 
 def _name_of(source: str) -> str:

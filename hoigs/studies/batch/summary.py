@@ -61,16 +61,15 @@ def summary_of(row: Row, batch: BatchFolder) -> dict[str, Any]:
     """State, scores (numbers, or "not computed: why") and times of a row."""
     folder = batch.of(row)
     state = State.known(folder)
-    todo = state.todo(stages_of(row, folder))
-    times = {name: done["seconds"] for name, done in state.done.items()}
-    why = state.failed.get("why", "")
+    stages = stages_of(row, folder)
+    todo, stage = state.todo(stages), state.failed.stage
+    times = {name: done.seconds for name, done in state.done.items()}
+    why = state.failed.why
     return {
         "name": row.name,
         "state": "failed" if why else "done" if not todo else f"before {todo[0].name}",
         "why": why,
-        "log": f"{batch.relative(row)}/{state.failed['stage']}.log"
-        if state.failed.get("stage")
-        else "",
+        "log": f"{batch.relative(row)}/{stage}.log" if stage in {s.name for s in stages} else "",
         "source": row.video or row.clip,
         "spec": row.spec,
         "scores": _scores(folder / "run" / "evaluation.json"),

@@ -8,15 +8,15 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.machine.cpus import available_cpus
+from hoigs.core.machine.python import PYTHON
 from hoigs.studies.execution.executor import Needs, Process
 
-PROGRAM = (sys.executable, "-P", "-m", "hoigs.studies.execution.command")
+PROGRAM = (*PYTHON, "-m", "hoigs.studies.execution.command")
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 ROUNDING = 1e-6  # of sums of shares of a GPU
 

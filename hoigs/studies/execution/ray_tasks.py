@@ -11,10 +11,12 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import hoigs
 from hoigs.core.errors import HoigsError
 from hoigs.studies.execution.executor import Needs, Process
 from hoigs.studies.execution.local import (
@@ -97,10 +99,9 @@ class RayExecutor:
             memory=wanted["memory"],
             max_retries=needs.retries,
         )
-        reference = task.remote(
-            self._program, [lease, *command], str(log), settings | thread_settings(self._threads),
-            str(Path.cwd()),
-        )  # fmt: skip
+        settings |= thread_settings(self._threads)
+        words, here = [lease, *command], str(Path.cwd())
+        reference = task.remote(self._program, words, str(log.absolute()), settings, here)
         return _RayProcess(self._ray, reference, log)
 
     def _machines(self) -> list[dict[str, float]]:
@@ -115,10 +116,11 @@ def _join(ray: Any, address: str | None) -> None:
         HoigsError: there is no cluster, or Ray would listen on more than loopback.
     """
     if address is None:
-        ray.init(
-            address="local", include_dashboard=False, log_to_driver=False,
-            logging_level="WARNING", _node_ip_address=LOOPBACK,
-        )  # fmt: skip
+        with _elsewhere():
+            ray.init(
+                address="local", include_dashboard=False, log_to_driver=False,
+                logging_level="WARNING", _node_ip_address=LOOPBACK,
+            )  # fmt: skip
         if (found := ray.util.get_node_ip_address()) != LOOPBACK:
             ray.shutdown()
             raise HoigsError(
@@ -130,12 +132,25 @@ def _join(ray: Any, address: str | None) -> None:
         if address != "auto":  # Ray itself waits many minutes for a head that is not there
             host, _, port = address.rpartition(":")
             socket.create_connection((host, int(port)), ANSWER_S).close()
-        ray.init(address=address, log_to_driver=False, logging_level="WARNING")
+        with _elsewhere():
+            ray.init(address=address, log_to_driver=False, logging_level="WARNING")
     except (OSError, ValueError, RuntimeError) as error:
         raise HoigsError(
             f"--address {address}: no Ray cluster answers there ({error}); on one of its machines "
             "`--address auto` finds it, and `ray start --head` starts one"
         ) from error
+
+
+@contextmanager
+def _elsewhere() -> Iterator[None]:
+    """In the folder that holds the package hoigs: the workers of Ray import from the folder where
+    it was initialised first of all, and in that of a data set may lie a numpy.py."""
+    before = Path.cwd()
+    os.chdir(Path(hoigs.__file__).parents[1])
+    try:
+        yield
+    finally:
+        os.chdir(before)
 
 
 def run_process(

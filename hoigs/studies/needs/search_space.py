@@ -11,6 +11,7 @@ from pydantic import Field, ValidationError
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.files.regular_file import regular_file
 from hoigs.core.spec.loader import load_yaml
 
 BUILTIN = Path(__file__).with_name("search_spaces.yaml")
@@ -80,7 +81,7 @@ def load_search_spaces(path: Path | None = None) -> tuple[SearchSpace, ...]:
     """
     path = path or BUILTIN
     try:
-        text = path.read_text(encoding="utf-8")
+        text = regular_file(path).read_text(encoding="utf-8")
     except OSError as error:
         raise HoigsError(
             f"{path}: the file of search spaces cannot be read: {error.strerror}"

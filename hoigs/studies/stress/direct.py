@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 
+from hoigs.core.machine.python import safe_children
 from hoigs.studies.stress.bench import TINY, Bench
 from hoigs.studies.stress.capability import Capability
 from hoigs.studies.stress.case import Case
@@ -22,7 +23,8 @@ OnResult = Callable[[str, str, CheckResult], None]
 def processes(workers: int, tasks: int) -> Iterator[ProcessPoolExecutor]:
     """A pool whose processes compute with one thread each."""
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(max(1, min(workers, tasks)), spawn, _one_thread) as pool:
+    count = max(1, min(workers, tasks))
+    with safe_children(), ProcessPoolExecutor(count, spawn, _one_thread) as pool:
         yield pool
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from hoigs.core.machine.python import PYTHON
 from hoigs.core.registry.component import INTERFACES
 from hoigs.core.registry.manager import HOOK
 from hoigs.testing.checks import CheckError
@@ -30,7 +31,7 @@ def _probe(steps: Sequence[str], first: Sequence[str], hook: str | None) -> dict
         job.write_text(
             json.dumps({"path": sys.path, "first": first, "hook": hook, "steps": list(steps)})
         )
-        command = [sys.executable, str(PROBE), str(result), str(job)]
+        command = [*PYTHON, str(PROBE), str(result), str(job)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if not result.is_file():
             raise CheckError(f"importing it ends the process ({done.returncode}): {done.stderr}")

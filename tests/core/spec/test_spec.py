@@ -224,6 +224,17 @@ def test_all_mistakes_are_told_at_once(parse):
     assert lines[0].startswith("my.yaml:3:40 interaction.qqq: unknown key (valid: keyframe_step")
 
 
+def test_mistakes_of_the_spec_do_not_hide_those_of_its_components(parse):
+    text = TEXT.replace("keyframe_step: 3", "keyframe_stp: 3").replace("steps: 7", "stps: 7")
+    text = text.replace("points: 1e3", "points: 0").replace("features:plain", "features:plan")
+    lines = complaints(parse, text.replace("interaction:", "interactoin:"))
+    places = {line.partition(": ")[0].partition(" ")[2] for line in lines}
+    assert places == {
+        "interactoin", "train.stps", "model.object.points", "model.object.features.use",
+        "model.object.deformation.keyframe_stp",
+    }  # fmt: skip
+
+
 def test_where_a_part_of_a_spec_stands(parse):
     assert parse().at("model", "object") == "my.yaml:9:5 model.object"
     assert parse().at("evaluation") == "my.yaml:1:1 evaluation"

@@ -65,6 +65,9 @@ def test_positions():
         ("a: &x [1]\nb: *x", "my.yaml:2:4: aliases"),
         ("a: {<<: *x}", "my.yaml:1:9: aliases"),
         ("a: !!python/object/apply:os.system ['true']", "my.yaml:1:4: the tag"),
+        ("a: !!int b", "my.yaml:1:4: 'b' is no int"),
+        ("a: !!bool x", "my.yaml:1:4: 'x' is no bool"),
+        ("a: 0x" + "f" * 5000, "my.yaml:1:4: a number of 5002 digits"),
         ("a: !mine 3", "my.yaml:1:4: the tag !mine"),
         ("a: !!set {b}", "my.yaml:1:4: the tag"),
         ("- 1", "my.yaml:1:1: expected `key: value` lines, got a list"),
@@ -130,6 +133,10 @@ def test_toml_that_is_none():
         load_toml("a = 1\nb = @", "my.toml")
     with pytest.raises(SpecError, match=r"^my\.toml: Cannot overwrite"):
         load_toml("a = 1\na = 2", "my.toml")
+    with pytest.raises(SpecError, match=r"^my\.toml: .* digits"):
+        load_toml("a = " + "9" * 5000, "my.toml")
+    with pytest.raises(SpecError, match=r"^my\.toml: nested"):
+        load_toml("a = " + "[" * 3000, "my.toml")
 
 
 def test_overrides():

@@ -124,8 +124,8 @@ def test_gpus_of_the_environment(monkeypatch):
 
 def test_a_process_ends_when_its_lease_is_anothers(tmp_path, monkeypatch):
     """Even while its driver is suspended: it looks for itself."""
-    monkeypatch.chdir(tmp_path)
-    Path("sleeper.py").write_text(SLEEPER)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    (tmp_path / "sleeper.py").write_text(SLEEPER)
     where, lock = LocalExecutor(), FolderLock(tmp_path / "row", "hoigs batch").acquire()
     process = where.start(("sleeper",), tmp_path / "log", Needs(), lock.lease)
     try:
@@ -152,8 +152,8 @@ time.sleep(60)
 
 def test_a_process_ends_with_its_driver_though_its_parent_lives(tmp_path, monkeypatch):
     """As where both the driver and the head of a Ray cluster are killed."""
-    monkeypatch.chdir(tmp_path)
-    Path("sleeper.py").write_text(SLEEPER)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    (tmp_path / "sleeper.py").write_text(SLEEPER)
     words = [sys.executable, "-c", HOLDER, str(tmp_path / "row")]
     driver = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     assert driver.stdout is not None

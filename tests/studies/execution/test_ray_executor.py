@@ -112,14 +112,17 @@ def test_a_process_whose_worker_is_killed_is_begun_again_if_it_may_be(start, tmp
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
-def test_what_hoigs_starts_ends_when_a_worker_is_killed(ray, tmp_path, monkeypatch):
-    """By the program that runs commands, which finds the module in its folder."""
-    monkeypatch.chdir(tmp_path)
-    Path("sleeper.py").write_text(
+def test_what_hoigs_starts_ends_when_a_worker_is_killed(ray, tmp_path):
+    """By the program that runs commands, which finds the module on its path."""
+    (tmp_path / "sleeper.py").write_text(
         "import os, time\nprint(os.getpid(), os.getppid(), flush=True)\ntime.sleep(60)\n"
     )
+    runs = (
+        f"import runpy, sys; sys.path.insert(0, {str(tmp_path)!r}); "
+        "runpy.run_module('hoigs.studies.execution.command', run_name='__main__', alter_sys=True)"
+    )
     log = tmp_path / "log"
-    process = RayExecutor(1).start(("sleeper",), log, Needs(gpus=0))
+    process = RayExecutor(1, program=("-c", runs)).start(("sleeper",), log, Needs(gpus=0))
     until = time.monotonic() + 30
     while not (log.exists() and log.read_text()) and time.monotonic() < until:
         time.sleep(0.05)
@@ -136,6 +139,20 @@ def test_no_cluster_at_an_address(ray):
     )
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
     assert "HoigsError: --address 127.0.0.1:1: no Ray cluster answers there" in done.stderr
+
+
+def test_workers_import_nothing_from_the_folder_where_ray_is_started(ray, tmp_path):
+    """In a process of its own: Ray can be initialised once in each."""
+    text = (
+        "import sys\n"
+        "from hoigs.studies.execution.executor import make_executor\n"
+        "make_executor('ray')\n"
+        "import ray\n"
+        "print(ray.get(ray.remote(lambda: sys.path).remote()))\n"
+    )
+    done = subprocess.run([sys.executable, "-P", "-c", text], capture_output=True, text=True,
+                          check=False, cwd=tmp_path)  # fmt: skip
+    assert done.stdout.startswith("['/") and str(tmp_path) not in done.stdout, done.stderr
 
 
 def test_by_default_nothing_listens_but_on_loopback(ray):

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from PIL import Image
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.regular_file import regular_file
 from hoigs.plugins.estimators.common.frame_files import FileDiagnostics
 
 
@@ -19,7 +20,7 @@ def read_png16(path: Path) -> Int[np.ndarray, "H W"]:
         HoigsError: 8 bits or colours, which are pictures of depth, not depth.
     """
     try:
-        with Image.open(path) as image:
+        with Image.open(regular_file(path)) as image:
             if not image.mode.startswith("I"):
                 raise HoigsError(
                     f"{path} is an 8-bit or coloured image ({image.mode}): a picture of depth, "
@@ -49,9 +50,9 @@ def read_exr(path: Path) -> Float[np.ndarray, "H W"]:
     import av
 
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(regular_file(path))) as container:
             frame = next(container.decode(video=0))
-    except (av.error.FFmpegError, StopIteration, IndexError, ValueError) as error:
+    except (OSError, av.error.FFmpegError, StopIteration, IndexError, ValueError) as error:
         raise HoigsError(
             f"{path} is no EXR file that ffmpeg decodes ({error}); write .npy or .npz instead"
         ) from error

@@ -11,6 +11,7 @@ import numpy as np
 
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.files.npz import plain_reason
+from hoigs.core.files.regular_file import regular_file
 from hoigs.core.interfaces.estimator import VideoRequest
 
 _NUMBER = re.compile(r"\d+")
@@ -154,7 +155,7 @@ def image_size(path: Path, problems: FileDiagnostics) -> tuple[int, int] | None:
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with Image.open(regular_file(path)) as image:
             return image.size
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         problems.add(f"{path} is no readable image: {error}")
@@ -164,7 +165,7 @@ def image_size(path: Path, problems: FileDiagnostics) -> tuple[int, int] | None:
 def load_array(path: Path, problems: FileDiagnostics) -> np.ndarray | None:
     """A .npy file, mapped, not read; adds to `problems` when it is damaged. No pickles."""
     try:
-        return np.load(path, mmap_mode="r", allow_pickle=False)
+        return np.load(regular_file(path), mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         problems.add(f"{path} is no readable .npy file: {plain_reason(error)}")
         return None
@@ -176,7 +177,7 @@ def npz_shapes(
     """Shape and type of each array of an .npz file, from their headers."""
     found = {}
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(regular_file(path)) as archive:
             for name in archive.namelist():
                 with archive.open(name) as stream:
                     shape, _, dtype = _read_header(stream)

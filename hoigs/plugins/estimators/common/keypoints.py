@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from hoigs.core.files.json_file import parse_json
 from hoigs.core.interfaces.estimator import (
     BODY_25_LANDMARKS,
     COCO_17_LANDMARKS,
@@ -38,6 +38,7 @@ CONVENTIONS: dict[int, tuple[str, tuple[int, ...]]] = {
     33: ("BlazePose 33", tuple(range(33))),
     133: ("COCO-WholeBody", tuple(WHOLE_BODY_133)),
 }
+MOST_BYTES = 2**30  # of one JSON file: text of all keypoints of a long video
 Person = Float[np.ndarray, "K 3"]
 
 
@@ -207,7 +208,7 @@ def _frame_of(image_id: int | str) -> int:
 
 def _json(path: Path, problems: FileDiagnostics) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parse_json(path, MOST_BYTES)
     except (OSError, ValueError) as error:
         problems.add(f"{path} is no readable JSON file: {error}")
         return None

@@ -11,6 +11,7 @@ from PIL import Image
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.files.npz import load_array
+from hoigs.core.files.regular_file import regular_file
 from hoigs.plugins.estimators.common.frame_files import FileDiagnostics
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -120,18 +121,18 @@ def read_video_masks(path: Path, inside: Inside, problems: FileDiagnostics) -> P
 
     stack = PackedMasks()
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(regular_file(path))) as container:
             for frame in container.decode(video=0):
                 bright = frame.to_ndarray(format="gray") > 127
                 stack.append(~bright if inside == "dark" else bright)
-    except (av.error.FFmpegError, IndexError, ValueError) as error:
+    except (OSError, av.error.FFmpegError, IndexError, ValueError) as error:
         problems.add(f"{path} is no readable video: {error}")
     return stack
 
 
 def _open(path: Path) -> Image.Image:
     try:
-        image = Image.open(path)
+        image = Image.open(regular_file(path))
         image.load()
     except (OSError, SyntaxError) as error:
         raise HoigsError(f"{path} is no readable image: {error}") from error

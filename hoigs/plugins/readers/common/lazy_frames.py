@@ -15,6 +15,7 @@ from torch import Tensor
 from hoigs.core.errors import ClipError
 from hoigs.core.files.npz import load_array, load_arrays
 from hoigs.core.files.pixel_cache import PixelCache
+from hoigs.core.files.regular_file import regular_file
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import FrameStore
 from hoigs.core.values.lens import Lens
@@ -213,7 +214,7 @@ def opened(path: Path) -> Image.Image:
         ClipError: it cannot be read; the message names the file.
     """
     try:
-        image = Image.open(path)
+        image = Image.open(regular_file(path))
         image.load()
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ClipError(f"{path} cannot be decoded ({error}); write it again") from error
@@ -227,7 +228,7 @@ def image_size(path: Path) -> tuple[int, int]:
         ClipError: not a readable image.
     """
     try:
-        with Image.open(path) as image:
+        with Image.open(regular_file(path)) as image:
             return image.size
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ClipError(f"{path} is not a readable image ({error})") from error

@@ -9,6 +9,7 @@ import numpy as np
 
 from hoigs.core.errors import ClipError
 from hoigs.core.files.json_file import short
+from hoigs.core.files.regular_file import regular_file
 
 
 def numbers(value: Any, where: str, *shape: int, flat: bool = False) -> np.ndarray:
@@ -59,7 +60,7 @@ def read_lines(path: Path) -> list[str]:
         ClipError: it is no text.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = regular_file(path).read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError) as error:
         raise ClipError(f"{path} is not text in UTF-8 ({error}); write it again") from error
     return [line.strip() for line in lines if line.strip()]
