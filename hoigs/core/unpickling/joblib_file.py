@@ -11,64 +11,52 @@ import io
 import pickle
 import zlib
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from hoigs.core.errors import ClipError
 from hoigs.core.files.npz import MOST_RATIO, SMALL_BYTES
-from hoigs.core.unpickling.pickles import refuse_unknown, storage
+from hoigs.core.unpickling.calls import Named, refused
+from hoigs.core.unpickling.pickles import Unpickler
 
-WRAPPER = ("joblib.numpy_pickle", "NumpyArrayWrapper")
+WRAPPER = Named("joblib.numpy_pickle.NumpyArrayWrapper", None)
 
 
 class _Wrapper:
-    """What joblib writes in place of an array; its attributes come from the file."""
-
-    shape: tuple[int, ...]
-    order: str
-    dtype: np.dtype
+    """What joblib writes in place of an array, until its state is read."""
 
 
-_PythonUnpickler: Any = pickle._Unpickler  # the C version cannot be extended
-
-
-class _Unpickler(_PythonUnpickler):  # type: ignore[misc]  # which is Any
-    dispatch: ClassVar = dict(_PythonUnpickler.dispatch)
-
-    def __init__(self, file: io.BytesIO) -> None:
-        super().__init__(file, encoding="latin1")
-        self.file = file
+class _Unpickler(Unpickler):
+    dispatch = Unpickler.dispatch.copy()
 
     def find_class(self, module: str, name: str) -> Any:
-        if (module, name) == WRAPPER:
-            return _Wrapper
-        if (module, name) == ("torch.storage", "_load_from_bytes"):
-            return storage
-        refuse_unknown(module, name)
-        return super().find_class(module, name)
+        return WRAPPER if f"{module}.{name}" == WRAPPER.name else super().find_class(module, name)
+
+    def load_newobj(self) -> None:
+        arguments, kind = self.stack.pop(), self.stack.pop()
+        if kind is not WRAPPER or arguments != ():
+            raise refused("it makes an object of a class; only numbers and arrays are read")
+        self.append(_Wrapper())
 
     def load_build(self) -> None:
-        super().load_build()
-        if isinstance(self.stack[-1], _Wrapper):
-            self.stack.append(self._array(self.stack.pop()))
+        if type(self.stack[-2]) is not _Wrapper:
+            return super().load_build()
+        state = self.stack.pop()
+        self.stack[-1] = self._array(state)
 
-    dispatch[pickle.BUILD[0]] = load_build
+    def _array(self, state: dict[str, Any]) -> np.ndarray:
+        """The array whose bytes follow now."""
+        if state.get("numpy_array_alignment_bytes") is not None:  # joblib 1.2 on
+            self.content.read(self.content.read(1)[0])
+        shape, dtype = state["shape"], state["dtype"]
+        content = self.content.read(self.calls.nbytes(shape, dtype))
+        order = "F" if state["order"] == "F" else "C"
+        return self.calls.array(shape, dtype, bytearray(content), order)
 
-    def _array(self, wrapper: _Wrapper) -> np.ndarray:
-        if wrapper.dtype.hasobject:
-            raise pickle.UnpicklingError("it holds arrays of Python objects; save numbers")
-        if getattr(wrapper, "numpy_array_alignment_bytes", None) is not None:  # joblib 1.2 on
-            self.file.read(self.file.read(1)[0])
-        count = int(np.prod(wrapper.shape, dtype=np.int64))
-        size = count * wrapper.dtype.itemsize
-        content = self.file.read(size)
-        if len(content) != size:
-            raise EOFError("the file ends within an array")
-        values = np.frombuffer(content, dtype=wrapper.dtype).copy()
-        if wrapper.order == "F":
-            return values.reshape(wrapper.shape[::-1]).T
-        return values.reshape(wrapper.shape)
+
+_Unpickler.dispatch[pickle.NEWOBJ[0]] = _Unpickler.load_newobj
+_Unpickler.dispatch[pickle.BUILD[0]] = _Unpickler.load_build
 
 
 def _decompressed(content: bytes) -> bytes:
@@ -95,6 +83,6 @@ def load_joblib(path: Path) -> Any:
         content = path.read_bytes()
         if content[:2] == b"\x1f\x8b" or content[:1] == b"\x78":
             content = _decompressed(content)
-        return _Unpickler(io.BytesIO(content)).load()
+        return _Unpickler(io.BytesIO(content), len(content)).load()
     except Exception as error:  # a damaged pickle raises anything
         raise ClipError(f"{path} cannot be read: {error or type(error).__name__}") from error
