@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
+from collections import OrderedDict, defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,19 @@ from hoigs.core.unpickling.pickles import load_pickle, load_pickled_npy
 VALUE = {
     "a": {"K": np.eye(3), "s": np.float32(2.5), "name": "x", "ids": [1, 2], "raw": b"\x00\xff"},
     "b": np.arange(6).reshape(2, 3)[:, ::-1],
+    "c": {
+        "empty": np.zeros((0, 3)),
+        "F": np.eye(2, 3).T,
+        "text": np.array(["a", "bcd"]),
+        "K": np.arange(24).reshape(2, 3, 4).swapaxes(0, 1),
+        "big": np.arange(300, dtype=">i4"),
+        "object": np.array([{"a": 1}, None]),
+        "none": b"",
+        "set": {1, "a"},
+        "complex": 2 + 1j,
+        "long": 2**63,
+        "default": defaultdict(dict, {np.int64(1): OrderedDict(a=(1, [True]))}),
+    },
 }
 
 
@@ -31,6 +45,23 @@ def test_values_come_back(tmp_path: Path, protocol: int) -> None:
     np.testing.assert_array_equal(back["b"], VALUE["b"])
     np.testing.assert_array_equal(back["a"]["K"], np.eye(3))
     assert back["a"]["s"] == 2.5 and back["a"]["ids"] == [1, 2] and back["a"]["raw"] == b"\x00\xff"
+    for name, value in VALUE["c"].items():
+        np.testing.assert_array_equal(back["c"][name], value)
+    with pytest.raises(KeyError):
+        back["c"]["default"]["absent"]
+
+
+@pytest.mark.parametrize("core", [b"numpy.core.", b"numpy._core."])
+def test_numpy_1_and_2_are_read(tmp_path: Path, core: bytes) -> None:
+    for protocol in (2, 5):
+        content = pickle.dumps(np.eye(3), protocol=protocol)
+        names = content.replace(b"numpy._core.", b"numpy.core.").replace(b"numpy.core.", core)
+        assert names.count(core) == 1
+        if protocol == 5:  # whose names have their lengths before them
+            at = names.index(core)
+            names = names[: at - 1] + bytes([len(core) + len("numeric")]) + names[at:]
+        (tmp_path / "x.pkl").write_bytes(names)
+        np.testing.assert_array_equal(load_pickle(tmp_path / "x.pkl"), np.eye(3))
 
 
 def test_npy_with_a_dictionary_and_with_numbers(tmp_path: Path) -> None:
@@ -40,6 +71,14 @@ def test_npy_with_a_dictionary_and_with_numbers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_pickled_npy(tmp_path / "n.npy"), np.arange(3))
     np.save(tmp_path / "o.npy", np.array([{"a": 1}, {"a": 2}], dtype=object), allow_pickle=True)
     assert load_pickled_npy(tmp_path / "o.npy")[1] == {"a": 2}
+
+
+def test_npy_whose_pickle_is_not_the_array_of_its_header(tmp_path: Path) -> None:
+    np.save(tmp_path / "x.npy", VALUE, allow_pickle=True)
+    header = (tmp_path / "x.npy").read_bytes()[:128]
+    (tmp_path / "x.npy").write_bytes(header + pickle.dumps([1]))
+    with pytest.raises(ClipError, match=r"x\.npy holds a list.*\(\)"):
+        load_pickled_npy(tmp_path / "x.npy")
 
 
 def test_tensors_come_back_and_carry_no_code(
