@@ -12,7 +12,7 @@ import pickle
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,7 @@ EMPTY_ROWS = 2**16
 _DTYPES = frozenset(
     ("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8", "f16", "c8", "c16")
 )
+Names = dict[str, Callable[..., Any] | None]
 _LATIN = ("latin1", "latin-1")
 
 
@@ -73,19 +74,19 @@ class Calls:
         self.size = size
         self.most = self.left = max(SMALL_BYTES, MOST_RATIO * size)
         self._unfilled: dict[int, np.ndarray] = {}  # of `_reconstruct`, by id, until their state
-        array = {"_reconstruct": self._reconstruct, "scalar": self._scalar}
-        buffer = {"_frombuffer": self._frombuffer}
-        plain: dict[str, Callable[..., Any] | None] = {
+        array: Names = {"_reconstruct": self._reconstruct, "scalar": self._scalar}
+        buffer: Names = {"_frombuffer": self._frombuffer}
+        plain: Names = {
             "dict": None, "set": self.make_set, "frozenset": self._frozenset,
             "complex": self._complex, "bytes": self._no_bytes,
         }  # fmt: skip
         # numpy 1 and 2, Python 2 and 3 name the same functions differently
-        self.allowed: dict[str, dict[str, Callable[..., Any] | None]] = {
+        self.allowed: dict[str, Names] = {
             "numpy": {"ndarray": None, "dtype": self._dtype},
-            "numpy.core.multiarray": {**array},
-            "numpy._core.multiarray": {**array},
-            "numpy.core.numeric": {**buffer},
-            "numpy._core.numeric": {**buffer},
+            "numpy.core.multiarray": array,
+            "numpy._core.multiarray": array,
+            "numpy.core.numeric": buffer,
+            "numpy._core.numeric": buffer,
             "collections": {"OrderedDict": self._ordered, "defaultdict": self._default},
             "_codecs": {"encode": self._encode},  # how protocol 2 spells bytes
             # HOLD saves some arrays as tensors
@@ -127,14 +128,16 @@ class Calls:
         if self.left < 0:
             raise refused(f"its {self.size} bytes unfold to more than {self.most / 2**30:.2g} GiB")
 
-    def array(self, shape: Any, dtype: Any, content: Any, order: str = "C") -> np.ndarray:
+    def array(
+        self, shape: Any, dtype: Any, content: Any, order: Literal["C", "F"] = "C"
+    ) -> np.ndarray:
         """An array over just its bytes.
 
         Raises:
             UnpicklingError: it is not of numbers or texts, or its size is not that of `content`.
         """
         kind = self._checked(shape, dtype, content)
-        return np.ndarray(shape, kind, content, order=order)  # type: ignore[call-overload]
+        return np.ndarray(shape, kind, content, order=order)
 
     def nbytes(self, shape: Any, dtype: Any) -> int:
         """How many bytes an array has whose shape and dtype a file claims."""
@@ -207,7 +210,7 @@ class Calls:
                 content = content.encode("latin1")
             kind, content = self._checked(shape, dtype, content), bytes(content)
         self.spend(8 * len(content) if kind.hasobject else len(content))
-        array.__setstate__((1, shape, kind, bool(fortran), content))
+        array.__setstate__((1, shape, kind, bool(fortran), content))  # type: ignore[arg-type]
 
     def _scalar(self, dtype: Any, content: Any = b"") -> Any:
         if type(content) is str:  # of Python 2
@@ -281,10 +284,10 @@ class Calls:
             raise refused(f"the numbers of a tensor are a {type(found).__name__}")
         numbers = found._untyped_storage  # its public methods warn that they will go
         self.spend(numbers.nbytes())
-        return torch.empty(0, dtype=found.dtype).set_(numbers)  # type: ignore[call-overload]
+        return torch.empty(0, dtype=found.dtype).set_(numbers)
 
     def _tensor(self, storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> Any:
-        """A tensor in its storage, of which it has no more numbers than that."""
+        """A tensor in its storage, of which it may hold a number many times, as `expand` does."""
         import torch
 
         if type(storage) is not torch.Tensor or storage.dim() != 1:
@@ -293,8 +296,6 @@ class Calls:
         steps = type(strides) is tuple and all(type(n) is int and n >= 0 for n in strides)
         if not steps or len(strides) != len(sizes) or type(offset) is not int or offset < 0:
             raise refused(f"a tensor of shape {shape} has the strides {strides!r:.80}")
-        if math.prod(sizes) > len(storage):
-            raise refused(f"a tensor of shape {shape} has {len(storage)} numbers")
         return storage.as_strided(sizes, strides, offset)  # torch checks that it is within
 
 

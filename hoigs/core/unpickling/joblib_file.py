@@ -11,14 +11,14 @@ import io
 import pickle
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from hoigs.core.errors import ClipError
 from hoigs.core.files.npz import MOST_RATIO, SMALL_BYTES
 from hoigs.core.unpickling.calls import Named, refused
-from hoigs.core.unpickling.pickles import Unpickler
+from hoigs.core.unpickling.pickles import Opcodes, Unpickler
 
 WRAPPER = Named("joblib.numpy_pickle.NumpyArrayWrapper", None)
 
@@ -28,7 +28,7 @@ class _Wrapper:
 
 
 class _Unpickler(Unpickler):
-    dispatch = Unpickler.dispatch.copy()
+    dispatch: ClassVar[Opcodes] = Opcodes(Unpickler.dispatch)
 
     def find_class(self, module: str, name: str) -> Any:
         return WRAPPER if f"{module}.{name}" == WRAPPER.name else super().find_class(module, name)
@@ -51,7 +51,7 @@ class _Unpickler(Unpickler):
             self.content.read(self.content.read(1)[0])
         shape, dtype = state["shape"], state["dtype"]
         content = self.content.read(self.calls.nbytes(shape, dtype))
-        order = "F" if state["order"] == "F" else "C"
+        order: Literal["C", "F"] = "F" if state["order"] == "F" else "C"
         return self.calls.array(shape, dtype, bytearray(content), order)
 
 

@@ -41,9 +41,11 @@ _OWN = (
 )  # fmt: skip
 
 
-class _Opcodes(dict[int, Callable[[Any], None]]):
+class Opcodes(dict[int, Callable[[Any], None]]):
+    """What is done for each opcode; UnpicklingError for others."""
+
     def __missing__(self, code: int) -> Callable[[Any], None]:
-        known = pickletools.code2op.get(chr(code))
+        known = next((op for op in pickletools.opcodes if ord(op.code) == code), None)
         what = f"the opcode {known.name}" if known else f"the byte {code}, which is no opcode,"
         raise refused(f"it holds {what} where numbers, arrays, lists or dictionaries are expected")
 
@@ -55,7 +57,7 @@ class Unpickler(_PythonUnpickler):  # type: ignore[misc]  # which is Any
         size: of the whole file, bytes; what it makes is in proportion.
     """
 
-    dispatch: ClassVar = _Opcodes()
+    dispatch: ClassVar[Opcodes] = Opcodes()
 
     def __init__(self, content: io.BytesIO, size: int) -> None:
         super().__init__(content, encoding="latin1")
@@ -200,7 +202,7 @@ def _size(value: Any) -> int | None:
 
 def _items(value: Any) -> Iterable[Any]:
     if type(value) in (list, tuple, set, frozenset):
-        return value  # type: ignore[no-any-return]
+        return value
     if type(value) is dict:
         return chain(value, value.values())
     if type(value) is np.ndarray:  # of objects

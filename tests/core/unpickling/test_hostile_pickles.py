@@ -224,7 +224,7 @@ ARRAY = written(Made(RECONSTRUCT, BLANK, (1, (3,), dtype("u1"), False, bytes(3))
         (written(Made(storage().function, (storage(),))), "tensor"),
         (
             written(Made(Name("torch._utils", "_rebuild_tensor_v2"),
-                         (storage(), 0, (10, 10), (0, 0), False, ()))), "6 numbers",
+                         (storage(), 0, (10**4, 10**4), (0, 0), False, ()))), "10000"
         ),
         (written(Made(Name("torch._utils", "_rebuild_tensor_v2"),
                       (storage(), 4, (3,), (1,), False, ()))), "out of bounds"),
