@@ -11,6 +11,11 @@ from typing import Any
 from hoigs.core.errors import HoigsError, did_you_mean
 
 _URL = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]+):/+(.+)$", re.DOTALL)
+# fsspec has more, some of which read other addresses, mount archives or render templates that a
+# stranger's file holds; these only read and write files where they say.
+SCHEMES = (
+    "s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "hf", "https", "http", "file", "memory",
+)  # fmt: skip
 EXTRA = "pip install 'hoigs[storage]' (and s3fs for s3://, gcsfs for gs://, adlfs for az://)"
 
 
@@ -27,8 +32,15 @@ def file_system(url: str) -> tuple[Any, str]:
     """fsspec's file system of a URL, and the path in it.
 
     Raises:
-        HoigsError: there is no such scheme, or its package is not installed.
+        HoigsError: its scheme is none of `SCHEMES`, it is a chain of several, or the package of its
+            scheme is not installed.
     """
+    scheme = url.partition(":")[0]
+    if scheme not in SCHEMES:
+        hint = did_you_mean(scheme, SCHEMES)
+        raise HoigsError(f"{url}: {scheme}:// is not read; expected {', '.join(SCHEMES)}{hint}")
+    if "::" in url:
+        raise HoigsError(f"{url}: a chain of several addresses is not read; name the one by ://")
     try:
         import fsspec
     except ImportError as error:
@@ -38,9 +50,7 @@ def file_system(url: str) -> tuple[Any, str]:
     except ImportError as error:
         raise HoigsError(f"{url}: {error}; {EXTRA}") from error
     except ValueError as error:
-        scheme = url.partition(":")[0]
-        hint = did_you_mean(scheme, fsspec.available_protocols())
-        raise HoigsError(f"{url}: {error}{hint}") from error
+        raise HoigsError(f"{url}: {error}") from error
 
 
 @contextmanager
