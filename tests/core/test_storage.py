@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ import pytest
 from hoigs.core.errors import HoigsError
 from hoigs.core.storage.fetch import fetched, local_path
 from hoigs.core.storage.publish import COMPLETE, publish
-from hoigs.core.storage.urls import as_url
+from hoigs.core.storage.urls import SCHEMES, as_url
 
 
 @pytest.fixture(autouse=True)
@@ -141,15 +142,27 @@ def test_the_cache_keeps_to_its_bound_but_for_what_is_in_use(
     [
         ("memory://lab/gone", "there is no such file or folder"),
         ("memry://lab/gone", 'memry.*did you mean "memory"'),
-        ("reference://clip::memory://lab/ref.json", "reference://"),
-        ("zip://a::memory://lab/a.zip", "zip://"),
-        ("s3://lab::memory://lab", "::"),
+        ("memory://lab/gone::reference://b", "memory://lab/gone::reference://b: .*chain"),
         ("http://127.0.0.1:9/a", r"http://127\.0\.0\.1:9/a: "),
     ],
 )
 def test_what_cannot_be_fetched(url: str, message: str) -> None:
     with pytest.raises(HoigsError, match=message):
         fetched(url)
+
+
+@pytest.mark.parametrize(
+    "scheme", sorted(s for s in {*fsspec.available_protocols()} - {*SCHEMES} if as_url(f"{s}://a"))
+)
+def test_a_scheme_that_may_do_more_than_read_is_refused_before_fsspec_sees_it(
+    tmp_path: Path, scheme: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fsspec.core, "url_to_fs", None)
+    (tmp_path / "a").touch()
+    url = f"{scheme}://lab/a::memory://b"
+    for work in (lambda: fetched(url), lambda: publish(tmp_path, url)):
+        with pytest.raises(HoigsError, match=rf"{re.escape(scheme)}://.* s3, "):
+            work()
 
 
 def test_a_row_is_read_from_s3_and_published_there(

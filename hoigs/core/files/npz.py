@@ -139,10 +139,20 @@ def _array(file: IO[bytes], name: str, size: int) -> np.ndarray:
 
 
 def _header(file: IO[bytes], name: str) -> ArrayHeader:
+    header = read_header(file, name)
+    if header.dtype.hasobject:
+        raise ValueError(f"{name} holds pickled objects")
+    return header
+
+
+def read_header(file: IO[bytes], name: str) -> ArrayHeader:
+    """The header of an npy, of objects too; the file stands at the content then.
+
+    Raises:
+        ValueError, EOFError, TokenError: it is damaged.
+    """
     with _header_lock:
         shape, fortran, dtype = _parsed(file)
-    if dtype.hasobject:
-        raise ValueError(f"{name} holds pickled objects")
     if any(size < 0 for size in shape):
         raise ValueError(f"{name} has the shape {shape}")
     return ArrayHeader(shape, dtype, fortran)

@@ -11,11 +11,10 @@ from typing import Any
 from hoigs.core.errors import HoigsError, did_you_mean
 
 _URL = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]+):/+(.+)$", re.DOTALL)
-# file systems that only read and write files: others of fsspec unpack archives, run templates that
-# a file holds ("reference"), or chain file systems ("::")
+# fsspec has more, some of which read other addresses, mount archives or render templates that a
+# stranger's file holds; these only read and write files where they say.
 SCHEMES = (
-    "s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "http", "https", "file", "memory", "sftp",
-    "ssh", "ftp", "hf", "hdfs", "webhdfs", "oss", "oci",
+    "s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "hf", "https", "http", "file", "memory",
 )  # fmt: skip
 EXTRA = "pip install 'hoigs[storage]' (and s3fs for s3://, gcsfs for gs://, adlfs for az://)"
 
@@ -33,13 +32,15 @@ def file_system(url: str) -> tuple[Any, str]:
     """fsspec's file system of a URL, and the path in it.
 
     Raises:
-        HoigsError: the scheme is none of `SCHEMES`, or its package is not installed.
+        HoigsError: its scheme is none of `SCHEMES`, it is a chain of several, or the package of its
+            scheme is not installed.
     """
-    scheme = url.partition(":")[0].lower()
-    if scheme not in SCHEMES or "::" in url:
-        what = "chains of file systems (::)" if scheme in SCHEMES else f"{scheme}://"
-        hint = did_you_mean(scheme, SCHEMES) if scheme not in SCHEMES else ""
-        raise HoigsError(f"{url}: {what} cannot be read{hint}; there are {', '.join(SCHEMES)}")
+    scheme = url.partition(":")[0]
+    if scheme not in SCHEMES:
+        hint = did_you_mean(scheme, SCHEMES)
+        raise HoigsError(f"{url}: {scheme}:// is not read; expected {', '.join(SCHEMES)}{hint}")
+    if "::" in url:
+        raise HoigsError(f"{url}: a chain of several addresses is not read; name the one by ://")
     try:
         import fsspec
     except ImportError as error:
