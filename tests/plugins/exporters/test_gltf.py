@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.exporters.common.bodies import body_motion
 from hoigs.plugins.exporters.common.objects import object_motion
-from hoigs.plugins.exporters.common.world import turned_gaussians, world_turn
+from hoigs.plugins.exporters.common.world import Move, world_move
 from hoigs.plugins.exporters.gltf_body import GltfBodyExporter
 from hoigs.plugins.exporters.gltf_splat import NAME, GltfSplatExporter
 
@@ -110,7 +110,7 @@ def test_the_skin_is_the_body(body):
     joints = np.concatenate([read.array(shape["attributes"][f"JOINTS_{k}"]) for k in sets], 1)
     weights = np.concatenate([read.array(shape["attributes"][f"WEIGHTS_{k}"]) for k in sets], 1)
     inverse = read.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
-    turn = world_turn(request.clip, "y").numpy()
+    turn = world_move(request.clip, "y").turn.numpy()
     for frame in (0, 2):
         moves = np.stack([read.world(j, frame) for j in skin["joints"]]) @ inverse
         blended = np.einsum("vk,vkab->vab", weights, moves[joints.astype(int)])
@@ -125,7 +125,7 @@ def test_objects_and_the_camera_move(body):
     request, path = body
     read, motion = Read(path), object_motion(request, "object")
     turn = np.eye(4)
-    turn[:3, :3] = world_turn(request.clip, "y").numpy()
+    turn[:3, :3] = world_move(request.clip, "y").turn.numpy()
     for frame in (0, 2):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = motion.rotations[frame], motion.translations[frame]
@@ -149,5 +149,5 @@ def test_splats_draw_the_picture(splats, psnr_to_ours):
                 torch.stack([get(k) for k in bands if k in shape], 1),
             )
         )  # fmt: skip
-    back = world_turn(request.clip, "y").mT
-    assert psnr_to_ours(turned_gaussians(Gaussians.cat(parts), back), 0) > 60
+    back = Move(world_move(request.clip, "y").turn.mT, torch.zeros(3))
+    assert psnr_to_ours(back.gaussians(Gaussians.cat(parts)), 0) > 60

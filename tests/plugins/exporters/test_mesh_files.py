@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from hoigs.plugins.exporters.common.bodies import body_motion
-from hoigs.plugins.exporters.common.world import world_turn
+from hoigs.plugins.exporters.common.world import world_move
 from hoigs.plugins.exporters.mesh_sequence import (
     MeshSequenceConfig,
     MeshSequenceExporter,
@@ -20,7 +20,7 @@ from hoigs.plugins.exporters.mesh_sequence import (
 def test_surfaces_come_back(file, request_of, tmp_path):
     request = request_of("human", "object", end=2.0)
     MeshSequenceExporter(MeshSequenceConfig(file=file)).export(request, tmp_path / "out")
-    turn = world_turn(request.clip, "y").numpy()
+    turn = world_move(request.clip, "y").turn.numpy()
     for i in (0, 2):
         path = tmp_path / "out" / "human" / f"frame_{i:04d}.{file}"
         mesh = trimesh.load(path, process=False, force="mesh")

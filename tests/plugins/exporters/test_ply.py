@@ -12,7 +12,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.maths.spherical_harmonics import rotate_sh, sh_basis
 from hoigs.plugins.exporters.common.ply_file import parse_ply, ply_bytes, read_ply
-from hoigs.plugins.exporters.common.world import world_turn
+from hoigs.plugins.exporters.common.world import world_move
 from hoigs.plugins.exporters.ply import PlyConfig, PlyExporter
 
 
@@ -29,7 +29,7 @@ def test_a_turned_world_looks_the_same_to_a_turned_camera(up, request_of, psnr_t
         noise = torch.randn(before.shape, generator=torch.Generator().manual_seed(0))
         request.scene.entity("object").sh.add_(0.2 * noise)
     PlyExporter(PlyConfig(up=up)).export(request, tmp_path / "out")
-    turn = world_turn(request.clip, up)
+    turn = world_move(request.clip, up).turn
     assert torch.allclose(turn @ request.clip.up(), torch.eye(3)["xyz".index(up)], atol=1e-5)
     back = torch.eye(4)
     back[:3, :3] = turn.mT

@@ -11,7 +11,7 @@ from hoigs.core.interfaces.body import PELVIS
 from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.exporters.bvh import BvhConfig, BvhExporter
 from hoigs.plugins.exporters.common.bodies import body_motion
-from hoigs.plugins.exporters.common.world import world_turn
+from hoigs.plugins.exporters.common.world import world_move
 from hoigs.plugins.exporters.smpl_npz import AmassExporter, SmplxExporter
 
 
@@ -74,7 +74,7 @@ def test_bvh(unit, request_, ours, tmp_path):
     names, places, step = read_bvh(tmp_path / "out" / "human.bvh")
     assert step == pytest.approx(1 / request_.fps)
     order = [names.index(n) for n in request_.bodies["human"].joint_names]
-    turned = ours @ world_turn(request_.clip, "y").numpy().T
+    turned = ours @ world_move(request_.clip, "y").turn.numpy().T
     metre = 100 if unit == "cm" else 1
     assert np.abs(places[:, order] / metre - turned).max() < 1e-3
 
@@ -106,4 +106,4 @@ def test_parameters(exporter, request_, ours, tmp_path):
         assert ("scale of human" in done.omitted) == (scale != 1.0)
     joints = joints[:, :1] + scale * (joints - joints[:, :1])
     up = "z" if exporter is AmassExporter else "clip"
-    assert np.abs(joints - ours @ world_turn(request_.clip, up).numpy().T).max() < 1e-3
+    assert np.abs(joints - ours @ world_move(request_.clip, up).turn.numpy().T).max() < 1e-3

@@ -10,7 +10,7 @@ from hoigs.core.registry.registry import default_registry
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.exporters.common.bodies import body_motion
 from hoigs.plugins.exporters.common.objects import object_motion
-from hoigs.plugins.exporters.common.world import turned_gaussians, world_turn
+from hoigs.plugins.exporters.common.world import Move, world_move
 
 WHY = "usd-core is not installed: hoigs[usd]"
 Gf, Usd, UsdGeom, UsdSkel, UsdVol = (
@@ -57,8 +57,8 @@ def test_gaussians_draw_the_picture(frame, written, psnr_to_ours):
                 ),
             )
         )
-    back = world_turn(request.clip, "y").mT
-    assert psnr_to_ours(turned_gaussians(Gaussians.cat(parts), back), frame) > 60
+    back = Move(world_move(request.clip, "y").turn.mT, torch.zeros(3))
+    assert psnr_to_ours(back.gaussians(Gaussians.cat(parts)), frame) > 60
 
 
 def test_what_stands_still_has_no_samples(written):
@@ -75,7 +75,7 @@ def test_usdskel_poses_the_body(written):
     assert UsdSkel.BakeSkinning(root, Gf.Interval(0, 2))
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/people/human/mesh"))
     motion = body_motion(request, "human")
-    turn = world_turn(request.clip, "y").numpy()
+    turn = world_move(request.clip, "y").turn.numpy()
     for frame in (0, 2):
         points = np.array(mesh.GetPointsAttr().Get(frame))
         away = np.linalg.norm(points - motion.vertices(frame).numpy() @ turn.T, axis=1)
@@ -85,7 +85,7 @@ def test_usdskel_poses_the_body(written):
 def test_objects_and_the_camera_move(written):
     request, stage = written
     motion, turn = object_motion(request, "object"), np.eye(4)
-    turn[:3, :3] = world_turn(request.clip, "y").numpy()
+    turn[:3, :3] = world_move(request.clip, "y").turn.numpy()
     for frame in (0, 2):
         cache = UsdGeom.XformCache(frame)
         pose = np.eye(4)
