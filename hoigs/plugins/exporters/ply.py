@@ -18,6 +18,9 @@ class PlyConfig(ComponentConfig):
 
     up: Up = "clip"
     """"y" or "z" turns the world, SH too, so that this axis points up; "clip" leaves it"""
+    pad_sh: bool = True
+    """45 f_rest whatever the run's SH degree, the rest zeros: the original 3DGS viewers and loaders
+    open nothing else; false leaves out the zeros"""
 
 
 class PlyExporter(Exporter):
@@ -41,7 +44,7 @@ class PlyExporter(Exporter):
         progress(0.0, "gaussians")
         state = request.scene(request.moments[0].to(request.scene.device), request.entities)
         move = world_move(request.clip, self.config.up)
-        data = ply_bytes(move.gaussians(state.joined()))
+        data = ply_bytes(move.gaussians(state.joined()), pad_sh=self.config.pad_sh)
         progress(0.5, "writing")
         (folder / "scene.ply").write_bytes(data)
         lost = {"entities": "one list of Gaussians; export them one by one with --entities"}

@@ -18,6 +18,8 @@ class PlySequenceConfig(ComponentConfig):
 
     up: Up = "clip"
     """"y" or "z" turns the world, SH too, so that this axis points up; "clip" leaves it"""
+    pad_sh: bool = False
+    """45 f_rest in every file, as `exporter:ply` writes them; without, files are smaller"""
     merged: bool = True
     """one file a moment; false makes a folder for each entity"""
 
@@ -49,7 +51,7 @@ class PlySequenceExporter(Exporter):
             parts = {"": state.joined()} if self.config.merged else state.gaussians
             for name, gaussians in parts.items():
                 (folder / name).mkdir(exist_ok=True)
-                data = ply_bytes(move.gaussians(gaussians))
+                data = ply_bytes(move.gaussians(gaussians), pad_sh=self.config.pad_sh)
                 (folder / name / f"frame_{i:04d}.ply").write_bytes(data)
         if self.config.merged and len(request.entities) > 1:
             return {"entities": "one list of Gaussians; --set merged=false keeps them apart"}

@@ -69,6 +69,20 @@ def test_other_programs_read_it(request_of, tmp_path):
     torch.testing.assert_close(again.log_scales, ours.log_scales)
 
 
+@pytest.mark.parametrize("pad_sh", [True, False])
+def test_the_original_viewers_find_45_coefficients(pad_sh, request_of, tmp_path):
+    request = request_of("object")
+    PlyExporter(PlyConfig(pad_sh=pad_sh)).export(request, tmp_path / "out")
+    head = (tmp_path / "out" / "scene.ply").read_bytes().split(b"end_header")[0]
+    own = request.scene.entity("object").sh.shape[1]
+    assert own < 16 and head.count(b"f_rest_") == (45 if pad_sh else 3 * (own - 1))
+    read = read_ply(tmp_path / "out" / "scene.ply").sh
+    with torch.no_grad():
+        ours = request.scene(request.moments[0]).gaussians["object"].sh
+    torch.testing.assert_close(read[:, :own], ours)
+    assert not read[:, own:].any()
+
+
 def test_damaged_files_are_refused(loaded):
     data = ply_bytes(loaded.model.entity("object").canonical)
     for broken, words in (
