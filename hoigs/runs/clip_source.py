@@ -20,6 +20,8 @@ from hoigs.synthesis.builtin import builtin_clip, generator_version
 from hoigs.synthesis.config import SceneConfig
 from hoigs.synthesis.named import PREFIX, is_named, named_clip
 
+NAME_IT = "name one with --clip (`hoigs train` takes it as its argument)"
+
 
 def clip_folder(clip: str | Path, registry: Registry | None = None) -> Path:
     """The folder of a clip argument; a built-in clip is generated unless it is cached.
@@ -55,8 +57,8 @@ def recorded_folder(run: Path, provenance: Mapping[str, Any], registry: Registry
     try:
         config = SceneConfig.model_validate(made["config"])
     except (KeyError, ValidationError):  # no built-in clip
-        raise ClipError(f"{missing}; name it") from None
-    other = f"{missing}, and another version of hoigs generated it; name a clip"
+        raise ClipError(f"{missing}; {NAME_IT}") from None
+    other = f"{missing}, and another version of hoigs generated it; {NAME_IT}"
     if made.get("generator") != f"hoigs.synthesis {generator_version()}":
         raise ClipError(other)
     again = builtin_clip(registry.get("body:anny")(), config)

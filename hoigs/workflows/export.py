@@ -70,7 +70,7 @@ def export(
     exporter, name = make_exporter(format, overrides, registry)
     target = Path(out) if out is not None else run / "exports" / name
     refuse_existing(target)
-    loaded = LoadedRun.open(run, clip=clip, device=device, plugins=plugins)
+    loaded = LoadedRun.open(run, clip=clip, device=device, plugins=plugins, pixels=False)
     known = loaded.model.names()
     for entity in entities:
         if entity not in known:

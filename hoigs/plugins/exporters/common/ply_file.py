@@ -13,8 +13,6 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.values.gaussians import Gaussians
 
 SIZES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1"}
-
-
 FULL_SH = 16  # coefficients a channel of degree 3
 
 
