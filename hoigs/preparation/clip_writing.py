@@ -50,6 +50,7 @@ def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
         for name, thing in made.objects_made.items():
             writer.set_object(name, thing.track)
         writer.set_points(made.scene.points, made.scene.colors)
+        writer.set_world(made.world())
         if made.video.uneven:
             writer.set_times(made.video.times)
         if made.track.model is not None:

@@ -12,7 +12,9 @@ import numpy as np
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.model.standing import world_of_people
 from hoigs.core.values.clip import BodyTrack
+from hoigs.core.values.world import World
 from hoigs.preparation.bodies.file_body import FileBody
 from hoigs.preparation.body.silhouette import silhouette
 from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras, known_lens
@@ -395,6 +397,12 @@ class Pipeline:
     def object_masks(self, name: str) -> MaskStack:
         """The final masks of an object."""
         return self.masks.object if name == self.options.object else self.masks.further[name]
+
+    def world(self) -> World:
+        """Up and floor by the people who stand, else by the cameras."""
+        people = [(self.body, person.poses) for person in self.people.people.values()]
+        found = world_of_people(people, self.video.fps) if people else None
+        return World.guessed(self.cameras) if found is None else found
 
     def people_masks(self) -> dict[str, MaskStack]:
         """The final masks of everybody."""

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from hoigs.core.errors import ClipError
+from hoigs.core.errors import ClipError, HoigsError
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.model.standing import in_known_world
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.storage.fetch import local_path
 from hoigs.core.values.clip import Clip
@@ -16,6 +19,8 @@ from hoigs.runs.reader_choice import ReaderChoice, choose_reader
 from hoigs.synthesis.builtin import builtin_clip, generator_version
 from hoigs.synthesis.config import SceneConfig
 from hoigs.synthesis.named import PREFIX, is_named, named_clip
+
+NAME_IT = "name one with --clip (`hoigs train` takes it as its argument)"
 
 
 def clip_folder(clip: str | Path, registry: Registry | None = None) -> Path:
@@ -52,8 +57,8 @@ def recorded_folder(run: Path, provenance: Mapping[str, Any], registry: Registry
     try:
         config = SceneConfig.model_validate(made["config"])
     except (KeyError, ValidationError):  # no built-in clip
-        raise ClipError(f"{missing}; name it") from None
-    other = f"{missing}, and another version of hoigs generated it; name a clip"
+        raise ClipError(f"{missing}; {NAME_IT}") from None
+    other = f"{missing}, and another version of hoigs generated it; {NAME_IT}"
     if made.get("generator") != f"hoigs.synthesis {generator_version()}":
         raise ClipError(other)
     again = builtin_clip(registry.get("body:anny")(), config)
@@ -116,7 +121,23 @@ def read_clip(
     require_folder(folder)
     choice = reader or choose_reader(folder, registry)
     choice.reader.allow_faults = allow_faults
-    clip = choice.reader.read(folder)
+    clip = _in_known_world(choice.reader.read(folder), registry)
     if width is None or width >= clip.cameras[0].width:
         return clip
     return clip.resized(width)
+
+
+def _in_known_world(clip: Clip, registry: Registry) -> Clip:
+    """The clip with up and floor from the people in it, where its data do not say.
+
+    Bodies that need settings, as a path to their file, are left out: `hoigs export` has those of
+    the run's spec.
+    """
+    bodies = {}
+    for name, track in clip.bodies.items() if clip.world.is_guess else ():
+        with suppress(HoigsError):  # no such body here; who trains is told
+            config = registry.config_class(track.model)
+            if not any(field.is_required() for field in config.model_fields.values()):
+                context = BuildContext(entity=name, clip=clip, body_track=track)
+                bodies[name] = registry.concrete(track.model).from_config(config(), context)
+    return in_known_world(clip, bodies)

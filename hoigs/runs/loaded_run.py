@@ -14,7 +14,7 @@ from hoigs.core.errors import CheckpointError, HoigsError
 from hoigs.core.model.camera_refinement import CameraRefinement
 from hoigs.core.model.compose import compose
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.registry.registry import default_registry
+from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
 from hoigs.runs.checkpoint import (
@@ -24,6 +24,7 @@ from hoigs.runs.checkpoint import (
 )
 from hoigs.runs.choices import pick_device, with_rasterizer
 from hoigs.runs.clip_source import clip_folder, read_clip, recorded_folder
+from hoigs.runs.kept_clip import load_kept
 from hoigs.runs.reader_choice import recorded_reader
 from hoigs.runs.resuming import load_spec
 from hoigs.runs.run_folder import RunFolder
@@ -54,6 +55,7 @@ class LoadedRun:
         rasterizer: str | None = None,
         device: str = "cpu",
         plugins: Sequence[Path | str] = (),
+        pixels: bool = True,
     ) -> LoadedRun:
         """Read a run folder.
 
@@ -61,6 +63,8 @@ class LoadedRun:
             clip: in place of the one that it was trained on, a folder or "builtin:NAME".
             rasterizer: in place of the spec's. device: "cpu", "cuda" or "auto".
             plugins: Python files to load (and run) first.
+            pixels: whether the clip's images will be needed. If not, a run whose clip is gone is
+                opened with the cameras and poses that it keeps.
 
         Raises:
             HoigsError: this is no run, it is damaged, or its clip is not there.
@@ -72,15 +76,12 @@ class LoadedRun:
         device, changes = pick_device(device), with_rasterizer((), rasterizer)
         spec = load_spec(run.spec, changes, registry)
         provenance = run.read_provenance()
-        if clip is None:
-            folder = recorded_folder(path, provenance, registry)
-        else:
-            folder = clip_folder(clip, registry)
         torch.manual_seed(spec.train.seed)
-        allowed = bool(provenance.get("allow_faults"))
-        recorded = provenance["clip"].get("reader") if clip is None else None
-        choice = recorded_reader(recorded, path, folder, registry) if recorded else None
-        source = read_clip(folder, registry, spec.train.width, allow_faults=allowed, reader=choice)
+        gone = clip is None and not (path / provenance["clip"]["path"]).is_dir()
+        if gone and not pixels and run.kept_clip.is_file():
+            source = load_kept(run.kept_clip)
+        else:
+            source = _clip_of(path, provenance, clip, spec.train.width, registry)
         checkpoint = load_newest(run.checkpoints, DRAWN)
         model = compose(spec, source, registry)
         ended = checkpoint.meta["step"] >= spec.train.steps  # or else training removes old ones
@@ -110,6 +111,24 @@ class LoadedRun:
         step = checkpoint.meta["step"]
         model.set_progress(min(1.0, step / self.spec.train.steps))
         return replace(self, model=model, step=step)
+
+
+def _clip_of(
+    path: Path,
+    provenance: dict[str, Any],
+    clip: Path | str | None,
+    width: int | None,
+    registry: Registry,
+) -> Clip:
+    """The clip of a run with its pixels, or another one that was named."""
+    if clip is None:
+        folder = recorded_folder(path, provenance, registry)
+    else:
+        folder = clip_folder(clip, registry)
+    allowed = bool(provenance.get("allow_faults"))
+    recorded = provenance["clip"].get("reader") if clip is None else None
+    choice = recorded_reader(recorded, path, folder, registry) if recorded else None
+    return read_clip(folder, registry, width, allow_faults=allowed, reader=choice)
 
 
 @torch.no_grad()

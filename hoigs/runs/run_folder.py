@@ -46,6 +46,7 @@ RUN = Layout(
         _WRITTEN_WHOLE,
         rf"\.{_WRITTEN_WHOLE}\.part",
         r"metrics\.(jsonl|part)",
+        r"clip\.npz|\.clip\.npz\.part",
         r"checkpoints/step_\d+\.((safetensors|json)(\.part)?|\d+\.part)",
         r"renders/[^/]+\.(mp4|webm|mov|gif)(\.part)?",
         r"exports/.+",
@@ -96,6 +97,16 @@ class RunFolder:
     @property
     def checkpoints(self) -> Path:
         return self.path / "checkpoints"
+
+    @property
+    def kept_clip(self) -> Path:
+        """The clip without its pixels (`hoigs.runs.kept_clip`); older runs have none."""
+        return self.path / "clip.npz"
+
+    def keep_clip_of(self, other: RunFolder) -> None:
+        """Take over what another run keeps of its clip, if it keeps anything."""
+        if other.kept_clip.is_file():
+            shutil.copyfile(other.kept_clip, self.kept_clip)
 
     @property
     def windows(self) -> Path:

@@ -17,6 +17,7 @@ import torch
 from hoigs.core.clip_folder.write import ClipWriter
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.clip import POSES_EXACT, BodyTrack, ObjectTrack, uniform_test_split
+from hoigs.core.values.world import World
 from hoigs.synthesis.clips import name_of
 from hoigs.synthesis.config import SceneConfig
 from hoigs.synthesis.degradation.damage import damage, with_frames_dropped
@@ -167,6 +168,7 @@ def write_scene(
         writer.set_object("object", gather.object_track())
         writer.set_points(*gather.scene_points())
         writer.set_split(uniform_test_split(config.frames, config.test_frames))
+        writer.set_world(World(up=(0.0, 1.0, 0.0), floor=0.0))  # as room and walking have it
         writer.provenance.update(
             {
                 "generator": f"hoigs.synthesis {generator_version()}",

@@ -23,6 +23,7 @@ from hoigs.metrics.lpips import Lpips, find_weights
 from hoigs.runs.checkpoint import has_checkpoint, load_newest
 from hoigs.runs.choices import pick_device, with_rasterizer
 from hoigs.runs.clip_source import read_clip
+from hoigs.runs.kept_clip import save_kept
 from hoigs.runs.resuming import (
     DEFAULT_SPEC,
     changes_of,
@@ -192,6 +193,7 @@ class Session:
                 "device": device,
             }
             run.create(spec.dump(), provenance, overwrite, [folder])
+        save_kept(source, run.kept_clip)
         return cls(spec, source, run, trainer, faults, choice.key, changes)
 
     def train(self, on_step: Callable[[StepReport], None] | None = None) -> None:

@@ -128,7 +128,9 @@ def render(
     suffix = ".webm" if background == TRANSPARENT else ".mp4"
     target = Path(out) if out is not None else run / "renders" / f"{stem}{suffix}"
     _check_target(target, background)
-    loaded = LoadedRun.open(run, clip=clip, rasterizer=rasterizer, device=device, plugins=plugins)
+    loaded = LoadedRun.open(
+        run, clip=clip, rasterizer=rasterizer, device=device, plugins=plugins, pixels=compare
+    )
     names = list(loaded.model.entities)
     for entity in chosen:
         if entity not in names:

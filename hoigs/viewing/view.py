@@ -80,7 +80,7 @@ def view(
                 "file: leave them out"
             )
         loaded = LoadedRun.open(
-            runs[0], clip=clip, rasterizer=rasterizer, device=device, plugins=plugins
+            runs[0], clip=clip, rasterizer=rasterizer, device=device, plugins=plugins, pixels=False
         )
         return write_page(loaded, html, max_mb=max_mb, entities=entities, progress=progress)
     if max_mb is not None or entities:

@@ -15,6 +15,7 @@ from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.files.folder_lock import FolderLock
 from hoigs.core.model.compose import compose_bodies
 from hoigs.core.model.exporter import SHEET, Exported, Exporter, ExportRequest
+from hoigs.core.model.standing import in_known_world
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.values.between import frame_numbers, moment_between
@@ -69,12 +70,14 @@ def export(
     exporter, name = make_exporter(format, overrides, registry)
     target = Path(out) if out is not None else run / "exports" / name
     refuse_existing(target)
-    loaded = LoadedRun.open(run, clip=clip, device=device, plugins=plugins)
+    loaded = LoadedRun.open(run, clip=clip, device=device, plugins=plugins, pixels=False)
     known = loaded.model.names()
     for entity in entities:
         if entity not in known:
             hint = did_you_mean(entity, known)
             raise HoigsError(f'no entity "{entity}"{hint}; this run has {", ".join(known)}')
+    bodies = _bodies(loaded, registry)
+    loaded = replace(loaded, clip=in_known_world(loaded.clip, bodies))
     moments, rate = export_moments(loaded.clip, start, end, fps, slow)
     chosen = moments if exporter.moving else moments[:1]
     request = ExportRequest(
@@ -82,7 +85,7 @@ def export(
         loaded.clip,
         tuple(m.to(loaded.model.device) for m in chosen),
         tuple(entities),
-        bodies={n: b.to(loaded.model.device) for n, b in _bodies(loaded, registry).items()},
+        bodies={n: b.to(loaded.model.device) for n, b in bodies.items()},
         fps=rate,
     )
     if not any(request.of_kind(kind) for kind in exporter.kinds):

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from hoigs.core.files.json_file import parse_json, short
 from hoigs.core.files.safe_replace import Layout, one_of
 from hoigs.core.names import NAME, RULE
+from hoigs.core.values.world import How
 
 FORMAT, VIEWS_FORMAT, VERSION = "hoigs-clip", "hoigs-views", 1
 HEADER, VIEWS = "clip.json", "held_out/views.json"
@@ -53,6 +54,23 @@ class SplitHeader(_Strict):
 
 
 Count = Annotated[int, Field(ge=1, le=10**9)]
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=False)]
+
+
+class WorldHeader(_Strict):
+    """`world`, as `hoigs.core.values.world.World`."""
+
+    up: list[Finite] = Field(min_length=3, max_length=3)
+    floor: Finite | None = None
+    metres: bool = True
+    known: How = "given"
+
+    @field_validator("up")
+    @classmethod
+    def _up_has_a_direction(cls, up: list[float]) -> list[float]:
+        if not any(up):
+            raise ValueError("all zero; expected a direction")
+        return up
 
 
 class ClipHeader(_Strict):
@@ -82,6 +100,13 @@ class ClipHeader(_Strict):
         default=None,
         description="of frames that are not evenly spaced: seconds of each since the first; `fps` "
         "is then their mean rate",
+    )
+    world: WorldHeader | None = Field(
+        default=None,
+        description='`{"up": [0, 1, 0], "floor": 0, "metres": true, "known": "given"}`: up in the '
+        "world's axes, height of the floor along it or null, whether lengths are metres, and who "
+        'knows: "given", "floor" (feet at rest), "body" (people who stand), "cameras (guess)". '
+        "Folders without it are read: up then comes from the bodies, else from the cameras",
     )
     provenance: dict[str, Any] = Field(
         default_factory=dict, description="free: where each part came from"

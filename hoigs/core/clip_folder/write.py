@@ -25,6 +25,7 @@ from hoigs.core.clip_folder.format import (
     EntityHeader,
     SplitHeader,
     ViewsHeader,
+    WorldHeader,
     is_clip_folder,
 )
 from hoigs.core.clip_folder.frame_files import (
@@ -41,6 +42,7 @@ from hoigs.core.files.safe_replace import refuse_unwritable, require_replaceable
 from hoigs.core.files.whole_files import failures_named
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, ObjectTrack, uniform_test_split
+from hoigs.core.values.world import World
 
 
 class ClipWriter:
@@ -92,6 +94,7 @@ class ClipWriter:
         self._split: Mapping[str, Sequence[int]] | None = None
         self._colmap: Path | None = None
         self._times: list[float] | None = None
+        self._world: World | None = None
         self._held_out_frames: list[int] = []
         refuse_to_overwrite(self.folder)
 
@@ -181,6 +184,10 @@ class ClipWriter:
         mean rate, whatever it was."""
         self._times = [float(s - seconds[0]) for s in seconds]
 
+    def set_world(self, world: World) -> None:
+        """Up, floor and unit; without it readers take them from the bodies, or the cameras."""
+        self._world = world
+
     def set_colmap(self, model: Path) -> None:
         """A COLMAP model folder to keep beside the clip, as colmap/."""
         self._colmap = Path(model)
@@ -235,6 +242,7 @@ class ClipWriter:
             entities=entities,
             split=SplitHeader(**{k: [int(i) for i in split[k]] for k in ("train", "test")}),
             depth_kind=self.depth_kind,
+            world=None if self._world is None else WorldHeader(**self._world.to_dict()),
             provenance=self.provenance,
         )
 
@@ -269,6 +277,7 @@ def write_clip(clip: Clip, folder: str | Path, **options: Any) -> None:
             duration = (clip.num_frames - 1) / clip.fps
             writer.set_times([float(m.time) * duration for m in clip.moments])
         writer.set_split(clip.split)
+        writer.set_world(clip.world)
         writer.provenance.update(clip.provenance)
 
 

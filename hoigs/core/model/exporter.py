@@ -79,15 +79,18 @@ class Exported:
         folder: the new folder.
         files: path of each file below `folder`, with "/", to its size in bytes.
         omitted: what of the scene the format cannot hold, to the reason.
+        supposed: what the files say that nobody knows, to where it was taken from.
     """
 
     folder: Path
     files: Mapping[str, int]
     omitted: Mapping[str, str] = field(default_factory=dict)
+    supposed: Mapping[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
         lines = [f"{self.folder / name}: {size} bytes" for name, size in self.files.items()]
-        return "\n".join([*lines, *(f"not exported: {k}: {v}" for k, v in self.omitted.items())])
+        lines += [f"not exported: {k}: {v}" for k, v in self.omitted.items()]
+        return "\n".join([*lines, *(f"supposed: {k}: {v}" for k, v in self.supposed.items())])
 
 
 class Exporter(Configurable, ABC):
@@ -102,6 +105,8 @@ class Exporter(Configurable, ABC):
         kinds: kinds of entities that the format can hold; others are left out.
         moving: whether the files hold more than one moment.
         reads_gaussians: False if nothing of the Gaussians enters the files, as with a skeleton.
+        up: the axis of the files that points against gravity, "y" or "z"; "clip" where they keep
+            the world of the clip.
         axes: of the coordinates in the files. units: of lengths.
         keeps: what the files hold, to the form it has there.
     """
@@ -110,6 +115,7 @@ class Exporter(Configurable, ABC):
     kinds: ClassVar[frozenset[EntityKind]] = frozenset({"scene", "human", "object"})
     moving: ClassVar[bool] = True
     reads_gaussians: ClassVar[bool] = True
+    up: str = "clip"
     axes: str = "the world of the clip; cameras are OpenCV's (x right, y down, z forward)"
     units: str = "metres"
     keeps: ClassVar[Mapping[str, str]] = {}
@@ -150,7 +156,8 @@ class Exporter(Configurable, ABC):
             paths = sorted(path for path in unfinished.rglob("*") if path.is_file())
             if not paths:
                 raise HoigsError(f"{type(self).__name__} wrote no file for {out}")
-            text = json.dumps(self.sheet(request) | {"lost": omitted}, indent=2)
+            said = {"lost": omitted, "supposed": self.supposed(request)}
+            text = json.dumps(self.sheet(request) | said, indent=2)
             (unfinished / SHEET).write_text(text + "\n", encoding="utf-8")
             paths.append(unfinished / SHEET)
             sizes = {p.relative_to(unfinished).as_posix(): p.stat().st_size for p in paths}
@@ -159,7 +166,21 @@ class Exporter(Configurable, ABC):
         except BaseException:
             shutil.rmtree(unfinished)
             raise
-        return Exported(out, sizes, omitted)
+        return Exported(out, sizes, omitted, self.supposed(request))
+
+    def supposed(self, request: ExportRequest) -> dict[str, str]:
+        """What the files say that the clip only guesses: `Exported.supposed`."""
+        world, found = request.clip.world, {}
+        if self.up != "clip" and world.is_guess:
+            found["up"] = (
+                "the mean upward direction of the cameras, as the clip does not say where up is "
+                "and no person in it stands; its floor is not known"
+            )
+        elif self.up != "clip" and world.floor is None:
+            found["floor"] = f"not known: the clip's origin stays at {self.up} = 0"
+        if not world.metres:
+            found["unit"] = "the clip's own, taken for a metre: its size in metres is not known"
+        return found
 
     def _unsuited(self, request: ExportRequest) -> dict[str, str]:
         """Entities of a kind that the format cannot hold, to the reason.
@@ -192,5 +213,6 @@ class Exporter(Configurable, ABC):
             "fps": request.fps if self.moving else None,
             "units": self.units,
             "axes": self.axes,
+            "world": request.clip.world.to_dict(),
             "kept": dict(self.keeps),
         }

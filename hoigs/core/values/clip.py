@@ -21,6 +21,7 @@ from hoigs.core.maths.frame_times import FrameTimes
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind
+from hoigs.core.values.world import World
 
 CACHE_MB = 512  # of resized images kept in memory
 EVEN = 1e-5  # of the clip: times this near to even ones are even
@@ -165,6 +166,8 @@ class Clip:
         provenance: where each part came from.
         faults: what is wrong with the clip and was accepted when it was read (`clip_folder.health`
             finds more).
+        world: up, floor and unit. Where nobody knows, up is a guess by the cameras, which
+            `world.known` says.
     """
 
     name: str
@@ -182,6 +185,11 @@ class Clip:
     depth_kind: str = "none"
     provenance: Mapping[str, Any] = field(default_factory=dict)
     faults: Sequence[Diagnostic] = ()
+    world: World = None  # type: ignore[assignment]  # filled in below
+
+    def __post_init__(self) -> None:
+        if self.world is None:
+            object.__setattr__(self, "world", World.guessed(self.cameras))
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -282,9 +290,8 @@ class Clip:
         )
 
     def up(self) -> Float[Tensor, " 3"]:
-        """The mean upward direction of the cameras, unit, as a COLMAP world defines none."""
-        ups = torch.stack([-camera.world_to_camera[1, :3] for camera in self.cameras])
-        return torch.nn.functional.normalize(ups.mean(0), dim=0)
+        """`world.up` as a tensor, unit."""
+        return self.world.up_vector()
 
     def extent(self) -> float:
         """Scene extent, metres: 1.1 x camera spread (Kerbl et al. 2023, arXiv:2308.04079), but at

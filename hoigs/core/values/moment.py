@@ -77,7 +77,7 @@ class BodyPose:
         }
         return replace(self, **changed)
 
-    def frame(self, index: int | slice) -> BodyPose:
+    def frame(self, index: int | slice | Tensor) -> BodyPose:
         """One frame of a batched pose, or some; betas without a batch are shared."""
         shared = self.betas if self.betas.dim() == 1 else self.betas[index]
         return replace(

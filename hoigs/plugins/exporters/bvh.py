@@ -12,7 +12,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.model.exporter import Exporter, ExportRequest
 from hoigs.core.progress import Progress
 from hoigs.plugins.exporters.common.bodies import BodyMotion, body_motions
-from hoigs.plugins.exporters.common.world import AXES, Up, world_turn
+from hoigs.plugins.exporters.common.world import AXES, Up, world_move
 
 
 class BvhConfig(ComponentConfig):
@@ -38,16 +38,17 @@ class BvhExporter(Exporter):
 
     def __init__(self, config: BvhConfig | None = None) -> None:
         self.config = config or BvhConfig()
-        self.axes = AXES[self.config.up]
+        self.up = self.config.up
+        self.axes = AXES[self.up]
         self.units = {"m": "metres", "cm": "centimetres"}[self.config.unit]
 
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
         """See `Exporter.write`."""
         progress(0.0, "poses")
-        turn = world_turn(request.clip, self.config.up)
+        move = world_move(request.clip, self.config.up)
         for motion in body_motions(request):
             text = bvh_text(
-                motion.turned(turn), request.fps, 100.0 if self.config.unit == "cm" else 1.0
+                motion.moved(move), request.fps, 100.0 if self.config.unit == "cm" else 1.0
             )
             (folder / f"{motion.name}.bvh").write_text(text, encoding="ascii")
         return {

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import gzip
+import io
+import json
 import math
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
@@ -20,7 +24,9 @@ from hoigs.core.values.between import camera_between, frame_of
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import SH_C0, Gaussians
 from hoigs.plugins.exporters.common.ply_file import parse_ply, ply_bytes
+from hoigs.plugins.exporters.common.world import Move
 
+FLAGS, ANTIALIASED = 14, 1  # the byte of an SPZ header, and its bit
 EYES = 8  # cameras of the video, of which a colour is the mean
 
 
@@ -44,6 +50,7 @@ class GaussForgeExporter(Exporter):
         progress(0.0, "gaussians")
         ours = request.scene(request.moments[0], request.entities).joined()
         data, read = self.packed(self.prepared(ours, request.clip))
+        data = self.marked(data, request.scene.antialiased)
         progress(0.5, "comparing")
         (folder / f"scene{self.suffixes[0]}").write_bytes(data)
         if len(read) != len(ours):
@@ -70,12 +77,35 @@ class GaussForgeExporter(Exporter):
         data = converted(ply_bytes(gaussians), "ply", self.file_format)
         return data, parse_ply(converted(data, self.file_format, "ply"), self.file_format)
 
+    def marked(self, data: bytes, antialiased: bool) -> bytes:
+        """The file with its mark of Gaussians that were trained antialiased.
+
+        Overridden where the format has one; GaussForge does not set it.
+        """
+        del antialiased
+        return data
+
 
 class SpzExporter(GaussForgeExporter):
-    """`scene.spz`, Niantic's."""
+    """`scene.spz`, Niantic's: x right, y up, z backward, where a PLY of 3DGS has y down and z
+    forward.
+    """
 
     suffixes = (".spz",)
     file_format = "spz"
+    axes = "x right, y up, z backward: those of the clip's world (and of ply) with y and z negated"
+    half_turn: ClassVar = Move(torch.diag(torch.tensor((1.0, -1.0, -1.0))), torch.zeros(3))
+
+    def packed(self, gaussians: Gaussians) -> tuple[bytes, Gaussians]:
+        """As above; GaussForge itself does not turn the axes of a PLY to SPZ's."""
+        data, read = super().packed(self.half_turn.gaussians(gaussians))
+        return data, self.half_turn.gaussians(read)
+
+    def marked(self, data: bytes, antialiased: bool) -> bytes:
+        """Bit 0 of the header's flags."""
+        raw = bytearray(gzip.decompress(data))
+        raw[FLAGS] = raw[FLAGS] & ~ANTIALIASED | (ANTIALIASED if antialiased else 0)
+        return gzip.compress(bytes(raw), mtime=0)
 
 
 class SplatExporter(GaussForgeExporter):
@@ -98,6 +128,18 @@ class SogExporter(GaussForgeExporter):
 
     suffixes = (".sog",)
     file_format = "sog"
+
+    def marked(self, data: bytes, antialiased: bool) -> bytes:
+        """`antialias` in meta.json."""
+        made = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(made, "w") as new:
+            for name in old.namelist():
+                content = old.read(name)
+                if name == "meta.json":
+                    meta = json.loads(content) | {"antialias": antialiased}
+                    content = json.dumps(meta).encode()
+                new.writestr(zipfile.ZipInfo(name), content)
+        return made.getvalue()
 
 
 class CompressedPlyExporter(GaussForgeExporter):

@@ -23,7 +23,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.plugins.exporters.common.bodies import BodyMotion, body_motion
 from hoigs.plugins.exporters.common.glb import INDICES, VERTICES, Glb
 from hoigs.plugins.exporters.common.objects import SEEN, ObjectMotion, object_motions
-from hoigs.plugins.exporters.common.world import AXES, world_turn
+from hoigs.plugins.exporters.common.world import AXES, world_move
 
 INFLUENCES = 8  # joints that may move a vertex: two sets of four, which glTF players read
 
@@ -43,6 +43,7 @@ class GltfBodyExporter(Exporter):
     Config: ClassVar[type[ComponentConfig]] = GltfBodyConfig
     suffixes = (".glb",)
     kinds: ClassVar = frozenset({"human", "object"})
+    up = "y"
     axes = AXES["y"]
     keeps: ClassVar = {
         "people": "skinned meshes in their shape, coloured by the nearest Gaussians",
@@ -82,8 +83,11 @@ class GltfBodyExporter(Exporter):
             frames = [frame_of(request.clip, moment) for moment in request.moments]
             cameras = [camera_between(request.clip, frame).to("cpu") for frame in frames]
             children.append(add_camera(clock, cameras))
-        turn = matrices_to_quats(world_turn(request.clip, "y"))
-        root = glb.add("nodes", name="world", rotation=_xyzw(turn).tolist(), children=children)
+        move = world_move(request.clip, "y")
+        root = glb.add(
+            "nodes", name="world", rotation=_xyzw(matrices_to_quats(move.turn)).tolist(),
+            translation=move.shift.tolist(), children=children,
+        )  # fmt: skip
         glb.add("scenes", nodes=[root, *skins])
         glb.document["scene"] = 0
         progress(0.9, "writing")

@@ -13,7 +13,7 @@ from hoigs.core.model.exporter import Exporter, ExportRequest
 from hoigs.core.progress import Progress
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.exporters.common.glb import VERTICES, Glb
-from hoigs.plugins.exporters.common.world import AXES, turned_gaussians, world_turn
+from hoigs.plugins.exporters.common.world import AXES, world_move
 
 NAME = "KHR_gaussian_splatting"
 
@@ -32,6 +32,7 @@ class GltfSplatExporter(Exporter):
     Config: ClassVar[type[ComponentConfig]] = GltfSplatConfig
     suffixes = (".glb",)
     moving: ClassVar = False
+    up = "y"
     axes = AXES["y"]
     keeps: ClassVar = {
         "means": "POSITION", "rotations": "unit quaternions xyzw", "opacities": "in [0, 1]",
@@ -44,14 +45,14 @@ class GltfSplatExporter(Exporter):
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
         """See `Exporter.write`."""
         progress(0.0, "gaussians")
-        turn = world_turn(request.clip, "y")
+        move = world_move(request.clip, "y")
         state = request.scene(request.moments[0], request.entities)
         glb = Glb()
         glb.document["extensionsUsed"] = [NAME]
         nodes = []
         for name, gaussians in state.gaussians.items():
             if len(gaussians):
-                mesh = add_splats(glb, name, turned_gaussians(gaussians, turn))
+                mesh = add_splats(glb, name, move.gaussians(gaussians))
                 nodes.append(glb.add("nodes", name=name, mesh=mesh))
         glb.add("scenes", nodes=nodes)
         glb.document["scene"] = 0

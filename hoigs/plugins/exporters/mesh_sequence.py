@@ -19,7 +19,7 @@ from hoigs.core.model.exporter import Exporter, ExportRequest
 from hoigs.core.progress import Progress
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.exporters.common.bodies import body_motion
-from hoigs.plugins.exporters.common.world import AXES, Up, world_turn
+from hoigs.plugins.exporters.common.world import AXES, Up, world_move
 
 
 class MeshSequenceConfig(ComponentConfig):
@@ -53,12 +53,13 @@ class MeshSequenceExporter(Exporter):
 
     def __init__(self, config: MeshSequenceConfig | None = None) -> None:
         self.config = config or MeshSequenceConfig()
-        self.axes = AXES[self.config.up]
+        self.up = self.config.up
+        self.axes = AXES[self.up]
 
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
         """See `Exporter.write`."""
         lost = {"looks": "a mesh has one colour a vertex, from all sides; ply-sequence holds them"}
-        turn = world_turn(request.clip, self.config.up)
+        move = world_move(request.clip, self.config.up)
         for done, name in enumerate(request.entities):
             if request.scene.entity(name).kind not in self.kinds:
                 continue
@@ -75,7 +76,7 @@ class MeshSequenceExporter(Exporter):
             moments, faces, colors = found
             for i, vertices in enumerate(moments):
                 path = folder / name / f"frame_{i:04d}.{self.config.file}"
-                path.write_bytes(mesh_bytes(vertices @ turn.mT, faces, colors, self.config.file))
+                path.write_bytes(mesh_bytes(move.points(vertices), faces, colors, self.config.file))
         return lost
 
     def _person(

@@ -10,7 +10,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.model.exporter import Exporter, ExportRequest
 from hoigs.core.progress import Progress
 from hoigs.plugins.exporters.common.ply_file import ply_bytes
-from hoigs.plugins.exporters.common.world import AXES, Up, turned_gaussians, world_turn
+from hoigs.plugins.exporters.common.world import AXES, Up, world_move
 
 
 class PlyConfig(ComponentConfig):
@@ -18,6 +18,9 @@ class PlyConfig(ComponentConfig):
 
     up: Up = "clip"
     """"y" or "z" turns the world, SH too, so that this axis points up; "clip" leaves it"""
+    pad_sh: bool = True
+    """45 f_rest whatever the run's SH degree, the rest zeros: the original 3DGS viewers and loaders
+    open nothing else; false leaves out the zeros"""
 
 
 class PlyExporter(Exporter):
@@ -33,14 +36,15 @@ class PlyExporter(Exporter):
 
     def __init__(self, config: PlyConfig | None = None) -> None:
         self.config = config or PlyConfig()
-        self.axes = AXES[self.config.up]
+        self.up = self.config.up
+        self.axes = AXES[self.up]
 
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
         """See `Exporter.write`."""
         progress(0.0, "gaussians")
         state = request.scene(request.moments[0].to(request.scene.device), request.entities)
-        turn = world_turn(request.clip, self.config.up)
-        data = ply_bytes(turned_gaussians(state.joined(), turn))
+        move = world_move(request.clip, self.config.up)
+        data = ply_bytes(move.gaussians(state.joined()), pad_sh=self.config.pad_sh)
         progress(0.5, "writing")
         (folder / "scene.ply").write_bytes(data)
         lost = {"entities": "one list of Gaussians; export them one by one with --entities"}

@@ -10,7 +10,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.model.exporter import Exporter, ExportRequest
 from hoigs.core.progress import Progress
 from hoigs.plugins.exporters.common.ply_file import ply_bytes
-from hoigs.plugins.exporters.common.world import AXES, Up, turned_gaussians, world_turn
+from hoigs.plugins.exporters.common.world import AXES, Up, world_move
 
 
 class PlySequenceConfig(ComponentConfig):
@@ -18,6 +18,8 @@ class PlySequenceConfig(ComponentConfig):
 
     up: Up = "clip"
     """"y" or "z" turns the world, SH too, so that this axis points up; "clip" leaves it"""
+    pad_sh: bool = False
+    """45 f_rest in every file, as `exporter:ply` writes them; without, files are smaller"""
     merged: bool = True
     """one file a moment; false makes a folder for each entity"""
 
@@ -37,18 +39,19 @@ class PlySequenceExporter(Exporter):
 
     def __init__(self, config: PlySequenceConfig | None = None) -> None:
         self.config = config or PlySequenceConfig()
-        self.axes = AXES[self.config.up]
+        self.up = self.config.up
+        self.axes = AXES[self.up]
 
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
         """See `Exporter.write`."""
-        turn = world_turn(request.clip, self.config.up)
+        move = world_move(request.clip, self.config.up)
         for i, moment in enumerate(request.moments):
             progress(i / len(request.moments), f"moment {i + 1} of {len(request.moments)}")
             state = request.scene(moment, request.entities)
             parts = {"": state.joined()} if self.config.merged else state.gaussians
             for name, gaussians in parts.items():
                 (folder / name).mkdir(exist_ok=True)
-                data = ply_bytes(turned_gaussians(gaussians, turn))
+                data = ply_bytes(move.gaussians(gaussians), pad_sh=self.config.pad_sh)
                 (folder / name / f"frame_{i:04d}.ply").write_bytes(data)
         if self.config.merged and len(request.entities) > 1:
             return {"entities": "one list of Gaussians; --set merged=false keeps them apart"}

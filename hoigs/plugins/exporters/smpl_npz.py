@@ -14,7 +14,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.model.exporter import Exporter, ExportRequest
 from hoigs.core.progress import Progress
 from hoigs.plugins.exporters.common.bodies import BodyMotion, body_motions
-from hoigs.plugins.exporters.common.world import AXES, Up, world_turn
+from hoigs.plugins.exporters.common.world import AXES, Up, world_move
 
 
 class SmplxNpzConfig(ComponentConfig):
@@ -43,15 +43,16 @@ class _ParametersExporter(Exporter):
 
     def __init__(self, config: SmplxNpzConfig | AmassConfig | None = None) -> None:
         self.config = config or self.Config()
-        self.axes = AXES[self.config.up]
+        self.up = self.config.up
+        self.axes = AXES[self.up]
 
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
         """See `Exporter.write`."""
         progress(0.0, "poses")
-        turn = world_turn(request.clip, self.config.up)
+        move = world_move(request.clip, self.config.up)
         lost = {"surface details and looks": "the files hold parameters of a body"}
         for motion in body_motions(request):
-            turned = motion.turned(turn)
+            turned = motion.moved(move)
             arrays: dict[str, Any] = self.arrays(turned, request)
             np.savez(folder / f"{motion.name}.npz", **arrays)
             lost |= _unlike_smpl(motion, type(self).__name__)

@@ -21,7 +21,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.exporters.common.bodies import BodyMotion, body_motion
 from hoigs.plugins.exporters.common.objects import ObjectMotion, object_motions
-from hoigs.plugins.exporters.common.world import AXES, turned_gaussians, world_turn
+from hoigs.plugins.exporters.common.world import AXES, Move, world_move
 
 INFLUENCES = 8  # joints that may move a vertex
 FILM = 36.0  # width of the camera's aperture, millimetres
@@ -44,6 +44,7 @@ class UsdExporter(Exporter):
 
     Config: ClassVar[type[ComponentConfig]] = UsdConfig
     suffixes = (".usd", ".usdc")
+    up = "y"
     axes = AXES["y"]
     keeps: ClassVar = {
         "Gaussians": "ParticleField3DGaussianSplat, float32, all SH bands, time samples",
@@ -57,27 +58,27 @@ class UsdExporter(Exporter):
 
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
         """See `Exporter.write`."""
-        turn = world_turn(request.clip, "y")
+        move = world_move(request.clip, "y")
         stage = _stage(request)
         lost: dict[str, str] = {}
         if self.config.splats:
-            _add_splats(stage, request, turn, progress)
+            _add_splats(stage, request, move, progress)
         for name in request.of_kind("human") if self.config.skeletons else ():
             progress(0.7, name)
             if name in request.bodies:
-                motion = body_motion(request, name).turned(turn)
+                motion = body_motion(request, name).moved(move)
                 _add_person(stage, motion, hidden=self.config.splats)
             else:
                 lost[f"skeleton of {name}"] = "it has no body model"
         progress(0.8, "objects and camera")
         for rigid in object_motions(request):
-            _add_object(stage, rigid, turn, hidden=self.config.splats)
+            _add_object(stage, rigid, move, hidden=self.config.splats)
             if rigid.residual > 1e-4:
                 lost[f"deformation of the points of {rigid.name}"] = (
                     f"the Xform is rigid, {1000 * rigid.residual:.2f} mm (RMS) from the Gaussians"
                 )
         frames = [frame_of(request.clip, moment) for moment in request.moments]
-        _add_camera(stage, [camera_between(request.clip, f).to("cpu") for f in frames], turn)
+        _add_camera(stage, [camera_between(request.clip, f).to("cpu") for f in frames], move)
         progress(0.9, "writing")
         stage.GetRootLayer().Export(str(folder / "scene.usd"))
         return lost
@@ -119,15 +120,13 @@ def _quats(quats: Float[Tensor, "N 4"]) -> Any:
     return Vt.QuatfArray([Gf.Quatf(w, x, y, z) for w, x, y, z in unit])
 
 
-def _add_splats(
-    stage: Usd.Stage, request: ExportRequest, turn: Float[Tensor, "3 3"], progress: Progress
-) -> None:
+def _add_splats(stage: Usd.Stage, request: ExportRequest, move: Move, progress: Progress) -> None:
     moments: dict[str, list[Gaussians]] = {name: [] for name in request.entities}
     for i, moment in enumerate(request.moments):
         progress(0.5 * i / len(request.moments), f"moment {i + 1} of {len(request.moments)}")
         state = request.scene(moment, request.entities)
         for name, gaussians in state.gaussians.items():
-            moments[name].append(turned_gaussians(gaussians.detach().to("cpu"), turn))
+            moments[name].append(move.gaussians(gaussians.detach().to("cpu")))
     UsdGeom.Scope.Define(stage, "/World/splats")
     for name, seen in moments.items():
         prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/World/splats/{_name(name)}")
@@ -218,13 +217,11 @@ def _matrix(turn: Float[Tensor, "3 3"], place: Float[Tensor, " 3"]) -> Gf.Matrix
     return Gf.Matrix4d(*whole.flatten().tolist())
 
 
-def _add_object(
-    stage: Usd.Stage, motion: ObjectMotion, turn: Float[Tensor, "3 3"], *, hidden: bool
-) -> None:
+def _add_object(stage: Usd.Stage, motion: ObjectMotion, move: Move, *, hidden: bool) -> None:
     UsdGeom.Scope.Define(stage, "/World/objects")
     frame = UsdGeom.Xform.Define(stage, f"/World/objects/{_name(motion.name)}")
     poses = zip(motion.rotations, motion.translations, strict=True)
-    _set(frame.AddTransformOp(), [_matrix(turn @ r, turn @ t) for r, t in poses])
+    _set(frame.AddTransformOp(), [_matrix(move.turn @ r, move.points(t)) for r, t in poses])
     points = UsdGeom.Points.Define(stage, frame.GetPath().AppendChild("points"))
     points.CreatePointsAttr(_vectors(motion.points))
     points.CreateWidthsAttr(Vt.FloatArray(len(motion.points), 0.005))
@@ -234,12 +231,12 @@ def _add_object(
         points.CreateVisibilityAttr(UsdGeom.Tokens.invisible)
 
 
-def _add_camera(stage: Usd.Stage, cameras: Sequence[Camera], turn: Float[Tensor, "3 3"]) -> None:
+def _add_camera(stage: Usd.Stage, cameras: Sequence[Camera], move: Move) -> None:
     """The camera of the video; USD's looks along -z with y up, its lengths are millimetres."""
     camera = UsdGeom.Camera.Define(stage, "/World/camera")
     flip = torch.diag(torch.tensor((1.0, -1.0, -1.0)))
-    views = [turn @ c.world_to_camera[:3, :3].mT @ flip for c in cameras]
-    places = [turn @ c.center for c in cameras]
+    views = [move.turn @ c.world_to_camera[:3, :3].mT @ flip for c in cameras]
+    places = [move.points(c.center) for c in cameras]
     _set(camera.AddTransformOp(), [_matrix(r, t) for r, t in zip(views, places, strict=True)])
     # lengths of the lens are in tenths of the scene's unit; only their ratios matter
     scale = [FILM / c.width for c in cameras]

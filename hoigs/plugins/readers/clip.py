@@ -35,6 +35,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind
+from hoigs.core.values.world import World
 from hoigs.plugins.readers.common.config import ReaderConfig
 
 LEAST_BRIGHT = 16  # of a mask's brightest pixel, unless it is empty
@@ -82,6 +83,7 @@ class ClipFolderReader(ClipReader):
             "fps": header.fps,
             "depth_kind": header.depth_kind,
             "provenance": header.provenance,
+            "world": _world(header),
         }
         held_out = self._read_held_out(folder, header, moments, shared, unusable)
         return Clip(
@@ -238,6 +240,15 @@ def _tensors(path: Path) -> dict[str, Tensor]:
 
 def _kinds(header: ClipHeader) -> dict[str, EntityKind]:
     return {name: entity.kind for name, entity in header.entities.items()}
+
+
+def _world(header: ClipHeader) -> World | None:
+    """None in folders of before there was such a key; built-in clips have had one floor ever."""
+    if header.world is not None:
+        return World.from_dict(header.world.model_dump())
+    if str(header.provenance.get("generator", "")).startswith("hoigs.synthesis "):
+        return World(up=(0.0, 1.0, 0.0), floor=0.0)
+    return None
 
 
 def _read_cameras(path: Path, width: int, height: int) -> list[Camera]:

@@ -11,6 +11,7 @@ from pydantic import Field
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.values.clip import Clip, uniform_test_split
 from hoigs.core.values.tokens import EntityKind
+from hoigs.core.values.world import World
 from hoigs.plugins.readers.common.colmap_model import model_folder, read_sparse, sparse_needs
 from hoigs.plugins.readers.common.config import VideoReaderConfig
 from hoigs.plugins.readers.common.frame_order import image_files, video_moments
@@ -90,6 +91,7 @@ class ColmapReader(ClipReader):
             points=model.points,
             point_colors=model.colors,
             split=split_of(len(images), self.config.test_every),
+            world=World.guessed(cameras, metres=False),
             fps=self.config.fps,
             provenance={
                 "reader": "reader:colmap",

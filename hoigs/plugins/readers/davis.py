@@ -16,6 +16,7 @@ from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip, uniform_test_split
 from hoigs.core.values.tokens import EntityKind
+from hoigs.core.values.world import World
 from hoigs.plugins.readers.common.config import VideoReaderConfig
 from hoigs.plugins.readers.common.frame_order import image_files, video_moments
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, image_size, opened
@@ -110,6 +111,7 @@ class DavisReader(ClipReader):
             points=points,
             point_colors=colors,
             split=uniform_test_split(len(images)),
+            world=World.guessed(cameras, metres=False),
             fps=self.config.fps,
             provenance={
                 "reader": "reader:davis",

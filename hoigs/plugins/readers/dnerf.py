@@ -9,6 +9,7 @@ from pydantic import Field
 
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.values.clip import Clip
+from hoigs.core.values.world import World
 from hoigs.plugins.readers.common.config import ReaderConfig
 from hoigs.plugins.readers.common.frame_order import timed_moments
 from hoigs.plugins.readers.common.json_file import parse_json
@@ -102,6 +103,7 @@ class DnerfReader(ClipReader):
             points=points,
             point_colors=colors,
             split=split,
+            world=World(up=(0.0, 0.0, 1.0), metres=False),  # Blender's
             provenance={
                 "reader": "reader:dnerf",
                 "cameras": "Blender, exact; the scene has no unit",

@@ -14,6 +14,7 @@ from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.lens import Lens
 from hoigs.core.values.moment import Moment
+from hoigs.core.values.world import World
 from hoigs.plugins.readers.common.config import VideoReaderConfig
 from hoigs.plugins.readers.common.frame_order import natural
 from hoigs.plugins.readers.common.json_file import parse_json, parse_json_map
@@ -151,6 +152,7 @@ class HypernerfReader(ClipReader):
             points=points,
             point_colors=colors,
             split=split,
+            world=World.guessed(cameras, metres=False),
             fps=self.config.fps,
             depth_kind="metric" if any(depths) else "none",
             provenance={

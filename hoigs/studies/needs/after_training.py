@@ -131,6 +131,7 @@ def _replace(run: RunFolder, pruned: Trained) -> None:
     try:
         new.create(pruned.spec.dump(), provenance)
         shutil.copyfile(run.metrics, new.metrics)
+        new.keep_clip_of(run)
         Checkpoint({k: v.detach().clone() for k, v in tensors.items()}, meta).save(new.checkpoints)
         run.replace_by(new, overwrite=True)
     finally:

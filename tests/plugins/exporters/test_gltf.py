@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.exporters.common.bodies import body_motion
 from hoigs.plugins.exporters.common.objects import object_motion
-from hoigs.plugins.exporters.common.world import turned_gaussians, world_turn
+from hoigs.plugins.exporters.common.world import Move
 from hoigs.plugins.exporters.gltf_body import GltfBodyExporter
 from hoigs.plugins.exporters.gltf_splat import NAME, GltfSplatExporter
 
@@ -100,7 +100,7 @@ def test_the_khronos_validator_finds_nothing(body, splats):
         assert not bad, bad[:5]
 
 
-def test_the_skin_is_the_body(body):
+def test_the_skin_is_the_body(body, upright):
     request, path = body
     read, motion = Read(path), body_motion(request, "human")
     shape = read.json["meshes"][read.json["nodes"][read.node("human")]["mesh"]]["primitives"][0]
@@ -110,22 +110,22 @@ def test_the_skin_is_the_body(body):
     joints = np.concatenate([read.array(shape["attributes"][f"JOINTS_{k}"]) for k in sets], 1)
     weights = np.concatenate([read.array(shape["attributes"][f"WEIGHTS_{k}"]) for k in sets], 1)
     inverse = read.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
-    turn = world_turn(request.clip, "y").numpy()
+    move = upright(request, "y")
+    turn, shift = move[:3, :3], move[:3, 3]
     for frame in (0, 2):
         moves = np.stack([read.world(j, frame) for j in skin["joints"]]) @ inverse
         blended = np.einsum("vk,vkab->vab", weights, moves[joints.astype(int)])
         posed = (blended[:, :3, :3] @ points[..., None])[..., 0] + blended[:, :3, 3]
-        away = np.linalg.norm(posed - motion.vertices(frame).numpy() @ turn.T, axis=1)
+        away = np.linalg.norm(posed - motion.vertices(frame).numpy() @ turn.T - shift, axis=1)
         assert away.mean() < 1e-3 and np.quantile(away, 0.99) < 5e-3
         hips = read.world(skin["joints"][0], frame)[:3, 3]
-        assert np.abs(hips - turn @ motion.joints(frame)[0].numpy()).max() < 1e-4
+        assert np.abs(hips - turn @ motion.joints(frame)[0].numpy() - shift).max() < 1e-4
 
 
-def test_objects_and_the_camera_move(body):
+def test_objects_and_the_camera_move(body, upright):
     request, path = body
     read, motion = Read(path), object_motion(request, "object")
-    turn = np.eye(4)
-    turn[:3, :3] = world_turn(request.clip, "y").numpy()
+    turn = upright(request, "y")
     for frame in (0, 2):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = motion.rotations[frame], motion.translations[frame]
@@ -135,7 +135,7 @@ def test_objects_and_the_camera_move(body):
         assert np.allclose(read.world(read.node("camera"), frame), turn @ view, atol=1e-4)
 
 
-def test_splats_draw_the_picture(splats, psnr_to_ours):
+def test_splats_draw_the_picture(splats, psnr_to_ours, upright):
     request, path = splats
     read, parts = Read(path), []
     for mesh in read.json["meshes"]:
@@ -149,5 +149,6 @@ def test_splats_draw_the_picture(splats, psnr_to_ours):
                 torch.stack([get(k) for k in bands if k in shape], 1),
             )
         )  # fmt: skip
-    back = world_turn(request.clip, "y").mT
-    assert psnr_to_ours(turned_gaussians(Gaussians.cat(parts), back), 0) > 60
+    move = np.float32(np.linalg.inv(upright(request, "y")))
+    back = Move(torch.from_numpy(move[:3, :3]), torch.from_numpy(move[:3, 3]))
+    assert psnr_to_ours(back.gaussians(Gaussians.cat(parts)), 0) > 60

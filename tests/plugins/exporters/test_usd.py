@@ -10,7 +10,7 @@ from hoigs.core.registry.registry import default_registry
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.exporters.common.bodies import body_motion
 from hoigs.plugins.exporters.common.objects import object_motion
-from hoigs.plugins.exporters.common.world import turned_gaussians, world_turn
+from hoigs.plugins.exporters.common.world import Move
 
 WHY = "usd-core is not installed: hoigs[usd]"
 Gf, Usd, UsdGeom, UsdSkel, UsdVol = (
@@ -38,7 +38,7 @@ def test_the_validators_find_nothing(written):
 
 
 @pytest.mark.parametrize("frame", [0, 2])
-def test_gaussians_draw_the_picture(frame, written, psnr_to_ours):
+def test_gaussians_draw_the_picture(frame, written, psnr_to_ours, upright):
     request, stage = written
     parts = []
     for name in request.entities:
@@ -57,8 +57,9 @@ def test_gaussians_draw_the_picture(frame, written, psnr_to_ours):
                 ),
             )
         )
-    back = world_turn(request.clip, "y").mT
-    assert psnr_to_ours(turned_gaussians(Gaussians.cat(parts), back), frame) > 60
+    move = np.float32(np.linalg.inv(upright(request, "y")))
+    back = Move(torch.from_numpy(move[:3, :3]), torch.from_numpy(move[:3, 3]))
+    assert psnr_to_ours(back.gaussians(Gaussians.cat(parts)), frame) > 60
 
 
 def test_what_stands_still_has_no_samples(written):
@@ -69,23 +70,24 @@ def test_what_stands_still_has_no_samples(written):
     assert stage.GetEndTimeCode() == 2 and UsdGeom.GetStageUpAxis(stage) == "Y"
 
 
-def test_usdskel_poses_the_body(written):
+def test_usdskel_poses_the_body(written, upright):
     request, stage = written
     root = UsdSkel.Root(stage.GetPrimAtPath("/World/people/human"))
     assert UsdSkel.BakeSkinning(root, Gf.Interval(0, 2))
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/people/human/mesh"))
     motion = body_motion(request, "human")
-    turn = world_turn(request.clip, "y").numpy()
+    move = upright(request, "y")
     for frame in (0, 2):
         points = np.array(mesh.GetPointsAttr().Get(frame))
-        away = np.linalg.norm(points - motion.vertices(frame).numpy() @ turn.T, axis=1)
+        away = np.linalg.norm(
+            points - motion.vertices(frame).numpy() @ move[:3, :3].T - move[:3, 3], axis=1
+        )
         assert away.mean() < 1e-3
 
 
-def test_objects_and_the_camera_move(written):
+def test_objects_and_the_camera_move(written, upright):
     request, stage = written
-    motion, turn = object_motion(request, "object"), np.eye(4)
-    turn[:3, :3] = world_turn(request.clip, "y").numpy()
+    motion, turn = object_motion(request, "object"), upright(request, "y")
     for frame in (0, 2):
         cache = UsdGeom.XformCache(frame)
         pose = np.eye(4)
@@ -96,7 +98,7 @@ def test_objects_and_the_camera_move(written):
         seen = UsdGeom.Camera(stage.GetPrimAtPath("/World/camera")).GetCamera(frame)
         camera = request.clip.cameras[frame]
         point = camera.unproject(torch.tensor([[20.0, 45.0]]), torch.tensor([2.0]))[0].numpy()
-        clip_space = np.append(turn[:3, :3] @ point, 1) @ np.array(
+        clip_space = (turn @ np.append(point, 1)) @ np.array(
             seen.frustum.ComputeViewMatrix() * seen.frustum.ComputeProjectionMatrix()
         )
         x, y = clip_space[:2] / clip_space[3]

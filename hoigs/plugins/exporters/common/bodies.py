@@ -20,6 +20,7 @@ from hoigs.core.maths.rotations import (
 )
 from hoigs.core.model.exporter import ExportRequest
 from hoigs.core.values.moment import BodyPose, Moment
+from hoigs.plugins.exporters.common.world import Move
 
 
 @dataclass(frozen=True)
@@ -72,14 +73,14 @@ class BodyMotion:
     def _scaled(self, points: Float[Tensor, "P 3"], index: int) -> Float[Tensor, "P 3"]:
         return self.pelvis[index] + self.scale * (points - self.pelvis[index])
 
-    def turned(self, turn: Float[Tensor, "3 3"]) -> BodyMotion:
-        """The same in a world that is rotated."""
+    def moved(self, move: Move) -> BodyMotion:
+        """The same in a world that is moved."""
         # in float64, as turns near 180 degrees lose digits in float32
         roots = axis_angle_to_quats(self.rotations[:, 0].double())
-        first = matrices_to_quats(turn.double()).expand_as(roots)
+        first = matrices_to_quats(move.turn.double()).expand_as(roots)
         rotations = self.rotations.clone()
         rotations[:, 0] = quats_to_axis_angle(multiply_quats(first, roots)).to(rotations)
-        transl = self.pelvis @ turn.mT - self.rest_joints[0]
+        transl = move.points(self.pelvis) - self.rest_joints[0]
         return replace(self, rotations=rotations, transl=transl)
 
 

@@ -13,6 +13,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.values.gaussians import Gaussians
 
 SIZES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1"}
+FULL_SH = 16  # coefficients a channel of degree 3
 
 
 def columns(coefficients: int) -> list[str]:
@@ -24,14 +25,20 @@ def columns(coefficients: int) -> list[str]:
     ]  # fmt: skip
 
 
-def ply_bytes(gaussians: Gaussians) -> bytes:
+def ply_bytes(gaussians: Gaussians, *, pad_sh: bool = False) -> bytes:
     """A binary PLY of raw values: log-scales, opacity logits, wxyz, float32.
 
     Coefficients after the first lie channel by channel, as 3DGS stores them.
+
+    Args:
+        pad_sh: add SH bands of zeros up to degree 3, which 3DGS's own loader asserts.
     """
     g = gaussians.detach().to("cpu", torch.float32)
-    names = columns(g.sh.shape[1])
-    rest = g.sh[:, 1:].mT.reshape(len(g), -1)
+    sh = g.sh
+    if pad_sh:
+        sh = torch.nn.functional.pad(sh, (0, 0, 0, max(0, FULL_SH - sh.shape[1])))
+    names = columns(sh.shape[1])
+    rest = sh[:, 1:].mT.reshape(len(g), -1)
     quats = torch.nn.functional.normalize(g.quats, dim=-1)
     parts: list[Tensor] = [
         g.means, torch.zeros_like(g.means), g.sh[:, 0], rest, g.opacity_logits[:, None],

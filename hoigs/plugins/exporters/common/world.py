@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -20,19 +21,44 @@ from hoigs.core.values.gaussians import Gaussians
 Up = Literal["clip", "y", "z"]
 AXES: dict[Up, str] = {
     "clip": "the world of the clip; cameras are OpenCV's (x right, y down, z forward)",
-    "y": "right-handed, y up: the world of the clip, turned so that the mean upward direction of "
-    "its cameras is +y",
-    "z": "right-handed, z up: the world of the clip, turned so that the mean upward direction of "
-    "its cameras is +z",
+    "y": "right-handed, y up: the world of the clip, turned so that its up is +y and moved along "
+    "it so that its floor is y = 0",
+    "z": "right-handed, z up: the world of the clip, turned so that its up is +z and moved along "
+    "it so that its floor is z = 0",
 }
 
 
-def world_turn(clip: Clip, up: Up) -> Float[Tensor, "3 3"]:
-    """The rotation from the world of the clip to one in which `up` is upward; float32."""
+@dataclass(frozen=True)
+class Move:
+    """A rigid motion of the world: x becomes turn x + shift, metres."""
+
+    turn: Float[Tensor, "3 3"]
+    shift: Float[Tensor, " 3"]
+
+    def points(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Points of the clip's world in the new one."""
+        return points @ self.turn.to(points).mT + self.shift.to(points)
+
+    def gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians in the new world: means, orientations and SH colours."""
+        means, quats, sh = gaussians.means, gaussians.quats, gaussians.sh
+        if not torch.equal(self.turn, torch.eye(3)):
+            turn = self.turn.to(means)
+            quats = multiply_quats(matrices_to_quats(turn).expand_as(quats), quats)
+            sh = rotate_sh(sh, turn)
+        return gaussians.replace(means=self.points(means), quats=quats, sh=sh)
+
+
+def world_move(clip: Clip, up: Up) -> Move:
+    """From the world of the clip to one in which `up` is upward and the floor is at 0, float32.
+
+    Where the clip knows no floor, its origin stays.
+    """
     if up == "clip":
-        return torch.eye(3)
+        return Move(torch.eye(3), torch.zeros(3))
     target = torch.tensor((0.0, 1.0, 0.0) if up == "y" else (0.0, 0.0, 1.0))
-    return rotation_between(clip.up().cpu().float(), target)
+    turn = rotation_between(clip.world.up_vector(), target)
+    return Move(turn, -(clip.world.floor or 0.0) * target)
 
 
 def rotation_between(a: Float[Tensor, " 3"], b: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
@@ -46,16 +72,3 @@ def rotation_between(a: Float[Tensor, " 3"], b: Float[Tensor, " 3"]) -> Float[Te
         axis = axis / axis.norm()
         return axis_angle_to_matrices(axis * torch.pi)
     return axis_angle_to_matrices(axis / sine * torch.atan2(sine, cosine))
-
-
-def turned_gaussians(gaussians: Gaussians, turn: Float[Tensor, "3 3"]) -> Gaussians:
-    """Gaussians of a world that is rotated: means, orientations and SH colours."""
-    if torch.equal(turn, torch.eye(3).to(turn)):
-        return gaussians
-    turn = turn.to(gaussians.means)
-    quat = matrices_to_quats(turn)
-    return gaussians.replace(
-        means=gaussians.means @ turn.mT,
-        quats=multiply_quats(quat.expand_as(gaussians.quats), gaussians.quats),
-        sh=rotate_sh(gaussians.sh, turn),
-    )

@@ -99,6 +99,7 @@ def compress(
     try:
         temporary.create(loaded.spec.dump(), provenance)
         shutil.copyfile(source.metrics, temporary.metrics)
+        temporary.keep_clip_of(source)
         size = write_compact(
             temporary.checkpoints,
             loaded.model.state_dict(),
