@@ -247,7 +247,7 @@ class Calls:
     def make_set(self, items: Any = ()) -> set[Any]:
         if type(items) not in (tuple, list) or not all(map(is_key, items)):
             raise refused(f"a set is made of a {_kind(items)} of other than texts and numbers")
-        self.spend(64 * len(items))
+        self.spend(sys.getsizeof(set()) + 64 * len(items))
         return set(items)
 
     def _frozenset(self, items: Any = ()) -> frozenset[Any]:

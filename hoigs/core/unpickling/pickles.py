@@ -33,12 +33,12 @@ _PLAIN = (
     "BININT2", "FLOAT", "BINFLOAT", "STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE",
     "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8",
     "EMPTY_LIST", "LIST", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_DICT",
-    "EMPTY_SET", "GLOBAL", "STACK_GLOBAL",
+    "GLOBAL", "STACK_GLOBAL",
 )  # fmt: skip
 # Those that are done here; all others are refused.
 _OWN = (
     "FRAME", "INT", "LONG", "LONG1", "LONG4", "BYTEARRAY8", "APPEND", "APPENDS", "SETITEM",
-    "SETITEMS", "DICT", "ADDITEMS", "FROZENSET", "REDUCE", "BUILD",
+    "SETITEMS", "DICT", "EMPTY_SET", "ADDITEMS", "FROZENSET", "REDUCE", "BUILD",
 )  # fmt: skip
 
 
@@ -127,6 +127,9 @@ class Unpickler(_PythonUnpickler):  # type: ignore[misc]  # which is Any
             raise refused("a dictionary has keys that are no text or number, or lacks a value")
         self._last(dict).update(zip(keys, values))
 
+    def load_empty_set(self) -> None:
+        self.append(self.calls.make_set())
+
     def load_additems(self) -> None:
         items = self.pop_mark()
         self._last(set).update(self.calls.make_set(items))
@@ -178,7 +181,8 @@ def _weigh(value: Any, most: int) -> None:
                 size, below = size + more, max(below, levels + 1)
                 if size > most:
                     raise refused(f"its values unfold to more than {most / 2**30:.2g} GiB")
-            known[id(value)] = size, below
+            if below:  # what is empty is quick to look at again
+                known[id(value)] = size, below
         if depth + below >= DEEPEST:
             raise refused(f"its lists are nested {DEEPEST} deep, or hold themselves")
         return size, below

@@ -270,3 +270,20 @@ def test_what_attacks_is_refused_at_once(tmp_path: Path, opcodes: bytes, fact: s
         assert tracemalloc.get_traced_memory()[1] < 2**24
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "opcodes",
+    [
+        b"(" + b"\x8f" * 10**4 + b"l",  # sets
+        written([*range(1000)]) + b"q\x00(" + 99 * (b"c__builtin__\nset\nh\x00\x85R"),
+        written("a" * 10**5) + b"q\x00(" + 99 * (b"c_codecs\nencode\nh\x00S'latin1'\n\x86R"),
+    ],
+)  # fmt: skip
+def test_what_is_made_again_and_again_is_bounded_by_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opcodes: bytes
+) -> None:
+    monkeypatch.setattr("hoigs.core.unpickling.calls.SMALL_BYTES", 2**20)
+    monkeypatch.setattr("hoigs.core.unpickling.calls.MOST_RATIO", 10)
+    with pytest.raises(ClipError, match=f"{len(opcodes) + 1} bytes unfold to more than"):
+        read(tmp_path / "x.pkl", opcodes)
