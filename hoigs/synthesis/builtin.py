@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from hoigs.core.clip_folder.write import ClipWriter
+from hoigs.core.environments.cache import made
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.clip import POSES_EXACT, BodyTrack, ObjectTrack, uniform_test_split
 from hoigs.core.values.world import World
@@ -94,8 +95,7 @@ def builtin_clip(
         return folder
     progress = progress or GenerationNotice(name_of(config))
     progress(0, config.frames)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=".builtin-", dir=folder.parent))
+    scratch = Path(tempfile.mkdtemp(prefix=".builtin-", dir=made(folder.parent)))
     try:
         write_scene(generate(config, body), scratch / "clip", body_key=body_key, progress=progress)
         try:

@@ -21,7 +21,7 @@ from typing import Any
 
 from filelock import FileLock
 
-from hoigs.core.environments.cache import cache_folder
+from hoigs.core.environments.cache import cache_folder, made
 from hoigs.core.environments.interpreters import find_python
 from hoigs.core.environments.npm_file import NpmFile
 from hoigs.core.errors import HoigsError
@@ -90,8 +90,7 @@ class ManagedEnvironment:
         Raises:
             HoigsError: no Python fits, or a package cannot be had; what was downloaded is kept.
         """
-        self._root.mkdir(parents=True, exist_ok=True)
-        with FileLock(self._root / "lock"):
+        with FileLock(made(self._root) / "lock"):
             if not self.installed:
                 self._make(progress)
             elif self.lacking():

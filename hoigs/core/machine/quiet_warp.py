@@ -8,13 +8,29 @@ from contextlib import contextmanager
 
 import warp as wp
 
+from hoigs.core.errors import HoigsError
+
 __all__ = ["wp"]
 
 NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 
 
 def start() -> None:
-    """Initialise Warp without its banner, its list of devices and its notice of each module."""
+    """Initialise Warp without its banner, its list of devices and its notice of each module.
+
+    Raises:
+        HoigsError: the folder of its kernels cannot be made.
+    """
+    try:
+        _init()
+    except OSError as error:
+        raise HoigsError(
+            f"{error.filename}: Warp cannot keep its kernels there ({error.strerror}); set "
+            "WARP_CACHE_PATH to a folder that can be written to"
+        ) from error
+
+
+def _init() -> None:
     if not hasattr(wp.config, "log_level"):  # Warp before 1.12
         setattr(wp.config, "quiet", True)  # noqa: B010
         wp.init()

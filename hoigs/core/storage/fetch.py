@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from hoigs.core.environments.cache import cache_folder
+from hoigs.core.environments.cache import cache_folder, made
 from hoigs.core.errors import HoigsError
 from hoigs.core.files.json_file import read_json
 from hoigs.core.storage.publish import COMPLETE, digest_of
@@ -91,8 +91,7 @@ def _version(info: dict[str, Any]) -> tuple[int, str]:
 def _download(
     fs: Any, path: str, files: dict[str, tuple[int, str]], entry: Path, target: Path, url: str
 ) -> None:
-    entry.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(prefix=f".{entry.name}.", dir=entry.parent))
+    part = Path(tempfile.mkdtemp(prefix=f".{entry.name}.", dir=made(entry.parent)))
     try:
         for name, (size, _) in files.items():
             to = part / target.name / name if name else part / target.name
