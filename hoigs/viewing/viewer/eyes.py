@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import math
 import time
+import traceback
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from hoigs.viewing.viewer.pictures.resolution import Resolution
+from hoigs.viewing.viewer.takes import Film
 from hoigs.viewing.viewer.views import View
 
 STILL_S = 0.25  # a picture is drawn in full once nothing has changed for so long
 START_S = 2.0  # after a browser's first answer, in which its own start may still come
+RETRY_S = 1.0  # after a failure
 STEP = 0.6  # of the distance to the target: how far the mouse moves a camera at once, at most
 
 
@@ -30,6 +34,7 @@ class Eye:
         full: whether that was a still picture, in full size and quality.
         changed: when something last changed, seconds.
         rates: times of the last drawings.
+        film: its film in the making.
     """
 
     def __init__(self, client: Any, widest: int, dragged: Callable[[Eye], None]) -> None:
@@ -37,6 +42,8 @@ class Eye:
         self.resolution = Resolution(widest)
         self.drawn: object = None
         self.full, self.changed = False, 0.0
+        self.film: Film | None = None
+        self._failure, self._again = "", 0.0
         self.rates: deque[float] = deque(maxlen=20)
         self._set: deque[np.ndarray] = deque(maxlen=400)  # positions of cameras
         self._answered = math.inf  # when the browser first took a camera that was set, seconds
@@ -74,6 +81,23 @@ class Eye:
         near = np.linalg.norm(seen.position - self._taken) < STEP * distance
         if near and now - self._answered > START_S:
             self._dragged(self)
+
+    @contextmanager
+    def apart(self) -> Iterator[None]:
+        """What fails in here is told to this browser, and ends nothing but its own work."""
+        try:
+            yield
+        except Exception as error:
+            self._again = time.monotonic() + RETRY_S
+            text = f"{type(error).__name__}: {error}"
+            if text != self._failure:  # not at every try
+                self._failure = text
+                traceback.print_exc()
+                self.client.add_notification("This cannot be drawn", text, color="red")
+
+    def ready(self, now: float) -> bool:
+        """Whether to draw for it: not just after a failure."""
+        return now >= self._again
 
     def rate(self) -> float:
         """Pictures a second over the last ones; 0 with fewer than three."""

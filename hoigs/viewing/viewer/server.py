@@ -15,16 +15,19 @@ LOCAL = "127.0.0.1"
 
 
 def open_server(host: str, port: int, label: str) -> Any:
-    """A viser server.
+    """A viser server, behind a door that keeps other pages and unfit messages out (`access`).
 
     Args:
         port: 0 finds a free one.
 
     Raises:
-        HoigsError: viser is absent, the port is in use, or this machine has no such host.
+        HoigsError: viser is absent or cannot be guarded, the port is in use, or this machine has no
+            such host.
     """
     require_viser()
     import viser
+
+    from hoigs.viewing.viewer.access import Door, guarded
 
     class Server(viser.ViserServer):
         def request_share_url(self, verbose: bool = True) -> str | None:
@@ -33,8 +36,17 @@ def open_server(host: str, port: int, label: str) -> Any:
             return None
 
     _require_free(host, port)
-    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a box with other addresses
+    door = Door(host)
+    # viser prints a box with other addresses
+    with contextlib.redirect_stdout(io.StringIO()), guarded(door):
         server = Server(host=host, port=port, label=label, verbose=False)
+    if not door.closed:
+        stop(server)
+        raise HoigsError(
+            f"viser {viser.__version__} starts its server in a way that is not known here, so other "
+            "pages could not be kept out: pip install viser==1.1.1"
+        )
+    door.control = server.gui._gui_input_handle_from_uuid.get
     if port not in (0, server.get_port()):  # taken in between: viser goes on to the next
         stop(server)
         raise HoigsError(_in_use(port))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import queue
 import tempfile
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path as FilePath
@@ -20,6 +23,8 @@ from hoigs.viewing.viewer.pictures.run_drawing import Drawing, RunDrawing
 from hoigs.viewing.viewer.views import Vector, View
 
 FILM_FPS = 30
+AHEAD = 4  # pictures that are drawn and not yet encoded, at most
+MOST_KEYS = 100  # views on a path
 
 
 @dataclass
@@ -58,28 +63,57 @@ class Path:
         return frame_a + (frame_b - frame_a) * r, view
 
 
-def film(
-    path: Path,
-    seconds: float,
-    draw: Callable[[float, View], UInt8[np.ndarray, "H W 3"]],
-    report: Callable[[str], None],
-) -> bytes:
-    """The path as an mp4.
+class Film:
+    """The path as an mp4 in the making: a picture is drawn at each `step`, in the thread of whoever
+    calls it, and another thread encodes them, so that other pictures can be drawn in between.
 
     Args:
+        path: as it is now. seconds: of the film.
         draw: a picture at a frame number from a view; all of one even size.
-        report: receives lines on the progress.
+
+    Attributes:
+        drawn, count: pictures.
     """
-    count = max(2, round(seconds * FILM_FPS))
 
-    def frames() -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-        for i in range(count):
-            if i % 10 == 0:
-                report(f"Filming: {100 * i // count} %")
-            yield draw(*path.at(i / (count - 1)))
+    def __init__(
+        self,
+        path: Path,
+        seconds: float,
+        draw: Callable[[float, View], UInt8[np.ndarray, "H W 3"]],
+    ) -> None:
+        self.drawn, self.count = 0, max(2, round(seconds * FILM_FPS))
+        self._path, self._draw = Path(list(path.keys)), draw
+        self._frames = queue.Queue[UInt8[np.ndarray, "H W 3"] | None]()
+        self._made: Future[bytes] = Future()
+        threading.Thread(target=self._encode, daemon=True).start()
 
-    with tempfile.TemporaryDirectory() as folder:
-        return write_video(FilePath(folder) / "path.mp4", frames(), fps=FILM_FPS).read_bytes()
+    def step(self) -> bytes | None:
+        """Draw one more, unless the encoder is behind; the whole file once it is done.
+
+        Raises:
+            Exception: the drawing or the encoding failed, as it said itself.
+        """
+        if self._made.done():
+            return self._made.result()
+        if self.drawn < self.count and self._frames.qsize() < AHEAD:
+            self._frames.put(self._draw(*self._path.at(self.drawn / (self.count - 1))))
+            self.drawn += 1
+            if self.drawn == self.count:
+                self._frames.put(None)
+        return None
+
+    def cancel(self) -> None:
+        """Let go of it; the encoder ends with what it has."""
+        self._frames.put(None)
+
+    def _encode(self) -> None:
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                file = FilePath(folder) / "path.mp4"
+                write_video(file, iter(self._frames.get, None), fps=FILM_FPS)
+                self._made.set_result(file.read_bytes())
+        except Exception as error:
+            self._made.set_exception(error)
 
 
 def png(image: UInt8[np.ndarray, "H W 3"]) -> bytes:

@@ -68,7 +68,7 @@ class Viewer:
         self.settings = Settings.initial(first.modes, first.names)
         if len(drawings) > 1:
             self.settings.layout, self.settings.other = "beside", "run"
-        self._wake, self._jobs = threading.Event(), queue.SimpleQueue[Callable[[], None]]()
+        self._wake, self._jobs = threading.Event(), queue.SimpleQueue[tuple[Eye, str]]()
         self._stopped, self._widest = False, widest
         self._refresh, self._refreshed = refresh, 0.0
         self._splats = splats
@@ -88,14 +88,19 @@ class Viewer:
         server.initial_camera.position, server.initial_camera.look_at = start.position, start.target
         server.initial_camera.up, server.initial_camera.fov = self.up, start.fov
         server.on_client_connect(self._connect)
-        server.on_client_disconnect(lambda client: self._eyes.pop(client.client_id, None))
+        server.on_client_disconnect(self._disconnect)
 
     def serve(self) -> None:
         """Draw until `stop`."""
-        while not self._stopped:
-            if not self.turn():
-                self._wake.wait(IDLE_S)
-                self._wake.clear()
+        try:
+            while not self._stopped:
+                if not self.turn():
+                    self._wake.wait(IDLE_S)
+                    self._wake.clear()
+        finally:
+            for eye in list(self._eyes.values()):
+                if eye.film is not None:
+                    eye.film.cancel()
 
     def stop(self) -> None:
         self._stopped = True
@@ -106,7 +111,9 @@ class Viewer:
         now = time.monotonic()
         self._poll(now)
         while not self._jobs.empty():
-            self._jobs.get()()
+            eye, action = self._jobs.get()
+            with eye.apart():
+                self._take(action, eye)
         with self.controls.lock:
             if self.settings.needs_video and not self.settings.video:
                 self.settings.video = self.controls.video.value = True
@@ -122,8 +129,15 @@ class Viewer:
             self._send(settings, frame)
         drew = False
         for eye in list(self._eyes.values()):
-            self._follow(eye, settings, frame)
-            drew |= self._clear(eye) if browser else self._draw_for(eye, settings, frame, now)
+            if eye.ready(now):
+                with eye.apart():
+                    self._follow(eye, settings, frame)
+                    drew |= (
+                        self._clear(eye) if browser else self._draw_for(eye, settings, frame, now)
+                    )
+            if eye.film is not None:
+                with eye.apart():
+                    drew |= self._go_on(eye, eye.film)
         self._anchor = (settings.follow, frame)
         return drew
 
@@ -149,6 +163,11 @@ class Viewer:
             self._wake.set()
 
         self._wake.set()
+
+    def _disconnect(self, client: Any) -> None:
+        eye = self._eyes.pop(client.client_id, None)
+        if eye is not None and eye.film is not None:
+            eye.film.cancel()
 
     def _dragged(self, eye: Eye) -> None:
         """A person has moved the camera: it is no longer that of the video."""
@@ -267,7 +286,7 @@ class Viewer:
         """A button was pressed: the drawing thread does the work."""
         eye = self._eyes.get(client.client_id) if client is not None else None
         if eye is not None:
-            self._jobs.put(lambda: self._take(action, eye))
+            self._jobs.put((eye, action))
             self._wake.set()
 
     def _take(self, action: str, eye: Eye) -> None:
@@ -280,28 +299,39 @@ class Viewer:
             )
             return
         if action == "add key":
-            self.path.keys.append((frame, eye.view))
+            if len(self.path.keys) < takes.MOST_KEYS:
+                self.path.keys.append((frame, eye.view))
         elif action == "clear keys":
             self.path.keys.clear()
-        elif action == "film" and len(self.path.keys) > 1:
-            self._film(eye)
+        elif action == "film" and len(self.path.keys) > 1 and eye.film is None:
+            eye.film = self._film(eye)
         self.controls.keys.content = str(self.path)
 
-    def _film(self, eye: Eye) -> None:
-        """Draw the path to an mp4, which the browser downloads."""
+    def _film(self, eye: Eye) -> takes.Film:
+        """A film of the path, to be drawn a picture at a time."""
         settings = replace(self.settings, video=False, overlays=set())
         if settings.needs_video:  # which a path leaves
             settings = replace(settings, layout="one", mode="colour")
-        width, height = (n // 2 * 2 for n in eye.resolution.size(eye.canvas, moving=False))
+        size = eye.resolution.size(eye.canvas, moving=False)
+        width, height = (max(n // 2 * 2, 2) for n in size)
 
         def draw(frame: float, view: View) -> UInt8[np.ndarray, "H W 3"]:
             return self.picture((width, height), settings, frame, view).image
 
-        def report(text: str) -> None:
-            self.controls.keys.content = text
+        return takes.Film(self.path, self.controls.seconds.value, draw)
 
-        data = takes.film(self.path, self.controls.seconds.value, draw, report)
-        eye.client.send_file_download("hoigs_path.mp4", data, save_immediately=True)
+    def _go_on(self, eye: Eye, film: takes.Film) -> bool:
+        """Draw the film's next picture, or give the browser what is done; whether one was drawn."""
+        before, eye.film = film.drawn, None  # where it fails, it is over
+        done = film.step()
+        if done is not None:
+            eye.client.send_file_download("hoigs_path.mp4", done, save_immediately=True)
+            self.controls.keys.content = str(self.path)
+            return True
+        eye.film = film
+        if film.drawn % 10 == 1:
+            self.controls.keys.content = f"Filming: {100 * film.drawn // film.count} %"
+        return film.drawn > before
 
 
 def _thinned(depth: np.ndarray) -> np.ndarray:
