@@ -68,6 +68,9 @@ def test_static_camera_and_ball(
     assert seen == sorted(seen) and seen[-1] == pytest.approx(1)
     assert len(clip) == FRAMES and clip.kinds == {"human": "human", "object": "object"}
     assert clip.depth_kind == "none" and clip.fps == 12
+    assert clip.world.known in ("body", "floor")  # cameras are level here, so they agree
+    assert float(clip.up() @ torch.tensor((0.0, -1.0, 0.0))) > np.cos(np.radians(10))
+    assert clip.world.floor is not None
     track = clip.objects["object"]
     assert track.observed.tolist() == [i != 5 for i in range(FRAMES)]
     for i, frame in enumerate(clip):

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import errno
 import json
+import math
+import shutil
 from pathlib import Path
 
 import pytest
+import trimesh
 from exported_run import tiny_run
 
 import hoigs as h
@@ -34,7 +37,7 @@ def test_bad_input_is_answered_and_leaves_nothing(hoigs, tmp_path):
     run = tiny_run()
     cases = (
         ([run, "--format", "pyl"], 'did you mean "ply"?'),
-        ([run, "--format", "ply", "--set", "ub=y"], "ub: unknown key (valid: up)"),
+        ([run, "--format", "ply", "--set", "ub=y"], "ub: unknown key (valid: up, pad_sh)"),
         ([run, "--format", "ply", "--entities", "hunan"], 'did you mean "human"?'),
         ([run, "--format", "ply", "--from", 8, "--to", 3], "--from 8 is behind --to 3"),
         ([run, "--format", "ply", "--slow", 0], "error: --slow 0: expected a positive number"),
@@ -48,6 +51,52 @@ def test_bad_input_is_answered_and_leaves_nothing(hoigs, tmp_path):
         done = hoigs("export", *arguments, "--out", tmp_path / "x.ply")
         assert done.code == 2 and words in done.err, (arguments, done.err)
     assert not list(tmp_path.iterdir())
+
+
+def test_feet_stand_at_zero_in_a_run_of_a_tilted_video(tmp_path):
+    """The cameras of built-in clips look down by nine degrees; their floor is known."""
+    done = h.export(
+        tiny_run(), format="mesh-sequence", out=tmp_path / "m", entities=["human"], end=0
+    )
+    mesh = trimesh.load(tmp_path / "m" / "human" / "frame_0000.ply", process=False, force="mesh")
+    low, high = mesh.bounds[:, 1]
+    assert abs(low) < 0.03 and 1.0 < high < 1.9
+    assert not done.supposed
+    world = json.loads((tmp_path / "m" / "export.json").read_text())["world"]
+    assert world == {"up": [0, 1, 0], "floor": 0, "metres": True, "known": "given"}
+
+
+@pytest.mark.parametrize("bodies", [True, False])
+def test_without_a_known_floor_up_is_the_bodys_or_a_guess_that_is_said(bodies, tmp_path, hoigs):
+    """A folder of before there was a world, as of a video: bodies tell up; cameras would guess."""
+    clip = shutil.copytree(clip_of(tiny_run()), tmp_path / "clip")
+    header = json.loads((clip / "clip.json").read_text())
+    del header["world"], header["provenance"]["generator"]
+    if not bodies:
+        del header["entities"]["human"]
+    (clip / "clip.json").write_text(json.dumps(header))
+    read = h.read_clip(clip)
+    tilt = math.degrees(math.acos(float(read.up()[1])))
+    if bodies:
+        assert read.world.known in ("body", "floor") and tilt < 3
+        assert abs(read.world.floor) < 0.04
+        return
+    assert read.world.is_guess and 7 < tilt < 11
+    small = ["--set", "train.steps=2", "--set", "model.scene.points=60", "--no-eval"]
+    run = tmp_path / "run"
+    assert hoigs("train", clip, "--spec", "static", *small, "--out", run).code == 0
+    for settings, said in ((["--set", "up=y"], True), ([], False)):
+        out = tmp_path / f"{said}.ply"
+        done = hoigs("export", run, "--format", "ply", "--out", out, *settings)
+        assert done.code == 0 and ("supposed: up:" in done.out) == said
+        sheet = json.loads((tmp_path / f"{said}.ply.json").read_text())
+        assert ("up" in sheet["supposed"]) == said
+        assert sheet["world"]["known"] == "cameras (guess)"
+
+
+def clip_of(run: Path) -> Path:
+    record = json.loads((run / "provenance.json").read_text())
+    return (run / record["clip"]["path"]).resolve()
 
 
 def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
@@ -66,8 +115,6 @@ def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
 
 
 def test_a_run_without_checkpoint(tmp_path):
-    import shutil
-
     shutil.copytree(tiny_run(), tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "checkpoints")
     with pytest.raises(HoigsError, match="checkpoints"):

@@ -47,6 +47,8 @@ class World:
             raise ValueError(f"floor is {self.floor}, expected a finite number or None")
         if self.known not in get_args(How):
             raise ValueError(f"known is {self.known!r}, expected one of {', '.join(get_args(How))}")
+        if abs(length - 1) < 1e-12:  # so that what is stored comes back as it was
+            length = 1.0
         x, y, z = (float(value) / length for value in self.up)
         object.__setattr__(self, "up", (x, y, z))
 

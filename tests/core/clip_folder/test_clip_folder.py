@@ -17,6 +17,7 @@ from hoigs.core.errors import ClipError
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, ObjectTrack
 from hoigs.core.values.moment import BodyPose
+from hoigs.core.values.world import World
 from hoigs.plugins.readers.clip import ClipFolderReader
 
 FRAMES, WIDTH, HEIGHT = 8, 20, 14
@@ -134,6 +135,29 @@ def test_an_object_whose_rotation_is_unknown_stays_so(tmp_path: Path) -> None:
     outline = replace(track, rotation_known=False)
     write_clip(replace(clip, objects={**clip.objects, name: outline}), tmp_path / "second")
     assert not ClipFolderReader().read(tmp_path / "second").objects[name].rotation_known
+
+
+def test_the_world_travels_with_who_knows_it(tmp_path: Path) -> None:
+    world = World(up=(0.1, -0.9, 0.2), floor=-1.5, known="floor")
+    write(tmp_path / "clip")
+    older = ClipFolderReader().read(tmp_path / "clip")
+    assert older.world.is_guess  # a folder of before there was such a key
+    write_clip(replace(older, world=world), tmp_path / "new")
+    found = ClipFolderReader().read(tmp_path / "new")
+    assert found.world.up == pytest.approx(world.up) and found.held_out is not None
+    assert replace(found.world, up=world.up) == world and found.held_out.world == found.world
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("up", [0, 0, 0]), ("up", [0, 1]), ("floor", "low"), ("known", "me")]
+)
+def test_a_world_that_means_nothing_is_named(key: str, value: object, tmp_path: Path) -> None:
+    write(tmp_path / "clip")
+    header = json.loads((tmp_path / "clip" / "clip.json").read_text())
+    header["world"] = {"up": [0, 1, 0], key: value}
+    (tmp_path / "clip" / "clip.json").write_text(json.dumps(header))
+    with pytest.raises(ClipError, match=rf"world\.{key}"):
+        ClipFolderReader().read(tmp_path / "clip")
 
 
 def test_replaces_an_older_clip_only(tmp_path: Path) -> None:
