@@ -90,6 +90,8 @@ def find_source(
     path = Path(path)
     if not path.exists():
         raise SourceError(f"{path} does not exist; expected a video, or a folder with one")
+    if not path.is_dir():
+        require_regular(path)
     folder = path if path.is_dir() else path.parent
     missing: list[str] = []
     video = path if path.is_file() else _find_video(folder, missing)
@@ -148,6 +150,19 @@ def find_source(
 
 def _files(kind: EstimateKind, path: str, **settings: Any) -> ComponentSpec:
     return ComponentSpec(use=f"estimator:{kind}-files", path=path, **settings)
+
+
+def require_regular(path: Path) -> None:
+    """A pipe or a device is refused: reading one waits, and frames are read more than once.
+
+    Raises:
+        SourceError: something is there that is no regular file.
+    """
+    if path.exists() and not path.is_file():
+        raise SourceError(
+            f"{path} is no regular file (it is a pipe, a device or the like): copy its content "
+            "to a file"
+        )
 
 
 def find_video(path: Path) -> Path | None:
