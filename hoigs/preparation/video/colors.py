@@ -8,6 +8,7 @@ grey when so shown: they are converted to sRGB, HDR by FFmpeg's tone mapping.
 
 from __future__ import annotations
 
+import itertools
 import threading
 from fractions import Fraction
 from functools import lru_cache
@@ -83,7 +84,7 @@ class _Graph:
 
         self._lock, self._graph = threading.Lock(), Graph()
         nodes = [self._graph.add(name, options) for name, options in chain]
-        for first, second in zip(nodes[:-1], nodes[1:], strict=True):
+        for first, second in itertools.pairwise(nodes):
             first.link_to(second)
         self._graph.configure()
 

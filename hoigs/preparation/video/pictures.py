@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import UInt8
 
+from hoigs.core.files.images import eight_bits
 from hoigs.preparation.video.colors import converted
 from hoigs.preparation.video.source import SourceError
 
@@ -82,7 +83,7 @@ class FilePicture:
 
         try:
             with Image.open(self.path) as image:
-                return ImageOps.exif_transpose(image).convert("RGB")
+                return eight_bits(ImageOps.exif_transpose(image)).convert("RGB")
         except (OSError, ValueError) as error:
             raise SourceError(f"{self.path} is not a readable image: {error}") from error
 
@@ -112,7 +113,9 @@ def orientation(frame: Any) -> tuple[bool, int, int]:
     matrix = frame.side_data.get("DISPLAYMATRIX")
     if matrix is None:
         return False, 1, 1
-    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()  # (x, y) to ax + cy, bx + dy
+    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[
+        :5
+    ].tolist()  # (x, y) to ax + cy, bx + dy
     if abs(a) + abs(d) >= abs(b) + abs(c):
         return False, -1 if d < 0 else 1, -1 if a < 0 else 1
     return True, -1 if b < 0 else 1, -1 if c < 0 else 1
