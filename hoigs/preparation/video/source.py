@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.colmap_files import PARTS, models_in
 from hoigs.core.files.npz import holds
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
@@ -19,7 +20,6 @@ CAMERAS = "cameras.npz"
 MEGASAM = frozenset({"images", "depths", "intrinsic", "cam_c2w"})  # arrays of its npz
 VGGT = frozenset({"extrinsic", "intrinsic", "depth", "images"})  # likewise
 FRAME_FOLDERS = ("frames", "images")  # where a folder of frames may keep them
-_COLMAP_FILES = ("cameras", "images", "points3D")
 _LAYOUT = """  FOLDER/
     video.mp4            the video (any name; one file), or frames/00000.png and so on
     pose_mediapipe.npz   image_xyzv and world_xyzv [F, 33, 4], from MediaPipe Pose; or a body of
@@ -218,10 +218,16 @@ def _find_colmap(folder: Path, missing: list[str]) -> Path | None:
     sparse = folder / "sparse"
     if not sparse.is_dir():
         return None
-    for model in (sparse / "0", sparse):
-        for suffix in (".bin", ".txt"):
-            if all((model / (name + suffix)).is_file() for name in _COLMAP_FILES):
-                return model
+    whole = {
+        sparse / name: count
+        for name, count in models_in(sparse).items()
+        if any(
+            all((sparse / name / (part + suffix)).is_file() for part in PARTS)
+            for suffix in (".bin", ".txt")
+        )
+    }
+    if whole:
+        return max(whole, key=lambda model: whole[model])
     missing.append(
         "sparse/{cameras,images,points3D}.bin: the folder is there but no COLMAP model is in it; "
         "run `colmap mapper`, or delete the folder, or use --camera sfm or static"
