@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from hoigs.preparation.video.container import open_video
 from hoigs.preparation.video.packet_index import packet_index
 from hoigs.preparation.video.pictures import FilePicture, Picture, VideoPicture
 from hoigs.preparation.video.source import SourceError, numbered_frames
@@ -27,17 +28,10 @@ class _Cursor:
     """A decoder, and where in the video it is."""
 
     def __init__(self, path: Path) -> None:
-        import av
-
         self.lock = threading.Lock()
         self.at = -1  # the frame that was decoded last
         self.used = 0.0  # when
-        try:
-            self.container = av.open(str(path))
-            self.video = self.container.streams.video[0]
-            self.video.thread_type = "AUTO"
-        except (av.error.FFmpegError, IndexError, ValueError) as error:
-            raise SourceError(f"{path} is not a readable video: {error}") from error
+        self.container, self.video = open_video(path)
         self.frames: Iterator[Any] = self.container.decode(self.video)
 
     def seek(self, time: int, before: int) -> None:
@@ -162,7 +156,7 @@ class ScrubbedVideo:
                         self._cursors.append(cursor)
                 for frame in cursor.frames:
                     cursor.at = self._number(frame, cursor.at)
-                    picture = VideoPicture(frame)
+                    picture = VideoPicture(frame, cursor.video.sample_aspect_ratio)
                     if cursor.at >= number:
                         return picture
                     if cursor.at > number - self._most // 2:

@@ -121,6 +121,11 @@ class Lens:
         camera = pycolmap.Camera(
             model=self.model, width=self.width, height=self.height, params=list(self.params)
         )
+        if not camera.focal_length_idxs():  # asked for its focal length, COLMAP ends the process
+            raise ClipError(
+                f"{self.model} has no focal length, so no pinhole image: take perspective pictures "
+                "of the panorama first (COLMAP's examples: panorama_sfm.py)"
+            )
         if not camera.verify_params():
             raise ClipError(
                 f"{self.model} has the parameters {camera.params_info}; got {len(self.params)}"

@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
+import torch
 from pydantic import Field
+from torch import Tensor
 
+from hoigs.core.errors import ClipError, did_you_mean
+from hoigs.core.files.colmap_files import choice_told
 from hoigs.core.interfaces.reader import ClipReader
-from hoigs.core.values.clip import Clip, uniform_test_split
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Clip, FrameStore, uniform_test_split
 from hoigs.core.values.tokens import EntityKind
 from hoigs.core.values.world import World
-from hoigs.plugins.readers.common.colmap_model import model_folder, read_sparse, sparse_needs
+from hoigs.plugins.readers.common.colmap_model import (
+    SparseModel,
+    model_folder,
+    read_sparse,
+    sparse_needs,
+)
 from hoigs.plugins.readers.common.config import VideoReaderConfig
-from hoigs.plugins.readers.common.frame_order import image_files, video_moments
+from hoigs.plugins.readers.common.frame_order import image_files, natural, video_moments
 from hoigs.plugins.readers.common.lazy_frames import LazyFrames, MaskFiles, lens_for
 from hoigs.plugins.readers.common.listing import Need, require_files
+from hoigs.plugins.readers.common.start_points import points_along_rays
 
 LAYOUT = "a COLMAP folder (images/ and sparse/)"
+NEAREST, FARTHEST = 0.5, 50.0  # where a scene without points may be; 1: the cameras' way
 MASK_MAKER = "your segmenter makes masks/ENTITY/, 0/255, one for each image; or remove the folder"
 NO_POSES = "a COLMAP folder holds none; `hoigs prepare` fits a body to landmarks"
 
@@ -27,6 +42,16 @@ class ColmapConfig(VideoReaderConfig):
     """Settings of reader:colmap."""
 
     factor: int = Field(default=1, ge=1, description="2 reads images_2/, and so on")
+    model: str | None = Field(
+        default=None, description="the model's folder (sparse/0); default: the largest in sparse/"
+    )
+    camera: str | None = Field(
+        default=None,
+        description="images of this folder in images/ alone, where each camera has one; else all",
+    )
+    points: int = Field(
+        default=20_000, ge=1, description="scene points to start from where the model has none"
+    )
     test_every: int | None = Field(
         default=None,
         ge=2,
@@ -38,9 +63,12 @@ class ColmapReader(ClipReader):
     """Cameras and points of a sparse model, in COLMAP's own unit; distortion is taken out.
 
     Images are in natural order of their names. One that COLMAP could not register is left out,
-    but keeps its time. `masks/NAME/` holds the masks of an entity: a human if NAME starts with
-    "human" or "person", else an object. Mask files directly in `masks/` are COLMAP's own
-    (pixels without features) and are not read.
+    but keeps its time. Where folders in images/ have frames of equal numbers, they are cameras
+    that run at once: equal numbers are of one time.
+
+    `masks/NAME/` holds the masks of an entity: a human if NAME starts with "human" or "person",
+    else an object. Mask files directly in `masks/` are COLMAP's own (pixels without features) and
+    are not read.
     """
 
     Config: ClassVar = ColmapConfig
@@ -56,12 +84,18 @@ class ColmapReader(ClipReader):
         shrink = "the video's frames, the ones that COLMAP was run on"
         if (factor := self.config.factor) != 1:
             shrink = f"images at 1/{factor} size: `mogrify -resize {100 / factor:g}%`"
-        needs = [Need.of(f"{image_folder}/", maker=shrink), *sparse_needs(folder)]
+        chosen = self.config.model
+        needs = [Need.of(f"{image_folder}/", maker=shrink), *sparse_needs(folder, chosen)]
         require_files(folder, LAYOUT, needs)
-        place = model_folder(folder)
+        place = model_folder(folder, chosen)
         assert place is not None  # require_files has found it
+        told = choice_told(folder / "sparse", folder / place) if chosen is None else None
+        if told:
+            warnings.warn(f"{told}; --reader-set model={place} takes it always", stacklevel=2)
         model = read_sparse(folder / place)
         files = _by_stem(folder / image_folder)
+        if self.config.camera is not None:
+            model, files = _of_camera(self.config.camera, model, files)
         stems = [_stem(view.name, files) for view in model.views]
         masks = mask_folders(folder)
         needs = [Need.of(f"{image_folder}/{v.name}", maker=shrink)
@@ -72,33 +106,101 @@ class ColmapReader(ClipReader):
         images = [files[stem] for stem in stems]
         lenses = [lens_for(view.lens, path) for view, path in zip(model.views, images)]
         cameras = [lens.camera(v.world_to_camera) for lens, v in zip(lenses, model.views)]
-        order = {path: i for i, path in enumerate(files.values())}
+        store = LazyFrames(
+            folder,
+            images,
+            cameras,
+            masks={n: MaskFiles([folder / "masks" / n / f"{s}.png" for s in stems]) for n in masks},
+            lenses=lenses,
+            cache_mb=self.config.cache_mb,
+        )
+        points, colors, origin = self._points(model, store, cameras, tuple(masks))
+        order, count = _instants(files)
+        at_once = "" if count == len(files) else f"; {len(files)} images of {count} instants"
         return Clip(
             name=folder.resolve().name,
-            store=LazyFrames(
-                folder,
-                images,
-                cameras,
-                masks={
-                    n: MaskFiles([folder / "masks" / n / f"{s}.png" for s in stems]) for n in masks
-                },
-                lenses=lenses,
-                cache_mb=self.config.cache_mb,
-            ),
+            store=store,
             cameras=cameras,
-            moments=video_moments([order[p] for p in images], len(files)),
+            moments=video_moments([order[stem] for stem in stems], count),
             kinds=masks,
-            points=model.points,
-            point_colors=model.colors,
+            points=points,
+            point_colors=colors,
             split=split_of(len(images), self.config.test_every),
             world=World.guessed(cameras, metres=False),
             fps=self.config.fps,
             provenance={
                 "reader": "reader:colmap",
-                "cameras": f"{model.summary}; world in COLMAP's unit",
+                "cameras": f"{place}: {model.summary}; world in COLMAP's unit{at_once}",
+                "points": origin,
                 **{f"poses of {n}": NO_POSES for n, kind in masks.items() if kind == "human"},
             },
         )
+
+    def _points(
+        self,
+        model: SparseModel,
+        store: FrameStore,
+        cameras: Sequence[Camera],
+        entities: Sequence[str],
+    ) -> tuple[Tensor, Tensor, str]:
+        """The model's; where it has none, at random depths about the distance that the cameras
+        move by, as for cameras that go round a scene."""
+        if len(model.points):
+            return model.points, model.colors, "COLMAP's"
+        centers = torch.stack([camera.center for camera in cameras])
+        reach = float((centers - centers.mean(0)).norm(dim=-1).max()) or 1.0
+        span = (NEAREST * reach, FARTHEST * reach)
+        points, colors = points_along_rays(store, cameras, entities, span, self.config.points)
+        return points, colors, f"random, along rays, {span[0]:.3g} to {span[1]:.3g} away"
+
+
+def _of_camera(
+    name: str, model: SparseModel, files: Mapping[str, Path]
+) -> tuple[SparseModel, dict[str, Path]]:
+    """The views and images of one camera's folder alone.
+
+    Raises:
+        ClipError: it has none.
+    """
+    views = [view for view in model.views if view.name.startswith(f"{name}/")]
+    if not views:
+        known = sorted({v.name.rpartition("/")[0] for v in model.views})
+        raise ClipError(
+            f"camera: no registered image is in {name}/{did_you_mean(name, known)}; the model has "
+            f"images in {', '.join(repr(k) for k in known)}"
+        )
+    kept = {stem: path for stem, path in files.items() if stem.startswith(f"{name}/")}
+    return replace(model, views=views), kept
+
+
+def _instants(files: Mapping[str, Path]) -> tuple[dict[str, int], int]:
+    """When each image was taken, as the number of an instant, and how many instants there are.
+
+    Images of one folder are a video. Folders are cameras that run at once if images in them have
+    equal numbers (the last in their names; equal names, where some have no number or share one);
+    else their images follow each other.
+    """
+    folders: dict[str, list[str]] = {}
+    for stem in files:
+        folders.setdefault(stem.rpartition("/")[0], []).append(stem)
+    for key in (_number, _name):
+        keys = {folder: [key(stem) for stem in stems] for folder, stems in folders.items()}
+        if any(None in found or len(set(found)) < len(found) for found in keys.values()):
+            continue
+        instants = sorted({str(k) for found in keys.values() for k in found}, key=natural)
+        if len(instants) < len(files):
+            place = {instant: i for i, instant in enumerate(instants)}
+            return {stem: place[str(key(stem))] for stem in files}, len(instants)
+    return {stem: i for i, stem in enumerate(files)}, len(files)
+
+
+def _number(stem: str) -> int | None:
+    digits = re.findall(r"\d+", _name(stem))
+    return int(digits[-1]) if digits else None
+
+
+def _name(stem: str) -> str:
+    return stem.rpartition("/")[2]
 
 
 def _by_stem(root: Path) -> dict[str, Path]:

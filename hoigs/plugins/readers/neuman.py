@@ -132,7 +132,7 @@ class NeumanReader(ClipReader):
 
 def _needs(folder: Path, images: Sequence[str]) -> list[Need]:
     needs = [] if images else [Need.of("images/00000.png", maker=AUTHORS)]
-    needs += sparse_needs(folder, ("sparse",), maker=MAKERS["sparse"])
+    needs += sparse_needs(folder, "sparse", maker=MAKERS["sparse"])
     needs += [Need.of(f"segmentations/{name}", maker=MAKERS["masks"]) for name in images]
     needs.append(Need.of(*SMPL_FILES, maker=MAKERS["smpl"]))
     needs.append(Need.of("alignments.npy", maker=MAKERS["alignments"]))

@@ -112,10 +112,10 @@ def colmap_cameras(video: Frames, model: Path, *, partial: bool = False) -> Came
     Raises:
         SourceError: the model is unreadable, lacks frames, or has cameras of several kinds.
     """
-    from hoigs.core.machine.colmap import pycolmap
+    from hoigs.core.machine.colmap import read_model
 
     try:
-        model_read = pycolmap.Reconstruction(str(model))
+        model_read = read_model(model)
     except (RuntimeError, ValueError, IndexError) as error:
         raise SourceError(f"{model} is not a readable COLMAP model: {error}") from error
     by_frame = _by_frame(model_read)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hoigs.core.diagnostics import ranges
+from hoigs.core.files.colmap_files import choice_told
 from hoigs.core.files.npz import holds
 from hoigs.core.values.lens import Lens
 from hoigs.preparation.bodies.file_body import FileBody
@@ -77,7 +78,9 @@ def choose_cameras(
             read = reader if holds(given, arrays) else read
         return ChosenCameras(read(video, given))
     if not options.own_cameras and model is not None:
-        return ChosenCameras(colmap_cameras(video, model))
+        sparse = model if model.name == "sparse" else model.parent
+        told = choice_told(sparse, model)
+        return ChosenCameras(colmap_cameras(video, model), warnings=[told] if told else [])
     if options.camera in {"auto", "static", "turning"}:
         still_lens = lens
         if lens is None and options.focal is None and bodies is not None:

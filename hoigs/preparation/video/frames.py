@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from hoigs.core.files.regular_file import regular_file
+from hoigs.preparation.video.container import open_video, unreadable
 from hoigs.preparation.video.packet_index import PacketIndex, packet_index
 from hoigs.preparation.video.pictures import FilePicture, Picture, VideoPicture
 from hoigs.preparation.video.sharpness import sharpness
@@ -297,7 +298,7 @@ class VideoFrames(Frames):
             if index is not None and index.keyframe(first):
                 yield from self._sought(container, stream, index, first)
             else:
-                yield from map(VideoPicture, islice(container.decode(stream), first, None))
+                yield from _pictures(container, stream, first)
 
     def _sought(
         self, container: Any, stream: Any, index: PacketIndex, first: int
@@ -313,7 +314,7 @@ class VideoFrames(Frames):
             if number != expected:
                 break
             expected += 1
-            yield VideoPicture(frame)
+            yield VideoPicture(frame, stream.sample_aspect_ratio)
         if expected < len(index):  # times of packets and of frames differ, or frames are damaged
             self._note(
                 f"frame {expected} of {self.path.name} is not where the video's index has it: "
@@ -322,33 +323,25 @@ class VideoFrames(Frames):
                 "fixed.mp4`"
             )
             with self._opened() as (anew, video):
-                yield from map(VideoPicture, islice(anew.decode(video), expected, None))
+                yield from _pictures(anew, video, expected)
 
     @contextmanager
     def _opened(self) -> Iterator[tuple[Any, Any]]:
         """The file and its video stream; errors of the decoder are named."""
         import av
 
+        container, stream = open_video(self.path)
         try:
-            with av.open(str(self.path)) as container:
-                if not container.streams.video:
-                    raise SourceError(
-                        f"{self.path} has no video stream, {_listed(container.streams)} only"
-                    )
-                stream = container.streams.video[0]
-                stream.thread_type = "AUTO"
+            with container:
                 self._rate = float(stream.average_rate or stream.guessed_rate or 30)
                 yield container, stream
         except (av.error.FFmpegError, ValueError) as error:
-            size = self.path.stat().st_size if self.path.exists() else 0
-            raise SourceError(
-                f"{self.path} ({size} bytes) is not a readable video: {error}; "
-                "re-encode it, for example with `ffmpeg -i VIDEO -c:v libx264 fixed.mp4`"
-            ) from error
+            raise unreadable(self.path, error) from error
 
 
-def _listed(streams: Iterable[Any]) -> str:
-    return " and ".join(sorted({stream.type for stream in streams})) or "nothing"
+def _pictures(container: Any, stream: Any, first: int) -> Iterator[Picture]:
+    for frame in islice(container.decode(stream), first, None):
+        yield VideoPicture(frame, stream.sample_aspect_ratio)
 
 
 class FolderFrames(Frames):

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from hoigs.preparation.video.container import open_video
+from hoigs.preparation.video.source import SourceError
+
 MOST = 0.97  # of the header's frames, which are an estimate where it gives seconds only
 
 
@@ -12,13 +15,13 @@ def video_header(path: Path) -> tuple[int, float] | None:
     import av
 
     try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
+        container, stream = open_video(path)
+        with container:
             rate = float(stream.average_rate or 0)
             seconds = float((stream.duration or 0) * (stream.time_base or 0))
             count = stream.frames or round(seconds * rate)
             return (count, rate) if count and rate else None
-    except (av.error.FFmpegError, IndexError, ValueError):
+    except (av.error.FFmpegError, SourceError, ValueError):
         return None
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import UInt8
 
+from hoigs.core.files.images import eight_bits
+from hoigs.preparation.video.colors import converted
 from hoigs.preparation.video.source import SourceError
 
 
@@ -32,32 +35,38 @@ class Picture(Protocol):
 
 
 class VideoPicture:
-    """A decoded frame."""
+    """A decoded frame, as players show it: upright, with square pixels, in 8-bit sRGB.
 
-    def __init__(self, frame) -> None:
-        self.frame, self.turns = frame, quarter_turns(frame)
+    Args:
+        frame: PyAV's. aspect: width of a pixel over its height, as stored; None: square.
+
+    Raises:
+        SourceError: by `rgb` and `grey`, if its colours cannot be converted.
+    """
+
+    def __init__(self, frame: Any, aspect: Fraction | None = None) -> None:
+        self.frame, self.orientation = frame, orientation(frame)
         self.seconds: float | None = frame.time
+        # the shorter side of a pixel grows: nothing is lost
+        wide, high = max(aspect or 1, 1), max(1 / aspect if aspect else 1, 1)
+        self._shown = max(1, round(frame.width * wide)), max(1, round(frame.height * high))
 
     def size(self) -> tuple[int, int]:
-        size = (self.frame.width, self.frame.height)
-        return size[::-1] if self.turns % 2 else size
+        return self._shown[::-1] if self.orientation[0] else self._shown
 
     def rgb(self, width: int, height: int) -> UInt8[np.ndarray, "H W 3"]:
-        frame = self.frame
-        if self.turns % 2:
+        swapped, down, right = self.orientation
+        if swapped:
             width, height = height, width
-        if (width, height) != (frame.width, frame.height):
-            frame = frame.reformat(width=width, height=height, interpolation="AREA")
-        pixels = frame.to_ndarray(format="rgb24")
-        return np.ascontiguousarray(np.rot90(pixels, self.turns)) if self.turns else pixels
+        pixels = converted(self.frame, width, height).to_ndarray()
+        if swapped:
+            pixels = pixels.transpose(1, 0, 2)
+        return np.ascontiguousarray(pixels[::down, ::right])
 
     def grey(self, width: int) -> UInt8[np.ndarray, "h w"]:
-        frame = self.frame
-        width = min(width, frame.width)
-        height = max(1, round(frame.height * width / frame.width))
-        return frame.reformat(
-            width=width, height=height, format="gray", interpolation="AREA"
-        ).to_ndarray()
+        width = min(width, self._shown[0])
+        height = max(1, round(self._shown[1] * width / self._shown[0]))
+        return converted(self.frame, width, height, "gray").to_ndarray()
 
 
 class FilePicture:
@@ -74,7 +83,7 @@ class FilePicture:
 
         try:
             with Image.open(self.path) as image:
-                return ImageOps.exif_transpose(image).convert("RGB")
+                return eight_bits(ImageOps.exif_transpose(image)).convert("RGB")
         except (OSError, ValueError) as error:
             raise SourceError(f"{self.path} is not a readable image: {error}") from error
 
@@ -98,6 +107,15 @@ class FilePicture:
         return np.array(image.resize((width, height), Image.Resampling.BOX))
 
 
-def quarter_turns(frame) -> int:
-    """Counter-clockwise quarter turns that set the frame upright; phones store them apart."""
-    return round(getattr(frame, "rotation", 0) / 90) % 4
+def orientation(frame: Any) -> tuple[bool, int, int]:
+    """How a frame is set upright, which phones store apart: whether rows and columns are swapped,
+    then steps, 1 or -1, along rows and along columns."""
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return False, 1, 1
+    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[
+        :5
+    ].tolist()  # (x, y) to ax + cy, bx + dy
+    if abs(a) + abs(d) >= abs(b) + abs(c):
+        return False, -1 if d < 0 else 1, -1 if a < 0 else 1
+    return True, -1 if b < 0 else 1, -1 if c < 0 else 1

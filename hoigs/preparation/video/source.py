@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.colmap_files import PARTS, models_in
 from hoigs.core.files.npz import holds
 from hoigs.core.files.regular_file import regular_file
 from hoigs.core.interfaces.estimator import EstimateKind
@@ -20,7 +21,6 @@ CAMERAS = "cameras.npz"
 MEGASAM = frozenset({"images", "depths", "intrinsic", "cam_c2w"})  # arrays of its npz
 VGGT = frozenset({"extrinsic", "intrinsic", "depth", "images"})  # likewise
 FRAME_FOLDERS = ("frames", "images")  # where a folder of frames may keep them
-_COLMAP_FILES = ("cameras", "images", "points3D")
 _LAYOUT = """  FOLDER/
     video.mp4            the video (any name; one file), or frames/00000.png and so on
     pose_mediapipe.npz   image_xyzv and world_xyzv [F, 33, 4], from MediaPipe Pose; or a body of
@@ -91,6 +91,8 @@ def find_source(
     path = Path(path)
     if not path.exists():
         raise SourceError(f"{path} does not exist; expected a video, or a folder with one")
+    if not path.is_dir():
+        require_regular(path)
     folder = path if path.is_dir() else path.parent
     missing: list[str] = []
     try:
@@ -155,6 +157,19 @@ def _files(kind: EstimateKind, path: str, **settings: Any) -> ComponentSpec:
     return ComponentSpec(use=f"estimator:{kind}-files", path=path, **settings)
 
 
+def require_regular(path: Path) -> None:
+    """A pipe or a device is refused: reading one waits, and frames are read more than once.
+
+    Raises:
+        SourceError: something is there that is no regular file.
+    """
+    if path.exists() and not path.is_file():
+        raise SourceError(
+            f"{path} is no regular file (it is a pipe, a device or the like): copy its content "
+            "to a file"
+        )
+
+
 def find_video(path: Path) -> Path | None:
     """The video of a source, or its folder of frames; None if it has neither.
 
@@ -208,10 +223,16 @@ def _find_colmap(folder: Path, missing: list[str]) -> Path | None:
     sparse = folder / "sparse"
     if not sparse.is_dir():
         return None
-    for model in (sparse / "0", sparse):
-        for suffix in (".bin", ".txt"):
-            if all((model / (name + suffix)).is_file() for name in _COLMAP_FILES):
-                return model
+    whole = {
+        sparse / name: count
+        for name, count in models_in(sparse).items()
+        if any(
+            all((sparse / name / (part + suffix)).is_file() for part in PARTS)
+            for suffix in (".bin", ".txt")
+        )
+    }
+    if whole:
+        return max(whole, key=lambda model: whole[model])
     missing.append(
         "sparse/{cameras,images,points3D}.bin: the folder is there but no COLMAP model is in it; "
         "run `colmap mapper`, or delete the folder, or use --camera sfm or static"

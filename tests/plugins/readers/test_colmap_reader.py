@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,20 @@ from hoigs.core.errors import ClipError
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.lens import Lens
 from hoigs.plugins.readers.colmap import ColmapConfig, ColmapReader
+
+
+def renamed(folder: Path, name: Callable[[int], str]) -> None:
+    """Images, masks and a text model with other names."""
+    path = folder / "sparse/0/images.txt"
+    text = path.read_text()
+    for i in range(8):
+        text = text.replace(f" frame_{i + 1}.png", f" {name(i)}")
+        for place in ("images", "masks/human", "masks/object"):
+            if (old := folder / place / f"frame_{i + 1}.png").is_file():
+                new = folder / place / name(i).replace("\\", "/")
+                new.parent.mkdir(exist_ok=True)
+                shutil.move(old, new)
+    path.write_text(text)
 
 
 @pytest.mark.parametrize(
@@ -83,19 +98,85 @@ def test_frames_are_in_the_order_of_their_names(builtin: Clip, tmp_path: Path) -
 def test_images_in_folders_of_their_own(builtin: Clip, tmp_path: Path) -> None:
     """One folder a camera, with the same names in both; masks likewise."""
     colmap.write(builtin, tmp_path)
-    text = (tmp_path / "sparse/0/images.txt").read_text()
-    for i in range(8):
-        room, name = f"cam{i // 4}", f"{i % 4}.png"
-        text = text.replace(f"frame_{i + 1}.png", f"{room}/{name}")
-        for place in ("images", "masks/human", "masks/object"):
-            (tmp_path / place / room).mkdir(exist_ok=True)
-            shutil.move(tmp_path / place / f"frame_{i + 1}.png", tmp_path / place / room / name)
-    (tmp_path / "sparse/0/images.txt").write_text(text)
+    renamed(tmp_path, lambda i: f"cam{i // 4}/{i % 4}.png")
     clip = ColmapReader().read(tmp_path)
     same_cameras(clip.cameras, builtin.cameras)
     for mine, theirs in zip(clip, builtin, strict=True):
         assert mine.image.equal(theirs.image)
         assert mine.masks["human"].equal(theirs.masks["human"])
+
+
+@pytest.mark.parametrize("name", ["my frame {:02d}.png", "a room\\{:02d}.png"])
+def test_names_with_spaces_and_of_windows(builtin: Clip, tmp_path: Path, name: str) -> None:
+    colmap.write(builtin, tmp_path)
+    renamed(tmp_path, name.format)
+    clip = ColmapReader().read(tmp_path)
+    same_cameras(clip.cameras, builtin.cameras)
+    for mine, theirs in zip(clip, builtin, strict=True):
+        assert mine.image.equal(theirs.image) and mine.masks["human"].equal(theirs.masks["human"])
+
+
+@pytest.mark.parametrize(
+    ("name", "instants"),
+    [
+        (lambda i: f"cam{i // 4}/{i % 4}.png", [0, 1, 2, 3, 0, 1, 2, 3]),
+        (lambda i: f"cam{i // 4}/c{i // 4}_{i % 4:03d}.png", [0, 1, 2, 3, 0, 1, 2, 3]),
+        (lambda i: f"cam{i // 5}/{i % 5 + 2 * (i // 5)}.png", [0, 1, 2, 3, 4, 2, 3, 4]),
+        (lambda i: f"cam{i // 4}/{'abcd'[i % 4]}.png", [0, 1, 2, 3, 0, 1, 2, 3]),
+        (lambda i: f"part{i // 4}/{i}.png", [0, 1, 2, 3, 4, 5, 6, 7]),
+    ],
+)
+def test_cameras_that_run_at_once(
+    builtin: Clip, tmp_path: Path, name: Callable[[int], str], instants: list[int]
+) -> None:
+    colmap.write(builtin, tmp_path, masks=False)
+    renamed(tmp_path, name)
+    moments = ColmapReader().read(tmp_path).moments
+    assert [m.index for m in moments] == instants
+    assert [m.time for m in moments] == pytest.approx([i / max(instants) for i in instants])
+
+
+def test_one_camera_of_several(builtin: Clip, tmp_path: Path) -> None:
+    colmap.write(builtin, tmp_path)
+    renamed(tmp_path, lambda i: f"cam{i // 4}/{i % 4}.png")
+    clip = ColmapReader(ColmapReader.Config(camera="cam1")).read(tmp_path)
+    same_cameras(clip.cameras, builtin.cameras[4:])
+    assert [m.time for m in clip.moments] == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    with pytest.raises(ClipError, match=r'cam2.*"cam[01]"'):
+        ColmapReader(ColmapReader.Config(camera="cam2")).read(tmp_path)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_the_largest_model_is_taken_and_said(builtin: Clip, tmp_path: Path, binary: bool) -> None:
+    colmap.write(builtin, tmp_path, binary=binary, place="sparse/1")
+    colmap.write(builtin, tmp_path, binary=binary, place="sparse/0", order=(0, 1, 2))
+    with pytest.warns(UserWarning, match=r"sparse/0 \(3 images\), sparse/1 \(8 images\)"):
+        clip = ColmapReader().read(tmp_path)
+    assert len(clip) == 8 and clip.provenance["cameras"].startswith("sparse/1")
+    assert len(ColmapReader(ColmapReader.Config(model="sparse/0")).read(tmp_path)) == 3
+
+
+def test_a_model_without_points(builtin: Clip, tmp_path: Path) -> None:
+    """Points lie in front of the cameras, and are said to be random."""
+    colmap.write(builtin, tmp_path)
+    path = tmp_path / "sparse/0/points3D.txt"
+    path.write_text(path.read_text().splitlines()[0] + "\n")
+    clip = ColmapReader(ColmapReader.Config(points=100)).read(tmp_path)
+    assert 100 <= len(clip.points) < 110 and clip.points.isfinite().all()
+    assert "random" in clip.provenance["points"]
+    seen = [camera.project(clip.points)[1].min() > 0 for camera in clip.cameras]
+    assert any(seen)
+
+
+@pytest.mark.parametrize(
+    "model", [("EQUIRECTANGULAR", (32.0, 32.0)), ("LIGHT_FIELD", (32.0, 32.0))]
+)
+def test_a_lens_without_a_pinhole_image_is_named(
+    builtin: Clip, tmp_path: Path, model: tuple[str, tuple[float, ...]]
+) -> None:
+    colmap.write(builtin, tmp_path, lens=model)
+    with pytest.raises(ClipError, match=rf"sparse/0.*{model[0]}"):
+        ColmapReader().read(tmp_path)
 
 
 def test_a_partial_folder_is_told_in_one_message(builtin: Clip, tmp_path: Path) -> None:

@@ -48,6 +48,15 @@ def test_alpha_is_laid_over_the_background(tmp_path: Path) -> None:
     assert LazyFrames(tmp_path, [path], [CAMERA]).image(0)[0, 0].tolist() == [80, 0, 0]
 
 
+def test_greys_of_16_bits(tmp_path: Path) -> None:
+    path = picture(tmp_path, "deep.png", np.full((H, W), 100 * 257, np.uint16))
+    assert LazyFrames(tmp_path, [path], [CAMERA]).image(0)[0, 0].tolist() == [100] * 3
+    odd = tmp_path / "light.tif"
+    Image.fromarray(np.full((H, W), 0.5, np.float32)).save(odd)
+    with pytest.raises(ClipError, match=r"light\.tif.*0\.5"):
+        LazyFrames(tmp_path, [odd], [CAMERA]).image(0)
+
+
 def test_masks_of_any_polarity_and_size(tmp_path: Path, image: Path) -> None:
     half = np.zeros((H // 2, W // 2), np.uint8)
     half[2, 3] = 255

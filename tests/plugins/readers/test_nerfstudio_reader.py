@@ -56,6 +56,30 @@ def test_without_the_optional(builtin: Clip, tmp_path: Path) -> None:
     assert clip.split["test"] and clip.split["train"]
 
 
+def test_masks_in_alpha_and_paths_of_windows(builtin: Clip, tmp_path: Path) -> None:
+    nerfstudio.write(builtin, tmp_path)
+    want = NerfstudioReader().read(tmp_path)
+
+    def change(content: Any) -> None:
+        for frame in content["frames"]:
+            path = tmp_path / frame["mask_path"]
+            with Image.open(path) as image:
+                alpha = image.convert("L")
+            white = Image.new("L", alpha.size, 255)
+            Image.merge("RGBA", (white, white, white, alpha)).save(path)
+            for key in ("file_path", "mask_path", "depth_file_path"):
+                frame[key] = frame[key].replace("/", "\\")
+        for key in ("train_filenames", "val_filenames"):
+            content[key] = [name.replace("/", "\\") for name in content[key]]
+
+    edit(tmp_path, change)
+    clip = NerfstudioReader().read(tmp_path)
+    assert clip.split == want.split
+    for mine, theirs in zip(clip, want, strict=True):
+        assert mine.image.equal(theirs.image) and mine.ignored is not None
+        assert mine.ignored.any() and mine.ignored.equal(theirs.ignored)
+
+
 def test_distortion_is_taken_out_of_all(builtin: Clip, tmp_path: Path) -> None:
     """And the principal point stays where it is."""
     bent = {"fl_x": 18.0, "fl_y": 19.0, "cx": 14.0, "cy": 17.5, "k1": -0.2, "k2": 0.02, "p1": 0.001}

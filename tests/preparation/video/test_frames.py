@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from tiny import FRAMES, HEIGHT, WIDTH, picture
 
 from hoigs.preparation.video.frames import VideoFrames
-from hoigs.preparation.video.pictures import quarter_turns
 from hoigs.preparation.video.source import SourceError
 
 
@@ -52,8 +50,3 @@ def test_empty_and_damaged_videos(tiny_video: Path, tmp_path: Path) -> None:
     text.write_text("this is no video")
     with pytest.raises(SourceError, match="is not a readable video"):
         VideoFrames(text)
-
-
-@pytest.mark.parametrize(("angle", "turns"), [(0, 0), (90, 1), (-90, 3), (180, 2), (-180, 2)])
-def test_a_phones_rotation_tag_is_obeyed(angle: int, turns: int) -> None:
-    assert quarter_turns(SimpleNamespace(rotation=angle)) == turns

@@ -75,9 +75,9 @@ def test_nothing_before_the_keyframe_is_decoded(
 def _counted(decoded: list[int]):
     real = frames_module.VideoPicture
 
-    def made(frame):
+    def made(frame, aspect):
         decoded.append(frame.pts)
-        return real(frame)
+        return real(frame, aspect)
 
     return made
 

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Int
 from PIL import Image
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.images import mask_values
 from hoigs.core.files.npz import load_array
 from hoigs.core.files.regular_file import regular_file
 from hoigs.plugins.estimators.common.frame_files import FileDiagnostics
@@ -51,7 +52,10 @@ def read_mask(path: Path, inside: Inside) -> Bool[np.ndarray, "H W"]:
     else:
         with _open(path) as image:
             counts = image.mode in ("P", "1")
-            values = np.asarray(image if counts else image.convert("L"))
+            try:
+                values = np.asarray(image) if counts else mask_values(image)
+            except ValueError as error:
+                raise HoigsError(f"{path}: {error}") from error
     if inside == "dark":
         return values < 128
     if inside == "nonzero" or (inside == "auto" and counts):

@@ -14,13 +14,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.errors import ClipError
+from hoigs.core.files.colmap_files import PARTS, holds_model, models_in
 from hoigs.core.values.lens import Lens
 from hoigs.plugins.readers.common.frame_order import natural
 from hoigs.plugins.readers.common.listing import Need
 from hoigs.plugins.readers.common.poses import rigid
 
 MAKER = "COLMAP makes the sparse model (`colmap mapper`; mask out what moves)"
-PARTS = ("cameras", "images", "points3D")
 # of an entry in a binary file: bytes before its own count, of that count, of each that it counts
 ENTRY_BYTES = {
     "cameras": (24, 0, 0), "images": (64, 8, 24), "points3D": (43, 8, 8),
@@ -51,28 +51,26 @@ class SparseModel:
     summary: str
 
 
-def model_folder(folder: Path, places: tuple[str, ...] = ("sparse/0", "sparse")) -> str | None:
-    """The first of `places` under `folder` with a model in it, complete or not."""
-    for place in places:
-        if any((folder / place / f"{p}.{s}").is_file() for p in PARTS for s in ("bin", "txt")):
-            return place
-    return None
+def model_folder(folder: Path, place: str | None = None) -> str | None:
+    """The model under `folder`, complete or not: the largest in sparse/, the first of equal ones,
+    or the one in `place`; None: there is none."""
+    if place is not None:
+        return place if holds_model(folder / place) else None
+    found = models_in(folder / "sparse")
+    return f"sparse/{max(found, key=lambda n: found[n])}".rstrip("/") if found else None
 
 
 def sparse_needs(
-    folder: Path,
-    places: tuple[str, ...] = ("sparse/0", "sparse"),
-    points: bool = True,
-    maker: str = MAKER,
+    folder: Path, place: str | None = None, points: bool = True, maker: str = MAKER
 ) -> list[Need]:
     """The files of a sparse model, in the form (binary or text) that is there already."""
-    place = model_folder(folder, places) or places[0]
+    whole = model_folder(folder, place) is None
+    place = model_folder(folder, place) or place or "sparse/0"
     parts = PARTS if points else PARTS[:2]
     form = "txt" if any((folder / place / f"{p}.txt").is_file() for p in PARTS) else "bin"
     if all((folder / place / f"{p}.bin").is_file() for p in parts):
         form = "bin"
     other = "bin" if form == "txt" else "txt"
-    whole = model_folder(folder, places) is None
     return [
         Need((f"{place}/{p}.{form}", f"{place}/{p}.{other}") if whole else (f"{place}/{p}.{form}",),
              maker)
@@ -86,12 +84,12 @@ def read_sparse(folder: Path) -> SparseModel:
     Raises:
         ClipError: it is damaged, or registers no image.
     """
-    from hoigs.core.machine.colmap import pycolmap
+    from hoigs.core.machine.colmap import read_model
 
     _require_counts_fit(folder)
     try:
         if any((folder / f"points3D.{s}").is_file() for s in ("bin", "txt")):
-            model: Any = pycolmap.Reconstruction(str(folder))
+            model: Any = read_model(folder)
         else:
             model = _without_points(folder)
         registered = sorted(model.images.values(), key=lambda i: natural(i.name))
@@ -100,15 +98,19 @@ def read_sparse(folder: Path) -> SparseModel:
     for number, camera in model.cameras.items():
         if not np.isfinite(camera.params).all() or min(camera.width, camera.height) < 1:
             raise ClipError(f"{folder}: camera {number} is {camera.todict()}; run COLMAP again")
-    lenses = {
-        number: Lens(c.model_name, tuple(float(p) for p in c.params), c.width, c.height)
-        for number, c in model.cameras.items()
-    }
+    lenses = {}
+    for number, c in model.cameras.items():
+        params = tuple(float(p) for p in c.params)
+        try:
+            lenses[number] = Lens(c.model_name, params, c.width, c.height)
+        except ClipError as error:
+            raise ClipError(f"{folder}: camera {number}: {error}") from error
     views = []
     for image in registered:
         if image.has_pose:
             pose = np.asarray(image.cam_from_world().matrix(), np.float64)
-            views.append(View(image.name, lenses[image.camera_id], rigid(pose[:, :3], pose[:, 3])))
+            name = image.name.replace("\\", "/")  # of a COLMAP on Windows
+            views.append(View(name, lenses[image.camera_id], rigid(pose[:, :3], pose[:, 3])))
     if not views:
         raise ClipError(
             f"{folder} registers no image; run COLMAP again, with moving objects masked"
@@ -156,7 +158,7 @@ def _require_counts_fit(folder: Path) -> None:
 
 def _without_points(folder: Path) -> Any:
     """cameras.txt and images.txt alone: pycolmap needs all three files, and tracks that exist."""
-    from hoigs.core.machine.colmap import pycolmap
+    from hoigs.core.machine.colmap import read_model
 
     lines = (folder / "images.txt").read_text(encoding="utf-8").split("\n")
     rows = [line for line in lines if not line.startswith("#")]
@@ -166,4 +168,4 @@ def _without_points(folder: Path) -> Any:
         # each image has two lines; the second has its observations and may be empty
         (place / "images.txt").write_text("".join(f"{row}\n\n" for row in rows[::2] if row.strip()))
         (place / "points3D.txt").write_text("")
-        return pycolmap.Reconstruction(scratch)
+        return read_model(place)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from hoigs.core.errors import ClipError
+from hoigs.core.files.images import eight_bits, mask_values
 from hoigs.core.files.npz import load_array, load_arrays
 from hoigs.core.files.pixel_cache import PixelCache
 from hoigs.core.files.regular_file import regular_file
@@ -27,12 +29,12 @@ ASPECT_TOLERANCE = 0.02  # a mask of half an odd size has a slightly different a
 
 def bright(image: Image.Image) -> Array:
     """Foreground is brighter than half: masks of 0 and 255."""
-    return np.asarray(image.convert("L")) > 127
+    return mask_values(image) > 127
 
 
 def dark(image: Image.Image) -> Array:
     """Foreground is darker than half: masks whose background is white."""
-    return np.asarray(image.convert("L")) < 128
+    return mask_values(image) < 128
 
 
 @dataclass(frozen=True)
@@ -155,7 +157,7 @@ class LazyFrames(FrameStore):
         path, camera = files.paths[position], self.cameras[position]
         if path is None:
             return torch.zeros(camera.height, camera.width, dtype=torch.bool)
-        with opened(path) as image:
+        with opened(path) as image, _named(path):
             marked = np.asarray(files.foreground(image), dtype=np.bool_)
         return torch.from_numpy(self._flat(position).mask(self._fitted(path, marked, position)))
 
@@ -169,9 +171,9 @@ class LazyFrames(FrameStore):
         return torch.from_numpy(self._flat(position).depth(self._fitted(path, values, position)))
 
     def _decode(self, path: Path) -> UInt8[Array, "H W 3"]:
-        with opened(path) as image:
+        with opened(path) as image, _named(path):
             if image.mode not in ("RGBA", "LA", "PA") and "transparency" not in image.info:
-                return np.array(image.convert("RGB"))
+                return np.array(eight_bits(image).convert("RGB"))
             pixels = np.asarray(image.convert("RGBA"), dtype=np.float32)
         alpha = pixels[..., 3:] / 255
         mixed = pixels[..., :3] * alpha + np.array(self.background, np.float32) * (1 - alpha)
@@ -219,6 +221,15 @@ def opened(path: Path) -> Image.Image:
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ClipError(f"{path} cannot be decoded ({error}); write it again") from error
     return image
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Values that are no picture's, with the name of their file."""
+    try:
+        yield
+    except ValueError as error:
+        raise ClipError(f"{path}: {error}") from error
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, FiniteFloat, field_validator
+from pydantic import AfterValidator, BaseModel, FiniteFloat, field_validator
 
 from hoigs.core.errors import ClipError
 from hoigs.core.values.lens import Lens
@@ -37,14 +38,22 @@ class Intrinsics(BaseModel):
     p2: FiniteFloat | None = None
 
 
+def _slashes(path: str) -> str:
+    return path.replace("\\", "/")
+
+
+# a path of the file, which Windows writes with backslashes
+DataPath = Annotated[str, AfterValidator(_slashes)]
+
+
 class TransformFrame(Intrinsics):
     """One image."""
 
-    file_path: str
+    file_path: DataPath
     transform_matrix: list[list[FiniteFloat]]
     time: FiniteFloat | None = None
-    mask_path: str | None = None
-    depth_file_path: str | None = None
+    mask_path: DataPath | None = None
+    depth_file_path: DataPath | None = None
 
     @field_validator("transform_matrix")
     @classmethod
@@ -64,10 +73,10 @@ class Transforms(Intrinsics):
     frames: list[TransformFrame]
     applied_transform: list[list[FiniteFloat]] | None = None
     applied_scale: FiniteFloat = 1.0
-    ply_file_path: str | None = None
-    train_filenames: list[str] | None = None
-    val_filenames: list[str] | None = None
-    test_filenames: list[str] | None = None
+    ply_file_path: DataPath | None = None
+    train_filenames: list[DataPath] | None = None
+    val_filenames: list[DataPath] | None = None
+    test_filenames: list[DataPath] | None = None
 
 
 def lens_of(file: Transforms, frame: TransformFrame, image: Path, where: str) -> Lens:

@@ -81,7 +81,7 @@ def _pose_folder(folder: Path) -> str:
 
 
 def _has_model(folder: Path) -> bool:
-    return model_folder(folder, ("sparse",)) is not None
+    return model_folder(folder, "sparse") is not None
 
 
 def _lists(folder: Path) -> dict[str, str]:
@@ -100,7 +100,7 @@ def folder_needs(folder: Path) -> list[Need]:
     needs.append(Need.of(f"{OPTIMIZED}/{_pose_folder(folder)}/", maker=FITTING))
     needs.append(Need.of(f"{OPTIMIZED}/shape_param.json", maker=FITTING))
     if _has_model(folder):
-        needs += sparse_needs(folder, ("sparse",), points=False)
+        needs += sparse_needs(folder, "sparse", points=False)
     else:
         needs.append(Need.of("sparse/cameras.txt", "cam_params/", maker=CAMERAS))
     return [*needs, Need.of("sparse/points3D.txt", "sparse/points3D.bin", POINTS, maker=BACKGROUND)]
@@ -179,7 +179,7 @@ def frame_needs(
 
 
 def background_points(folder: Path) -> tuple[*Points, str]:
-    if model_folder(folder, ("sparse",)) is not None:
+    if model_folder(folder, "sparse") is not None:
         model = read_sparse(folder / "sparse")
         if len(model.points):
             return model.points, model.colors, model.summary

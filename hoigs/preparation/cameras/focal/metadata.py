@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from hoigs.preparation.video.source import SourceError, numbered_frames
+from hoigs.preparation.video.container import open_video
+from hoigs.preparation.video.source import numbered_frames
 
 # phones that give it give the equivalent on 35 mm film, whose picture is 43.27 mm across: Apple's
 # QuickTime key, and EXIF's name for the same
@@ -31,13 +32,9 @@ def focal_of_metadata(path: Path, width: int, height: int) -> tuple[float, str] 
 
 
 def _of_container(path: Path) -> tuple[float, str] | None:
-    import av
-
-    try:
-        with av.open(str(path)) as container:
-            entries = [container.metadata, *(stream.metadata for stream in container.streams)]
-    except (av.error.FFmpegError, ValueError) as error:
-        raise SourceError(f"{path} is not a readable video: {error}") from error
+    container, _ = open_video(path)
+    with container:
+        entries = [container.metadata, *(stream.metadata for stream in container.streams)]
     for metadata in entries:
         for key, value in metadata.items():
             if key.lower().endswith(SUFFIXES) and (film := _positive(value)):
