@@ -27,6 +27,7 @@ _PUBLIC = {
     # interfaces
     "BodyModel": "hoigs.core.interfaces.body",
     "ClipReader": "hoigs.core.interfaces.reader",
+    "ComponentConfig": "hoigs.core.config",
     "DeformationModel": "hoigs.core.interfaces.deformation",
     "DensityControl": "hoigs.core.interfaces.density",
     "FeatureExtractor": "hoigs.core.interfaces.features",

@@ -39,6 +39,9 @@ from hoigs.training.trainer import Trainer
 class Session:
     """One training run, ready to start.
 
+    `open` seeds torch's random state, from which the steps of `train` draw; `hoigs.train` restores
+    the caller's.
+
     Attributes:
         faults: defects of the clip that training tolerates; the run's provenance lists them too.
         reader: registry key of the reader that read the clip.

@@ -23,6 +23,7 @@ from hoigs.core.errors import ClipError, SpecError
 from hoigs.core.files.whole_files import write_whole
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.machine.busy import short_waits_when_busy
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.model.compose import compose, compose_density
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.registry.registry import Registry, default_registry
@@ -71,6 +72,7 @@ class RefinedPoses:
 
 
 @short_waits_when_busy()
+@callers_random_state()
 def refine_poses(
     clip: Path | str,
     out: Path | str,

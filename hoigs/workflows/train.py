@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError, Interrupted
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.progress import Progress
 from hoigs.core.spec.schema import Spec
 from hoigs.evaluation.report.sections import clock
@@ -44,6 +45,7 @@ class TrainedRun:
     evaluated: EvaluatedRun | None
 
 
+@callers_random_state()
 def train(
     clip: Path | str | None = None,
     spec: str | Path | Spec | None = None,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.progress import Progress
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_name
@@ -37,6 +38,7 @@ class AutoRun:
     after: After
 
 
+@callers_random_state()
 def auto(
     clip: Path | str,
     spec: str | Path | None = None,

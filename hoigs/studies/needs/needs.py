@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.runs.choices import pick_device, with_rasterizer
@@ -23,6 +24,7 @@ def needs_folder(clip: Path | str) -> Path:
     return Path("runs") / f"needs-{clip_name(clip)}"
 
 
+@callers_random_state()
 def needs(
     clip: Path | str,
     spec: str | Path = "hoigs",
