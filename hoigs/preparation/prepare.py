@@ -16,6 +16,7 @@ from hoigs.core.errors import ClipError, HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.machine.busy import short_waits_when_busy
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.storage.fetch import local_path
@@ -176,6 +177,7 @@ def prepare_until(
 
 
 @short_waits_when_busy()
+@callers_random_state()
 def _run(
     source: str | Path,
     out: str | Path,

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from hoigs.core.errors import CheckpointError, HoigsError
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.model.camera_refinement import CameraRefinement
 from hoigs.core.model.compose import compose
 from hoigs.core.model.scene import SceneModel
@@ -47,6 +48,7 @@ class LoadedRun:
     provenance: dict[str, Any]
 
     @classmethod
+    @callers_random_state()
     def open(
         cls,
         path: Path | str,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from hoigs.testing.checks import CheckError, Component, ComponentSubject
 from hoigs.testing.compare import require_finite
 
 Made = TypeVar("Made")
+Module = TypeVar("Module", bound=nn.Module)
 
 CPU = torch.device("cpu")
 NUDGE = 0.03  # standard deviation of the noise that moves parameters off zero
@@ -45,6 +47,29 @@ def perturb(module: nn.Module, seed: int = 1, size: float = NUDGE) -> None:
         if parameter.requires_grad and parameter.is_floating_point():
             noise = torch.randn(parameter.shape, generator=generator)
             parameter.add_((size * noise).to(parameter))
+
+
+def copied(module: Module, run: Callable[[Module], object]) -> Module:
+    """A deep copy made after a training pass whose graph has not been freed, as AveragedModel
+    makes it.
+
+    Raises:
+        CheckError: torch cannot copy what the pass left in the module.
+    """
+    training = module.training
+    module.train()
+    with torch.enable_grad():
+        held = run(module)
+    try:
+        twin = copy.deepcopy(module)
+    except (RuntimeError, TypeError) as error:
+        raise CheckError(
+            f"after a training pass it cannot be copied: {str(error).splitlines()[0]}; a "
+            "deformation names what a pass leaves in it in `transient`"
+        ) from error
+    del held
+    module.train(training)
+    return twin.train(training)
 
 
 def weighted_sum(tensors: Mapping[str, Tensor]) -> Tensor:

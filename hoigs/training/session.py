@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -37,17 +36,12 @@ from hoigs.training.reports import StepReport
 from hoigs.training.trainer import Trainer
 
 
-@contextmanager
-def random_state_kept() -> Iterator[None]:
-    """The random numbers of torch that the caller draws afterwards are those without the block."""
-    devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
-    with torch.random.fork_rng(devices=devices):
-        yield
-
-
 @dataclass
 class Session:
     """One training run, ready to start.
+
+    `open` seeds torch's random state, from which the steps of `train` draw; `hoigs.train` restores
+    the caller's.
 
     Attributes:
         faults: defects of the clip that training tolerates; the run's provenance lists them too.

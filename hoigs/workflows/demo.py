@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.progress import Progress
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
@@ -33,6 +34,7 @@ FAST_POINTS = {
 }
 
 
+@callers_random_state()
 def demo(
     *,
     out: Path | str = "runs/demo",

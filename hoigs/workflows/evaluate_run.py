@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.files.folder_lock import FolderLock
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.progress import Progress
 from hoigs.core.spec.train_schema import EvaluationSpec
 from hoigs.evaluation.evaluate import evaluate
@@ -32,6 +33,7 @@ class EvaluatedRun:
     report: Path | None
 
 
+@callers_random_state()
 def evaluate_run(
     run: Path | str,
     *,

@@ -23,6 +23,7 @@ from hoigs.core.errors import ClipError, SpecError
 from hoigs.core.files.whole_files import write_whole
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.machine.busy import short_waits_when_busy
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.model.compose import compose, compose_density
 from hoigs.core.progress import Progress, no_progress
 from hoigs.core.registry.registry import Registry, default_registry
@@ -31,7 +32,6 @@ from hoigs.core.values.clip import POSES_EXACT, BodyTrack, Clip
 from hoigs.plugins.deformation.avatars.body.skinned_body import SkinnedBody
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_folder, read_clip, require_folder
-from hoigs.training.session import random_state_kept
 from hoigs.training.trainer import Trainer
 
 WIDTH = 256  # pixels: landmarks are off by one or two of a larger picture
@@ -72,7 +72,7 @@ class RefinedPoses:
 
 
 @short_waits_when_busy()
-@random_state_kept()
+@callers_random_state()
 def refine_poses(
     clip: Path | str,
     out: Path | str,

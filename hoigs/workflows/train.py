@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError, Interrupted
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.progress import Progress
 from hoigs.core.spec.schema import Spec
 from hoigs.evaluation.report.sections import clock
 from hoigs.training.reports import StepReport
-from hoigs.training.session import Session, random_state_kept
+from hoigs.training.session import Session
 from hoigs.viewing.live import LiveView
 from hoigs.viewing.viewer.server import LOCAL
 from hoigs.workflows.budget import plan_budget
@@ -44,7 +45,7 @@ class TrainedRun:
     evaluated: EvaluatedRun | None
 
 
-@random_state_kept()
+@callers_random_state()
 def train(
     clip: Path | str | None = None,
     spec: str | Path | Spec | None = None,

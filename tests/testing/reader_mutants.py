@@ -84,6 +84,25 @@ class LeavesAnIndex(ClipFolderReader):
         return clip
 
 
+class Decoding(Wrapped):
+    def __init__(self, store) -> None:
+        super().__init__(store)
+
+        def decode(position):
+            return store.image(position)
+
+        self.decode = decode
+
+    def image(self, position):
+        return self.decode(position)
+
+
+class KeepsAFunction(ClipFolderReader):
+    def read(self, folder):
+        clip = super().read(folder)
+        return replace(clip, store=Decoding(clip.store))
+
+
 MUTANTS = {
     "C01": Stumbles,
     "C02": LeavesACache,
@@ -93,4 +112,5 @@ MUTANTS = {
     "C06": SecondsForTimes,
     "C07": Eager,
     "C08": LeavesAnIndex,
+    "C09": KeepsAFunction,
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
+from typing import Any
 
 from torch import Tensor
 
@@ -27,11 +28,13 @@ class PixelCache:
         self._kept: OrderedDict[Hashable, Tensor] = OrderedDict()
         self._lock = threading.Lock()
 
-    def __getstate__(self) -> int:
-        return self.budget // 2**20  # a copy decodes its own
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies and pickles have the budget only: pixels are decoded again where they are read."""
+        return {"budget": self.budget}
 
-    def __setstate__(self, cache_mb: int) -> None:
-        self.__init__(cache_mb)  # type: ignore[misc]
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(0)  # type: ignore[misc]  # makes an empty cache and a lock
+        self.budget = state["budget"]
 
     def get(self, key: Hashable, load: Callable[[], Tensor]) -> Tensor:
         """What is kept under `key`, or what `load` returns."""

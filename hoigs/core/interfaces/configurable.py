@@ -5,38 +5,59 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
 from typing import Any, ClassVar, Self
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import did_you_mean
 
+Parameters = dict[str, inspect.Parameter]
+
+
+class _Signature:
+    """`__signature__` of a component: the arguments of its constructor and its settings."""
+
+    def __get__(self, instance: object | None, owner: type[Configurable]) -> inspect.Signature:
+        if instance is not None or owner.Config is ComponentConfig:
+            raise AttributeError("__signature__")  # inspect then reads the constructor's own
+        given = _constructor(owner)
+        if "config" not in given:
+            raise AttributeError("__signature__")
+        only = inspect.Parameter.KEYWORD_ONLY
+        shown = [p for p in given.values() if p.kind is not only]
+        for name, field in owner.Config.model_fields.items():
+            if name not in given:
+                default = field.get_default(call_default_factory=True, validated_data={})
+                default = inspect.Parameter.empty if field.is_required() else default
+                shown.append(
+                    inspect.Parameter(name, only, default=default, annotation=field.annotation)
+                )
+        shown += [p for p in given.values() if p.kind is only]
+        return inspect.Signature(shown)
+
 
 class Configurable:
     """The base of every interface: settings are declared once, in `Config`.
 
-    A class with settings names its ComponentConfig as `Config` and takes one as the argument
-    `config` of its constructor. Whoever calls the constructor may give the settings by name
-    instead: `CubicHermite(keyframes=17, track=track)` is
-    `CubicHermite(CubicHermite.Config(keyframes=17), track=track)`. Further arguments of a
-    constructor come from the BuildContext (a body, a track, a clip), so a class that needs it
-    overrides `from_config`; they take precedence over settings of the same name. A class that names
-    no `Config` gets its settings as keywords.
+    A class with settings names its ComponentConfig as `Config` and takes one, or None, as the
+    argument `config` of its constructor, the first. Callers give the settings themselves:
+    `CubicHermite(keyframes=17, track=track)`, or the config: `CubicHermite(config, track=track)`.
+    An argument of the constructor takes precedence over a setting of its name. Further arguments of
+    a constructor come from the BuildContext (a body, a track, a clip), so a class that needs it
+    overrides `from_config`. A class that names no `Config` gets its settings as keywords.
+
+    Constructors raise TypeError for an argument that they do not have, naming the nearest that they
+    do, and for a `config` of another class; pydantic's ValidationError, a ValueError, for a setting
+    whose value is not valid.
     """
 
     Config: ClassVar[type[ComponentConfig]] = ComponentConfig
+    __signature__ = _Signature()
 
-    def __init_subclass__(cls, **options: Any) -> None:
-        super().__init_subclass__(**options)
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
         own = cls.__dict__.get("__init__")
         if own is not None and "config" in inspect.signature(own).parameters:
-            cls.__init__ = _with_settings(own)  # type: ignore[method-assign]
-        if cls.Config is not ComponentConfig:
-            cls.__signature__ = _signature(cls)  # type: ignore[attr-defined]
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What is copied or pickled: not the graph that a forward pass left in attributes."""
-        return {name: _without_graph(value) for name, value in self.__dict__.items()}
+            cls.__init__ = _taking_settings(own)  # type: ignore[method-assign]
 
     @classmethod
     def from_config(cls, config: Any, context: Any) -> Self:
@@ -51,78 +72,57 @@ class Configurable:
         return build(**config.model_dump()) if cls.Config is ComponentConfig else build(config)
 
 
-def _with_settings(own: Callable[..., None]) -> Callable[..., None]:
-    """A constructor that also takes the fields of `Config` as keywords."""
-
-    @functools.wraps(own)
-    def constructor(self: Any, config: Any = None, *others: Any, **given: Any) -> None:
-        kind = type(self)
-        if config is not None and not isinstance(config, ComponentConfig):
-            raise TypeError(
-                f"{kind.__name__}: config: expected a {kind.Config.__name__}, got "
-                f"{type(config).__name__}; name the argument that it is for"
-            )
-        arguments = _arguments(kind)
-        settings = {k: given.pop(k) for k in list(given) if k not in arguments}
-        if settings:
-            known = kind.Config.model_fields
-            for name in settings:
-                if name not in known:
-                    hint = did_you_mean(name, [*arguments, *known])
-                    raise TypeError(f"{kind.__name__} has no argument {name!r}{hint}")
-            if config is not None:
-                raise TypeError(
-                    f"{kind.__name__}: {', '.join(settings)} and a config; put all into one of them"
-                )
-            config = kind.Config(**settings)
-        own(self, config, *others, **given)
-
-    return constructor
-
-
-def _arguments(kind: type) -> dict[str, inspect.Parameter]:
-    """The named arguments of a constructor and of those that it passes others on to."""
-    found: dict[str, inspect.Parameter] = {}
-    for base in kind.__mro__:
+def _constructor(cls: type) -> Parameters:
+    """Arguments of a class's constructor; those that it passes on to a base as `**given` are the
+    base's."""
+    found: Parameters = {}
+    for base in cls.__mro__:
         own = base.__dict__.get("__init__")
-        if own is None or not issubclass(base, Configurable):
+        if own is None:
             continue
-        parameters = inspect.signature(inspect.unwrap(own)).parameters
-        for name, parameter in list(parameters.items())[1:]:
-            if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
-                found.setdefault(name, parameter)
-        if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+        parameters = list(inspect.signature(own).parameters.values())[1:]
+        passes_on = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters)
+        variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+        for p in parameters:
+            if p.kind not in variable:
+                found.setdefault(p.name, p)
+        if not passes_on:
             break
     return found
 
 
-def _signature(kind: type[Configurable]) -> inspect.Signature:
-    """What the constructor takes: its own arguments, then the settings by name."""
-    arguments = _arguments(kind)
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    shown = [p for n, p in arguments.items() if n == "config"]
-    shown += [p.replace(kind=keyword) for n, p in arguments.items() if n != "config"]
-    for name, field in kind.Config.model_fields.items():
-        if "config" in arguments and name not in arguments:
-            default = inspect.Parameter.empty if field.is_required() else field.get_default()
-            shown.append(
-                inspect.Parameter(name, keyword, default=default, annotation=field.annotation)
+def _taking_settings(init: Callable[..., None]) -> Callable[..., None]:
+    """A constructor that takes a config, which can also be given setting by setting."""
+
+    needed = inspect.signature(init).parameters["config"].default is inspect.Parameter.empty
+
+    @functools.wraps(init)
+    def build(self: Any, *args: Any, **kwargs: Any) -> None:
+        cls, known = type(self), _constructor(type(self))
+        fields = cls.Config.model_fields
+        settings = {k: kwargs.pop(k) for k in list(kwargs) if k in fields and k not in known}
+        valid = [*(k for k in known if k != "config"), *(k for k in fields if k not in known)]
+        unknown = [k for k in kwargs if k not in known]
+        if unknown and cls.__init__ is build:
+            raise TypeError(
+                f"{cls.__name__} has no argument {unknown[0]!r}"
+                f"{did_you_mean(unknown[0], valid)} (it has {', '.join(valid) or 'none'})"
             )
-    return inspect.Signature(shown)
+        config = args[0] if args else kwargs.get("config")
+        if config is not None and not isinstance(config, cls.Config):
+            raise TypeError(
+                f"{cls.__name__}: config, the first argument, is of type {type(config).__name__}, "
+                f"expected {cls.Config.__name__} or None; name the others: "
+                f"{', '.join(f'{k}=' for k in valid)}"
+            )
+        if settings or (needed and config is None):
+            if config is not None:
+                raise TypeError(
+                    f"{cls.__name__} is given a config and {', '.join(settings)}: settings belong "
+                    "in one of them"
+                )
+            args, kwargs = args[1:], {k: v for k, v in kwargs.items() if k != "config"}
+            args = (cls.Config(**settings), *args)
+        init(self, *args, **kwargs)
 
-
-def _without_graph(value: Any) -> Any:
-    """A value of an attribute; emptied if it holds a tensor that a computation made."""
-    if not _has_graph(value):
-        return value
-    return {} if isinstance(value, dict) else None
-
-
-def _has_graph(value: Any) -> bool:
-    if isinstance(value, dict):
-        return any(map(_has_graph, value.values()))
-    if isinstance(value, list | tuple):
-        return any(map(_has_graph, value))
-    if is_dataclass(value) and not isinstance(value, type):
-        return any(_has_graph(getattr(value, f.name, None)) for f in fields(value))
-    return getattr(value, "grad_fn", None) is not None
+    return build

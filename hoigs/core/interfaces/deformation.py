@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, Literal, Protocol, TypeGuard, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, TypeGuard, runtime_checkable
 
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -74,6 +75,9 @@ class DeformationModel(Configurable, nn.Module, ABC):
         cuda_graph_safe: whether a CUDA graph may capture it; the conditions are in
             `hoigs.core.cuda_graphs.eligibility`.
         progress: done share of the training run, in [0, 1]; see `set_progress`.
+        transient: attributes that hold results of a pass (a cache, outputs kept for
+            `regularizers`) to the values they have in a copy or a pickle of the model: torch
+            copies no tensor that has a graph. Those of base classes are included.
     """
 
     kinds: frozenset[EntityKind] = frozenset({"scene", "human", "object"})
@@ -90,6 +94,14 @@ class DeformationModel(Configurable, nn.Module, ABC):
     input_space: Literal["canonical", "world"] = "canonical"
     cuda_graph_safe: bool = False
     progress: float = 1.0
+    transient: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(self.__dict__)
+        for base in reversed(type(self).__mro__):
+            for name, value in vars(base).get("transient", {}).items():
+                state[name] = copy.copy(value)
+        return state
 
     def bind(self, canonical: Gaussians) -> None:
         """Allocate what depends on the number of Gaussians. Called once, by the Entity."""

@@ -6,7 +6,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import Any, overload
 
@@ -20,6 +19,7 @@ from hoigs.core.files.pixel_cache import PixelCache
 from hoigs.core.maths.frame_times import FrameTimes
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose, Moment
+from hoigs.core.values.shown import SHOWN, html_table, one_line
 from hoigs.core.values.tokens import EntityKind
 from hoigs.core.values.world import World
 
@@ -83,6 +83,8 @@ class Frame:
     ignored: Bool[Tensor, "H W"] | None = None
     unknown: frozenset[str] = frozenset()
 
+    __repr__ = one_line
+
     @property
     def rgb(self) -> Float[Tensor, "H W 3"]:
         """RGB in [0, 1]."""
@@ -120,6 +122,12 @@ class BodyTrack:
     gender: str | None = None
     template: Float[Tensor, "V 3"] | None = None
 
+    __repr__ = one_line
+
+    def cut(self, rows: slice) -> BodyTrack:
+        """The track over some frames."""
+        return replace(self, poses=self.poses.frame(rows))
+
 
 @dataclass(frozen=True)
 class ObjectTrack:
@@ -147,6 +155,18 @@ class ObjectTrack:
     moving: Bool[Tensor, " P"] | None = None
     times: FrameTimes = None
     rotation_known: bool = True
+
+    __repr__ = one_line
+
+    def cut(self, rows: slice) -> ObjectTrack:
+        """The track over some frames, whose times run from 0 to 1 again."""
+        return replace(
+            self,
+            rotations=self.rotations[rows],
+            translations=self.translations[rows],
+            observed=self.observed[rows],
+            times=None if self.times is None else _stretched(self.times[rows]),
+        )
 
 
 @dataclass(frozen=True)
@@ -195,27 +215,41 @@ class Clip:
         return len(self.cameras)
 
     def __repr__(self) -> str:
-        camera = self.cameras[0] if self.cameras else None
-        size = f" of {camera.width}x{camera.height}" if camera is not None else ""
-        kinds = ", ".join(f"{name} ({kind})" for name, kind in self.kinds.items())
-        beside = f", {len(self.held_out)} held-out views" if self.held_out else ""
-        return f"Clip({self.name!r}: {len(self)} frames{size}; {kinds or 'scene alone'}{beside})"
+        return f"Clip({', '.join(f'{what}: {text}' for what, text in self._facts())})"
 
     def _repr_html_(self) -> str:
-        """For notebooks: what there is, by entity."""
-        rows = [("frames", f"{len(self)}, {len(self.split.get('test', ()))} of them test frames")]
-        rows += [(name, kind) for name, kind in self.kinds.items()]
-        rows += [("scene points", str(len(self.points))), ("depth", self.depth_kind)]
-        cells = "".join(f"<tr><th>{escape(a)}</th><td>{escape(b)}</td></tr>" for a, b in rows)
-        return f"<table><caption>{escape(repr(self))}</caption>{cells}</table>"
+        return html_table(f"Clip {self.name}", ("what", "value"), self._facts())
+
+    def _facts(self) -> list[tuple[str, str]]:
+        facts = [("name", self.name)]
+        if self.cameras:
+            size = f"{self.cameras[0].width}x{self.cameras[0].height}"
+            facts.append(("frames", f"{len(self)} of {size} pixels at {self.fps:g} a second"))
+        facts += [(part, f"{len(positions)} frames") for part, positions in self.split.items()]
+        kinds = [f"{name} ({kind})" for name, kind in self.kinds.items()]
+        if len(kinds) > SHOWN:
+            kinds = [*kinds[:SHOWN], f"{len(kinds) - SHOWN} more"]
+        facts.append(("entities", ", ".join(kinds) or "none"))
+        facts.append(("scene points", f"{len(self.points)}"))
+        if self.held_out is not None:
+            facts.append(("held-out views", f"{len(self.held_out)}"))
+        return facts
 
     @overload
     def __getitem__(self, position: int) -> Frame: ...
     @overload
     def __getitem__(self, position: slice) -> Clip: ...
     def __getitem__(self, position: int | slice) -> Frame | Clip:
+        """A frame, or for a slice a clip of its own, whose time runs from 0 to 1 again.
+
+        Tracks and held-out views are cut to the frames from the first to the last of the slice.
+
+        Raises:
+            IndexError: there is no such frame, or none in the slice.
+            ValueError: the slice runs backwards.
+        """
         if isinstance(position, slice):
-            return self.subset(range(len(self))[position])
+            return self._cut(position)
         if not -len(self) <= position < len(self):
             raise IndexError(f"frame {position} of a clip with {len(self)} frames")
         position %= len(self)
@@ -231,7 +265,55 @@ class Clip:
         )
 
     def __iter__(self) -> Iterator[Frame]:
-        return (self.frame(i) for i in range(len(self)))
+        return (self[i] for i in range(len(self)))
+
+    def _cut(self, part: slice) -> Clip:
+        if part.step is not None and part.step < 0:
+            raise ValueError(f"clip[::{part.step}]: the frames of a clip go forward in time")
+        positions = range(len(self))[part]
+        if not positions:
+            shown = f"{'' if part.start is None else part.start}:{part.stop}"
+            raise IndexError(f"no frame in [{shown}] of a clip with {len(self)} frames")
+        kept = [self.moments[p] for p in positions]
+        first, last = min(m.index for m in kept), max(m.index for m in kept)
+        span = (min(float(m.time) for m in kept), max(float(m.time) for m in kept))
+        rows = slice(first, last + 1)
+        bodies = {name: track.cut(rows) for name, track in self.bodies.items()}
+        objects = {name: track.cut(rows) for name, track in self.objects.items()}
+        cut = self._chosen(positions, first, span, bodies, objects)
+        held_out = None
+        if self.held_out is not None:
+            seen = [i for i, m in enumerate(self.held_out.moments) if first <= m.index <= last]
+            if seen:
+                held_out = self.held_out._chosen(seen, first, span, bodies, objects)
+        name = f"{self.name}-{first}-{last}"
+        provenance = {**self.provenance, "cut": f"frames {first} to {last} of {self.name}"}
+        return replace(cut, name=name, held_out=held_out, provenance=provenance)
+
+    def _chosen(
+        self,
+        positions: Sequence[int],
+        first: int,
+        span: tuple[float, float],
+        bodies: Mapping[str, BodyTrack],
+        objects: Mapping[str, ObjectTrack],
+    ) -> Clip:
+        """Frames at `positions`; frame `first` gets number 0, and the times `span` become 0, 1."""
+        start, length = span[0], span[1] - span[0]
+        moments = [
+            replace(m, index=m.index - first, time=(float(m.time) - start) / (length or 1.0))
+            for m in (self.moments[p] for p in positions)
+        ]
+        place = {old: new for new, old in enumerate(positions)}
+        return replace(
+            self,
+            store=ChosenStore(self.store, positions),
+            cameras=[self.cameras[p] for p in positions],
+            moments=moments,
+            split={k: [place[p] for p in v if p in place] for k, v in self.split.items()},
+            bodies=bodies,
+            objects=objects,
+        )
 
     @property
     def num_frames(self) -> int:
@@ -254,28 +336,7 @@ class Clip:
         return tuple(every.tolist()) if (np.diff(every) > 0).all() else None
 
     def frame(self, position: int) -> Frame:
-        found = self[position]
-        assert isinstance(found, Frame)
-        return found
-
-    def subset(self, positions: Sequence[int]) -> Clip:
-        """The frames at these positions as a clip. Times, frame numbers, bodies and objects stay
-        those of the whole video; of the held-out views, those of the same frames stay."""
-        place = {old: new for new, old in enumerate(positions)}
-        kept = {self.moments[i].index for i in positions}
-        held_out = self.held_out
-        if held_out is not None:
-            held_out = held_out.subset(
-                [i for i, moment in enumerate(held_out.moments) if moment.index in kept]
-            )
-        return replace(
-            self,
-            store=SubsetStore(self.store, positions),
-            cameras=[self.cameras[i] for i in positions],
-            moments=[self.moments[i] for i in positions],
-            split={n: [place[i] for i in part if i in place] for n, part in self.split.items()},
-            held_out=held_out if held_out else None,
-        )
+        return self[position]
 
     def resized(self, width: int) -> Clip:
         """This clip at another width, aspect kept; pixels are resampled on demand."""
@@ -303,28 +364,6 @@ class Clip:
         depth = self.cameras[0].to_camera(self.points)[:, 2]
         ahead = depth[depth > 0]
         return max(spread, 0.5 * float(ahead.median()) if len(ahead) else 1.0)
-
-
-class SubsetStore(FrameStore):
-    """Some frames of another store."""
-
-    def __init__(self, base: FrameStore, positions: Sequence[int]) -> None:
-        self.base, self.positions, self.root = base, list(positions), base.root
-
-    def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
-        return self.base.image(self.positions[position])
-
-    def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
-        return self.base.mask(entity, self.positions[position])
-
-    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
-        return self.base.depth(self.positions[position])
-
-    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
-        return self.base.ignored(self.positions[position])
-
-    def mask_known(self, entity: str, position: int) -> bool:
-        return self.base.mask_known(entity, self.positions[position])
 
 
 class ResizedStore(FrameStore):
@@ -362,6 +401,34 @@ class ResizedStore(FrameStore):
         width, height = self.sizes[position]
         resize = torch.nn.functional.interpolate
         return resize(image[None, None], (height, width), mode="nearest-exact")[0, 0]
+
+
+class ChosenStore(FrameStore):
+    """Some frames of another store, in the order of `positions`."""
+
+    def __init__(self, base: FrameStore, positions: Sequence[int]) -> None:
+        self.base, self.positions, self.root = base, list(positions), base.root
+
+    def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
+        return self.base.image(self.positions[position])
+
+    def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
+        return self.base.mask(entity, self.positions[position])
+
+    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
+        return self.base.depth(self.positions[position])
+
+    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
+        return self.base.ignored(self.positions[position])
+
+    def mask_known(self, entity: str, position: int) -> bool:
+        return self.base.mask_known(entity, self.positions[position])
+
+
+def _stretched(times: tuple[float, ...]) -> FrameTimes:
+    """Ascending times, moved and scaled to run from 0 to 1."""
+    length = (times[-1] - times[0]) or 1.0
+    return tuple((time - times[0]) / length for time in times)
 
 
 def uniform_test_split(count: int, tests: int = 16) -> dict[str, list[int]]:

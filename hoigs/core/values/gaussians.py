@@ -14,6 +14,7 @@ from torch import Tensor
 from hoigs.core.errors import NotFiniteError
 from hoigs.core.maths.nearest import nearest, surface_normals
 from hoigs.core.maths.rotations import quats_to_matrices, turned_quats
+from hoigs.core.values.shown import one_line
 
 SH_C0 = 0.28209479177387814  # Y_00, so that color = 0.5 + SH_C0 * sh[:, 0]
 
@@ -57,6 +58,8 @@ class Gaussians:
     log_scales: Float[Tensor, "N 3"]
     opacity_logits: Float[Tensor, " N"]
     sh: Float[Tensor, "N K 3"]
+
+    __repr__ = one_line
 
     def __len__(self) -> int:
         return self.means.shape[0]

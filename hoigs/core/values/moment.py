@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.maths.rotations import axis_angle_to_quats, multiply_quats, quats_to_axis_angle
+from hoigs.core.values.shown import one_line
 
 HandConvention = Literal["flat", "mean"]
 ResidualRule = Literal["add", "compose"]
@@ -38,6 +39,8 @@ class BodyPose:
     transl: Float[Tensor, "*batch 3"]
     betas: Float[Tensor, "*shape B"]
     hand_pose_convention: HandConvention = "flat"
+
+    __repr__ = one_line
 
     @staticmethod
     def zeros(*batch: int, betas: int = 10, **kwargs: Any) -> BodyPose:
@@ -113,6 +116,8 @@ class Moment:
     time: float
     index: int = 0
     poses: Mapping[str, BodyPose] = field(default_factory=dict)
+
+    __repr__ = one_line
 
     def to(self, *args: Any, **kwargs: Any) -> Moment:
         return replace(self, poses={k: p.to(*args, **kwargs) for k, p in self.poses.items()})

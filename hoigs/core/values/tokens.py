@@ -8,6 +8,8 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.values.shown import one_line
+
 EntityKind = Literal["scene", "human", "object"]
 
 
@@ -21,6 +23,8 @@ class Tokens:
 
     features: Float[Tensor, "M D"]
     positions: Float[Tensor, "M 3"]
+
+    __repr__ = one_line
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,8 @@ class Residual:
 
     pose: Float[Tensor, "51 3"] | None = None
     means: Float[Tensor, "N 3"] | None = None
+
+    __repr__ = one_line
 
 
 def displaced(means: Float[Tensor, "N 3"], residual: Residual | None) -> Float[Tensor, "N 3"]:

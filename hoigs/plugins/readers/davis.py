@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -136,7 +137,7 @@ def _palettes(folder: Path, images: Sequence[Path]) -> dict[int, MaskFiles]:
     seen: set[int] = set()
     for path in paths:
         seen.update(np.unique(_indices(opened(path))).tolist())
-    return {i: MaskFiles(paths, _index(i)) for i in sorted(seen - {0, VOID})}
+    return {i: MaskFiles(paths, partial(_index, i)) for i in sorted(seen - {0, VOID})}
 
 
 def _indices(image: Image.Image) -> np.ndarray:
@@ -148,8 +149,8 @@ def _indices(image: Image.Image) -> np.ndarray:
     return np.asarray(image)
 
 
-def _index(number: int) -> Any:
-    return lambda image: _indices(image) == number
+def _index(number: int, image: Image.Image) -> np.ndarray:
+    return _indices(image) == number
 
 
 def _shown(image: Image.Image) -> np.ndarray:

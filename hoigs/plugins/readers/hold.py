@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from PIL import Image
 
 from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.reader import ClipReader
@@ -81,7 +83,9 @@ class HoldReader(ClipReader):
         hands = [h for h in ("right", "left") if h in data["entities"]]
         kinds: dict[str, EntityKind] = {f"hand_{h}": "human" for h in hands}
         kinds["object"] = "object"
-        masks = {n: MaskFiles(paths, _marked(VALUES[n.removeprefix("hand_")])) for n in kinds}
+        masks = {
+            n: MaskFiles(paths, partial(_marked, VALUES[n.removeprefix("hand_")])) for n in kinds
+        }
         track = _object(data["entities"].get("object"), len(images), where)
         store = LazyFrames(build, images, cameras, masks=masks, cache_mb=self.config.cache_mb)
         away = float(cameras[0].to_camera(track.translations)[:, 2].median())
@@ -206,5 +210,5 @@ def _require_values(path: Path) -> None:
         )
 
 
-def _marked(value: int) -> Any:
-    return lambda image: np.asarray(image.convert("L")) == value
+def _marked(value: int, image: Image.Image) -> np.ndarray:
+    return np.asarray(image.convert("L")) == value

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.progress import Progress
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_name
@@ -16,7 +17,6 @@ from hoigs.studies.needs.after_training import After, add_to_answer, finish
 from hoigs.studies.needs.needs import needs
 from hoigs.studies.needs.pruning.compact_run import compact_of
 from hoigs.studies.needs.result import Needs
-from hoigs.training.session import random_state_kept
 from hoigs.workflows.evaluate_run import evaluate_run
 from hoigs.workflows.train import OnStart, OnStep, Report, TrainedRun, silent, train
 
@@ -38,7 +38,7 @@ class AutoRun:
     after: After
 
 
-@random_state_kept()
+@callers_random_state()
 def auto(
     clip: Path | str,
     spec: str | Path | None = None,

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.runs.choices import pick_device, with_rasterizer
@@ -15,7 +16,6 @@ from hoigs.studies.needs.report.write import require_new, write_needs
 from hoigs.studies.needs.result import Needs, Settings
 from hoigs.studies.needs.search import Search
 from hoigs.studies.needs.search_space import load_search_spaces
-from hoigs.training.session import random_state_kept
 from hoigs.workflows.train import Report, silent
 
 
@@ -24,7 +24,7 @@ def needs_folder(clip: Path | str) -> Path:
     return Path("runs") / f"needs-{clip_name(clip)}"
 
 
-@random_state_kept()
+@callers_random_state()
 def needs(
     clip: Path | str,
     spec: str | Path = "hoigs",

@@ -1,4 +1,4 @@
-"""Conformance of clip readers: `CHECKS`, C01 to C08, on folders that the kit writes."""
+"""Conformance of clip readers: `CHECKS`, C01 to C09, on folders that the kit writes."""
 
 from __future__ import annotations
 

@@ -1,10 +1,14 @@
-"""C05 to C08: the clip that is read."""
+"""C05 to C09: the clip that is read."""
 
 from __future__ import annotations
+
+import copy
+import pickle
 
 import torch
 from PIL import Image
 
+from hoigs.testing.checks import CheckError
 from hoigs.testing.compare import require, require_close, require_finite
 from hoigs.testing.reader.subject import (
     CHECKS,
@@ -87,3 +91,21 @@ def reading_writes_nothing(subject: ReaderSubject) -> None:
             str(p.relative_to(folder)) for p in {*before, *after} if before.get(p) != after.get(p)
         ]
         require(not changed, f"reading changed {changed}")
+
+
+@CHECKS.check("C09", has_folder)
+def a_clip_is_copied_and_pickled(subject: ReaderSubject) -> None:
+    """A deep copy and a pickle of the clip, also of one in use, have its pixels."""
+    with subject.folder() as folder:
+        clip = subject.reader().read(folder)
+        last = len(clip) - 1
+        image = clip.store.image(last)
+        for how, twin in (
+            ("a deep copy", lambda: copy.deepcopy(clip)),
+            ("a pickle", lambda: pickle.loads(pickle.dumps(clip))),
+        ):
+            try:
+                same = torch.equal(twin().store.image(last), image)
+            except (TypeError, AttributeError, RuntimeError, pickle.PicklingError) as error:
+                raise CheckError(f"{how} of the clip fails: {error}") from error
+            require(same, f"{how} of the clip has another image {last}")

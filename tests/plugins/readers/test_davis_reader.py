@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ def test_round_trip(builtin: Clip, tmp_path: Path, folders: bool) -> None:
     folder = davis.write(builtin, tmp_path, folders=folders)
     reader = DavisReader(DavisReader.Config(people=[1], points=300))
     assert reader.matches(folder) and not reader.matches(tmp_path)
-    clip = reader.read(folder)
+    clip = pickle.loads(pickle.dumps(reader.read(folder)))
     assert clip.kinds == {"human_1": "human", "object_2": "object"}
     for i in range(len(clip)):
         assert clip[i].image.equal(builtin[i].image)

@@ -71,6 +71,13 @@ class HexPlaneSkinning(SurfaceBody):
         "nonrigid_smoothness": 0.01,
         "nonrigid_sparsity": 1e-4,
     }
+    transient: ClassVar[Mapping[str, Any]] = {
+        "_cached": None,
+        "_own": None,
+        "_last": None,
+        "_changes": {},
+        "_held": None,
+    }
 
     field_vertices: Tensor
     log_weights: Tensor

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -102,6 +102,7 @@ class TriplaneAvatar(SurfaceBody):
         "laplacian": 10.0,
         "skinning": 1000.0,
     }
+    transient: ClassVar[Mapping[str, Any]] = {"_predicted": None}
 
     cut_gradients = frozenset({"refinement.pose"})  # the pose decoders read a detached pose
 

@@ -4,7 +4,7 @@ arXiv:2404.03613)."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 from jaxtyping import Float
@@ -91,6 +91,7 @@ class Embedded(DeformationModel):
         "table_smoothness": 1e-4,
         "opacity": 1e-4,
     }
+    transient: ClassVar[Mapping[str, Any]] = {"_opacity": None}
 
     def __init__(
         self, config: EmbeddedConfig | None = None, *, num_frames: int | None = None

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.compression.compact import write_compact
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.model.compose import compose
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.registry.registry import Registry, default_registry
@@ -60,6 +61,7 @@ def compact_of(run: Path) -> Path:
     return run.with_name(f"{run.name}-compact")
 
 
+@callers_random_state()
 def compress(
     run: Path | str,
     *,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import torch
@@ -89,6 +89,12 @@ class SkinnedBody(DeformationModel):
     provides = frozenset({"skeleton"})
     residuals = frozenset({"means", "pose"})
     input_space = "canonical"
+    transient: ClassVar[Mapping[str, Any]] = {
+        "_shape": None,
+        "_arm": None,
+        "_last_posed": None,
+        "held": False,
+    }
     learns_scale: ClassVar[bool] = False  # else the body keeps the size that the clip gives it
 
     config: Any  # of the subclass's Config

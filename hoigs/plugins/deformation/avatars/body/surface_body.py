@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -34,6 +34,7 @@ class SurfaceBody(SkinnedBody):
 
     provides = frozenset({"skeleton", "face"})
     rates: ClassVar[Mapping[str, str]] = {"refinement": "pose", "refinement.betas": "shape"}
+    transient: ClassVar[Mapping[str, Any]] = {"_change": None}
 
     template_weights: Tensor
     parts: Tensor
