@@ -48,6 +48,8 @@ class Eye:
         self._set: deque[np.ndarray] = deque(maxlen=400)  # positions of cameras
         self._answered = math.inf  # when the browser first took a camera that was set, seconds
         self._taken = np.zeros(3)  # the position of the last that it took
+        self._own: View | None = None  # the last that it had of itself
+        self._asked = 0  # how often it had another one of itself
 
     @property
     def canvas(self) -> tuple[int, int]:
@@ -75,9 +77,13 @@ class Eye:
         """
         seen, now = self.view, time.monotonic()
         distance = max(float(np.linalg.norm(seen.target - seen.position)), 1e-3)
-        if any(np.linalg.norm(seen.position - place) < 0.01 * distance for place in self._set):
+        apart = np.linalg.norm(np.array(self._set).reshape(-1, 3) - seen.position, axis=1)
+        if (apart < 0.01 * distance).any():
             self._answered, self._taken = min(self._answered, now), seen.position
             return
+        if self._own is None or not seen.near(self._own):
+            self._asked += 1
+        self._own = seen
         near = np.linalg.norm(seen.position - self._taken) < STEP * distance
         if near and now - self._answered > START_S:
             self._dragged(self)
@@ -106,7 +112,8 @@ class Eye:
         return (len(times) - 1) / span if span > 0 else 0.0
 
     def pose_key(self) -> tuple[object, ...]:
-        """The camera and the canvas, rounded, to notice changes."""
+        """The camera and the canvas, rounded, to notice changes; who asks from elsewhere, where the
+        camera is the video's, gets that picture again."""
         view = self.view
         numbers = np.concatenate((view.position, view.rotation.ravel(), [view.fov]))
-        return (self.canvas, *np.round(numbers, 5).tolist())
+        return (self.canvas, self._asked, *np.round(numbers, 5).tolist())

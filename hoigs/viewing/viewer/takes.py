@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from io import BytesIO
@@ -106,11 +106,15 @@ class Film:
         """Let go of it; the encoder ends with what it has."""
         self._frames.put(None)
 
+    def _drawn_ones(self) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+        while (frame := self._frames.get()) is not None:
+            yield frame
+
     def _encode(self) -> None:
         try:
             with tempfile.TemporaryDirectory() as folder:
                 file = FilePath(folder) / "path.mp4"
-                write_video(file, iter(self._frames.get, None), fps=FILM_FPS)
+                write_video(file, self._drawn_ones(), fps=FILM_FPS)
                 self._made.set_result(file.read_bytes())
         except Exception as error:
             self._made.set_exception(error)

@@ -157,8 +157,9 @@ class Viewer:
         eye = Eye(client, self._widest, self._dragged)
         self._eyes[client.client_id] = eye
 
+        # in viser's loop: in a thread of its own the drawing could set another camera before it
         @client.camera.on_update
-        def _(_: Any) -> None:
+        async def _(_: Any) -> None:
             eye.moved()
             self._wake.set()
 
