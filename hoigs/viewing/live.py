@@ -11,7 +11,8 @@ from pathlib import Path
 from types import TracebackType
 
 from hoigs.core.machine.python import PYTHON
-from hoigs.viewing.viewer.server import free_port, require_viser
+from hoigs.viewing.viewer.addresses import free_port
+from hoigs.viewing.viewer.server import require_viser
 
 NICENESS = 10  # where processors are short, training goes first
 

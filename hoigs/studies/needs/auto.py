@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.whole_files import named
 from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.progress import Progress
 from hoigs.runs.choices import pick_device
@@ -122,6 +123,7 @@ def auto(
 
 def needs_of(run: Path) -> Path:
     """Folder of the `needs` answer that a run of `auto` is trained with."""
+    run = named(run)
     return run.with_name(f"{run.name}-needs")
 
 

@@ -19,8 +19,8 @@ from typing import Any
 from websockets.asyncio import server as websockets
 from websockets.http11 import Request, Response
 
+from hoigs.viewing.viewer.addresses import is_loopback
 from hoigs.viewing.viewer.messages import LARGEST, checked
-from hoigs.viewing.viewer.server import is_loopback
 
 Answer = Callable[[websockets.ServerConnection, Request], Response | None]
 
