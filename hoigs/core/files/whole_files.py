@@ -1,10 +1,16 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, beside what they replace."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+
+def named(path: Path) -> Path:
+    """`path` with a name of its own, so that others can be made of it: that of the folder itself
+    in place of "." and ".."."""
+    return path.resolve() if path.name in ("", "..") else path
 
 
 @contextmanager

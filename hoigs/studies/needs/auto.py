@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.files.whole_files import named
 from hoigs.core.progress import Progress
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_name
@@ -120,6 +121,7 @@ def auto(
 
 def needs_of(run: Path) -> Path:
     """Folder of the `needs` answer that a run of `auto` is trained with."""
+    run = named(run)
     return run.with_name(f"{run.name}-needs")
 
 
