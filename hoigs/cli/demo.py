@@ -66,9 +66,11 @@ def demo(
 def _compare(runs: dict[str, TrainedRun]) -> None:
     """PSNR of the runs, region by region, on the same test frames."""
     regions = ("full", "human_object", "human", "object", "interaction", "background")
-    rows = []
+    rows, given = [], []
     for name, run in runs.items():
         assert run.evaluated is not None
         scores = [run.evaluated.evaluation.score(region, "psnr") for region in regions]
         rows.append((name, *(f"{s:.2f}" if isinstance(s, float) else str(s) for s in scores)))
-    print_table("PSNR on test frames, dB", ("spec", *regions), rows)
+        given.append(run.evaluated.evaluation.views[0].protocol.given())
+    title = "; ".join(("PSNR on test frames, dB", *filter(None, given[:1])))
+    print_table(title, ("spec", *regions), rows)

@@ -155,6 +155,7 @@ def _protocol(
         region="full",
         band=default_band(camera.width, camera.height) if band is None else band,
         test_pose=test_pose,
+        object_poses="given" if set(clip.objects) & set(model.entities) else "",
         pixels=pixels,
         width=camera.width,
         height=camera.height,

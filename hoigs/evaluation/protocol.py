@@ -46,6 +46,8 @@ class Protocol:
         test_pose: source of the body poses: "given" by the clip, with the corrections of
             neighbouring training frames; "interpolated" from these frames; "blended" from both; or
             "fitted" to the test images themselves (`posing.posed_clip`).
+        object_poses: source of the objects' tracks, which stay as they are at test frames: "given"
+            by the clip; "" where no object has one, and in scores of 0.1.
         own_share: of "blended" poses: 0 is "interpolated", 1 nearly "given"; None of others.
         pixels: "float" renders, or rounded to "8-bit"; clamped to [0, 1] either way.
         background: colour behind all Gaussians.
@@ -73,6 +75,7 @@ class Protocol:
     device: str
     rasterizer: str
     test_camera: TestCamera = "given"
+    object_poses: str = ""
     own_share: float | None = None
     fit_steps: int = 0
     cameras_refined: bool = False
@@ -88,6 +91,15 @@ class Protocol:
     def of(self, region: str) -> Protocol:
         """The same protocol for another region."""
         return replace(self, region=region)
+
+    def given(self) -> str:
+        """What a model was told of the frames that are scored: "cameras, body and object poses
+        given"; "" if that is nothing."""
+        sources = {"body": self.test_pose, "object": self.object_poses}
+        poses = " and ".join(what for what, how in sources.items() if how == "given")
+        told = ["cameras"] if self.test_camera == "given" else []
+        told += [f"{poses} poses"] if poses else []
+        return f"{', '.join(told)} given" if told else ""
 
     def _cameras(self) -> str:
         moved = ", moved by the corrections that training learned" if self.cameras_refined else ""
@@ -138,10 +150,11 @@ class Protocol:
             if self.ignored
             else ""
         )
+        objects = f"object poses: {self.object_poses}; " if self.object_poses else ""
         return [
             f"{self.frames} frames of split {self.split!r} from {self.views}, "
             f"{self.unseen_times or 'none'} of them at times that were not trained on; "
-            f"body poses: {self._poses()}; {self._cameras()}.",
+            f"body poses: {self._poses()}; {objects}{self._cameras()}.",
             *self._warnings(),
             f"{self.width}x{self.height}, {self.pixels} pixels clamped to [0, 1] over "
             f"{self.background}; {self.averages}; drawn by {self.rasterizer} on {self.device}"

@@ -13,6 +13,7 @@ from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.clip_folder.format import is_clip_folder
 from hoigs.core.clip_folder.write import refuse_to_overwrite
 from hoigs.core.errors import ClipError, HoigsError
+from hoigs.core.files.whole_files import named
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.machine.busy import short_waits_when_busy
@@ -47,7 +48,8 @@ __all__ = ["PrepareOptions", "PrepareReport", "prepare", "prepare_until", "work_
 
 def work_folder(out: str | Path) -> Path:
     """Where the stages of the clip `out` keep their results: `out`.prepare, beside it."""
-    out = Path(out).resolve()
+    out = Path(out).absolute()
+    out = named(out)
     return out.with_name(out.name + ".prepare")
 
 

@@ -14,6 +14,9 @@ ObjectMotionName = Literal[
     "held", "thrown", "pushed", "bending", "static", "carried", "gliding", "figure-eight"
 ]
 
+MOST_FRAMES = 100_000  # names of frames have five digits
+MOST_PIXELS = 8192  # a side
+MOST_POINTS = 10_000_000
 OF_ONE_MOTION: dict[str, ObjectMotionName] = {
     "cycles": "figure-eight", "throw_turns": "thrown", "throw_height": "thrown",
     "hidden_share": "carried", "regrips": "pushed", "jolt_metres": "pushed",
@@ -50,6 +53,7 @@ class CameraConfig(ComponentConfig):
     shutter_frames: int = Field(
         default=1,
         ge=1,
+        le=999,
         description="odd; each image is the mean of this many frames around its own",
     )
 
@@ -82,7 +86,9 @@ class ObjectConfig(ComponentConfig):
         le=0.6,
         description="of the clip with the back turned; None keeps the default walk",
     )
-    regrips: int = Field(default=0, ge=0, description="times that the hands leave a pushed object")
+    regrips: int = Field(
+        default=0, ge=0, le=MOST_FRAMES, description="times that the hands leave a pushed object"
+    )
     appears: float = Field(
         default=0.0, ge=0, lt=1, description="share of the clip before it appears"
     )
@@ -188,11 +194,11 @@ class NoiseConfig(ComponentConfig):
 class SceneConfig(ComponentConfig):
     """A synthetic clip: one person, one object, one room, one moving camera, known truth."""
 
-    frames: int = Field(default=64, ge=2, le=100_000)
+    frames: int = Field(default=64, ge=2, le=MOST_FRAMES)
     """Of the whole clip."""
-    width: int = Field(default=256, ge=16, le=16_384)
+    width: int = Field(default=256, ge=16, le=MOST_PIXELS)
     """Pixels."""
-    height: int = Field(default=256, ge=16, le=16_384)
+    height: int = Field(default=256, ge=16, le=MOST_PIXELS)
     """Pixels."""
     fps: float = Field(default=16.0, gt=0)
     """So that frames / fps is its length in seconds."""
@@ -204,16 +210,16 @@ class SceneConfig(ComponentConfig):
     edge_samples: int = Field(default=8, ge=1, le=64)
     """Rays a pixel, and rays where those disagree (edges, soft shadows); for colour only: masks and
     depth are those of the pixel's centre."""
-    held_out_views: int = Field(default=8, ge=0)
+    held_out_views: int = Field(default=8, ge=0, le=MOST_FRAMES)
     """Frames from cameras that are never trained on."""
     held_out_degrees: tuple[float, ...] = ()
     """How far these cameras are turned about the scene, by turns to the left and to the right of
     the training camera of their moment; empty: they stay near the path."""
     test_frames: int = Field(default=16, ge=1)
     """Uniformly chosen (HOSNeRF's rule: 16)."""
-    scene_points: int = Field(default=10_000, ge=100)
+    scene_points: int = Field(default=10_000, ge=100, le=MOST_POINTS)
     """Initial points written to the clip."""
-    object_points: int = Field(default=1_500, ge=50)
+    object_points: int = Field(default=1_500, ge=50, le=MOST_POINTS)
     """Initial points written to the clip."""
     betas: tuple[float, ...] = ()
     """Shape of the body, padded with zeros to the body's number of coefficients."""

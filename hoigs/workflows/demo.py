@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from hoigs.core.machine.random_state import callers_random_state
+from hoigs.core.files.whole_files import named
 from hoigs.core.progress import Progress
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
@@ -67,7 +68,7 @@ def demo(
     Raises:
         HoigsError: a folder exists already, or an option is wrong.
     """
-    folders = {"hoigs": Path(out)}
+    folders = {"hoigs": named(Path(out))}
     if not fast if baseline is None else baseline:
         folders["static"] = folders["hoigs"].with_name(f"{folders['hoigs'].name}-static")
     for folder in folders.values():  # check both before training for minutes

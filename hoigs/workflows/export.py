@@ -13,6 +13,7 @@ from typing import Any
 
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.files.folder_lock import FolderLock
+from hoigs.core.files.whole_files import named
 from hoigs.core.model.compose import compose_bodies
 from hoigs.core.model.exporter import SHEET, Exported, Exporter, ExportRequest
 from hoigs.core.model.standing import in_known_world
@@ -68,7 +69,7 @@ def export(
     run = Path(run)
     registry = default_registry(plugin_files=plugins)
     exporter, name = make_exporter(format, overrides, registry)
-    target = Path(out) if out is not None else run / "exports" / name
+    target = named(Path(out)) if out is not None else run / "exports" / name
     refuse_existing(target)
     loaded = LoadedRun.open(run, clip=clip, device=device, plugins=plugins, pixels=False)
     known = loaded.model.names()

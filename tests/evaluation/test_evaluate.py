@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.values.clip import Clip
+from hoigs.core.values.clip import Clip, ObjectTrack
 from hoigs.evaluation.evaluate import evaluate
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.evaluation.scores import METRICS
@@ -174,3 +174,25 @@ def test_tables_are_rectangular_and_explain_gaps(model: SceneModel, clip: Clip) 
     assert set(row[1:]) == {"0", "–"}
     assert any(note.startswith("object: not computed") for note in scores.notes)
     assert sizes.rows[-1][0] == "total" and sizes.rows[-1][2] == "240"
+
+
+def test_scores_say_that_object_poses_are_given(model: SceneModel, clip: Clip) -> None:
+    bare = replace(clip, objects={}, held_out=None)
+    track = ObjectTrack(
+        points=torch.zeros(1, 3), colors=torch.zeros(1, 3),
+        rotations=torch.eye(3).expand(len(clip), 3, 3),
+        translations=torch.zeros(len(clip), 3),
+        observed=torch.ones(len(clip), dtype=torch.bool), provenance="test",
+    )  # fmt: skip
+    tracked = replace(bare, objects={"ball": track})
+    for made, word, told in (
+        (bare, "", "cameras, body poses given"),
+        (tracked, "object poses: given", "cameras, body and object poses given"),
+    ):
+        protocol = evaluate(model, made, **QUICK).views[0].protocol
+        notes = " ".join(protocol.footnotes())
+        assert word in notes and ("object poses" in notes) == bool(word)
+        assert protocol.given() == told
+    moved = replace(protocol, test_camera="fitted", test_pose="interpolated")
+    assert moved.given() == "object poses given"
+    assert replace(moved, object_poses="").given() == ""

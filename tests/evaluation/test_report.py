@@ -7,6 +7,7 @@ import io
 import json
 import math
 import re
+import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -24,6 +25,7 @@ from hoigs.evaluation.report.contact_sheet import contact_sheet
 from hoigs.evaluation.report.curves import smoothed
 from hoigs.evaluation.report.media import evenly, key_position, within
 from hoigs.evaluation.report.sections import clock, short
+from hoigs.evaluation.report.write import in_shell
 from hoigs.runs.run_folder import RunFolder
 
 VOID = {"meta", "img", "input", "br"}
@@ -105,7 +107,7 @@ def test_the_page_is_whole_and_needs_nothing_else(run: Path, model: SceneModel, 
     assert "Method toy" in head and "man: " in head
     assert "hoigs train ~/clip --out ~" in head
     assert str(Path.home()).strip("/") + "/clip" not in page
-    for command in (f"hoigs view {run.name}", f"hoigs export {run.name}"):
+    for command in (f"hoigs view {run}", f"hoigs export {run}"):
         assert command in text
     for score in ("human_object", "full"):
         assert f"{evaluation.score(score, 'psnr'):.2f} dB" in text
@@ -138,6 +140,33 @@ def test_its_pictures_show_the_clip(run: Path, model: SceneModel, clip: Clip) ->
     assert len(cutouts) == 3
     opacity = [np.asarray(p)[..., 3].mean() for p in cutouts]
     assert opacity[0] > 240 and 5 < opacity[1] < 120 and 1 < opacity[2] < 60
+
+
+@pytest.mark.parametrize("place", ["here", "home", "elsewhere"])
+def test_its_commands_name_the_run_from_the_folder_where_it_was_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    folder = tmp_path / place / "my run"
+    folder.mkdir(parents=True)
+    word = in_shell(folder)
+    found = subprocess.run(
+        f"cd {word} && pwd", shell=True, capture_output=True, text=True, check=False
+    )
+    assert found.stdout.strip() == str(folder), (word, found.stderr)
+    assert (str(tmp_path) in word) == (place == "elsewhere")
+    assert in_shell(Path("../elsewhere")) == str(tmp_path / "elsewhere")
+    assert in_shell(Path()) == str(tmp_path / "here")
+
+
+def test_a_clip_that_only_held_out_cameras_score(run: Path, model: SceneModel, clip: Clip) -> None:
+    evaluation = evaluate(model, clip, timing_frames=0)
+    alone = replace(evaluation, views=[v for v in evaluation.views if "held-out" in v.name])
+    assert alone.views
+    page = write_report(run, model, clip, alone).read_text()
+    assert "Held-out camera" in page and "In a row" not in page
 
 
 def test_a_bare_folder_says_what_is_absent(tmp_path: Path, model: SceneModel, clip: Clip) -> None:

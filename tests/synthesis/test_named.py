@@ -38,6 +38,9 @@ def test_settings_follow_a_question_mark() -> None:
         ("builtin:carry?width", ["is not setting=value"]),
         ("builtin:jolted-push?object.hidden_share=0.5", ["hidden_share", '"carried"', '"pushed"']),
         ("builtin:carry?frames.of=3", ["frames has no settings"]),
+        ("builtin:carry?frames=1000000000", ["frames: ", "100000"]),
+        ("builtin:carry?width=100000000", ["width: ", "8192"]),
+        ("builtin:carry?scene_points=1000000000", ["scene_points: ", "10000000"]),
     ],
 )
 def test_mistakes_are_told(name: str, words: list[str]) -> None:

@@ -111,6 +111,16 @@ def without_home(text: str) -> str:
     return re.sub(rf"(?:(?:\.\./)+|(?<![\w.~-])/){home}(?![\w.-])", "~", text)
 
 
+def in_shell(folder: Path) -> str:
+    """A folder as a word of commands that a shell runs in the present one; `~` is the home."""
+    path, home, here = folder.resolve(), Path.home().resolve(), Path.cwd()
+    if path.is_relative_to(here) and path != here:
+        return shlex.quote(str(path.relative_to(here)))
+    if path.is_relative_to(home) and path != home:
+        return f"~/{shlex.quote(str(path.relative_to(home)))}"
+    return shlex.quote(str(path))
+
+
 def _hero(model: SceneModel, clip: Clip) -> str:
     captions = ("The video", "The reconstruction, from the same camera")
     moving = media.playback(model, clip)
@@ -121,6 +131,7 @@ def _compared(model: SceneModel, clip: Clip, evaluation: Evaluation) -> str:
     comparisons = media.comparisons(model, clip, evaluation)
     if not comparisons:
         return _section("Frames outside training", "The clip has none.", "")
+    sequence = media.scored_sequence(model, clip, evaluation)
     error = sections.color_bar("Absolute error", error_colors(), "0", f"{ERROR_FULL:g}")
     unseen = all(view.protocol.split == "test" for view in evaluation.views)
     return _section(
@@ -128,19 +139,19 @@ def _compared(model: SceneModel, clip: Clip, evaluation: Evaluation) -> str:
         ("None of these images took part in training. " if unseen else "")
         + "Drag the line between them; choose a frame below.",
         sections.comparer(comparisons, error),
-    ) + _section(
-        "In a row",
-        "The frames that were scored, in their order.",
-        sections.player(
-            media.scored_sequence(model, clip, evaluation),
-            ("The video", "The reconstruction", error),
-        ),
+    ) + (
+        _section(
+            "In a row",
+            "The frames that were scored, in their order.",
+            sections.player(sequence, ("The video", "The reconstruction", error)),
+        )
+        if sequence.pictures  # a clip may be scored by held-out cameras alone
+        else ""
     )
 
 
 def _further(folder: Path) -> str:
-    given = folder.is_absolute() or ".." in folder.parts
-    run = shlex.quote(folder.resolve().name if given else str(folder))
+    run = in_shell(folder)
     there = [path.relative_to(folder).as_posix() for kind in BESIDE for path in folder.glob(kind)]
     return _section(
         "Look further",

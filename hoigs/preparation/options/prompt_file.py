@@ -9,6 +9,7 @@ from typing import Any
 
 from hoigs.core.errors import SpecError
 from hoigs.core.files.json_file import parse_json
+from hoigs.core.files.whole_files import named
 from hoigs.preparation.options.prepare_options import PrepareOptions
 from hoigs.preparation.options.prompts import named_objects, named_people, split_name
 
@@ -30,7 +31,7 @@ class StoredPrompts:
 
 def prompt_file(video: Path) -> Path:
     """Where the clicks in a video, or a folder of frames, are kept."""
-    video = video.absolute() if video.name else video.resolve()
+    video = named(video)
     return video.with_name((video.name if video.is_dir() else video.stem) + ENDING)
 
 

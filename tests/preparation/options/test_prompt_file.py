@@ -15,6 +15,9 @@ from hoigs.preparation.options.prompt_file import (
     write_prompts,
 )
 from hoigs.preparation.options.prompts import with_prompts
+from hoigs.preparation.prepare import work_folder
+from hoigs.studies.needs.auto import needs_of
+from hoigs.studies.needs.pruning.compact_run import compact_of
 
 TEXTS = ("30,20@0", "-10,5@0", "1,2,30,40@4")
 
@@ -56,3 +59,18 @@ def test_what_cannot_be_used_is_named(tmp_path: Path) -> None:
         prompt_file(video).write_text(text)
         with pytest.raises(SpecError, match=message):
             with_stored(PrepareOptions(), video)
+
+
+@pytest.mark.parametrize("where", [".", "..", "frames/..", "../my"])
+def test_a_folder_may_be_named_by_a_dot(tmp_path, monkeypatch, where) -> None:
+    inside = tmp_path / "my" / "frames" if where == ".." else tmp_path / "my"
+    (tmp_path / "my" / "frames").mkdir(parents=True)
+    monkeypatch.chdir(inside)
+    write_prompts(Path(where), StoredPrompts(TEXTS))
+    assert (tmp_path / "my.prompts.json").is_file()
+    names = {
+        work_folder(Path(where)).name,
+        compact_of(Path(where)).name,
+        needs_of(Path(where)).name,
+    }
+    assert names == {"my.prepare", "my-compact", "my-needs"}

@@ -11,6 +11,7 @@ from typing import Any
 
 from hoigs.compression.compact import write_compact
 from hoigs.core.machine.random_state import callers_random_state
+from hoigs.core.files.whole_files import named
 from hoigs.core.model.compose import compose
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.registry.registry import Registry, default_registry
@@ -58,6 +59,7 @@ class Compacted:
 
 def compact_of(run: Path) -> Path:
     """Default folder of the compressed copy of a run."""
+    run = named(run)
     return run.with_name(f"{run.name}-compact")
 
 
