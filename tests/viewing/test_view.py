@@ -8,34 +8,19 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from browser import in_thread
+from served import served
 
 import hoigs
 from hoigs.core.errors import HoigsError
-from hoigs.viewing.viewer.viewer import Viewer
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'hoigs[viewer]'")
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@contextmanager
-def served(*what: Path, **options: Any) -> Iterator[tuple[Viewer, str, list[str]]]:
-    """A viewer that runs in a thread, its address, and the lines that it reports."""
-    lines: list[str] = []
-
-    def serve(started: Callable[[Viewer], None]) -> None:
-        hoigs.view(*what, port=0, device="cpu", report=lines.append, started=started, **options)
-
-    with in_thread(serve, Viewer.stop) as viewer:
-        address = next(line.split()[1] for line in lines if line.startswith("open http"))
-        yield viewer, address, lines
 
 
 def until(check: Callable[[], bool], page: Any, what: str, seconds: float = 40) -> None:
@@ -167,9 +152,9 @@ def test_wrong_input_gets_a_sentence(tiny_run: Path, tmp_path: Path) -> None:
         hoigs.view(tiny_run, clip)
     with pytest.raises(HoigsError, match="writes one run"):
         hoigs.view(clip, html=tmp_path / "a.html")
-    for served in ({"port": 0}, {"host": "::1"}, {"width": 640}, {"client": True}):
+    for option in ({"port": 0}, {"host": "::1"}, {"width": 640}, {"client": True}):
         with pytest.raises(HoigsError, match="--html writes a file: leave them out"):
-            hoigs.view(tiny_run, html=tmp_path / "a.html", **served)
+            hoigs.view(tiny_run, html=tmp_path / "a.html", **option)
     with pytest.raises(HoigsError, match="65535"):
         hoigs.view(clip, port=70_000)
     with pytest.raises(HoigsError, match="host"):

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from hoigs.viewing.viewer.pictures.resolution import Resolution
-from hoigs.viewing.viewer.takes import Film
 from hoigs.viewing.viewer.views import View
 
 STILL_S = 0.25  # a picture is drawn in full once nothing has changed for so long
@@ -34,7 +33,6 @@ class Eye:
         full: whether that was a still picture, in full size and quality.
         changed: when something last changed, seconds.
         rates: times of the last drawings.
-        film: its film in the making.
     """
 
     def __init__(self, client: Any, widest: int, dragged: Callable[[Eye], None]) -> None:
@@ -42,7 +40,6 @@ class Eye:
         self.resolution = Resolution(widest)
         self.drawn: object = None
         self.full, self.changed = False, 0.0
-        self.film: Film | None = None
         self._failure, self._again = "", 0.0
         self.rates: deque[float] = deque(maxlen=20)
         self._set: deque[np.ndarray] = deque(maxlen=400)  # positions of cameras

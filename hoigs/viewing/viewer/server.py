@@ -40,8 +40,8 @@ def open_server(host: str, port: int, label: str) -> Any:
     if not door.closed:
         stop(server)
         raise HoigsError(
-            f"viser {viser.__version__} starts its server in a way that is not known here: other "
-            "pages could not be kept out: pip install viser==1.1.1"
+            f"viser {viser.__version__} starts its server in a way that is not known here, so "
+            "other pages could not be kept out: pip install viser==1.1.1"
         )
     door.control = server.gui._gui_input_handle_from_uuid.get
     if port not in (0, server.get_port()):  # taken in between: viser goes on to the next

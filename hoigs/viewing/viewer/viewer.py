@@ -74,6 +74,7 @@ class Viewer:
         self._splats = splats
         self._splatted: object = None  # what was last sent
         self._eyes: dict[int, Eye] = {}
+        self._films: dict[Eye, takes.Film] = {}  # in the making
         self._version, self._told = 0, 0.0
         self._anchor: tuple[str | None, float] = (None, 0.0)  # what was followed, and its frame
         self.path = takes.Path()
@@ -88,7 +89,7 @@ class Viewer:
         server.initial_camera.position, server.initial_camera.look_at = start.position, start.target
         server.initial_camera.up, server.initial_camera.fov = self.up, start.fov
         server.on_client_connect(self._connect)
-        server.on_client_disconnect(self._disconnect)
+        server.on_client_disconnect(lambda client: self._eyes.pop(client.client_id, None))
 
     def serve(self) -> None:
         """Draw until `stop`."""
@@ -98,9 +99,8 @@ class Viewer:
                     self._wake.wait(IDLE_S)
                     self._wake.clear()
         finally:
-            for eye in list(self._eyes.values()):
-                if eye.film is not None:
-                    eye.film.cancel()
+            for film in self._films.values():
+                film.cancel()
 
     def stop(self) -> None:
         self._stopped = True
@@ -135,9 +135,9 @@ class Viewer:
                     drew |= (
                         self._clear(eye) if browser else self._draw_for(eye, settings, frame, now)
                     )
-            if eye.film is not None:
-                with eye.apart():
-                    drew |= self._go_on(eye, eye.film)
+        for eye in list(self._films):
+            with eye.apart():
+                drew |= self._go_on(eye)
         self._anchor = (settings.follow, frame)
         return drew
 
@@ -164,11 +164,6 @@ class Viewer:
             self._wake.set()
 
         self._wake.set()
-
-    def _disconnect(self, client: Any) -> None:
-        eye = self._eyes.pop(client.client_id, None)
-        if eye is not None and eye.film is not None:
-            eye.film.cancel()
 
     def _dragged(self, eye: Eye) -> None:
         """A person has moved the camera: it is no longer that of the video."""
@@ -304,8 +299,8 @@ class Viewer:
                 self.path.keys.append((frame, eye.view))
         elif action == "clear keys":
             self.path.keys.clear()
-        elif action == "film" and len(self.path.keys) > 1 and eye.film is None:
-            eye.film = self._film(eye)
+        elif action == "film" and len(self.path.keys) > 1 and eye not in self._films:
+            self._films[eye] = self._film(eye)
         self.controls.keys.content = str(self.path)
 
     def _film(self, eye: Eye) -> takes.Film:
@@ -321,15 +316,26 @@ class Viewer:
 
         return takes.Film(self.path, self.controls.seconds.value, draw)
 
-    def _go_on(self, eye: Eye, film: takes.Film) -> bool:
-        """Draw the film's next picture, or give the browser what is done; whether one was drawn."""
-        before, eye.film = film.drawn, None  # where it fails, it is over
-        done = film.step()
+    def _go_on(self, eye: Eye) -> bool:
+        """Draw the next picture of a film, or give the browser what is done; whether it was drawn.
+
+        A film that fails is over, and so is that of a browser that has left.
+        """
+        film = self._films.pop(eye)
+        if eye.client.client_id not in self._eyes:
+            film.cancel()
+            return False
+        before = film.drawn
+        try:
+            done = film.step()
+        except Exception:
+            film.cancel()
+            raise
         if done is not None:
             eye.client.send_file_download("hoigs_path.mp4", done, save_immediately=True)
             self.controls.keys.content = str(self.path)
             return True
-        eye.film = film
+        self._films[eye] = film
         if film.drawn % 10 == 1:
             self.controls.keys.content = f"Filming: {100 * film.drawn // film.count} %"
         return film.drawn > before
