@@ -73,11 +73,11 @@ def test_nobody_who_stands_on_their_head_and_no_search_in_every_frame() -> None:
 
 
 def test_the_mask_of_people_has_a_say_until_somebody_is_found() -> None:
-    elsewhere, nobody = np.zeros((90, 160), np.float32), np.zeros((90, 160), np.float32)
+    elsewhere, here = np.zeros((90, 160), np.float32), np.ones((90, 160), np.float32)
     elsewhere[:, :20] = 1
     assert guided(Graph()).process(IMAGE, elsewhere) is None
     pose = guided(Graph())
-    pose.process(IMAGE, nobody)
+    pose.process(IMAGE, here)
     points, _, _ = pose.process(IMAGE, elsewhere)
     assert np.isfinite(points).all()
 

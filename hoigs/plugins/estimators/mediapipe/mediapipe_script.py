@@ -179,8 +179,8 @@ class Finder:
     def of_one(self, image, wide, own):
         """The mask of one person: the pose's own, whose outline is coarse, and which knows them
         apart from others and from what they hold. Along its outline, and there alone, the
-        segmentations of all that is a person have a say; what is thin, such as an arm, they may
-        widen and not take away."""
+        segmentations of all that is a person have a say; they take away only beside what they
+        have of the person, so not from a thin arm, nor from a chest that they lack."""
         near = self.near(image, own > 0.5)
         mean = (own + wide + (wide if near is None else near)) / 3
         side = 2 * max(1, round(AROUND * max(own.shape))) + 1
@@ -188,8 +188,8 @@ class Finder:
         sure = np.uint8(own > 0.5)
         core = self.cv2.erode(sure, kernel)
         band = (self.cv2.dilate(sure, kernel) > 0) & (core == 0)
-        thin = (sure > 0) & (self.cv2.dilate(core, kernel) == 0)
-        return np.where(band, np.where(thin, np.maximum(own, mean), mean), own)
+        beside = self.cv2.dilate(core * np.uint8(mean > 0.5), kernel) > 0
+        return np.where(band, np.where(beside, mean, np.maximum(own, mean)), own)
 
     def landmarks(self, image, wide):
         """In the image and in space, the mask of their person, and what became of the frame; looked
