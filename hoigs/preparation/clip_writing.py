@@ -135,6 +135,14 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
         ),
         scene_points=len(made.scene.points),
         body={} if person is None else person.report,
+        landmarks={
+            name: {
+                "found": int(one.found.sum()),
+                "lost": one.fates.lost,
+                "repaired": one.fates.repaired,
+            }
+            for name, one in made.people.people.items()
+        },
         provenance=made.provenance,
         warnings=made.warnings,
         seconds=made.stages.seconds,

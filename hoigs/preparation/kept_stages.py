@@ -11,7 +11,7 @@ from hoigs.preparation.stages.plan import PLAN
 from hoigs.preparation.stages.progress import Stages
 from hoigs.preparation.stages.work_folder import Result, WorkFolder, digest
 
-FORMAT = 11  # of what the stages keep; another number makes older results unread
+FORMAT = 12  # of what the stages keep; another number makes older results unread
 T = TypeVar("T")
 
 

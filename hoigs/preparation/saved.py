@@ -20,7 +20,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.lens import Lens
 from hoigs.core.values.moment import BodyPose
-from hoigs.preparation.body.landmarks import LandmarkTrack
+from hoigs.preparation.body.landmarks import FrameFates, LandmarkTrack
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.cameras.choose import ChosenCameras
 from hoigs.preparation.entities.entity_masks import EntityMasks
@@ -47,9 +47,9 @@ CLASSES = {
     found.__name__: found
     for found in (
         BallTrack, BodyPose, CameraTrack, ChosenCameras, DepthFit, EntityMasks, FittedBody,
-        FittedPeople, FoundObject, FrameList, GivenMasks, LandmarkTrack, Lens, MadeObject, Nobody,
-        ObjectConfidence, ObjectTrack, RawEstimates, RawLandmarks, RawPerson, ScenePoints,
-        UndistortedEstimates, UndistortedPerson,
+        FittedPeople, FoundObject, FrameFates, FrameList, GivenMasks, LandmarkTrack, Lens,
+        MadeObject, Nobody, ObjectConfidence, ObjectTrack, RawEstimates, RawLandmarks, RawPerson,
+        ScenePoints, UndistortedEstimates, UndistortedPerson,
     )
 }  # fmt: skip
 

@@ -122,6 +122,44 @@ def test_a_video_alone_becomes_a_clip_of_a_person(
     mask, true = clip[5].masks["human"].numpy(), masks(5)[0]
     assert (mask & true).sum() / (mask | true).sum() > 0.9
     assert not (out / "object.jpg").exists() and report.body_residual_px < 3
+    assert report.landmarks == {"human": {"found": FRAMES, "lost": {}, "repaired": {}}}
+
+
+def test_each_frame_lost_or_repaired_is_reported_with_its_reason(
+    alone: Path, tmp_path: Path
+) -> None:
+    """One frame of many is enough: it need not be a fifth of them."""
+
+    class Blinking(Two):
+        def people(self, video) -> tuple[FramePrompt, ...]:
+            return ()
+
+        def estimate(self, video, progress=None) -> Estimates:
+            known = landmarks()
+            known["image_xyzv"][3] = known["world_xyzv"][3] = np.nan
+            track = Landmarks(
+                known["image_xyzv"], known["world_xyzv"],
+                lost={"the sun blinded it": (3,)}, repaired={"a second look helped": (5, 6)},
+            )  # fmt: skip
+            stack = LazyFrames(video.frames, lambda i: masks(i)[0])
+            return Estimates(EntityMasks({"human": stack}), {"human": track})
+
+    one, out = Blinking(), tmp_path / "clip"
+    report = prepare(
+        alone, out, object="none", options=OPTIONS, body=AnnyBody(),
+        estimators={"landmarks": one, "masks": one},
+    )  # fmt: skip
+    lost, repaired = {"the sun blinded it": [3]}, {"a second look helped": [5, 6]}
+    counted = {"human": {"found": FRAMES - 1, "lost": lost, "repaired": repaired}}
+    assert report.landmarks == counted
+    assert json.loads((out / "report.json").read_text())["landmarks"] == counted
+    page = (out / "report.html").read_text()
+    # the command's last lines are these warnings
+    for reason, frames in (("the sun blinded it", "(3)"), ("a second look helped", "(5-6)")):
+        (said,) = (text for text in report.warnings if reason in text)
+        assert frames in said and reason in page
+    (judged,) = (d for d in report.diagnostics() if d.kind == "landmarks of human")
+    assert judged.frames == (3,)
 
 
 def test_another_click_makes_only_the_object_again(

@@ -51,6 +51,15 @@ FAKE_CV2 = """
 import numpy
 BORDER_REPLICATE = "edge"
 CC_STAT_AREA = 0
+MORPH_ELLIPSE = 2
+def getStructuringElement(kind, size):
+    return numpy.ones(size, bool)
+def erode(mask, kernel):
+    from scipy.ndimage import binary_erosion
+    return binary_erosion(mask, kernel, border_value=1).astype("uint8")
+def dilate(mask, kernel):
+    from scipy.ndimage import binary_dilation
+    return binary_dilation(mask, kernel).astype("uint8")
 def connectedComponentsWithStats(mask):
     from scipy.ndimage import label
     parts, count = label(mask)

@@ -215,11 +215,16 @@ class Landmarks:
         world_xyzv: x, y, z in metres about the hips' middle along the camera's axes (x right,
             y down, z away), and visibility; None when the estimator sees the image only.
         provenance: who made them, with what, in a line.
+        lost: why a frame has none, in words that end a sentence, to the frames of which it is true;
+            those without landmarks that are in none are reported without a reason.
+        repaired: likewise, what it took to find them, of frames in which a first look did not.
     """
 
     image_xyzv: Float[np.ndarray, "F 33 4"]
     world_xyzv: Float[np.ndarray, "F 33 4"] | None = None
     provenance: str = ""
+    lost: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    repaired: Mapping[str, Sequence[int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

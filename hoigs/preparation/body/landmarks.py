@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -112,6 +113,64 @@ class LandmarkTrack:
     def solid(self) -> Bool[Tensor, " F"]:
         """Frames of `found` whose torso and limbs are known in space, too."""
         return self.found & torch.isfinite(self.world[:, list(SOLID)]).all(-1).all(-1)
+
+
+@dataclass(frozen=True)
+class FrameFates:
+    """Frames whose landmarks were lost or repaired, by the reason, in words that end a sentence."""
+
+    lost: dict[str, list[int]] = field(default_factory=dict)
+    repaired: dict[str, list[int]] = field(default_factory=dict)
+
+    @staticmethod
+    def at(
+        lost: Mapping[str, Iterable[int]],
+        repaired: Mapping[str, Iterable[int]],
+        numbers: Sequence[int],
+    ) -> FrameFates:
+        """Of chosen frames alone, by their position in `numbers`, those of the frames as given."""
+        place = {number: i for i, number in enumerate(numbers)}
+
+        def chosen(reasons: Mapping[str, Iterable[int]]) -> dict[str, list[int]]:
+            rows = {
+                text: [place[i] for i in found if i in place] for text, found in reasons.items()
+            }
+            return {text: sorted(found) for text, found in rows.items() if found}
+
+        return FrameFates(chosen(lost), chosen(repaired))
+
+    def complete(
+        self, given: LandmarkTrack, dropped: Mapping[str, Bool[Tensor, " F"]]
+    ) -> FrameFates:
+        """With a reason for every frame that the fit goes without.
+
+        Args:
+            given: as the estimator gave them; frames that it has are not among its lost ones.
+            dropped: frames of `given` that were not believed, by the reason.
+        """
+        found = given.found
+        lost = {text: [i for i in rows if not found[i]] for text, rows in self.lost.items()}
+        unsaid = ~found
+        unsaid[[i for rows in lost.values() for i in rows]] = False
+        some = given.known.any(1)
+        every = {
+            f"fewer than {ENOUGH} of the body's landmarks were found": unsaid & some,
+            "the source has no landmarks": unsaid & ~some,
+            **dropped,
+        }
+        lost |= {text: rows.nonzero()[:, 0].tolist() for text, rows in every.items()}
+        gone = {i for rows in lost.values() for i in rows}
+        kept = {text: [i for i in rows if i not in gone] for text, rows in self.repaired.items()}
+        return FrameFates(
+            {text: rows for text, rows in lost.items() if rows},
+            {text: rows for text, rows in kept.items() if rows},
+        )
+
+    def lost_frames(self) -> list[int]:
+        return sorted(i for rows in self.lost.values() for i in rows)
+
+    def repaired_frames(self) -> list[int]:
+        return sorted({i for rows in self.repaired.values() for i in rows})
 
 
 @dataclass(frozen=True)

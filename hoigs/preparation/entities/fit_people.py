@@ -10,8 +10,10 @@ import torch
 
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.preparation.bodies.file_body import FileBody
+from hoigs.preparation.body.landmarks import FrameFates
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.entities.person import FittedBody, fit_person
+from hoigs.preparation.estimates.given import RawLandmarks
 from hoigs.preparation.estimates.reader import RawEstimates, UndistortedEstimates
 from hoigs.preparation.options.prepare_options import PrepareOptions
 from hoigs.preparation.video.frames import Frames
@@ -41,7 +43,7 @@ def fit_people(
         found.landmarks, track, body, options.fit_steps, partial(share, 0), raw.landmarks.source,
         found.masks.persons(found.ball), times,
         None if bodies is None else bodies.rotations(video.indices), options.person_height,
-        options.chunking,
+        options.chunking, fates=_of_clip(raw.landmarks, track),
     )  # fmt: skip
     if bodies is not None:
         text = f"{fitted.provenance}; {bodies.used(video.indices)}"
@@ -52,9 +54,15 @@ def fit_people(
         people[name] = fit_person(
             person.landmarks, world, body, options.fit_steps, partial(share, k + 1),
             raw.further[name].landmarks.source, person.masks, times,
-            chunking=options.chunking,
+            chunking=options.chunking, fates=_of_clip(raw.further[name].landmarks, track),
         )  # fmt: skip
     return people
+
+
+def _of_clip(landmarks: RawLandmarks, track: CameraTrack) -> FrameFates:
+    """Of the frames that have a camera."""
+    fates = landmarks.fates
+    return FrameFates.at(fates.lost, fates.repaired, track.positions)
 
 
 def _share(progress: Callable[[float], None], count: int, number: int, done: float) -> None:

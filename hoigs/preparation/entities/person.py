@@ -18,7 +18,7 @@ from hoigs.core.values.moment import BodyPose
 from hoigs.core.windows import Chunking
 from hoigs.preparation.body.fit import fit_body
 from hoigs.preparation.body.fit_values import FitOptions, Joint
-from hoigs.preparation.body.landmarks import LandmarkTrack
+from hoigs.preparation.body.landmarks import FrameFates, LandmarkTrack
 from hoigs.preparation.body.silhouette import posed
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.entities.nobody import Nobody
@@ -28,6 +28,8 @@ SEEN, RARELY = 0.3, 0.2  # visibility; share of frames: a part seen in fewer of 
 DOUBTFUL = 0.25  # share of frames: networks see people in clouds and globes now and then
 PARTS = {"head": (0, 7, 8), "arms": (13, 14, 15, 16), "legs": (25, 26, 27, 28)}  # landmarks
 APART, APART_DEGREES = 0.01, 2.0  # metres: of the same frame in two windows, which then do not meet
+STRAY = "they stand alone between frames without any"
+OFF_THE_WAY = "beside frames without any, they are off the person's way"
 POOR_FIT = 0.02  # of the image's longer side: a fit that misses by more deserves a warning
 
 
@@ -42,6 +44,7 @@ class FittedBody:
         residuals: of each frame, NaN without landmarks.
         ground: largest y of the body, median over frames: the floor's height, if y points down.
         found: frames with landmarks; the body of the others is interpolated.
+        fates: why the others have none, and what it took to find some.
         report: measures of the fit.
     """
 
@@ -55,6 +58,7 @@ class FittedBody:
     provenance: str
     report: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    fates: FrameFates = field(default_factory=FrameFates)
 
     def posed(self, body: BodyModel) -> Iterator[tuple[Tensor, Tensor]]:
         """Vertices and joints, frame by frame."""
@@ -108,6 +112,7 @@ def fit_person(
     turns: Float[Tensor, "F 21 3"] | None = None,
     height: float | None = None,
     chunking: Chunking | None = None,
+    fates: FrameFates = FrameFates(),  # noqa: B008 - frozen
 ) -> FittedBody:
     """Fits the body to landmarks, and masks if there are any, in at most `steps`; finds the scale
     of a world that has none.
@@ -117,12 +122,14 @@ def fit_person(
         turns: axis-angle of the body's joints 1..21, about.
         height: of the person who stands upright, metres; None: the body model's mean.
         chunking: fit window by window.
+        fates: what the estimator says of frames without landmarks, and of others.
     """
-    strays = landmarks.strays()
+    given, strays = landmarks, landmarks.strays()
     jumps = landmarks.without(strays).jumps()
     landmarks = landmarks.without(strays | jumps)
     strays |= landmarks.strays()  # single frames between those that jumped
     landmarks = landmarks.without(strays)
+    fates = fates.complete(given, {STRAY: strays, OFF_THE_WAY: jumps & ~strays})
     options = FitOptions(scale=not track.metric, steps=steps)
     if height is not None:
         options = replace(options, mean_size=height / stature(body))
@@ -157,10 +164,10 @@ def fit_person(
         warnings=[
             *_warnings(residual, found, solid, track.cameras),
             *_unseen(landmarks),
-            *_left_out(strays, "stand alone between frames without any"),
-            *_left_out(jumps, "beside frames without any are off the person's way"),
+            *fates_said(fates, len(track.cameras)),
             *_open_joints(fit.joints),
         ],
+        fates=fates,
     )
 
 
@@ -195,11 +202,18 @@ def stature(body: BodyModel) -> float:
     return float(vertices[:, 1].max() - vertices[:, 1].min())
 
 
-def _left_out(which: Bool[Tensor, " F"], why: str) -> list[str]:
-    frames = which.nonzero()[:, 0].tolist()
-    if not frames:
-        return []
-    return [f"landmarks of {len(frames)} frames ({ranges(frames)}) {why}, and were left out"]
+def fates_said(fates: FrameFates, count: int) -> list[str]:
+    """Sentences for the report: which of `count` frames were lost or repaired, and why."""
+    said = []
+    for frames, reasons, what in (
+        (fates.lost_frames(), fates.lost, "have no landmarks that are believed; the body follows "
+         "their neighbours there, and masks where there are any"),
+        (fates.repaired_frames(), fates.repaired, "have landmarks that were not found at once"),
+    ):  # fmt: skip
+        if frames:
+            why = "; ".join(f"{text} in {len(i)} ({ranges(i)})" for text, i in reasons.items())
+            said.append(f"{len(frames)} of {count} frames {what}: {why}")
+    return said
 
 
 def _warnings(residual: float, found: int, solid: int, cameras: Sequence[Camera]) -> list[str]:
@@ -211,11 +225,6 @@ def _warnings(residual: float, found: int, solid: int, cameras: Sequence[Camera]
         )
     if residual > POOR_FIT * max(cameras[0].width, cameras[0].height):
         warnings.append(f"the body misses its landmarks by {residual:.1f} px: see overlay.mp4")
-    if found < 0.8 * len(cameras):
-        warnings.append(
-            f"landmarks were found in {found} of {len(cameras)} frames; the "
-            "others follow their neighbours, and masks where there are any"
-        )
     return warnings
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from hoigs.core.interfaces.estimator import Landmarks
 from hoigs.core.values.undistortion import Undistortion
-from hoigs.preparation.body.landmarks import LandmarkTrack
+from hoigs.preparation.body.landmarks import FrameFates, LandmarkTrack
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.ball.track import BallTrack
 from hoigs.preparation.video.frames import Frames
@@ -24,11 +25,13 @@ class RawLandmarks:
         image: x, y, relative depth (pixels of the frames) and visibility. world: metres about the
             hips' middle, and visibility; NaN if the estimator sees the image only.
         source: for the report.
+        fates: of the chosen frames, by their position.
     """
 
     image: Float[np.ndarray, "F 33 4"]
     world: Float[np.ndarray, "F 33 4"]
     source: str = "MediaPipe"
+    fates: FrameFates = field(default_factory=FrameFates)
 
     def undistorted(self, undistort: Undistortion, positions: Sequence[int]) -> LandmarkTrack:
         """On the cameras' undistorted images; `positions` are those of frames with a camera."""
@@ -39,27 +42,21 @@ class RawLandmarks:
 
 
 def chosen_landmarks(
-    image: Float[np.ndarray, "T 33 4"],
-    world: Float[np.ndarray, "T 33 4"] | None,
-    video: Frames,
-    what: str,
-    source: str = "MediaPipe",
+    track: Landmarks, video: Frames, what: str, source: str = "MediaPipe"
 ) -> RawLandmarks:
     """Landmarks of a whole video, in its own pixels, as those of the chosen frames.
-
-    Args:
-        world: None if the estimator sees the image only.
 
     Raises:
         NobodyFoundError: no person is found in them; `what` names where they come from.
     """
-    image = image[video.indices].astype(np.float64)
+    image, world = track.image_xyzv[video.indices].astype(np.float64), track.world_xyzv
     image[..., :3] *= video.width / video.native_width
     if world is None:
         places = np.full_like(image, np.nan)
     else:
         places = world[video.indices].astype(np.float64)
-    raw = RawLandmarks(image, places, source)
+    fates = FrameFates.at(track.lost, track.repaired, video.indices)
+    raw = RawLandmarks(image, places, source, fates)
     if not LandmarkTrack.from_mediapipe(raw.image, raw.world).found.any():
         raise NobodyFoundError(
             f"{what}: no person was found in the {len(image)} chosen frames; the body of a person "

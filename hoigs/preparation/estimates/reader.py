@@ -279,9 +279,7 @@ class EstimateReader:
         track: Landmarks = tracks[name]
         if len(self.options.people) > 1:
             who += f", {name}"
-        return chosen_landmarks(
-            track.image_xyzv, track.world_xyzv, self.video, who, track.provenance or "given"
-        )
+        return chosen_landmarks(track, self.video, who, track.provenance or "given")
 
     def _masks(self, names: tuple[str, str], progress: Callable[[float], None]) -> GivenMasks:
         found = self.estimate("masks", progress).masks

@@ -6,9 +6,9 @@ The limits between good, fair and bad are our own.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from hoigs.core.diagnostics import Diagnostic, Severity
+from hoigs.core.diagnostics import Diagnostic, Severity, ranges
 from hoigs.preparation.report.measures import Measures
 
 AGREES = 0.5  # correlation of textures from which the object's rotation is trusted
@@ -127,7 +127,29 @@ def _bodies(report: Measures) -> Iterator[MeasureDiagnostic]:
         )
 
 
+def _landmarks(report: Measures) -> Iterator[MeasureDiagnostic]:
+    """Frames with landmarks of each person; every other one with its reason."""
+    for name, of in report.landmarks.items():
+        lost = sorted(i for frames in of["lost"].values() for i in frames)
+        reasons = [
+            f"{text} in {len(frames)} ({ranges(frames, most=len(frames))})"
+            for key in ("lost", "repaired")
+            for text, frames in of[key].items()
+        ]
+        one = _judged(
+            f"landmarks of {name}",
+            f"{of['found']} of {report.frames} frames",
+            "; ".join(reasons) or "all found at once",
+            _judge(len(lost) / max(1, report.frames), 0.05, 0.2),
+            "the body follows its neighbours in the other frames, and the masks: click on the "
+            "person in one of them (--person X,Y@FRAME), leave these parts out (--start, --end), "
+            "or use another estimator (estimators.landmarks)",
+        )
+        yield replace(one, frames=tuple(lost))
+
+
 def _tracks(report: Measures) -> Iterator[MeasureDiagnostic]:
+    yield from _landmarks(report)
     yield from _bodies(report)
     if report.object_scale_spread is not None:
         yield _judged(

@@ -18,6 +18,8 @@ class Measures:
         body_residual_px: median distance of fitted to given landmarks, in frame pixels, of the
             first person; None without people.
         body: whatever else the body fit reports.
+        landmarks: by person, `found`: frames with landmarks; `lost` and `repaired`: by the reason,
+            which frames have none, and which only after more than a first look.
         scene_scale: metres a COLMAP unit; 1 for a static camera.
         object_scale_spread: standard deviation over frames of the object's apparent over its
             expected size: 0.05 means that its depth is uncertain by about 5 %; None
@@ -64,6 +66,7 @@ class Measures:
     object_observed: float | None
     scene_points: int
     body: dict[str, Any] = field(default_factory=dict)
+    landmarks: dict[str, dict[str, Any]] = field(default_factory=dict)
     provenance: dict[str, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)

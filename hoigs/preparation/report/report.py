@@ -30,6 +30,7 @@ class PrepareReport(Measures):
             ("camera", self.camera, f"parallax {self.parallax_degrees:.1f} degrees"),
             self._body_row("body", self.body_residual_px),
             *(self._body_row(n, m["body_residual_px"]) for n, m in self.further_people.items()),
+            *(self._landmark_row(n) for n in self.landmarks),
             ("scene scale", f"{self.scene_scale:.4g}", "metres a unit of the source"),
         ]
         if self.object_observed is None or self.object_scale_spread is None:
@@ -59,6 +60,12 @@ class PrepareReport(Measures):
         if residual is None:
             return name, "none", "nobody was looked for"
         return name, f"{residual:.1f} px", "median distance from the landmarks"
+
+    def _landmark_row(self, name: str) -> tuple[str, str, str]:
+        of = self.landmarks[name]
+        lost, repaired = (sum(map(len, of[key].values())) for key in ("lost", "repaired"))
+        note = f"{lost} lost, {repaired} not found at once"
+        return f"landmarks of {name}", f"{of['found']} of {self.frames} frames", note
 
     def to_markdown(self) -> str:
         table = "\n".join(f"| {what} | {value} | {note} |" for what, value, note in self.rows())

@@ -22,6 +22,7 @@ from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.estimator import EntityRequest, checked
 from hoigs.core.registry.registry import default_registry
 from hoigs.plugins.estimators.mediapipe.estimator import MediapipeEstimator
+from hoigs.plugins.estimators.mediapipe.mediapipe_doubts import LOST, NOBODY, OFF
 
 # a tool like those of the field: a folder of frames in, masks and one depth array out; it finds
 # what is bright, and writes down that it ran
@@ -169,7 +170,7 @@ class Selfie:
     def __init__(self, **settings):
         pass
     def process(self, image):
-        return Box(segmentation_mask=(image[..., 0] > 127).astype("float32"))
+        return Box(segmentation_mask=(image[..., 1] > 127).astype("float32"))
 class Pose:
     def __init__(self, **settings):
         self.settings = settings
@@ -257,6 +258,33 @@ def test_mediapipe_masks_the_person_and_drops_landmarks_beside_them(tmp_path, fa
         np.testing.assert_array_equal(mask, frame(i)[..., 0] > 127)
     seen = np.isfinite(found.landmarks["human"].image_xyzv[:, 0, 0])
     assert seen.tolist() == [True, False, True, False, False], "from 3 on they are beside the mask"
+    assert found.landmarks["human"].lost == {LOST[NOBODY]: (1,), LOST[OFF]: (3, 4)}
+    assert not found.landmarks["human"].repaired
+    notes = [note for note in found.masks.notes if "of the segmentation of selfies alone" in note]
+    assert len(notes) == 1 and "3 frames (1, 3-4)" in notes[0]
+
+
+def test_a_whole_picture_mask_without_the_head_loses_no_frame(tmp_path, fake_python):
+    """The model of selfies, which sees the green channel here, misses head and chest and takes a
+    chair in; the pose's own mask, of the red channel, has all of the person."""
+    person, chair = (slice(4, 22), slice(8, 22)), (slice(4, 24), slice(26, 31))
+
+    def frame(i: int) -> np.ndarray:
+        image = np.full((24, 32, 3), (100, 100, 255), np.uint8)
+        image[(*person, 0)] = 250
+        image[15 - i % 2 : 22, 8:22, 1] = image[(*chair, 1)] = 250
+        return image
+
+    video = replace(request(tmp_path, entities=HUMAN), read=frame)
+    estimator = mediapipe_estimator(python=fake_python, complexity=1)
+    found = checked(estimator.estimate(video), video, estimator)
+    track = found.landmarks["human"]
+    # one landmark in three is on the mask of selfies
+    assert np.isfinite(track.image_xyzv[:, 0, 0]).tolist() == [True, False, True, True, True]
+    assert track.lost == {LOST[NOBODY]: (1,)}
+    for i in (0, 2, 3, 4):
+        mask = found.masks.entities["human"][i]
+        assert mask[5:21, 9:21].all() and not mask[chair].any()
 
 
 def test_a_python_without_mediapipe_is_told_how_to_get_it(tmp_path):

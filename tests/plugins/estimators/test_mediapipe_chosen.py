@@ -10,6 +10,7 @@ from types import SimpleNamespace as Box
 
 import numpy as np
 import pytest
+from tiny_mediapipe import FAKE_CV2
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import EntityRequest, PromptPoint, VideoRequest
@@ -149,15 +150,33 @@ def test_clicks_on_two_people_are_not_one_person(people: ModuleType) -> None:
     )
 
 
-def test_the_mask_needs_no_segmentation_of_the_whole_image(people: ModuleType) -> None:
+def refined(own: np.ndarray, wide: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """The person's mask from that of the pose, of the whole image, and of its part about them."""
     script = importlib.import_module("mediapipe_script")
     finder = object.__new__(script.Finder)
-    finder.cv2 = Box(GaussianBlur=lambda image, *_: image)
-    finder.close = Box(process=lambda cut: Box(segmentation_mask=np.ones(cut.shape[:2])))
-    own, other = np.zeros((2, HEIGHT, WIDTH))
+    finder.cv2 = ModuleType("cv2")
+    exec(FAKE_CV2, vars(finder.cv2))
+    finder.near = lambda _image, _inside: near
+    found: np.ndarray = finder.of_one(image(0), wide, own) > 0.5
+    return found
+
+
+def test_the_mask_needs_no_segmentation_of_the_whole_image(people: ModuleType) -> None:
+    own, other = np.zeros((2, HEIGHT, WIDTH), np.float32)
     own[50:160, 40:80], other[50:160, 180:220] = 1, 1
-    mask = finder.of_one(image(0), other, own)
-    np.testing.assert_array_equal(mask > 0.5, own > 0.5)
+    np.testing.assert_array_equal(refined(own, other, own), own > 0.5)
+
+
+def test_segmentations_of_selfies_move_the_outline_of_the_pose_s_own_mask(
+    people: ModuleType,
+) -> None:
+    own, selfies = np.zeros((2, HEIGHT, WIDTH), np.float32)
+    own[20:50, 50:70] = own[50:160, 40:80] = own[60:64, 80:110] = 1  # head, body, a thin arm
+    selfies[50:160, 42:82] = selfies[150:165, 100:140] = 1  # of body and chair, 2 pixels aside
+    found = refined(own, selfies, selfies)
+    assert found[70:150, 42:82].all() and not found[70:150, 38:42].any()
+    assert found[20:46, 50:70].all() and found[60:64, 84:110].all()  # they lack head and arm
+    assert not found[:, 112:].any()
 
 
 def video(*entities: EntityRequest) -> VideoRequest:

@@ -7,6 +7,14 @@ from types import SimpleNamespace as Box
 import numpy as np
 import pytest
 
+from hoigs.plugins.estimators.mediapipe.mediapipe_doubts import (
+    FEW,
+    FOUND,
+    OFF,
+    SMALL,
+    doubt,
+    share_on,
+)
 from hoigs.plugins.estimators.mediapipe.mediapipe_guided import AGAIN, GuidedPose
 
 IMAGE = np.zeros((90, 160, 3), np.uint8)
@@ -33,7 +41,7 @@ class Graph:
 
 
 def guided(graph: Graph) -> GuidedPose:
-    return GuidedPose(graph, Box, lambda points, wide: True)
+    return GuidedPose(graph, Box, doubt, share_on)
 
 
 def test_the_best_square_is_followed() -> None:
@@ -62,3 +70,51 @@ def test_nobody_who_stands_on_their_head_and_no_search_in_every_frame() -> None:
     pose = guided(graph)
     assert [pose.process(IMAGE, None) for _ in range(AGAIN + 1)] == [None] * (AGAIN + 1)
     assert graph.looks == 16
+
+
+def test_the_mask_of_people_has_a_say_until_somebody_is_found() -> None:
+    elsewhere, here = np.zeros((90, 160), np.float32), np.ones((90, 160), np.float32)
+    elsewhere[:, :20] = 1
+    assert guided(Graph()).process(IMAGE, elsewhere) is None
+    pose = guided(Graph())
+    pose.process(IMAGE, here)
+    points, _, _ = pose.process(IMAGE, elsewhere)
+    assert np.isfinite(points).all()
+
+
+def square(*places: slice) -> np.ndarray:
+    mask = np.zeros((90, 160), np.float32)
+    for k in range(0, len(places), 2):
+        mask[places[k], places[k + 1]] = 1
+    return mask
+
+
+def spread(low: float, high: float, x: float = 50.0, seen: int = 33) -> np.ndarray:
+    points = np.zeros((33, 4))
+    points[:, 0], points[:, 1] = x, np.linspace(low, high, 33)
+    points[:seen, 3] = 0.9
+    return points
+
+
+@pytest.mark.parametrize(
+    ("points", "own", "wide", "why"),
+    [
+        # the mask of people lacks head and chest, or all of them; it has furniture
+        (spread(5, 80), square(slice(0, 90), slice(40, 60)), square(slice(60, 90), slice(160)),
+         FOUND),
+        (spread(5, 80), square(slice(0, 90), slice(40, 60)), square(slice(90), slice(90, 160)),
+         FOUND),
+        # arms raised to the head, the rest out of view: close together on a large mask
+        (spread(5, 20), square(slice(0, 90), slice(30, 70)), square(slice(90), slice(30, 70)),
+         FOUND),
+        # a mug in the hand of somebody
+        (spread(60, 70), square(slice(55, 75), slice(45, 60)), square(slice(90), slice(30, 90)),
+         SMALL),
+        (spread(5, 80), square(slice(0, 90), slice(90, 120)), square(slice(90), slice(40, 60)),
+         OFF),
+        (spread(5, 80, seen=3), square(slice(0, 90), slice(40, 60)), None, FEW),
+        (spread(5, 80), None, None, FOUND),
+    ],
+)  # fmt: skip
+def test_landmarks_are_held_against_their_own_mask(points, own, wide, why) -> None:
+    assert doubt(points, own, wide) == why

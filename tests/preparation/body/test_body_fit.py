@@ -25,11 +25,11 @@ from hoigs.preparation.body.fit import fit_body
 from hoigs.preparation.body.fit_problem import FitProblem
 from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Unknowns
 from hoigs.preparation.body.ground_scale import ground_scale
-from hoigs.preparation.body.landmarks import LandmarkTrack, points_of
+from hoigs.preparation.body.landmarks import FrameFates, LandmarkTrack, points_of
 from hoigs.preparation.body.normal_equations import NormalEquations
 from hoigs.preparation.body.priors.joint_limits import beyond
 from hoigs.preparation.body.start.limbs import limb_pose
-from hoigs.preparation.entities.person import stature
+from hoigs.preparation.entities.person import fates_said, stature
 from hoigs.preparation.report.mesh_overlay import overlay_frame
 
 FRAMES, WIDTH, HEIGHT, FOCAL = 9, 640, 480, 600.0
@@ -148,6 +148,27 @@ def test_landmarks_off_the_way_are_not_believed() -> None:
     assert jumps.nonzero()[:, 0].tolist() == [18, 19, 21]
     image[lost] = 0.0
     assert not LandmarkTrack(image, image.clone()).jumps().any()
+
+
+def test_every_frame_without_landmarks_has_its_reason() -> None:
+    image = torch.zeros(12, 33, 3)
+    image[[1, 2, 3, 4, 7]] = torch.nan
+    image[4, :4] = 0.0  # some, and too few
+    given = LandmarkTrack(image, image.clone())
+    fates = FrameFates.at(  # of frames of the video, every second one of which was chosen
+        {"dark": (2, 3, 4, 16), "cut": (5,)}, {"second look": (14, 18, 20)}, range(0, 24, 2)
+    )
+    assert fates == FrameFates({"dark": [1, 2, 8]}, {"second look": [7, 9, 10]})
+    dropped = torch.zeros(12, dtype=torch.bool)
+    dropped[10] = True
+    found = fates.complete(given, {"alone": dropped})
+    few, none = "fewer than 8 of the body's landmarks were found", "the source has no landmarks"
+    assert found.lost == {"dark": [1, 2], few: [4], none: [3, 7], "alone": [10]}
+    assert found.repaired == {"second look": [9]}  # 7 and 10 are lost
+    assert found.lost_frames() == [1, 2, 3, 4, 7, 10]
+    lost, repaired = fates_said(found, 12)
+    assert "6 of 12" in lost and "dark in 2 (1-2)" in lost and "second look in 1 (9)" in repaired
+    assert fates_said(FrameFates(), 12) == []
 
 
 def test_frames_without_landmarks_lie_between_their_neighbours() -> None:

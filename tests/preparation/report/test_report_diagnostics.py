@@ -27,13 +27,15 @@ def test_every_measure_is_judged_and_advised() -> None:
         camera="moving", registered=0.6, reprojection_px=3.0, parallax_degrees=2.0,
         sharpness=[1.0] * 30 + [0.2] * 10, body_residual_px=9.0, object_scale_spread=0.3,
         depth_residual=0.2, omega=1.0, coverage={"human": [0.0] * 20 + [0.1] * 20},
+        landmarks={"human": {"found": 30, "lost": {"dark": [*range(10)]}, "repaired": {}}},
     )  # fmt: skip
-    assert {state for state, _ in bad.values()} == {"bad"} and len(bad) == 9
+    assert {state for state, _ in bad.values()} == {"bad"} and len(bad) == 10
     assert all(advice for _, advice in bad.values())
     good = states(
         camera="moving", registered=1.0, reprojection_px=0.3, parallax_degrees=25.0,
         sharpness=[1.0] * 40, body_residual_px=0.5, object_scale_spread=0.02, depth_residual=0.02,
         omega=60.0, coverage={"human": [0.1] * 40},
+        landmarks={"human": {"found": 39, "lost": {"dark": [3]}, "repaired": {"again": [4]}}},
     )  # fmt: skip
     assert set(good) == set(bad)
     assert set(good.values()) == {("good", "")}

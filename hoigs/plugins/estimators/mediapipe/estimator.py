@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from pydantic import Field
 
 from hoigs.core.config import ComponentConfig
+from hoigs.core.diagnostics import ranges
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import (
     EntityMasks,
@@ -33,9 +34,10 @@ from hoigs.core.progress import Progress, no_progress
 from hoigs.plugins.estimators.common.environments import HEAVY, MEDIAPIPE
 from hoigs.plugins.estimators.common.subprocess import run_tool, settings_key
 from hoigs.plugins.estimators.mediapipe.masks import frames_of, steadied
+from hoigs.plugins.estimators.mediapipe.mediapipe_doubts import LOST, REPAIRED, UNSURE
 
 SCRIPT = Path(__file__).with_name("mediapipe_script.py")
-PARTS = ("guided", "chosen", "people", "look")
+PARTS = ("doubts", "guided", "chosen", "people", "look")
 IMPORTED = [SCRIPT.with_name(f"mediapipe_{part}.py") for part in PARTS]
 INSTALL = "run `hoigs estimators install mediapipe` and leave `python` out"
 OTHERS, FOLLOWED = 0.1, 0.8  # shares of the frames, above and below which there is something to say
@@ -86,8 +88,9 @@ class MediapipeEstimator(Estimator):
 
     It follows a person from frame to frame and loses one that jumps, so it is given every frame
     from the first wanted one to the last. Where no landmarks are found it looks again with a
-    border above the frame, and landmarks that are not on the person's mask are dropped. The mask is
-    the mean of the segmentation of the frame, of the person's part of it, and of the pose's own.
+    border above the frame, and landmarks that are not on the pose's own mask are dropped, with the
+    reason. That mask is the person's; along its outline the segmentations of the frame and of
+    the person's part of it have a say.
     """
 
     Config: ClassVar = MediapipeConfig
@@ -138,20 +141,27 @@ class MediapipeEstimator(Estimator):
         for k, name in enumerate(people):
             image = self._spread(found["image_xyzv"][k], given, video)
             world = self._spread(found["world_xyzv"][k], given, video)
-            landmarks[name] = Landmarks(image, world, text)
+            fate = self._fate(found["fate"][k], given)
+            landmarks[name] = Landmarks(
+                image, world, text, lost=_frames_by(fate, LOST), repaired=_frames_by(fate, REPAIRED)
+            )
         if not self.config.masks:
             return Estimates(landmarks=landmarks)
         frames = _frames(video, given, progress, "masks")
-        persons, still = steadied(out, found["person"], found["size"], frames, video)
+        persons, still, changed = steadied(out, found["person"], found["size"], frames, video)
         masks = {
             name: frames_of(persons[k], found["size"], first, video)
             for k, name in enumerate(people)
         }
-        text = "MediaPipe's segmentation of selfies and of poses; it takes in what is held"
+        text = "MediaPipe's segmentation of poses, its outline refined by that of selfies"
         text += "; the same wherever frames of the still camera are" if still else ""
         text += "; of the person clicked on" if chosen else ""
         images = {name: track.image_xyzv for name, track in landmarks.items()}
         notes = _lost(given, images) if chosen else _others(found["several"], images[people[0]])
+        if not chosen:
+            empty = ~found["person"][0].any((1, 2))
+            notes += _without_pose(found["fate"][0], empty, given, video.numbers)
+        notes += _changed(changed.any(0), given, video.numbers)
         return Estimates(EntityMasks(masks, None, text, notes=notes), landmarks)
 
     def people(self, video: VideoRequest) -> tuple[FramePrompt, ...]:
@@ -199,6 +209,16 @@ class MediapipeEstimator(Estimator):
             lacking = "has no mediapipe" in said
             raise HoigsError(f"{error}\n{INSTALL}" if lacking else str(error)) from error
         half.replace(out)
+
+    @staticmethod
+    def _fate(rows: np.ndarray, given: range) -> Mapping[int, int]:
+        """What became of each frame that was looked at, by its number."""
+        if rows.shape != (len(given),):
+            raise HoigsError(
+                f"estimator:mediapipe wrote what became of {rows.shape} frames, expected "
+                f"({len(given)},)"
+            )
+        return dict(zip(given, rows.tolist(), strict=True))
 
     def _spread(self, rows: np.ndarray, given: range, video: VideoRequest) -> np.ndarray:
         """The rows of the given frames among those of the whole video."""
@@ -263,6 +283,46 @@ def _misplaced(log: str) -> str:
             f"anna=X,Y@{other[1]}"
         )
     return ""
+
+
+def _frames_by(fate: Mapping[int, int], words: Mapping[int, str]) -> dict[str, tuple[int, ...]]:
+    """The frames of each fate that there are words for."""
+    return {
+        text: frames
+        for code, text in words.items()
+        if (frames := tuple(i for i, one in fate.items() if one == code))
+    }
+
+
+def _without_pose(
+    fate: UInt8[np.ndarray, " N"], empty: Bool[np.ndarray, " N"], given: range,
+    wanted: Sequence[int],
+) -> tuple[str, ...]:  # fmt: skip
+    """What there is to say of masks of frames in which no pose was found."""
+    lost = np.isin(fate, [code for code in LOST if code != UNSURE])
+    notes = []
+    for which, text in (
+        (lost & ~empty, "are of the segmentation of selfies alone, which may lack limbs or take "
+         "furniture in: no pose was found"),
+        (lost & empty, "are empty: neither a pose nor a person was found"),
+    ):  # fmt: skip
+        if frames := _wanted(which, given, wanted):
+            notes.append(f"the person's masks of {len(frames)} frames ({ranges(frames)}) {text}")
+    return tuple(notes)
+
+
+def _changed(which: Bool[np.ndarray, " N"], given: range, wanted: Sequence[int]) -> tuple[str, ...]:
+    frames = _wanted(which, given, wanted)
+    if not frames:
+        return ()
+    return (
+        f"parts of the person's masks of {len(frames)} frames ({ranges(frames)}) were changed to "
+        "what most frames show that look alike there",
+    )
+
+
+def _wanted(which: Bool[np.ndarray, " N"], given: range, wanted: Sequence[int]) -> list[int]:
+    return sorted({given[i] for i in np.flatnonzero(which).tolist()} & set(wanted))
 
 
 def _lost(given: range, images: Mapping[str, Float[np.ndarray, "F 33 4"]]) -> tuple[str, ...]:

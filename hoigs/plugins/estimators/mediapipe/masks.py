@@ -21,14 +21,16 @@ def steadied(
     size: Int[np.ndarray, "2"],
     frames: Iterable[UInt8[np.ndarray, "H W 3"]],
     video: VideoRequest,
-) -> tuple[UInt8[np.ndarray, "P N h B"], bool]:
-    """The bits of masks that agree where the camera stands still, and whether it does.
+) -> tuple[UInt8[np.ndarray, "P N h B"], bool, Bool[np.ndarray, "P N"]]:
+    """The bits of masks that agree where the camera stands still, whether it does, and which masks
+    were changed for it.
 
     Args:
         out: file of what MediaPipe found; the result is kept beside it.
         size: width and height of the masks. frames: those of the masks, read only if needed.
     """
-    key = zlib.crc32(Path(steady_masks.__file__).read_bytes())
+    scripts = (Path(steady_masks.__file__), Path(__file__))
+    key = zlib.crc32(b"".join(path.read_bytes() for path in scripts))
     kept = out.with_name(f"{out.stem}-steady-{key:08x}.npz")
     if not kept.is_file():
         bits = person.copy()
@@ -40,7 +42,8 @@ def steadied(
         with written_whole(kept) as part, part.open("wb") as file:
             np.savez_compressed(file, person=bits, still=steady.still)
     with np.load(kept, allow_pickle=False) as file:
-        return file["person"], bool(file["still"])
+        bits = file["person"]
+        return bits, bool(file["still"]), (bits != person).any((2, 3))
 
 
 def frames_of(

@@ -14,6 +14,7 @@ SIZES = (0.8, 1.1, 1.5, 2.0)  # sides of the squares, in longer sides of the ima
 HEIGHTS = (0.2, 0.5, 0.8, 1.1)  # their middles, in heights of the image
 FOUND = 0.8  # mean visibility of shoulders and of the better arm, for a person to be found
 KEPT = 0.5  # the same while they are followed
+ON = 0.5  # share of the seen landmarks that lie on the frame's mask of people, to be found there
 AGAIN = 15  # frames until a search that found nobody is repeated, or one that was lost is left
 SHOULDERS, LEFT, RIGHT, HIPS = [11, 12], [13, 15], [14, 16], [23, 24]
 HEAD, LEGS = slice(0, 11), slice(25, 33)
@@ -46,11 +47,12 @@ class GuidedPose:
 
     Args:
         graph: of `landmark_graph`. rect: makes a square for it, NormalizedRect.
-        credible: whether landmarks fit the frame's mask of people.
+        doubt: what there is against landmarks, given them, their own mask and the frame's mask of
+            people; 0: nothing. share_on: of the seen landmarks, those on a mask.
     """
 
-    def __init__(self, graph, rect, credible) -> None:
-        self.graph, self.rect, self.credible = graph, rect, credible
+    def __init__(self, graph, rect, doubt, share_on) -> None:
+        self.graph, self.rect, self.doubt, self.share_on = graph, rect, doubt, share_on
         self.square: tuple[float, float, float] | None = None  # x, y of the middle and side, pixels
         self.broad = 0.0  # distance of the shoulders when the person was found, pixels
         self.wait = 0
@@ -86,7 +88,11 @@ class GuidedPose:
         if middle is None:
             return None
         squares = [(middle, y * height, s * max(width, height)) for s in SIZES for y in HEIGHTS]
-        tried = [f for f in (self.look(image, wide, s) for s in squares) if f is not None]
+        looks = (self.look(image, wide, square) for square in squares)
+        # anything may look like a person in some square: here, the mask of people has to agree
+        tried = [
+            f for f in looks if f is not None and (wide is None or self.share_on(f[1], wide) >= ON)
+        ]
         return max(tried, key=lambda f: f[0], default=None)
 
     def look(self, image, wide, square):
@@ -98,7 +104,7 @@ class GuidedPose:
         points, space, mask = found
         broad = np.ptp(points[SHOULDERS, 0])
         near = broad >= max(NARROW * max(width, height), SAME * self.broad)
-        person = near and upright(points) and self.credible(points, wide)
+        person = near and upright(points) and not self.doubt(points, mask, wide)
         points[HEAD, 3] = 0.0  # one that can be seen is found by the detector
         x, y = points[LEGS, :2].astype(int).clip(0, [width - 1, height - 1]).T
         points[LEGS, 3] *= mask[y, x]  # not on the person: on a table before them

@@ -1,9 +1,10 @@
 """Run by the Python of an environment with mediapipe; it imports nothing of hoigs.
 
 Reads RGB frames from standard input and writes one .npz file: of each person image_xyzv and
-world_xyzv [P, N, 33, 4], NaN where they are not found; and, if masks are wanted, `person`, the bits
-of boolean masks [P, N, H, ceil(W / 8)], their `size`, and `several` [N], whether other people are
-seen. P is 1, or the number of people who were clicked on.
+world_xyzv [P, N, 33, 4], NaN where they are not found, and `fate` [P, N], what became of the frame
+(mediapipe_doubts.py); and, if masks are wanted, `person`, the bits of boolean masks
+[P, N, H, ceil(W / 8)], their `size`, and `several` [N], whether other people are seen. P is 1, or
+the number of people who were clicked on.
 """
 
 from __future__ import annotations
@@ -17,11 +18,8 @@ import numpy as np
 
 PADDING = 0.5  # of the height, above: a detector of faces finds people whose head is cut off
 MARGIN = 1.25  # of the person's box, the second look at the person's mask
-CREDIBLE = 0.5  # share of the seen landmarks that have to lie on the person's mask
-TALL = 0.3  # height of the landmarks in heights of the mask, below which they are of something else
-SEEN = 0.5  # visibility
 OTHER, ELSEWHERE = 0.25, 0.2  # of the largest part's area; of a part, that is the person's own
-AROUND, EDGE = 0.01, 0.2  # in longer sides and of 1: about a person's own mask
+AROUND = 0.01  # of the longer side, to both sides of the outline of the pose's own mask
 ROWS = ("image_xyzv", "world_xyzv")
 SOFT = 1 / 640  # of the longer side: standard deviation by which the person's mask is smoothed
 
@@ -116,6 +114,7 @@ class Finder:
         self.first, rows = frames[0], (len(names), len(frames), 33, 4)
         self.names, self.rows = names, {n: np.full(rows, np.nan, np.float32) for n in ROWS}
         self.person: list[list[np.ndarray | None]] = [[None] * len(frames) for _ in names]
+        self.fate = np.zeros((len(names), len(frames)), np.uint8)
         self.several = np.zeros(len(frames), bool)  # others are seen beside the person followed
 
     def add(self, place, image) -> None:
@@ -124,7 +123,7 @@ class Finder:
         if self.people is not None:
             self.add_people(place, image, wide)
             return
-        image_xyzv, world_xyzv, own = self.landmarks(image, wide)
+        image_xyzv, world_xyzv, own, self.fate[0, place] = self.landmarks(image, wide)
         self.rows["image_xyzv"][0, place], self.rows["world_xyzv"][0, place] = (
             image_xyzv, world_xyzv
         )  # fmt: skip
@@ -132,21 +131,24 @@ class Finder:
             self.person[0][place] = self.bits(image, self.of_anybody(place, image, wide, own))
 
     def of_anybody(self, place, image, wide, own):
-        """The mask of the person whom the detector took."""
-        if self.following and own is not None:
+        """The mask of the person whom the detector took; of people, where it took nobody."""
+        if own is None:
+            near = self.near(image, wide > 0.5)
+            return wide if near is None else (wide + near) / 2
+        if self.following:
             return own  # segmentation of selfies takes tables in where there is no head
-        self.several[place] = own is not None and self.another(wide, own)
-        if self.several[place]:
-            return self.of_one(image, wide, own)
-        near = self.near(image, wide > 0.5)
-        mean = wide if near is None else (wide + near) / 2
-        return mean if own is None else (2 * mean + own) / 3
+        self.several[place] = self.another(wide, own)
+        return self.of_one(image, wide, own)
 
     def add_people(self, place, image, wide) -> None:
         """Those who were clicked on; where masks overlap, the model of landmarks decides."""
         found = self.people.process(place, image)
+        from mediapipe_doubts import FOUND, GONE
+
         i = self.people.order[place] - self.first
         seen = {name: f for name, f in found.items() if f is not None}
+        for name in found:
+            self.fate[self.names.index(name), i] = FOUND if name in seen else GONE
         for name, (image_xyzv, world_xyzv, _) in seen.items():
             k = self.names.index(name)
             self.rows["image_xyzv"][k, i], self.rows["world_xyzv"][k, i] = image_xyzv, world_xyzv
@@ -175,21 +177,35 @@ class Finder:
         return any((own[parts == i] > 0.5).mean() < ELSEWHERE for i in large)
 
     def of_one(self, image, wide, own):
-        """The mask of one of several people: of the segmentations of all, what lies at their own
-        one, which knows them apart and is coarse. Each may miss a part of them, or, in the whole
-        image, one without a head altogether: a pixel needs one of both."""
-        around = self.cv2.GaussianBlur(own, (0, 0), max(1.0, AROUND * max(image.shape))) > EDGE
+        """The mask of one person: the pose's own, whose outline is coarse, and which knows them
+        apart from others and from what they hold. Along its outline, and there alone, the
+        segmentations of all that is a person have a say; they take away only beside what they
+        have of the person, so not from a thin arm, nor from a chest that they lack."""
         near = self.near(image, own > 0.5)
-        people = wide if near is None else np.maximum(wide, near)
-        return (2 * np.where(around, people, 0) + own) / 3
+        mean = (own + wide + (wide if near is None else near)) / 3
+        side = 2 * max(1, round(AROUND * max(own.shape))) + 1
+        kernel = self.cv2.getStructuringElement(self.cv2.MORPH_ELLIPSE, (side, side))
+        sure = np.uint8(own > 0.5)
+        core = self.cv2.erode(sure, kernel)
+        band = (self.cv2.dilate(sure, kernel) > 0) & (core == 0)
+        beside = self.cv2.dilate(core * np.uint8(mean > 0.5), kernel) > 0
+        return np.where(band, np.where(beside, mean, np.maximum(own, mean)), own)
 
     def landmarks(self, image, wide):
-        """In the image and in space, and the mask of their person; looked for a second time with a
-        border above the image where they are not found, as with a head out of view, and then
-        without the detector (mediapipe_guided.py)."""
-        if self.following and (found := self.guided.process(image, wide)) is not None:
+        """In the image and in space, the mask of their person, and what became of the frame; looked
+        for a second time with a border above the image where they are not found, as with a head
+        out of view, and then without the detector (mediapipe_guided.py)."""
+        from mediapipe_doubts import BORDER, FOUND, NOBODY, SQUARE, UNSURE, doubt, share_on
+
+        def guided():
+            found = self.guided.process(image, wide)
+            if found is None:
+                return None
+            return (*found, SQUARE if np.isfinite(found[0]).all() else UNSURE)
+
+        if self.following and (found := guided()) is not None:
             return found
-        self.following = False
+        self.following, fate = False, NOBODY
         height, width = image.shape[:2]
         border = round(PADDING * height)
         for pose, above in ((self.whole, 0), (self.padded, border)):
@@ -202,21 +218,22 @@ class Finder:
             # z is in the scale of x
             points = points_of(found.pose_landmarks) * [width, height + above, width, 1.0]
             points[:, 1] -= above
-            if not credible(points, wide):
+            own = found.segmentation_mask[above:] if self.masks else None
+            if doubted := doubt(points, own, wide):
                 pose.reset()
+                fate = doubted if fate == NOBODY else fate
                 continue
-            own = found.segmentation_mask
-            own = None if own is None else own[above:]
-            return points, points_of(found.pose_world_landmarks), own
+            how = BORDER if above else FOUND
+            return points, points_of(found.pose_world_landmarks), own, how
         if self.guided is None:
             from mediapipe_guided import GuidedPose, landmark_graph
 
-            self.guided = GuidedPose(*landmark_graph(self.complexity), credible)
-        if (found := self.guided.process(image, wide)) is not None:
+            self.guided = GuidedPose(*landmark_graph(self.complexity), doubt, share_on)
+        if (found := guided()) is not None:
             self.following = True
             return found
         nothing = np.full((33, 4), np.nan)
-        return nothing, nothing, None
+        return nothing, nothing, None, fate
 
     def near(self, image, inside):
         """The mask of a picture of the person alone, which shows more detail."""
@@ -233,27 +250,11 @@ class Finder:
         """What is written; `scale`: pixels of the video a pixel of the images here."""
         rows: dict[str, np.ndarray] = dict(self.rows)
         rows["image_xyzv"][..., :3] *= scale
+        rows["fate"] = self.fate
         if self.masks:
             rows["person"] = np.array(self.person)
             rows["several"] = self.several
         return rows
-
-
-def credible(points, wide) -> bool:
-    """Whether landmarks are of the masked person: most of those seen are on it, and not on a small
-    thing, such as a mug, that was taken for a person."""
-    if wide is None:
-        return True
-    rows = np.flatnonzero((wide > 0.5).any(1))
-    if not len(rows):
-        return True
-    seen = points[points[:, 3] > SEEN, :2]
-    inside = seen[(seen >= 0).all(1) & (seen[:, 0] < wide.shape[1]) & (seen[:, 1] < wide.shape[0])]
-    if len(inside) < 4:
-        return False
-    x, y = inside.astype(int).T
-    tall = np.ptp(inside[:, 1]) >= TALL * (rows[-1] - rows[0])
-    return bool(tall and (wide[y, x] > 0.5).mean() >= CREDIBLE)
 
 
 def box_of(mask, margin):
