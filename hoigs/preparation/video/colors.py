@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import itertools
 import threading
-from fractions import Fraction
 from functools import lru_cache
 from typing import Any
 
@@ -104,7 +103,7 @@ def _graph(
     form: str,
 ) -> _Graph:
     del light
-    buffer = f"video_size={size[0]}x{size[1]}:pix_fmt={pixels}:time_base={Fraction(1, 1000)}"
+    buffer = f"video_size={size[0]}x{size[1]}:pix_fmt={pixels}:time_base=1/1000"
     buffer += f":colorspace={tags[0]}:range={tags[1]}"
     return _Graph(
         [

@@ -14,6 +14,8 @@ from hoigs.core.files.images import eight_bits
 from hoigs.preparation.video.colors import converted
 from hoigs.preparation.video.source import SourceError
 
+LARGEST_ASPECT = 10  # of a pixel; what is recorded is from 1/3 to 4
+
 
 class Picture(Protocol):
     """One frame of a source, not yet converted.
@@ -41,12 +43,19 @@ class VideoPicture:
         frame: PyAV's. aspect: width of a pixel over its height, as stored; None: square.
 
     Raises:
-        SourceError: by `rgb` and `grey`, if its colours cannot be converted.
+        SourceError: the aspect is no picture's; by `rgb` and `grey`, if its colours cannot be
+            converted.
     """
 
     def __init__(self, frame: Any, aspect: Fraction | None = None) -> None:
         self.frame, self.orientation = frame, orientation(frame)
         self.seconds: float | None = frame.time
+        if aspect and not 1 / LARGEST_ASPECT <= aspect <= LARGEST_ASPECT:
+            raise SourceError(
+                f"the video's pixels are {aspect.numerator}:{aspect.denominator} as wide as high "
+                f"(sample aspect ratio), more than {LARGEST_ASPECT} to 1; mend it, such as with "
+                "`ffmpeg -i VIDEO -vf setsar=1 fixed.mp4`"
+            )
         # the shorter side of a pixel grows: nothing is lost
         wide, high = max(aspect or 1, 1), max(1 / aspect if aspect else 1, 1)
         self._shown = max(1, round(frame.width * wide)), max(1, round(frame.height * high))

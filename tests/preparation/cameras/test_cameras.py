@@ -84,6 +84,16 @@ def test_poses_points_and_width(tiny_video: Path, tmp_path: Path) -> None:
     assert "SIMPLE_RADIAL" in track.provenance
 
 
+def test_names_with_spaces(tiny_video: Path, tmp_path: Path) -> None:
+    """The frame's number stands after one."""
+    model = colmap_model(tmp_path / "sparse")
+    images = model / "images.txt"
+    images.write_text(images.read_text().replace(" frame_", " my frame "))
+    track = colmap_cameras(VideoFrames(tiny_video), model)
+    places = [float(camera.world_to_camera[0, 3]) for camera in track.cameras]
+    assert places == pytest.approx([-0.1 * i for i in range(FRAMES)], abs=1e-6)
+
+
 def test_no_distortion_leaves_pixels_alone(tiny_video: Path, tmp_path: Path) -> None:
     track = colmap_cameras(VideoFrames(tiny_video), colmap_model(tmp_path / "sparse", k1=0.0))
     image = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)

@@ -17,6 +17,7 @@ from av.filter import Graph
 from hoigs.annotation.video import ScrubbedVideo
 from hoigs.preparation.video.colors import converted
 from hoigs.preparation.video.frames import open_frames
+from hoigs.preparation.video.pictures import VideoPicture
 from hoigs.preparation.video.source import SourceError, find_source
 
 WIDTH, HEIGHT = 64, 48
@@ -211,6 +212,11 @@ def test_pixels_that_are_not_square(
     assert (scrubbed.width, scrubbed.height) == shown
     assert scrubbed.rgb(1).shape == (shown[1], shown[0], 3)
     scrubbed.close()
+
+
+def test_pixels_of_no_picture_are_refused() -> None:
+    with pytest.raises(SourceError, match="1:200"):
+        VideoPicture(av.VideoFrame.from_ndarray(picture()), Fraction(1, 200))
 
 
 # a matrix as in a video's header, and where the stored picture's first and last pixels are shown

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from hoigs.core.files.colmap_files import choice_told
 from hoigs.preparation.video.source import SourceError, find_source
 
 
@@ -73,3 +74,16 @@ def test_an_empty_video_is_said_before_what_is_absent(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "video.mp4"):
         with pytest.raises(SourceError, match=r"video\.mp4 is empty: 0 bytes"):
             find_source(path)
+
+
+def test_the_largest_colmap_model_is_taken(tiny_source: Path) -> None:
+    for name, images in (("0", 3), ("1", 5), ("2", 9)):
+        model = tiny_source / "sparse" / name
+        model.mkdir(parents=True)
+        for part in ("cameras", "points3D") if name != "2" else ("cameras",):  # 2 is cut off
+            (model / f"{part}.txt").write_text("")
+        rows = [f"{i} 1 0 0 0 0 0 0 1 a frame {i}.png\n\n" for i in range(images)]
+        (model / "images.txt").write_text("".join(rows))
+    assert find_source(tiny_source).colmap == tiny_source / "sparse/1"
+    told = choice_told(tiny_source / "sparse", tiny_source / "sparse/1")
+    assert told is not None and "sparse/0 (3 images)" in told and "sparse/1 (5 images)" in told
