@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 
 import jaxtyping
-import pytest
 import torch
 from browser import chromium, window
 from hypothesis import HealthCheck, settings
@@ -102,6 +101,14 @@ class Outcome:
     code: int
     out: str
     err: str
+
+
+@pytest.fixture
+def as_users_run_it() -> Iterator[None]:
+    """Without the test suite's checks of shapes, which would refuse what the code is to refuse."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture

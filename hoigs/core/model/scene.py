@@ -8,13 +8,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from hoigs.core.errors import require_type
+from hoigs.core.interfaces.features import FeatureExtractor
 from hoigs.core.interfaces.interaction import InteractionModule
 from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
-from hoigs.core.model.blame import call
+from hoigs.core.model.blame import call, require_residuals, require_tokens
 from hoigs.core.model.entity import Entity
+from hoigs.core.names import require_entity_name
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
+from hoigs.core.values.shown import html_table
 from hoigs.core.values.tokens import Residual, Tokens
 
 
@@ -67,7 +71,8 @@ class SceneModel(nn.Module):
         interaction_enabled: False during the warm-up of the interaction.
 
     Raises:
-        ValueError: there are no entities.
+        ValueError: there are no entities, or one has a name that none can have.
+        TypeError: an argument is of another type.
     """
 
     def __init__(
@@ -82,6 +87,12 @@ class SceneModel(nn.Module):
         super().__init__()
         if not entities:
             raise ValueError("SceneModel needs at least one entity")
+        for name, entity in entities.items():
+            require_entity_name(name)
+            require_type("SceneModel", f"entities[{name!r}]", entity, Entity)
+        require_type("SceneModel", "rasterizer", rasterizer, Rasterizer)
+        if interaction is not None:
+            require_type("SceneModel", "interaction", interaction, InteractionModule)
         self.entities = nn.ModuleDict(entities)
         self.interaction = interaction
         self.interaction_enabled = True
@@ -115,9 +126,15 @@ class SceneModel(nn.Module):
 
         Args:
             moment: on the model's device.
+
+        Raises:
+            PluginError: tokens or a residual have a shape that does not fit; it names the component
+                that gave them. TypeError: `moment` is none.
         """
+        require_type("SceneModel", "moment, the first argument,", moment, Moment)
         names = list(self.entities if only is None else only)
         tokens: dict[str, Tokens] = {}
+        extractors: dict[str, FeatureExtractor] = {}
         residuals: Mapping[str, Residual] = {}
         module = self.interaction
         if module is not None and module.reads and self.interaction_enabled:
@@ -125,10 +142,12 @@ class SceneModel(nn.Module):
                 features = self.entity(name).features
                 role = f"features of {name!r}"
                 described = call(features, role, self.entity(name).tokens, moment)
-                if described is not None:
-                    tokens[name] = described
+                if described is not None and features is not None:
+                    require_tokens(features, name, described, len(self.entity(name)))
+                    tokens[name], extractors[name] = described, features
             roles = {name: self.entity(name).role(moment) for name in self.entities}
             residuals = call(module, "interaction", module, tokens, roles)
+            require_residuals(module, residuals, tokens, extractors, self.count())
         gaussians = {}
         for name in names:
             entity, role = self.entity(name), f"deformation of {name!r}"
@@ -150,7 +169,12 @@ class SceneModel(nn.Module):
             moment, camera: on the model's device.
             background: RGB in [0, 1], [3]; in place of `request.background`.
             request: as for `draw`.
+
+        Raises:
+            TypeError: an argument is of another type, as where both are swapped.
         """
+        require_type("SceneModel.render", "moment, the first argument,", moment, Moment)
+        require_type("SceneModel.render", "camera, the second argument,", camera, Camera)
         state = self(moment, only)
         request = request or RenderRequest()
         if background is not None:
@@ -180,3 +204,16 @@ class SceneModel(nn.Module):
     def count(self) -> dict[str, int]:
         """The number of Gaussians of each entity."""
         return {name: len(self.entity(name)) for name in self.entities}
+
+    def _repr_html_(self) -> str:
+        rows = []
+        for name in self.entities:
+            entity = self.entity(name)
+            features = "–" if entity.features is None else type(entity.features).__name__
+            parts = (type(entity.deformation).__name__, features)
+            numbers = sum(p.numel() for p in entity.parameters() if p.requires_grad)
+            rows.append((name, entity.kind, f"{len(entity):,}", f"{numbers:,}", *parts))
+        interaction = "no" if self.interaction is None else type(self.interaction).__name__
+        drawn = f"{type(self.rasterizer).__name__} on {self.device}, {interaction} interaction"
+        columns = ("entity", "kind", "Gaussians", "parameters", "deformation", "features")
+        return html_table(f"SceneModel: {drawn}", columns, rows)
