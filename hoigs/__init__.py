@@ -16,9 +16,11 @@ _PUBLIC = {
     "BodyPose": "hoigs.core.values.moment",
     "Camera": "hoigs.core.values.camera",
     "Clip": "hoigs.core.values.clip",
+    "Frame": "hoigs.core.values.clip",
     "GaussianDelta": "hoigs.core.values.gaussians",
     "Gaussians": "hoigs.core.values.gaussians",
     "Moment": "hoigs.core.values.moment",
+    "ObjectTrack": "hoigs.core.values.clip",
     "RenderOutput": "hoigs.core.interfaces.rasterizer",
     "RenderRequest": "hoigs.core.interfaces.rasterizer",
     "Residual": "hoigs.core.values.tokens",
@@ -30,8 +32,12 @@ _PUBLIC = {
     "ComponentConfig": "hoigs.core.config",
     "DeformationModel": "hoigs.core.interfaces.deformation",
     "DensityControl": "hoigs.core.interfaces.density",
+    "Estimator": "hoigs.core.interfaces.estimator",
+    "Exporter": "hoigs.core.model.exporter",
     "FeatureExtractor": "hoigs.core.interfaces.features",
+    "HoigsError": "hoigs.core.errors",
     "InteractionModule": "hoigs.core.interfaces.interaction",
+    "ObjectInitializer": "hoigs.core.interfaces.initializer",
     "Rasterizer": "hoigs.core.interfaces.rasterizer",
     # composition
     "Component": "hoigs.core.registry.component",
@@ -68,7 +74,7 @@ _PUBLIC = {
     "compress": "hoigs.studies.needs.pruning.compact_run",
     "demo": "hoigs.workflows.demo",
     "doctor": "hoigs.workflows.doctor",
-    "evaluate_run": "hoigs.workflows.evaluate_run",
+    "evaluate": "hoigs.workflows.evaluate",
     "export": "hoigs.workflows.export",
     "needs": "hoigs.studies.needs.needs",
     "open_run": "hoigs.runs.loaded_run",
@@ -84,19 +90,25 @@ _PUBLIC = {
     "Playback": "hoigs.viewing.playback",
     "PrepareOptions": "hoigs.preparation.options.prepare_options",
     "Session": "hoigs.training.session",
+    "StepReport": "hoigs.training.reports",
     "TrainSpec": "hoigs.core.spec.train_schema",
     "Trainer": "hoigs.training.trainer",
     "builtin_clip": "hoigs.synthesis",
-    "evaluate": "hoigs.evaluation.evaluate",
+    "score": "hoigs.evaluation.evaluate",
     "read_clip": "hoigs.runs.clip_source",
 }
 
-__all__ = ["__version__", *_PUBLIC]  # noqa: PLE0604  (the names are strings)
+# public modules, that load with their first use as `hoigs.metrics`
+_MODULES = ("metrics",)
+
+__all__ = ["__version__", *_MODULES, *_PUBLIC]  # noqa: PLE0604  (the names are strings)
 
 
 def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
         return getattr(importlib.import_module(_PUBLIC[name]), name)
+    if name in _MODULES:
+        return importlib.import_module(f"hoigs.{name}")
     raise AttributeError(f"module 'hoigs' has no attribute {name!r}")
 
 

@@ -1,10 +1,15 @@
 # written by scripts/public_stub.py
 
+from hoigs import metrics as metrics
 from hoigs.annotation.annotate import annotate as annotate
+from hoigs.core.config import ComponentConfig as ComponentConfig
+from hoigs.core.errors import HoigsError as HoigsError
 from hoigs.core.interfaces.body import BodyModel as BodyModel
 from hoigs.core.interfaces.deformation import DeformationModel as DeformationModel
 from hoigs.core.interfaces.density import DensityControl as DensityControl
+from hoigs.core.interfaces.estimator import Estimator as Estimator
 from hoigs.core.interfaces.features import FeatureExtractor as FeatureExtractor
+from hoigs.core.interfaces.initializer import ObjectInitializer as ObjectInitializer
 from hoigs.core.interfaces.interaction import InteractionModule as InteractionModule
 from hoigs.core.interfaces.rasterizer import Rasterizer as Rasterizer
 from hoigs.core.interfaces.rasterizer import RenderOutput as RenderOutput
@@ -12,6 +17,7 @@ from hoigs.core.interfaces.rasterizer import RenderRequest as RenderRequest
 from hoigs.core.interfaces.reader import ClipReader as ClipReader
 from hoigs.core.model.compose import compose as compose
 from hoigs.core.model.entity import Entity as Entity
+from hoigs.core.model.exporter import Exporter as Exporter
 from hoigs.core.model.scene import SceneModel as SceneModel
 from hoigs.core.registry.component import Component as Component
 from hoigs.core.registry.hookspecs import hookimpl as hookimpl
@@ -20,6 +26,8 @@ from hoigs.core.spec.train_schema import TrainSpec as TrainSpec
 from hoigs.core.storage.publish import publish as publish
 from hoigs.core.values.camera import Camera as Camera
 from hoigs.core.values.clip import Clip as Clip
+from hoigs.core.values.clip import Frame as Frame
+from hoigs.core.values.clip import ObjectTrack as ObjectTrack
 from hoigs.core.values.gaussians import GaussianDelta as GaussianDelta
 from hoigs.core.values.gaussians import Gaussians as Gaussians
 from hoigs.core.values.moment import BodyPose as BodyPose
@@ -27,7 +35,7 @@ from hoigs.core.values.moment import Moment as Moment
 from hoigs.core.values.tokens import Residual as Residual
 from hoigs.core.values.tokens import Tokens as Tokens
 from hoigs.core.values.topology import TopologyChange as TopologyChange
-from hoigs.evaluation.evaluate import evaluate as evaluate
+from hoigs.evaluation.evaluate import score as score
 from hoigs.plugins.bodies.anny import AnnyBody as AnnyBody
 from hoigs.plugins.bodies.smplx import SmplxBody as SmplxBody
 from hoigs.plugins.deformation.avatars.hexplane_skinning import HexPlaneSkinning as HexPlaneSkinning
@@ -59,6 +67,7 @@ from hoigs.studies.needs.auto import auto as auto
 from hoigs.studies.needs.needs import needs as needs
 from hoigs.studies.needs.pruning.compact_run import compress as compress
 from hoigs.synthesis import builtin_clip as builtin_clip
+from hoigs.training.reports import StepReport as StepReport
 from hoigs.training.session import Session as Session
 from hoigs.training.trainer import Trainer as Trainer
 from hoigs.viewing.films import render as render
@@ -67,7 +76,7 @@ from hoigs.viewing.view import view as view
 from hoigs.workflows.bug_report import bug_report as bug_report
 from hoigs.workflows.demo import demo as demo
 from hoigs.workflows.doctor import doctor as doctor
-from hoigs.workflows.evaluate_run import evaluate_run as evaluate_run
+from hoigs.workflows.evaluate import evaluate as evaluate
 from hoigs.workflows.export import export as export
 from hoigs.workflows.refine_poses import refine_poses as refine_poses
 from hoigs.workflows.train import train as train

@@ -18,7 +18,8 @@ def text() -> str:
     import hoigs
 
     names = sorted((module, name) for name, module in hoigs._PUBLIC.items())
-    lines = [f"from {module} import {name} as {name}" for module, name in names]
+    lines = [f"from hoigs import {name} as {name}" for name in hoigs._MODULES]
+    lines += [f"from {module} import {name} as {name}" for module, name in names]
     return "\n".join(
         ["# written by scripts/public_stub.py", "", *lines, "", "__version__: str", ""]
     )

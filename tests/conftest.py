@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 import jaxtyping
+import pytest
 import torch
 from browser import chromium, window
 from hypothesis import HealthCheck, settings
@@ -118,10 +119,10 @@ def few_renders(monkeypatch: pytest.MonkeyPatch) -> None:
     tests/evaluation has the orbit at full length, and render times as they are configured.
     """
     from hoigs.evaluation.report import media
-    from hoigs.workflows import evaluate_run as workflow
+    from hoigs.workflows import evaluate as workflow
 
-    quick = partial(workflow.evaluate, timing_frames=4, timing_warmup=1)
-    monkeypatch.setattr(workflow, "evaluate", quick)
+    quick = partial(workflow.score, timing_frames=4, timing_warmup=1)
+    monkeypatch.setattr(workflow, "score", quick)
     monkeypatch.setattr(media, "ORBIT_FRAMES", 4)
 
 

@@ -17,7 +17,7 @@ from hoigs.cli.main import app
 FUNCTIONS = {
     "train": (hoigs.train, hoigs.auto),
     "needs": (hoigs.needs,),
-    "eval": (hoigs.evaluate_run,),
+    "eval": (hoigs.evaluate,),
     "prepare": (hoigs.prepare, hoigs.prepare_until),
     "refine": (hoigs.refine_poses,),
     "compress": (hoigs.compress,),
