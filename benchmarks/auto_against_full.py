@@ -41,7 +41,7 @@ def run_folder(name: str, kind: str, options: argparse.Namespace) -> Path:
 def train(name: str, kind: str, options: argparse.Namespace) -> dict[str, Any]:
     """One training, gone on with where it had begun, and its scores on test frames."""
     import hoigs
-    from hoigs.evaluation.evaluate import evaluate
+    from hoigs.evaluation.evaluate import score
     from hoigs.runs.checkpoint import has_checkpoint
     from hoigs.runs.loaded_run import LoadedRun
     from hoigs.runs.run_folder import RunFolder
@@ -68,7 +68,7 @@ def train(name: str, kind: str, options: argparse.Namespace) -> dict[str, Any]:
         if label and kind == "full":
             continue
         loaded = LoadedRun.open(path, device=options.device)
-        scores = evaluate(loaded.model, loaded.clip, timing_frames=0, held_out=not label)
+        scores = score(loaded.model, loaded.clip, timing_frames=0, held_out=not label)
         regions = ("human_object", "full", "background")
         found[f"{label}psnr"] = {region: scores.score(region, "psnr") for region in regions}
     loaded = LoadedRun.open(run, device=options.device)

@@ -42,7 +42,7 @@ LIMIT_DB = 1.5
 
 def measure(fault: str, options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """One clip trained on and scored."""
-    from hoigs.evaluation.evaluate import evaluate
+    from hoigs.evaluation.evaluate import score
     from hoigs.runs.clip_source import read_clip
     from hoigs.runs.loaded_run import LoadedRun
     from hoigs.training.session import Session
@@ -64,7 +64,7 @@ def measure(fault: str, options: argparse.Namespace, folder: Path) -> dict[str, 
     seconds = time.perf_counter() - started
     loaded = LoadedRun.open(run, clip=clip)
     judged = loaded.clip if fault in OWN else read_clip(base, width=options.width)
-    scores = evaluate(loaded.model, judged, timing_frames=0)
+    scores = score(loaded.model, judged, timing_frames=0)
     return {
         "fault": fault,
         "clip": clip,

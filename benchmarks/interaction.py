@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.at_size import machine, write
 from hoigs.core.files.npz import load_arrays
 from hoigs.core.maths.rotations import matrices_to_quats, quats_to_matrices, slerp
-from hoigs.evaluation.evaluate import evaluate
+from hoigs.evaluation.evaluate import score
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.synthesis.named import named_clip
 from hoigs.training.session import Session
@@ -114,7 +114,7 @@ def trained(
         )
         session.train()
         model = session.trainer.model
-        scores = evaluate(model, session.clip, timing_frames=0)
+        scores = score(model, session.clip, timing_frames=0)
     row: dict[str, Any] = {
         "clip": name, "query": options.clip_query, "every": options.every, "interaction": way,
         "seed": seed, "settings": settings, **machine(model.device),

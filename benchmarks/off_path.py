@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.at_size import machine, write
 from hoigs.core.registry.registry import default_registry
-from hoigs.evaluation.evaluate import evaluate
+from hoigs.evaluation.evaluate import score
 from hoigs.evaluation.scores import ViewScores
 from hoigs.runs.clip_source import read_clip
 from hoigs.training.session import Session
@@ -82,9 +82,9 @@ def trained(clip: str, variant: str, seed: int, options: argparse.Namespace) -> 
         session.train()
         seconds = time.perf_counter() - trained_from
         model, registry = session.trainer.model, default_registry()
-        own = evaluate(model, session.clip, timing_frames=0)
+        own = score(model, session.clip, timing_frames=0)
         around = read_clip(wide, registry, None)
-        turned = evaluate(model, around, timing_frames=0)
+        turned = score(model, around, timing_frames=0)
         if options.pictures:
             draw(model, around.held_out, options.pictures / f"{clip}-{name}-{seed}.png")
     row = {

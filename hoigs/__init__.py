@@ -16,17 +16,17 @@ _PUBLIC = {
     "BodyPose": "hoigs.core.values.moment",
     "Camera": "hoigs.core.values.camera",
     "Clip": "hoigs.core.values.clip",
+    "Frame": "hoigs.core.values.clip",
     "GaussianDelta": "hoigs.core.values.gaussians",
     "Gaussians": "hoigs.core.values.gaussians",
     "Moment": "hoigs.core.values.moment",
+    "ObjectTrack": "hoigs.core.values.clip",
     "RenderOutput": "hoigs.core.interfaces.rasterizer",
     "RenderRequest": "hoigs.core.interfaces.rasterizer",
     "Residual": "hoigs.core.values.tokens",
     "Tokens": "hoigs.core.values.tokens",
     "TopologyChange": "hoigs.core.values.topology",
-    "Frame": "hoigs.core.values.clip",
     "HoigsError": "hoigs.core.errors",
-    "ObjectTrack": "hoigs.core.values.clip",
     # interfaces
     "ComponentConfig": "hoigs.core.config",
     "Estimator": "hoigs.core.interfaces.estimator",
@@ -74,7 +74,7 @@ _PUBLIC = {
     "compress": "hoigs.studies.needs.pruning.compact_run",
     "demo": "hoigs.workflows.demo",
     "doctor": "hoigs.workflows.doctor",
-    "evaluate_run": "hoigs.workflows.evaluate_run",
+    "evaluate": "hoigs.workflows.evaluate",
     "export": "hoigs.workflows.export",
     "needs": "hoigs.studies.needs.needs",
     "open_run": "hoigs.runs.loaded_run",
@@ -94,16 +94,21 @@ _PUBLIC = {
     "TrainSpec": "hoigs.core.spec.train_schema",
     "Trainer": "hoigs.training.trainer",
     "builtin_clip": "hoigs.synthesis",
-    "evaluate": "hoigs.evaluation.evaluate",
+    "score": "hoigs.evaluation.evaluate",
     "read_clip": "hoigs.runs.clip_source",
 }
 
-__all__ = ["__version__", *_PUBLIC]  # noqa: PLE0604  (the names are strings)
+# public modules, that load with their first use as `hoigs.metrics`
+_MODULES = ("metrics",)
+
+__all__ = ["__version__", *_MODULES, *_PUBLIC]  # noqa: PLE0604  (the names are strings)
 
 
 def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
         return getattr(importlib.import_module(_PUBLIC[name]), name)
+    if name in _MODULES:
+        return importlib.import_module(f"hoigs.{name}")
     raise AttributeError(f"module 'hoigs' has no attribute {name!r}")
 
 

@@ -31,6 +31,7 @@ MODULES = (
     "hoigs.core.progress",
     "hoigs.core.registry.registry",
     "hoigs.core.values.topology",
+    "hoigs.metrics",
     "hoigs.testing",
 )
 

@@ -5,7 +5,6 @@ python scripts/docs_pages.py FOLDER      writes them into FOLDER, to look at
 
 from __future__ import annotations
 
-import importlib
 import io
 import json
 import sys
@@ -31,7 +30,6 @@ def pages() -> Pages:
     return {
         "reference/cli.md": cli_page(),
         "reference/spec-schema.md": schema_page(),
-        "reference/api.md": api_page(),
         **component_pages(),
     }
 
@@ -276,21 +274,6 @@ def _png(image: Any) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "PNG")
     return buffer.getvalue()
-
-
-def api_page() -> str:
-    """Every public name of hoigs, by where it is defined."""
-    import hoigs
-
-    groups: dict[str, list[str]] = {}
-    for name, module in hoigs._PUBLIC.items():
-        package = ".".join(module.split(".")[:2])
-        groups.setdefault(package, []).append(f"::: {module}.{name}")
-    lines = ["# Python", "", "`import hoigs as h` has these names; they load on first use.", ""]
-    for package, entries in groups.items():
-        doc = importlib.import_module(package).__doc__ or ""
-        lines += [f"## {package}", "", doc.partition("\n")[0], "", *(f"{e}\n" for e in entries)]
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

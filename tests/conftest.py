@@ -105,16 +105,24 @@ class Outcome:
 
 
 @pytest.fixture
+def as_users_run_it() -> Iterator[None]:
+    """Without the test suite's checks of shapes, which would refuse what the code is to refuse."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
 def few_renders(monkeypatch: pytest.MonkeyPatch) -> None:
     """The render time of 5 renders, not 110, and an orbit of 4, not 36: most of a tiny run's cost.
 
     tests/evaluation has the orbit at full length, and render times as they are configured.
     """
     from hoigs.evaluation.report import media
-    from hoigs.workflows import evaluate_run as workflow
+    from hoigs.workflows import evaluate as workflow
 
-    quick = partial(workflow.evaluate, timing_frames=4, timing_warmup=1)
-    monkeypatch.setattr(workflow, "evaluate", quick)
+    quick = partial(workflow.score, timing_frames=4, timing_warmup=1)
+    monkeypatch.setattr(workflow, "score", quick)
     monkeypatch.setattr(media, "ORBIT_FRAMES", 4)
 
 

@@ -30,7 +30,7 @@ def trained(clip: Path, run: Path, how: Training, truth: Any = None) -> dict[str
     Args:
         truth: a clip of the same frames whose pixels and masks are scored in place of the clip's.
     """
-    from hoigs.evaluation.evaluate import evaluate
+    from hoigs.evaluation.evaluate import score
     from hoigs.training.session import Session
 
     session = Session.open(
@@ -51,7 +51,7 @@ def trained(clip: Path, run: Path, how: Training, truth: Any = None) -> dict[str
         pixels = truth.resized(scored.cameras[0].width).store
         scored = replace(scored, store=pixels, kinds=truth.kinds)
     for poses in ("given", "interpolated", "blended"):
-        scores = evaluate(session.trainer.model, scored, timing_frames=0, test_pose=poses)
+        scores = score(session.trainer.model, scored, timing_frames=0, test_pose=poses)
         found[f"{poses} poses"] = {
             view.name: {r: _value(scores.score(r, "psnr", view.name)) for r in REGIONS}
             for view in scores.views

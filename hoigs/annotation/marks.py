@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from hoigs.core.errors import SpecError
 from hoigs.core.interfaces.estimator import FramePrompt, PromptPoint
-from hoigs.core.names import NAME
+from hoigs.core.names import require_entity_name
 from hoigs.preparation.options.prepare_options import PromptAt
 from hoigs.preparation.options.prompt_file import StoredPrompts
 from hoigs.preparation.options.prompts import parse_prompts, split_name
@@ -52,8 +52,9 @@ class Marked(BaseModel):
 
     @model_validator(mode="after")
     def _named(self) -> Marked:
-        if not NAME.fullmatch(self.name) or not self.name[0].isalpha():
-            raise ValueError(f"{self.name!r} is no name: use letters, digits, _ and -")
+        require_entity_name(self.name)
+        if not self.name[0].isalpha():
+            raise ValueError(f"{self.name!r} is no name: a letter comes first")
         return self
 
     def prompts(self) -> tuple[FramePrompt, ...]:

@@ -16,7 +16,7 @@ from hoigs.core.names import printable
 if TYPE_CHECKING:
     from hoigs.training.reports import StepReport
     from hoigs.training.session import Session
-    from hoigs.workflows.evaluate_run import EvaluatedRun
+    from hoigs.workflows.evaluate import EvaluatedRun
 
 
 def say(text: str) -> None:

@@ -52,7 +52,7 @@ def evaluate(
     Under another --test-pose or --test-camera than the spec's, only the scores are written, as
     evaluation-POSE-CAMERA.json beside the run's own.
     """
-    from hoigs.workflows.evaluate_run import evaluate_run
+    from hoigs.workflows.evaluate import evaluate as evaluate_run
 
     with Display() as show:
         done = evaluate_run(

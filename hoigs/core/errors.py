@@ -54,6 +54,14 @@ class Interrupted(KeyboardInterrupt):
         self.code = 128 + signal_number
 
 
+def require_type(owner: str, argument: str, value: object, expected: type) -> None:
+    """Raise TypeError, naming the argument and both types, when `value` is no `expected`."""
+    if not isinstance(value, expected):
+        found = value.__name__ if isinstance(value, type) else type(value).__name__
+        kind = "the class" if isinstance(value, type) else "of type"
+        raise TypeError(f"{owner}: {argument} is {kind} {found}, expected {expected.__name__}")
+
+
 def did_you_mean(name: str, valid: Iterable[str], count: int = 1) -> str:
     """`; did you mean "x"?` with the nearest of `valid`, or "" when nothing is near.
 

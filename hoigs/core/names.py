@@ -6,6 +6,27 @@ import re
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 RULE = "use letters, digits, _, - and . , a letter or digit first"
+ENTITY = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+
+
+def require_entity_name(name: str) -> None:
+    """Raise ValueError for a name that no entity can have.
+
+    Names of entities are also keys of specs and of torch's modules: in both a dot separates the
+    parts of a path, and a module's own attributes ("type", "train") are taken.
+    """
+    from torch import nn
+
+    if not ENTITY.fullmatch(name):
+        raise ValueError(
+            f"entity name {name!r}: names of entities have letters, digits, _ and -, a letter or "
+            "digit first, and no dots"
+        )
+    if hasattr(nn.ModuleDict, name):
+        raise ValueError(
+            f"entity name {name!r}: torch's modules have an attribute of that name; take another, "
+            f"as {name}_1"
+        )
 
 
 def name_from(text: str, otherwise: str) -> str:

@@ -1,6 +1,6 @@
 """Scores of trained models, each stored with its protocol.
 
-- `evaluate.evaluate`: entry point; scores a model on a clip, as a `scores.Evaluation`.
+- `evaluate.score`: entry point; scores a model on a clip, as a `scores.Evaluation`.
 - `protocol.Protocol`: the conditions of a score. `protocol.NotComputed`: why one is absent.
 - `posing.posed_clip`: body poses and cameras of test frames: interpolated, blended or fitted.
 - `blending`, `interpolation`: poses between training frames and a test frame's own.

@@ -1,4 +1,4 @@
-"""evaluate: scores of a model on a clip, each with its protocol or the reason why it is absent."""
+"""score: scores of a model on a clip, each with its protocol or the reason why it is absent."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TIMING_SHARE, FITTING_SHARE = 0.3, 0.5  # of the progress bar
 
 
 @short_waits_when_busy()
-def evaluate(
+def score(
     model: SceneModel,
     clip: Clip,
     *,

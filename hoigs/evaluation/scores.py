@@ -144,6 +144,11 @@ class Evaluation:
             tables.append(geometry_table(self.geometry))
         return [*tables, timing_table(self.timing), size_table(self.sizes)]
 
+    def _repr_html_(self) -> str:
+        from hoigs.evaluation.report.sections import table
+
+        return "".join(table(one) for one in self.tables())
+
     def to_dict(self) -> dict[str, Any]:
         """JSON values: every score with its protocol, and the reason of each that is absent."""
         scores, frames = [], []

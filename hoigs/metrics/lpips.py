@@ -7,6 +7,7 @@ torchvision's download cache, whose backbone needs the heads of an installed `lp
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import os
 import pickle
@@ -21,6 +22,7 @@ from torch import Tensor, nn
 from hoigs.core.errors import HoigsError
 from hoigs.core.files.npz import load_arrays
 from hoigs.core.files.regular_file import regular_file
+from hoigs.metrics.inputs import check_pair
 
 Net = Literal["alex", "vgg"]
 VARIABLE = "HOIGS_LPIPS_WEIGHTS"
@@ -195,6 +197,27 @@ class Lpips(nn.Module):
             if i in self.stack.taps:
                 features.append(x)
         return features
+
+
+def lpips(
+    image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], net: Net = "alex"
+) -> Float[Tensor, ""]:
+    """The distance of two images by the weights that `find_weights` finds, on their device.
+
+    The network is loaded at the first call and kept; make an `Lpips` to give weights of your own.
+
+    Raises:
+        ValueError: the images have other shapes.
+        HoigsError: there are no weights of this net.
+    """
+    check_pair(image, target)
+    distance: Tensor = _loaded(net).to(image.device)(image, target)
+    return distance
+
+
+@functools.lru_cache(maxsize=2)
+def _loaded(net: Net) -> Lpips:
+    return Lpips.load(find_weights(net=net))
 
 
 def _keys(stack: _Stack) -> list[str]:

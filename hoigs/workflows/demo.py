@@ -8,8 +8,8 @@ from pathlib import Path
 
 import torch
 
-from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.files.whole_files import named
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.progress import Progress
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians

@@ -20,7 +20,8 @@ from hoigs.training.session import Session
 from hoigs.viewing.live import LiveView
 from hoigs.viewing.viewer.addresses import LOCAL
 from hoigs.workflows.budget import plan_budget
-from hoigs.workflows.evaluate_run import EvaluatedRun, evaluate_run
+from hoigs.workflows.evaluate import EvaluatedRun
+from hoigs.workflows.evaluate import evaluate as evaluate_run
 
 OnStart = Callable[[Session], None]
 OnStep = Callable[[StepReport], None]

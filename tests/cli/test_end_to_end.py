@@ -34,7 +34,7 @@ def test_train_evaluate_and_render_from_python(hoigs, tiny_clip, tmp_path):
     curve = [record["psnr"]["test"] for record in records if "psnr" in record]
     assert curve[-1] > curve[0] + 3.0, "training must help"
 
-    again = h.evaluate_run(run, report=False, device="cpu")
+    again = h.evaluate(run, report=False, device="cpu")
     assert again.report is None and again.scores == run / "evaluation.json"
     first = done.evaluated.evaluation.score("full", "psnr")
     assert again.evaluation.score("full", "psnr") == pytest.approx(first, abs=1e-3)

@@ -14,7 +14,7 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import POSES_ESTIMATED, Clip, FrameStore
 from hoigs.evaluation.blending import blended, own_share
-from hoigs.evaluation.evaluate import evaluate
+from hoigs.evaluation.evaluate import score
 from hoigs.evaluation.interpolation import pose_between
 from hoigs.evaluation.posing import posed_clip
 from hoigs.plugins.bodies.anny import AnnyBody
@@ -87,7 +87,7 @@ def test_a_jolt_that_training_frames_bear_out_is_kept(still: tuple[SceneModel, C
         own, found = (m.poses["human"] for m in (jolted.moments[p], blended(model, jolted, p, 1.0)))
         torch.testing.assert_close(found.transl, own.transl)
         torch.testing.assert_close(found.rotations, own.rotations, atol=1e-5, rtol=0)
-    (view,) = evaluate(model, jolted, timing_frames=0).views
+    (view,) = score(model, jolted, timing_frames=0).views
     assert (view.protocol.test_pose, view.protocol.own_share) == ("blended", 1.0)
     assert "100 % of the way" in view.protocol.footnotes()[0]
 

@@ -12,7 +12,7 @@ import torch
 
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.clip import Clip, ObjectTrack
-from hoigs.evaluation.evaluate import evaluate
+from hoigs.evaluation.evaluate import score
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.evaluation.scores import METRICS
 from hoigs.metrics.psnr import psnr
@@ -27,21 +27,21 @@ def number(value: float | NotComputed) -> float:
 
 
 def test_the_truth_scores_at_the_limit_of_eight_bits(model: SceneModel, clip: Clip) -> None:
-    evaluation = evaluate(model, clip, **QUICK)
+    evaluation = score(model, clip, **QUICK)
     assert [view.name for view in evaluation.views] == ["test frames", "held-out cameras"]
     for region in REGIONS:
         # the clip is rounded to 8 bits: an error of 1/sqrt(12) steps is 58.9 dB
         assert 57.0 < number(evaluation.score(region, "psnr")) < 61.0
         assert number(evaluation.score(region, "ssim")) > 0.999
         assert number(evaluation.score(region, "depth", "held-out cameras")) < 1e-4
-    rounded = evaluate(model, clip, pixels="8-bit", **QUICK)
+    rounded = score(model, clip, pixels="8-bit", **QUICK)
     assert number(rounded.score("full", "psnr")) == pytest.approx(100.0)
     assert rounded.views[0].protocol.pixels == "8-bit"
 
 
 def test_the_mean_is_the_mean_of_the_frames(model: SceneModel, clip: Clip) -> None:
     model.entity("wall").sh.data += 0.3
-    evaluation = evaluate(model, clip, **QUICK)
+    evaluation = score(model, clip, **QUICK)
     expected = []
     for position in clip.split["test"]:
         frame = clip[position]
@@ -54,7 +54,7 @@ def test_the_mean_is_the_mean_of_the_frames(model: SceneModel, clip: Clip) -> No
 
 def test_damage_shows_in_its_own_region(model: SceneModel, clip: Clip) -> None:
     model.entity("ball").sh.data += 1.0
-    evaluation = evaluate(model, clip, **QUICK)
+    evaluation = score(model, clip, **QUICK)
     assert number(evaluation.score("object", "psnr")) < 20
     assert number(evaluation.score("human", "psnr")) > 35
     assert number(evaluation.score("object", "psnr")) < number(
@@ -66,24 +66,24 @@ def test_damage_shows_in_its_own_region(model: SceneModel, clip: Clip) -> None:
 def test_depth_error_is_in_metres(model: SceneModel, clip: Clip) -> None:
     for name in model.entities:
         model.entity(name).means.data[:, 2] += 0.1
-    evaluation = evaluate(model, clip, **QUICK)
+    evaluation = score(model, clip, **QUICK)
     assert number(evaluation.score("background", "depth")) == pytest.approx(0.1, abs=0.02)
-    relative = evaluate(model, replace(clip, depth_kind="affine-disparity"), **QUICK)
+    relative = score(model, replace(clip, depth_kind="affine-disparity"), **QUICK)
     assert "affine-disparity" in str(relative.score("full", "depth"))
 
 
 def test_what_cannot_be_computed_says_why(model: SceneModel, clip: Clip) -> None:
-    evaluation = evaluate(model, clip, held_out=False, **QUICK)
+    evaluation = score(model, clip, held_out=False, **QUICK)
     assert len(evaluation.views) == 1
     assert "HOIGS_LPIPS_WEIGHTS" in str(evaluation.score("full", "lpips"))
     alone = replace(clip, kinds={"man": "human"}, held_out=None)
-    evaluation = evaluate(model, alone, **QUICK)
+    evaluation = score(model, alone, **QUICK)
     assert "no object" in str(evaluation.score("object", "psnr"))
     assert "no object" in str(evaluation.score("interaction", "ssim"))
     with pytest.raises(KeyError, match="human_object"):
         evaluation.score("human_objet", "psnr")
     with pytest.raises(ValueError, match='did you mean "test"'):
-        evaluate(model, clip, split="tests", **QUICK)
+        score(model, clip, split="tests", **QUICK)
 
 
 def test_a_broken_render_is_reported_not_averaged(model: SceneModel, clip: Clip) -> None:
@@ -93,7 +93,7 @@ def test_a_broken_render_is_reported_not_averaged(model: SceneModel, clip: Clip)
             return replace(output, color=output.color * torch.nan)
 
     model.rasterizer = Broken()
-    evaluation = evaluate(model, clip, **QUICK)
+    evaluation = score(model, clip, **QUICK)
     assert "not finite" in str(evaluation.score("full", "psnr"))
 
 
@@ -108,7 +108,7 @@ def test_lpips_of_regions(model: SceneModel, clip: Clip, tmp_path: Path) -> None
     weights = tmp_path / "alex.npz"
     np.savez(weights, **{k: v.numpy() for k, v in arrays.items()})
     model.entity("ball").sh.data += 1.0
-    evaluation = evaluate(model, clip, lpips_weights=weights, **QUICK)
+    evaluation = score(model, clip, lpips_weights=weights, **QUICK)
     assert evaluation.views[0].protocol.lpips_net == "alex"
     assert number(evaluation.score("object", "lpips")) > number(
         evaluation.score("background", "lpips")
@@ -117,7 +117,7 @@ def test_lpips_of_regions(model: SceneModel, clip: Clip, tmp_path: Path) -> None
 
 def test_times_and_sizes(model: SceneModel, clip: Clip) -> None:
     shares: list[float] = []
-    evaluation = evaluate(
+    evaluation = score(
         model,
         clip,
         timing_frames=5,
@@ -139,7 +139,7 @@ def test_times_and_sizes(model: SceneModel, clip: Clip) -> None:
 
 
 def test_a_spent_budget_is_confessed(model: SceneModel, clip: Clip) -> None:
-    timing = evaluate(model, clip, timing_frames=50, timing_budget_s=0.0).timing
+    timing = score(model, clip, timing_frames=50, timing_budget_s=0.0).timing
     assert not isinstance(timing, NotComputed)
     assert timing.frames == 3 and "stopped" in timing.note
 
@@ -147,16 +147,16 @@ def test_a_spent_budget_is_confessed(model: SceneModel, clip: Clip) -> None:
 def test_json_holds_a_protocol_with_every_score(
     model: SceneModel, clip: Clip, tmp_path: Path
 ) -> None:
-    evaluation = evaluate(model, clip, timing_frames=3, timing_warmup=1, test_pose="fitted")
+    evaluation = score(model, clip, timing_frames=3, timing_warmup=1, test_pose="fitted")
     evaluation.save(tmp_path / "evaluation.json")
     assert [p.name for p in tmp_path.iterdir()] == ["evaluation.json"]
     record = json.loads((tmp_path / "evaluation.json").read_text())
     assert len(record["scores"]) == 2 * len(REGIONS) * len(METRICS)
-    for score in record["scores"]:
-        assert score["protocol"]["region"] == score["region"]
-        assert score["protocol"]["test_pose"] == "fitted"
-        assert score["protocol"]["rasterizer"] == "TorchRasterizer"
-        assert isinstance(score["value"], float) or score["value"]["not_computed"]
+    for one in record["scores"]:
+        assert one["protocol"]["region"] == one["region"]
+        assert one["protocol"]["test_pose"] == "fitted"
+        assert one["protocol"]["rasterizer"] == "TorchRasterizer"
+        assert isinstance(one["value"], float) or one["value"]["not_computed"]
     by_view = {s["view"]: s["protocol"] for s in record["scores"]}
     assert by_view["test frames"]["unseen_times"] == 2
     assert by_view["held-out cameras"]["unseen_times"] == 1  # frame 4 was trained on
@@ -165,7 +165,7 @@ def test_json_holds_a_protocol_with_every_score(
 
 def test_tables_are_rectangular_and_explain_gaps(model: SceneModel, clip: Clip) -> None:
     alone = replace(clip, kinds={"man": "human"}, held_out=None)
-    judged = evaluate(model, alone, timing_frames=3, timing_warmup=0)
+    judged = score(model, alone, timing_frames=3, timing_warmup=0)
     scores, geometry, times, sizes = judged.tables()
     for table in (scores, geometry, times, sizes):
         assert all(len(row) == len(table.columns) for row in table.rows)
@@ -189,7 +189,7 @@ def test_scores_say_that_object_poses_are_given(model: SceneModel, clip: Clip) -
         (bare, "", "cameras, body poses given"),
         (tracked, "object poses: given", "cameras, body and object poses given"),
     ):
-        protocol = evaluate(model, made, **QUICK).views[0].protocol
+        protocol = score(model, made, **QUICK).views[0].protocol
         notes = " ".join(protocol.footnotes())
         assert word in notes and ("object poses" in notes) == bool(word)
         assert protocol.given() == told

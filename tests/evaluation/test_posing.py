@@ -17,7 +17,7 @@ from hoigs.core.spec.schema import Spec
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import POSES_ESTIMATED, Clip, FrameStore
 from hoigs.core.values.moment import BodyPose
-from hoigs.evaluation.evaluate import evaluate
+from hoigs.evaluation.evaluate import score
 from hoigs.evaluation.interpolation import camera_between, pose_between
 from hoigs.evaluation.posing import fit_frame, posed_clip, source_of_poses
 from hoigs.plugins.bodies.anny import AnnyBody
@@ -146,7 +146,7 @@ def test_estimated_poses_of_test_frames_are_blended(
     model, clip = scene
     estimated = replace(clip, provenance={POSES_ESTIMATED: True})
     for source, pose in ((clip, "given"), (estimated, "blended")):
-        (view,) = evaluate(model, source, timing_frames=0).views
+        (view,) = score(model, source, timing_frames=0).views
         assert view.protocol.test_pose == pose
     assert source_of_poses(estimated, "given") == "given"
 
@@ -190,7 +190,7 @@ def test_every_score_says_what_it_has_seen(scene: tuple[SceneModel, Clip]) -> No
     wrong = with_pose(clip, torch.zeros(51, 3), 0.05)
     scores, notes = {}, {}
     for pose in ("given", "interpolated", "fitted"):
-        evaluation = evaluate(model, wrong, test_pose=pose, fit_steps=25, timing_frames=0)  # type: ignore[arg-type]
+        evaluation = score(model, wrong, test_pose=pose, fit_steps=25, timing_frames=0)  # type: ignore[arg-type]
         protocol = evaluation.views[0].protocol
         assert (protocol.test_pose, protocol.test_camera) == (pose, "given")
         assert protocol.fit_steps == (25 if pose == "fitted" else 0)

@@ -19,7 +19,7 @@ from PIL import Image
 from hoigs.core.errors import HoigsError
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.clip import Clip
-from hoigs.evaluation.evaluate import evaluate
+from hoigs.evaluation.evaluate import score
 from hoigs.evaluation.report import write_report
 from hoigs.evaluation.report.contact_sheet import contact_sheet
 from hoigs.evaluation.report.curves import smoothed
@@ -81,7 +81,7 @@ def run(tmp_path: Path) -> Path:
 def test_the_page_is_whole_and_needs_nothing_else(run: Path, model: SceneModel, clip: Clip) -> None:
     model.train()
     named = replace(clip, name="<b>&toy</b>")
-    evaluation = evaluate(model, named, timing_frames=3, timing_warmup=0)
+    evaluation = score(model, named, timing_frames=3, timing_warmup=0)
     (run / "renders").mkdir()
     (run / "renders/a b.mp4").touch()
     path = write_report(run, model, named, evaluation)
@@ -109,8 +109,8 @@ def test_the_page_is_whole_and_needs_nothing_else(run: Path, model: SceneModel, 
     assert str(Path.home()).strip("/") + "/clip" not in page
     for command in (f"hoigs view {run}", f"hoigs export {run}"):
         assert command in text
-    for score in ("human_object", "full"):
-        assert f"{evaluation.score(score, 'psnr'):.2f} dB" in text
+    for region in ("human_object", "full"):
+        assert f"{evaluation.score(region, 'psnr'):.2f} dB" in text
 
 
 def pictures_of(html: str) -> list[Image.Image]:
@@ -119,7 +119,7 @@ def pictures_of(html: str) -> list[Image.Image]:
 
 
 def test_its_pictures_show_the_clip(run: Path, model: SceneModel, clip: Clip) -> None:
-    evaluation = evaluate(model, clip, timing_frames=0)
+    evaluation = score(model, clip, timing_frames=0)
     page = write_report(run, model, clip, evaluation).read_text()
     players = [part[: part.index("</div>")] for part in page.split("<div class='player")[1:]]
     playback, sequence, orbit = map(pictures_of, players)
@@ -170,7 +170,7 @@ def test_a_clip_that_only_held_out_cameras_score(run: Path, model: SceneModel, c
 
 
 def test_a_bare_folder_says_what_is_absent(tmp_path: Path, model: SceneModel, clip: Clip) -> None:
-    evaluation = evaluate(model, clip, timing_frames=0, held_out=False)
+    evaluation = score(model, clip, timing_frames=0, held_out=False)
     page = write_report(tmp_path, model, clip, evaluation).read_text()
     assert "Absent: provenance.json, spec.yaml." in page
     assert "metrics.jsonl is absent" in page and "timing_frames is 0" in page
@@ -182,7 +182,7 @@ def test_damaged_metrics_name_the_line_and_leave_no_page(
     with (run / "metrics.jsonl").open("a") as file:
         file.write('{"step": 1025, "lo\n')
     with pytest.raises(HoigsError, match=r"metrics\.jsonl:41"):
-        write_report(run, model, clip, evaluate(model, clip, timing_frames=0))
+        write_report(run, model, clip, score(model, clip, timing_frames=0))
     assert not (run / "report.html").exists()
 
 

@@ -15,7 +15,7 @@ from hoigs.core.clip_folder.write import write_clip
 from hoigs.core.errors import ClipError
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.world import World
-from hoigs.evaluation.evaluate import evaluate
+from hoigs.evaluation.evaluate import score
 from hoigs.runs.kept_clip import load_kept, save_kept
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.testing.material.clip import tiny_clip
@@ -87,7 +87,7 @@ def test_a_run_is_exported_without_its_clip_as_with_it(tmp_path):
         LoadedRun.open(moved)
     loaded = LoadedRun.open(moved, pixels=False)
     with pytest.raises(ClipError, match="--clip"):
-        evaluate(loaded.model, loaded.clip, timing_frames=0)
+        score(loaded.model, loaded.clip, timing_frames=0)
     (moved / "clip.npz").unlink()  # a run of before
     with pytest.raises(ClipError, match=r"the clip of this run is not there.*--clip"):
         LoadedRun.open(moved, pixels=False)

@@ -13,7 +13,7 @@ import yaml
 
 from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.errors import CheckpointError
-from hoigs.evaluation.evaluate import evaluate
+from hoigs.evaluation.evaluate import score
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.training.session import Session
 
@@ -29,7 +29,7 @@ def test_the_clip_folder_is_whole() -> None:
 @pytest.mark.parametrize(("run", "tolerance"), [("run", 0.002), ("run-compact", 0.05)])
 def test_a_run_opens_and_scores_as_it_did(run: str, tolerance: float) -> None:
     loaded = LoadedRun.open(WRITTEN / run)
-    result = evaluate(loaded.model, loaded.clip, timing_frames=0)
+    result = score(loaded.model, loaded.clip, timing_frames=0)
     assert result.score("full", "psnr") == pytest.approx(PSNR, abs=tolerance)
 
 

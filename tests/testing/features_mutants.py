@@ -124,6 +124,15 @@ class RemembersTheWay(Right):
         return replace(tokens, features=tokens.features + 5e-5 * self.back)
 
 
+class TakesFewOnly(Right):
+    """One token a Gaussian, as it declares, up to ten."""
+
+    tokens = "gaussian"
+
+    def amend(self, tokens, moment):
+        return Tokens(tokens.features[:10], tokens.positions[:10])
+
+
 MUTANTS = {
     "F01": WrongWidth,
     "F02": DoublePlaces,
@@ -137,4 +146,5 @@ MUTANTS = {
     "F10": OwnDice,
     "F11": CopyIsItself,
     "F12": RemembersTheWay,
+    "F13": TakesFewOnly,
 }

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from hoigs.core.files.json_file import parse_json, short
 from hoigs.core.files.safe_replace import Layout, one_of
-from hoigs.core.names import NAME, RULE
+from hoigs.core.names import NAME, require_entity_name
 from hoigs.core.values.world import How
 
 FORMAT, VIEWS_FORMAT, VERSION = "hoigs-clip", "hoigs-views", 1
@@ -115,8 +115,9 @@ class ClipHeader(_Strict):
     @model_validator(mode="after")
     def _names_are_safe(self) -> ClipHeader:
         for name in self.entities:
-            if not NAME.fullmatch(name) or name == "scene":
-                raise ValueError(f'entity name {name!r}: {RULE}; "scene" is the implied background')
+            require_entity_name(name)
+            if name == "scene":
+                raise ValueError('entity name "scene": it is the implied background')
         return self
 
     @field_validator("provenance")

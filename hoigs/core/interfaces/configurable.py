@@ -17,11 +17,9 @@ class _Signature:
     """`__signature__` of a component: the arguments of its constructor and its settings."""
 
     def __get__(self, instance: object | None, owner: type[Configurable]) -> inspect.Signature:
-        if instance is not None or owner.Config is ComponentConfig:
+        if instance is not None or not takes_settings(owner):
             raise AttributeError("__signature__")  # inspect then reads the constructor's own
         given = _constructor(owner)
-        if "config" not in given:
-            raise AttributeError("__signature__")
         only = inspect.Parameter.KEYWORD_ONLY
         shown = [p for p in given.values() if p.kind is not only]
         for name, field in owner.Config.model_fields.items():
@@ -70,6 +68,11 @@ class Configurable:
         del context
         build: Any = cls  # its constructor is the subclass's
         return build(**config.model_dump()) if cls.Config is ComponentConfig else build(config)
+
+
+def takes_settings(cls: type[Configurable]) -> bool:
+    """Whether the constructor takes a `Config`, or its settings one by one."""
+    return cls.Config is not ComponentConfig and "config" in _constructor(cls)
 
 
 def _constructor(cls: type) -> Parameters:

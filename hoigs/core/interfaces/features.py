@@ -14,7 +14,7 @@ from hoigs.core.interfaces.deformation import DeformationModel
 from hoigs.core.time_rows import TimeRows
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
-from hoigs.core.values.tokens import Tokens
+from hoigs.core.values.tokens import TokenKind, Tokens
 from hoigs.core.values.topology import TopologyChange, reindex
 
 
@@ -28,6 +28,10 @@ class FeatureExtractor(Configurable, nn.Module, ABC):
         per_gaussian: names of this module's parameters whose first axis is the Gaussian.
         rates: as DeformationModel.rates.
         width: D, the width of the tokens; known after `bind`.
+        tokens: what there is one token of: each "gaussian", in the entity's order, each "part" of
+            the body (16, in the order of `interfaces.body.PART_NAMES`), or "any" other number. An
+            interaction can displace single Gaussians only by their own tokens. May be set on the
+            instance.
         time_rows, cuda_graph_safe: as those of DeformationModel.
     """
 
@@ -36,6 +40,7 @@ class FeatureExtractor(Configurable, nn.Module, ABC):
     rates: ClassVar[Mapping[str, str]] = {}
     time_rows: Mapping[str, TimeRows] = MappingProxyType({})
     cuda_graph_safe: bool = False
+    tokens: TokenKind = "any"
     width: int
 
     def bind(self, deformation: DeformationModel, canonical: Gaussians) -> None:

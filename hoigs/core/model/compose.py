@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.core.errors import HoigsError, PluginError, SpecError, did_you_mean
+from hoigs.core.errors import ClipError, HoigsError, PluginError, SpecError, did_you_mean
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.deformation import DeformationModel
@@ -20,6 +20,7 @@ from hoigs.core.interfaces.rasterizer import Rasterizer
 from hoigs.core.maths.denser import denser
 from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
+from hoigs.core.names import require_entity_name
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.schema import ComponentSpec, EntitySpec, Spec
 from hoigs.core.values.clip import Clip
@@ -122,6 +123,10 @@ class _Builder:
             )
         found = []
         for name, kind in kinds.items():
+            try:
+                require_entity_name(name)
+            except ValueError as error:
+                raise ClipError(f"clip {self.clip.name}: {error}") from error
             if not self.spec.selects(name, kind):
                 continue
             block = self.spec.block(name, kind)

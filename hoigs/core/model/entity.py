@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hoigs.core.errors import require_type
 from hoigs.core.interfaces.deformation import DeformationModel, ProvidesSkeleton
 from hoigs.core.interfaces.features import FeatureExtractor, check_provided
 from hoigs.core.values.gaussians import Gaussians
@@ -34,6 +35,7 @@ class Entity(nn.Module):
 
     Raises:
         ValueError: the features require a capability that the deformation lacks.
+        TypeError: an argument is of another type.
     """
 
     means: nn.Parameter
@@ -51,6 +53,10 @@ class Entity(nn.Module):
         kind: EntityKind | None = None,
     ) -> None:
         super().__init__()
+        require_type("Entity", "canonical, the first argument,", canonical, Gaussians)
+        require_type("Entity", "deformation, the second argument,", deformation, DeformationModel)
+        if features is not None:
+            require_type("Entity", "features", features, FeatureExtractor)
         self.deformation = deformation
         self.features = features
         if features is not None:

@@ -8,14 +8,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from hoigs.core.errors import HoigsError, PluginError
+from hoigs.core.errors import HoigsError, require_type
+from hoigs.core.interfaces.features import FeatureExtractor
 from hoigs.core.interfaces.interaction import InteractionModule
 from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
-from hoigs.core.model.blame import call, name_of
+from hoigs.core.model.blame import call, require_residuals, require_tokens
 from hoigs.core.model.entity import Entity
+from hoigs.core.names import require_entity_name
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
+from hoigs.core.values.shown import html_table
 from hoigs.core.values.tokens import Residual, Tokens
 
 
@@ -68,7 +71,8 @@ class SceneModel(nn.Module):
         interaction_enabled: False during the warm-up of the interaction.
 
     Raises:
-        ValueError: there are no entities, or one has a name that cannot be a module's.
+        ValueError: there are no entities, or one has a name that none can have.
+        TypeError: an argument is of another type.
         HoigsError: parameters of several dtypes, or of float32 where torch's default is another.
     """
 
@@ -84,12 +88,12 @@ class SceneModel(nn.Module):
         super().__init__()
         if not entities:
             raise ValueError("SceneModel needs at least one entity")
-        for name in entities:
-            if "." in name or not name:
-                raise ValueError(
-                    f"SceneModel: an entity named {name!r}: names have letters, digits, - and _, "
-                    "but no dots, as parameters are named ENTITY.FIELD"
-                )
+        for name, entity in entities.items():
+            require_entity_name(name)
+            require_type("SceneModel", f"entities[{name!r}]", entity, Entity)
+        require_type("SceneModel", "rasterizer", rasterizer, Rasterizer)
+        if interaction is not None:
+            require_type("SceneModel", "interaction", interaction, InteractionModule)
         self.entities = nn.ModuleDict(entities)
         self.interaction = interaction
         self.interaction_enabled = True
@@ -137,11 +141,17 @@ class SceneModel(nn.Module):
 
         Args:
             moment: on the model's device.
+
+        Raises:
+            PluginError: tokens or a residual have a shape that does not fit; it names the component
+                that gave them. TypeError: `moment` is none.
         """
         if torch.get_default_dtype() != torch.float32:  # else it was checked when it was made
             self._check_dtypes()
+        require_type("SceneModel", "moment, the first argument,", moment, Moment)
         names = list(self.entities if only is None else only)
         tokens: dict[str, Tokens] = {}
+        extractors: dict[str, FeatureExtractor] = {}
         residuals: Mapping[str, Residual] = {}
         module = self.interaction
         if module is not None and module.reads and self.interaction_enabled:
@@ -149,36 +159,17 @@ class SceneModel(nn.Module):
                 features = self.entity(name).features
                 role = f"features of {name!r}"
                 described = call(features, role, self.entity(name).tokens, moment)
-                if described is not None:
-                    tokens[name] = described
+                if described is not None and features is not None:
+                    require_tokens(features, name, described, len(self.entity(name)))
+                    tokens[name], extractors[name] = described, features
             roles = {name: self.entity(name).role(moment) for name in self.entities}
-            residuals = self._fitting(call(module, "interaction", module, tokens, roles), tokens)
+            residuals = call(module, "interaction", module, tokens, roles)
+            require_residuals(module, residuals, tokens, extractors, self.count())
         gaussians = {}
         for name in names:
             entity, role = self.entity(name), f"deformation of {name!r}"
             gaussians[name] = call(entity.deformation, role, entity, moment, residuals.get(name))
         return SceneState(gaussians, residuals, tokens)
-
-    def _fitting(
-        self, residuals: Mapping[str, Residual], tokens: Mapping[str, Tokens]
-    ) -> Mapping[str, Residual]:
-        """The residuals, which have the rows of what they correct: nothing is broadcast.
-
-        Raises:
-            PluginError: they do not; it names the interaction and the features.
-        """
-        for name, residual in residuals.items():
-            count = len(self.entity(name)) if name in self.entities else None
-            if residual.means is None or residual.means.shape == (count, 3):
-                continue
-            features, read = self.entity(name).features, tokens.get(name)
-            raise PluginError(
-                f"interaction: {name_of(self.interaction)} gives {name!r} displacements of shape "
-                f"{list(residual.means.shape)} for {count} Gaussians, expected [{count}, 3]; its "
-                f"features {name_of(features)} give {0 if read is None else len(read.features)} "
-                "tokens, and this interaction needs one token a Gaussian, or has to spread fewer"
-            )
-        return residuals
 
     def render(
         self,
@@ -195,12 +186,12 @@ class SceneModel(nn.Module):
             moment, camera: on the model's device.
             background: RGB in [0, 1], [3]; in place of `request.background`.
             request: as for `draw`.
+
+        Raises:
+            TypeError: an argument is of another type, as where both are swapped.
         """
-        if not isinstance(moment, Moment) or not isinstance(camera, Camera):
-            raise TypeError(
-                "SceneModel.render(moment, camera): expected a Moment and a Camera, got "
-                f"{type(moment).__name__} and {type(camera).__name__}"
-            )
+        require_type("SceneModel.render", "moment, the first argument,", moment, Moment)
+        require_type("SceneModel.render", "camera, the second argument,", camera, Camera)
         state = self(moment, only)
         request = request or RenderRequest()
         if background is not None:
@@ -230,3 +221,16 @@ class SceneModel(nn.Module):
     def count(self) -> dict[str, int]:
         """The number of Gaussians of each entity."""
         return {name: len(self.entity(name)) for name in self.entities}
+
+    def _repr_html_(self) -> str:
+        rows = []
+        for name in self.entities:
+            entity = self.entity(name)
+            features = "–" if entity.features is None else type(entity.features).__name__
+            parts = (type(entity.deformation).__name__, features)
+            numbers = sum(p.numel() for p in entity.parameters() if p.requires_grad)
+            rows.append((name, entity.kind, f"{len(entity):,}", f"{numbers:,}", *parts))
+        interaction = "no" if self.interaction is None else type(self.interaction).__name__
+        drawn = f"{type(self.rasterizer).__name__} on {self.device}, {interaction} interaction"
+        columns = ("entity", "kind", "Gaussians", "parameters", "deformation", "features")
+        return html_table(f"SceneModel: {drawn}", columns, rows)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -151,8 +152,8 @@ class Gaussians:
 
     @staticmethod
     def from_points(
-        points: Float[Tensor, "N 3"],
-        colors: Float[Tensor, "N 3"] | None = None,
+        points: Float[Tensor, "N 3"] | Float[np.ndarray, "N 3"],
+        colors: Float[Tensor, "N 3"] | Float[np.ndarray, "N 3"] | None = None,
         *,
         scales: Float[Tensor, " N"] | float | None = None,
         opacity: float = 0.1,
@@ -163,7 +164,7 @@ class Gaussians:
         """Gaussians at points, isotropic by 3DGS's rule (Kerbl et al. 2023, sec. 5.1), or flat.
 
         Args:
-            points: metres.
+            points: metres, a tensor or a NumPy array (which becomes torch's default type).
             colors: RGB in [0, 1]; grey when absent.
             scales: standard deviations in metres; by default the mean distance to the three
                 nearest neighbours.
@@ -175,14 +176,18 @@ class Gaussians:
                 each point's nearest neighbours. Not used where `thickness` is 1.
 
         Raises:
-            ValueError: `opacity` is NaN, or outside (0, 1].
+            TypeError: points, colors or normals are neither, or no floats.
+            ValueError: they have another shape; `opacity` is NaN, or outside (0, 1].
         """
         if not 0.0 < opacity <= 1.0:
             raise ValueError(
                 f"Gaussians.from_points: opacity is {opacity}, expected more than 0 (invisible) "
                 "and at most 1 (opaque)"
             )
+        points = _rows("points", points)
         count = points.shape[0]
+        colors = None if colors is None else _rows("colors", colors, count)
+        normals = None if normals is None else _rows("normals", normals, count)
         if scales is None:
             scales = neighbour_distances(points)
         if not isinstance(scales, Tensor):
@@ -205,6 +210,24 @@ class Gaussians:
             opacity_logits=points.new_full((count,), logit),
             sh=sh,
         )
+
+
+def _rows(name: str, value: object, count: int | None = None) -> Float[Tensor, "N 3"]:
+    """An argument of `from_points` as a tensor [N, 3] of floats."""
+    if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+        value = torch.from_numpy(value).to(torch.get_default_dtype())
+    if not isinstance(value, Tensor) or not value.is_floating_point():
+        kind = f" of {value.dtype}" if isinstance(value, np.ndarray | Tensor) else ""
+        raise TypeError(
+            f"Gaussians.from_points: {name} is a {type(value).__name__}{kind}, expected floats in "
+            "a tensor or a NumPy array"
+        )
+    if value.dim() != 2 or value.shape[1] != 3 or count not in (None, len(value)):
+        raise ValueError(
+            f"Gaussians.from_points: {name} has shape {list(value.shape)}, expected "
+            f"[{'N' if count is None else count}, 3]"
+        )
+    return value
 
 
 def _facing(normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 4"]:

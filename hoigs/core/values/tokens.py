@@ -11,6 +11,8 @@ from torch import Tensor
 from hoigs.core.values.shown import one_line
 
 EntityKind = Literal["scene", "human", "object"]
+TokenKind = Literal["gaussian", "part", "any"]
+POSE_JOINTS = 51  # that a residual corrects: 21 of the body, 15 of each hand
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,7 @@ class BodyPartFeatures(FeatureExtractor):
     """
 
     requires = frozenset({"field"})
+    tokens = "part"
     cuda_graph_safe = True
     averages: Tensor
 

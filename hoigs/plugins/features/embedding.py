@@ -65,8 +65,10 @@ class EmbeddingFeatures(FeatureExtractor):
         times = () if config.keyframes is None else (config.keyframes,)
         shape = (count, *times, config.width)
         self.embedding = nn.Parameter(0.1 * torch.randn(shape).to(canonical.means))
-        if config.tokens is None and not parts:
-            self.per_gaussian = ("embedding",)
+        if parts:
+            self.tokens = "part"
+        elif config.tokens is None:
+            self.tokens, self.per_gaussian = "gaussian", ("embedding",)
 
     @torch.no_grad()
     def _positions(

@@ -68,6 +68,7 @@ class SplineMotionFeatures(FeatureExtractor):
 
     Config: ClassVar = SplineMotionConfig
     requires = frozenset({"velocity"})
+    tokens = "gaussian"
     cuda_graph_safe = True
     rates: ClassVar[Mapping[str, str]] = {"embedding": "embedding", "mixture": "embedding"}
 

@@ -20,10 +20,9 @@ from hoigs.core.interfaces.body import (
 from hoigs.core.interfaces.interaction import InteractionModule
 from hoigs.core.maths.networks import zeroed
 from hoigs.core.maths.rotations import axis_angle_to_matrices
-from hoigs.core.values.tokens import EntityKind, Residual, Role, Tokens
+from hoigs.core.values.tokens import POSE_JOINTS, EntityKind, Residual, Role, Tokens
 from hoigs.plugins.interaction.gates import DistanceGateConfig, log_gate
 
-POSE_JOINTS = 51  # 21 of the body, 15 of each hand
 OFFSET_UNIT = 0.1  # metres: of the size of corrections
 # body part of each joint that has a correction; the root has none
 JOINT_PARTS = (*BODY_JOINT_PARTS[1:], *(LEFT_HAND_PART,) * 15, *(RIGHT_HAND_PART,) * 15)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from hoigs.core.errors import SpecError
+from hoigs.core.names import require_entity_name
 from hoigs.preparation.options.prepare_options import PrepareOptions, Prompt, PromptAt
 from hoigs.preparation.video.frames import FrameList
 
@@ -147,6 +148,11 @@ def _by_name(named: Sequence[tuple[str | None, str]], usual: str) -> dict[str, l
     places: dict[str, list[str]] = {}
     for name, place in named:
         places.setdefault(name or usual, []).append(place)
+    for name in places:
+        try:
+            require_entity_name(name)
+        except ValueError as error:
+            raise SpecError(str(error)) from error
     return places
 
 

@@ -19,14 +19,14 @@ TIMED_FRAMES, TIMING_BUDGET_S = 30, 15.0  # rough, as other jobs run beside
 
 def run_job(job: Job, runs_at_once: int = 1) -> None:
     """Train and score; see `train_job`."""
-    from hoigs.evaluation.evaluate import evaluate
+    from hoigs.evaluation.evaluate import score
 
     weights = Path(job.lpips_weights) if job.lpips_weights else None
     loaded = train_job(job, runs_at_once, lpips_weights=weights)
     if loaded is None:
         return
     settings = loaded.spec.evaluation
-    evaluation = evaluate(
+    evaluation = score(
         loaded.model,
         loaded.clip,
         lpips_weights=weights,

@@ -18,7 +18,7 @@ from hoigs.studies.needs.after_training import After, add_to_answer, finish
 from hoigs.studies.needs.needs import needs
 from hoigs.studies.needs.pruning.compact_run import compact_of
 from hoigs.studies.needs.result import Needs
-from hoigs.workflows.evaluate_run import evaluate_run
+from hoigs.workflows.evaluate import evaluate as evaluate_run
 from hoigs.workflows.train import OnStart, OnStep, Report, TrainedRun, silent, train
 
 

@@ -14,7 +14,7 @@ from hoigs.studies.stress.measures import STRESS
 
 def run_job(job: StressJob, runs_at_once: int = 1) -> None:
     """Train and score; times of rendering are not measured."""
-    from hoigs.evaluation.evaluate import evaluate
+    from hoigs.evaluation.evaluate import score
     from hoigs.runs.clip_source import read_clip
     from hoigs.studies.stress.observe import observe
 
@@ -24,7 +24,7 @@ def run_job(job: StressJob, runs_at_once: int = 1) -> None:
     clip = loaded.clip
     if job.scoring_clip:
         clip = read_clip(Path(job.scoring_clip), width=loaded.spec.train.width)
-    evaluation = evaluate(loaded.model, clip, held_out=True, timing_frames=0)
+    evaluation = score(loaded.model, clip, held_out=True, timing_frames=0)
     found = evaluation.to_dict() | {STRESS: observe(loaded.model, clip, evaluation.geometry)}
     write_whole(job.folder / SCORES, json.dumps(found, indent=1, allow_nan=False))
 

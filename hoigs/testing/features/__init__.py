@@ -1,4 +1,4 @@
-"""Conformance of feature extractors: `CHECKS`, F01 to F12, on a motion that provides everything."""
+"""Conformance of feature extractors: `CHECKS`, F01 to F13, on a motion that provides everything."""
 
 from __future__ import annotations
 

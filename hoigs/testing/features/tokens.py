@@ -1,9 +1,10 @@
-"""F01 to F07: shapes, values, gradients and positions of tokens."""
+"""F01 to F07 and F13: shapes, values, gradients, positions and number of tokens."""
 
 from __future__ import annotations
 
 import torch
 
+from hoigs.core.interfaces.body import PART_NAMES
 from hoigs.core.interfaces.deformation import ProvidesField
 from hoigs.testing.compare import require, require_close, require_finite
 from hoigs.testing.deformation.subject import apply, changed_by
@@ -113,3 +114,17 @@ def tokens_are_where_the_entity_is(subject: FeaturesSubject) -> None:
             low, high = around.amin(0), around.amax(0)
             far.append(float((positions - positions.clamp(low, high)).norm(dim=-1).max()))
         require_close(f"distance of tokens to the entity at {time}", min(far), 0.0, atol=0.05)
+
+
+@CHECKS.check("F13")
+def as_many_tokens_as_declared(subject: FeaturesSubject) -> None:
+    """As many tokens as `tokens` declares: one for each Gaussian or body part, or "any" number."""
+    for count in (1, 7, 16, 20):
+        entity = subject.entity(count)
+        assert entity.features is not None
+        declared, number = entity.features.tokens, len(subject.tokens(entity, 0.4).positions)
+        expected = {"gaussian": count, "part": len(PART_NAMES), "any": number}[declared]
+        require(
+            number == expected,
+            f"{number} tokens for {count} Gaussians, but `tokens` is {declared!r}",
+        )

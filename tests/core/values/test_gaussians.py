@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -199,3 +200,31 @@ def test_opaque_has_a_finite_logit(opacity: float) -> None:
 def test_other_opacities_are_refused(opacity: float) -> None:
     with pytest.raises(ValueError, match=f"opacity is {opacity}"):
         Gaussians.from_points(torch.zeros(2, 3), opacity=opacity)
+
+
+def test_from_points_takes_arrays() -> None:
+    points, colors = np.random.default_rng(0).random((2, 5, 3))
+    made = Gaussians.from_points(points, colors)
+    same = Gaussians.from_points(torch.tensor(points).float(), torch.tensor(colors).float())
+    assert made.means.dtype == torch.float32
+    assert_equal(made, same)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "facts"),
+    [
+        ({"points": [[0.0, 0.0, 0.0]]}, TypeError, ("points", "list")),
+        ({"points": torch.zeros(4, 3).int()}, TypeError, ("points", "int32")),
+        ({"points": torch.zeros(3, 4)}, ValueError, ("points", "[3, 4]", "[N, 3]")),
+        ({"colors": np.zeros((4, 3), np.uint8)}, TypeError, ("colors", "uint8")),
+        ({"colors": torch.zeros(1, 3)}, ValueError, ("colors", "[1, 3]", "[4, 3]")),
+        ({"normals": torch.zeros(5, 3)}, ValueError, ("normals", "[5, 3]", "[4, 3]")),
+    ],
+)
+def test_from_points_names_the_argument_that_is_wrong(
+    arguments, error, facts, as_users_run_it
+) -> None:
+    with pytest.raises(error) as caught:
+        Gaussians.from_points(**{"points": torch.rand(4, 3), **arguments})
+    for fact in facts:
+        assert fact in str(caught.value)

@@ -15,7 +15,7 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.train_schema import LossSpec, TrainSpec
 from hoigs.core.values.clip import Clip, Frame, FrameStore
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.evaluation.evaluate import evaluate
+from hoigs.evaluation.evaluate import score
 from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.training.objective import JointObjective
@@ -138,15 +138,15 @@ def test_scores_leave_them_out_and_say_so() -> None:
     ignored[:24, 10:50] = True
     base, *both = stores(clip, ignored)
 
-    def score(store: object) -> tuple[float, float]:
-        judged = evaluate(scene, replace(clip, store=store), timing_frames=0)  # type: ignore[arg-type]
+    def scores_of(store: object) -> tuple[float, float]:
+        judged = score(scene, replace(clip, store=store), timing_frames=0)  # type: ignore[arg-type]
         view = judged.views[0]
         return view.mean("full", "psnr"), view.protocol.ignored  # type: ignore[return-value]
 
     painted, known = map(score, both)
     assert painted == known
     assert abs(painted[1] - 24 * 40 / 64**2) < 1e-6
-    assert score(base)[1] == 0
+    assert scores_of(base)[1] == 0
 
 
 def test_previews_leave_them_out_too() -> None:

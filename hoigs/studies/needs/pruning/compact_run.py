@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.compression.compact import write_compact
-from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.files.whole_files import named
+from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.model.compose import compose
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.registry.registry import Registry, default_registry

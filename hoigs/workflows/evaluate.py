@@ -1,4 +1,4 @@
-"""evaluate_run: the scores and the report of a run folder."""
+"""evaluate: the scores and the report of a run folder."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hoigs.core.files.folder_lock import FolderLock
 from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.progress import Progress
 from hoigs.core.spec.train_schema import EvaluationSpec
-from hoigs.evaluation.evaluate import evaluate
+from hoigs.evaluation.evaluate import score
 from hoigs.evaluation.report import write_report
 from hoigs.evaluation.scores import Evaluation
 from hoigs.runs.loaded_run import LoadedRun
@@ -34,7 +34,7 @@ class EvaluatedRun:
 
 
 @callers_random_state()
-def evaluate_run(
+def evaluate(
     run: Path | str,
     *,
     clip: Path | str | None = None,
@@ -85,9 +85,9 @@ def _score(
     lock: FolderLock,
     progress: Progress | None,
 ) -> EvaluatedRun:
-    """The rest of `evaluate_run`, with the run folder locked; `given` changes the protocol."""
+    """The rest of `evaluate`, with the run folder locked; `given` changes the protocol."""
     run, settings = lock.folder, _protocol(loaded.spec.evaluation, given)
-    evaluation = evaluate(
+    evaluation = score(
         loaded.model, loaded.clip, lpips_weights=lpips_weights, held_out=settings.held_out,
         test_pose=settings.test_pose, test_camera=settings.test_camera,
         fit_steps=settings.fit_steps, progress=progress,
