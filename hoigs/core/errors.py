@@ -26,6 +26,10 @@ class CheckpointError(HoigsError):
     """A checkpoint that is damaged or belongs to another spec."""
 
 
+class CameraError(HoigsError):
+    """A camera that is no pinhole: NaN, skew, or a pose that is not rigid; names the entry."""
+
+
 class RenderError(HoigsError):
     """Gaussians, a camera or a request that a rasterizer cannot draw."""
 

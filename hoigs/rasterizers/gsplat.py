@@ -29,6 +29,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import RenderError
 from hoigs.core.interfaces.rasterizer import Capabilities, Rasterizer, RenderOutput, RenderRequest
 from hoigs.core.maths.projection import LIMIT, Projection
+from hoigs.core.maths.spherical_harmonics import not_negative
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.compositing import project_gaussians, to_output
@@ -162,7 +163,7 @@ def _colors(
     stored = rows.sh_degree
     degree = stored if request.sh_degree is None else min(request.sh_degree, stored)
     values = gsplat.spherical_harmonics(degree, rows.means - camera.center, rows.sh)
-    return (values + 0.5).clamp_min(0.0)
+    return not_negative(values + 0.5)
 
 
 def _nothing(

@@ -17,7 +17,7 @@ from torch import Tensor
 from hoigs.core.errors import RenderError
 from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.gaussians import SH_C0, Gaussians
 from hoigs.rasterizers.compositing import Splats, blend, prepare, to_output
 
 Call = tuple[Gaussians, Camera, RenderRequest]
@@ -356,6 +356,11 @@ MUTANTS: dict[str, tuple[str, Callable[[], Rasterizer]]] = {
         lambda g, c, r: g if not r.antialiased or len(g) == 1
         else g.replace(log_scales=scaled_gradient(g.log_scales))
     )),
+    "R53": ("BlackStaysBlack", lambda: on_rows(
+        lambda g, *_: g.replace(sh=torch.where(
+            (0.5 + SH_C0 * g.sh[:, :1] > 0) | (g.sh[:, :1] < -2), g.sh, g.sh.detach()
+        ))
+    )),
     "R60": ("ZeroIsTheIdentity", lambda: on_rows(
         lambda g, *_: g.replace(
             quats=torch.where((g.quats == 0).all(-1, True), IDENTITY.to(g.quats), g.quats)
@@ -366,7 +371,7 @@ MUTANTS: dict[str, tuple[str, Callable[[], Rasterizer]]] = {
         lambda g, *_: hidden(g, ((g.means != 0) & (g.means.abs() < TINY)).all(-1))
     )),
     "R63": ("HugeLogitIsNothing", lambda: on_rows(
-        lambda g, *_: hidden(g, g.opacity_logits > 1e20)
+        lambda g, *_: hidden(g, (g.opacity_logits > 1e20) & g.opacity_logits.isfinite())
     )),
     "R64": ("BrokenCameraShows", lambda: on_output(
         lambda o, g, c, r: {"depth": o.depth + 0.0 * c.K.sum() * c.world_to_camera.sum()}
@@ -374,6 +379,9 @@ MUTANTS: dict[str, tuple[str, Callable[[], Rasterizer]]] = {
     "R65": ("BrokenPixelSpreads", lambda: on_output(
         lambda o, g, c, r: {}
         if r.background is None else {"alpha": o.alpha + 0.0 * r.background.sum()}
+    )),
+    "R66": ("InfiniteLogitIsNothing", lambda: on_rows(
+        lambda g, *_: hidden(g, g.opacity_logits.isinf())
     )),
     "R80": ("DicedGradient", lambda: on_rows(
         lambda g, *_: g.replace(sh=scaled_gradient(g.sh, 1 + 3e-5 * torch.rand(1)))

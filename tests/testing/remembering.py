@@ -13,6 +13,7 @@ from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderReq
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
+from hoigs.testing.rasterizer.scenes import forged
 
 RAW = tuple(f.name for f in fields(Gaussians))
 ASKED = ("features", "screen_offsets", "background", "absolute_gradients")
@@ -44,7 +45,7 @@ class Remembering(Rasterizer):
         inputs += [camera.world_to_camera, *(getattr(request, name) for name in asked)]
 
         def draw(*x: Tensor) -> RenderOutput:
-            view = Camera(camera.K, x[len(RAW)], camera.width, camera.height)
+            view = forged(camera, world_to_camera=x[len(RAW)])
             values = dict(zip(asked, x[len(RAW) + 1 :]))
             return TorchRasterizer().render(
                 Gaussians(*x[: len(RAW)]), view, request.replace(**values)

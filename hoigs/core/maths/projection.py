@@ -21,12 +21,14 @@ backends agree exactly on the following.
 With the principal point in the middle the clamp is 3DGS's 1.3 tan(fov / 2). It bounds only the
 Jacobian, never (u, v), and its gradient is clamp's: none to x / z outside the limits.
 
-**Colour.** max(0.5 + sum_k sh_k Y_k(d), 0), d = normalise(mean - camera centre), where the camera
-centre is -R^T t (see `hoigs.core.maths.spherical_harmonics`).
+**Colour.** max(c, 0), c = 0.5 + sum_k sh_k Y_k(d), d = normalise(mean - camera centre), where the
+camera centre is -R^T t (see `hoigs.core.maths.spherical_harmonics`). Its gradient is that of c
+where c >= -BLACK = -1e-6, else zero: black learns, also where rounding puts it below zero.
 
 **Culling.** A row is not drawn, and every one of its gradients is zero, when
   - `subset` excludes it;
-  - any of its raw fields (all of sh), features or screen_offsets is not finite;
+  - any of its raw fields (all of sh), features or screen_offsets is not finite, but for opacity
+    logits of +infinity and -infinity: opacities of 1 and 0, with a gradient of zero;
   - |quat| is outside [1e-8, 1e8] (the zero quaternion);
   - z <= near, or one of |x|, |y|, z, the scales, |u| or |v| exceeds LIMIT = 1e10;
   - not xx + yy <= MAX_VARIANCE = 1e12 (overflow), or not det >= MIN_DETERMINANT = 1e-12;
@@ -78,7 +80,7 @@ class Projection:
         depths: camera z, metres.
         covs: screen covariance (xx, xy, yy), low-pass included, square pixels.
         conics: inverse of `covs` (xx, xy, yy).
-        opacities: in (0, 1), as they are composited.
+        opacities: in [0, 1], as they are composited.
         extents: half width and half height of the box where alpha >= min_alpha, pixels; infinite
             when min_alpha is 0. No gradient.
         radii: ceil(3 sigma) of the longest axis, pixels. No gradient.
@@ -127,10 +129,11 @@ def project(
         near: metres. low_pass: square pixels. antialiased: opacities make up for `low_pass`.
         min_alpha: 0 means no cut-off.
     """
-    rows = (means, quats, log_scales, opacity_logits[:, None], screen_offsets)
+    rows = (means, quats, log_scales, screen_offsets)
     camera = (world_to_camera, K, K.new_tensor([width, height]), low_pass)
     with torch.no_grad():
         keep = torch.stack([torch.isfinite(x).all(-1) for x in rows if x is not None]).all(0)
+        keep &= ~opacity_logits.isnan()
         if drawable is not None:
             keep &= drawable
         norms = quats.norm(dim=-1)

@@ -18,6 +18,7 @@ C3 = (
     0.3731763325901154,
     1.445305721320277,
 )
+BLACK = 1e-6  # a colour as little below zero is zero but for rounding
 
 
 def sh_basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch K"]:
@@ -84,7 +85,7 @@ def sh_to_colors(
     """Colours of Gaussians seen from a point: max(0.5 + sum_k sh_k Y_k(d), 0).
 
     d = normalise(mean - camera_center). Gradients reach the coefficients and, through d, the means
-    and the camera. Where the sum is below zero the gradient is zero, as clamp's.
+    and the camera, as `not_negative` passes them.
 
     Args:
         sh: raw coefficients, K = (stored degree + 1)^2.
@@ -95,10 +96,20 @@ def sh_to_colors(
     stored = int(sh.shape[1] ** 0.5 + 0.5) - 1
     active = stored if degree is None else min(degree, stored)
     if active == 0:  # constant colour: no direction, so no gradient to means or camera
-        return (0.5 + C0 * sh[:, 0]).clamp_min(0.0)
+        return not_negative(0.5 + C0 * sh[:, 0])
     directions = torch.nn.functional.normalize(means - camera_center, dim=-1)
     basis = sh_basis(directions, active)
-    return (0.5 + torch.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]])).clamp_min(0.0)
+    return not_negative(0.5 + torch.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]]))
+
+
+def not_negative(colors: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """max(c, 0), with the gradient of c where c >= -BLACK, else none.
+
+    The coefficients of black give a c on either side of zero, as sums are ordered and products
+    fused into them; black must learn all the same.
+    """
+    raised = (colors.clamp_min(0.0) - colors).detach()
+    return torch.where(colors >= -BLACK, colors + raised, 0.0)
 
 
 def rotate_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "N K 3"]:

@@ -48,7 +48,7 @@ class Gaussians:
         means: centres, metres.
         quats: rotations wxyz, not necessarily normalised.
         log_scales: natural logarithm of the standard deviations in metres.
-        opacity_logits: logit of the opacity.
+        opacity_logits: logit of the opacity; +infinity is drawn as opaque and does not learn.
         sh: spherical-harmonics colour coefficients, K = (degree + 1)^2.
     """
 
@@ -68,7 +68,7 @@ class Gaussians:
 
     @property
     def opacities(self) -> Float[Tensor, " N"]:
-        """Opacities in (0, 1) (activated)."""
+        """Opacities in [0, 1] (activated)."""
         return torch.sigmoid(self.opacity_logits)
 
     @property
@@ -164,12 +164,21 @@ class Gaussians:
             colors: RGB in [0, 1]; grey when absent.
             scales: standard deviations in metres; by default the mean distance to the three
                 nearest neighbours.
-            opacity: initial opacity in (0, 1).
+            opacity: initial opacity in (0, 1]. 1 is taken as 1 - 2^-24, the largest number below it
+                in float32, so that its logit is finite.
             sh_degree: bands to allocate; all but the first start at zero.
             thickness: standard deviation along the surface's normal, as a share of `scales`.
             normals: of the surface, unit, of either sign; by default those of the plane through
                 each point's nearest neighbours. Not used where `thickness` is 1.
+
+        Raises:
+            ValueError: `opacity` is NaN, or outside (0, 1].
         """
+        if not 0.0 < opacity <= 1.0:
+            raise ValueError(
+                f"Gaussians.from_points: opacity is {opacity}, expected more than 0 (invisible) "
+                "and at most 1 (opaque)"
+            )
         count = points.shape[0]
         if scales is None:
             scales = neighbour_distances(points)
@@ -185,7 +194,7 @@ class Gaussians:
         if thickness != 1.0:
             quats = _facing(surface_normals(points) if normals is None else normals)
             log_scales[:, 2] += math.log(thickness)
-        logit = torch.logit(torch.tensor(opacity)).item()
+        logit = torch.logit(torch.tensor(min(opacity, 1 - 2**-24))).item()
         return Gaussians(
             means=points.clone(),
             quats=quats,

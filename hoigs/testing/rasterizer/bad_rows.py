@@ -1,4 +1,4 @@
-"""R60 to R65: broken and extreme numbers affect only the rows that hold them."""
+"""R60 to R66: broken and extreme numbers affect only the rows that hold them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from hoigs.core.errors import RenderError
+from hoigs.core.errors import CameraError, RenderError
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.compositing import project_gaussians
@@ -19,6 +19,7 @@ from hoigs.testing.rasterizer.scenes import (
     RAW,
     Scene,
     a_camera,
+    forged,
     images,
     one_gaussian,
     random_gaussians,
@@ -30,7 +31,7 @@ ROWS = (*RAW, "features", "screen_offsets")
 NOT_FINITE = (math.nan, math.inf, -math.inf)
 # rows that the rules of `hoigs.core.maths.projection` do not draw, whatever else they hold
 CULLED = (
-    *((name, value) for name in ROWS for value in NOT_FINITE),
+    *((name, x) for name in ROWS for x in NOT_FINITE if name != "opacity_logits" or math.isnan(x)),
     ("quats", 0.0),
     ("quats", 1e-40),
     ("quats", 1e30),
@@ -151,7 +152,7 @@ def denormal_numbers_draw_as_zero(subject: RasterizerSubject) -> None:
     output, gradients = subject.drawn(Scene(tiny, a_camera()), squares)
     wanted = subject.render(zero, a_camera())
     for name, image in images(wanted).items():
-        require_close(name, images(output)[name], image, atol=1e-6)
+        require_close(name, images(output)[name], image, atol=1e-6, rtol=1e-6)
     for name, gradient in gradients.items():
         require(gradient is not None, f"no gradient reached {name}")
         assert gradient is not None
@@ -205,17 +206,21 @@ def large_values_change_only_their_pixels(subject: RasterizerSubject) -> None:
 
 @CHECKS.check("R64")
 def a_broken_camera_is_drawn_or_refused(subject: RasterizerSubject) -> None:
-    """NaN, infinity and zero in the camera give a finite picture or a RenderError."""
+    """NaN, infinity and zero in the camera give a finite picture, a RenderError or a CameraError.
+
+    The camera is forged, as no camera looks at its values where they require gradients or lie on
+    a GPU.
+    """
     gaussians, camera = random_gaussians(30, degree=1), a_camera()
     for field, place in (("K", (0, 0)), ("K", (1, 2)), ("world_to_camera", (0, 0)),
                          ("world_to_camera", (2, 3))):  # fmt: skip
         for value in (*NOT_FINITE, 0.0, 1e30, -1e30):
             broken = getattr(camera, field).clone()
             broken[place] = value
-            scene = Scene(gaussians, replace(camera, **{field: broken}))
+            scene = Scene(gaussians, forged(camera, **{field: broken}))
             try:
                 output, gradients = subject.drawn(scene, squares)
-            except RenderError:
+            except (RenderError, CameraError):
                 continue
             what = f"with {field}{list(place)} = {value}"
             for name, image in images(output).items():
@@ -241,3 +246,35 @@ def a_broken_background_pixel_affects_no_other(subject: RasterizerSubject) -> No
     require_close("color elsewhere", output.color[~there], clean.color[~there], atol=0.0)
     for name in ("alpha", "depth", "features"):
         require_close(name, images(output)[name], images(clean)[name], atol=0.0)
+
+
+@CHECKS.check("R66")
+def infinite_logits_are_opaque_or_nothing(subject: RasterizerSubject) -> None:
+    """A logit of +infinity is an opacity of 1, one of -infinity of 0; their gradients are zero."""
+    infinite = torch.tensor([math.inf, -math.inf]).repeat(10)
+    for limit in subject.choices("max_alpha", (0.999, 0.99)):
+        opaque = one_gaussian(scale=300.0).replace(opacity_logits=infinite[:1])
+        alpha = subject.render(opaque, a_camera(), RenderRequest(max_alpha=limit)).alpha.max()
+        require_close("alpha of an infinite logit", alpha, limit, atol=1e-6)
+        for cut in subject.choices("min_alpha", (1 / 255, 0.0)):
+            scene = random_scene(60, degree=1, channels=2)
+            scene = replace(scene, request=scene.request.replace(max_alpha=limit, min_alpha=cut))
+            logits = scene.gaussians.opacity_logits.clone()
+            logits[:20] = infinite
+            given = replace(scene, gaussians=scene.gaussians.replace(opacity_logits=logits))
+            logits = logits.clamp(-100.0, 100.0)  # opacities of 0 and 1 in float32
+            alike = replace(scene, gaussians=scene.gaussians.replace(opacity_logits=logits))
+            (output, gradients), (like, slopes) = (subject.drawn(s, squares) for s in (given, alike))
+            for name, image in images(like).items():
+                require_finite(name, images(output)[name].detach())
+                require_close(name, images(output)[name], image, atol=2e-6, rtol=1e-5)
+            for name, gradient in gradients.items():
+                wanted = slopes[name]
+                require(gradient is not None, f"no gradient reached {name}")
+                assert gradient is not None and wanted is not None
+                require_finite(f"gradient of {name}", gradient)
+                size = float(wanted.abs().max())
+                require_close(f"gradient of {name}", gradient, wanted, atol=1e-5 * size)
+            gradient = gradients["opacity_logits"]
+            assert gradient is not None
+            require_zero("gradient of infinite logits", gradient[:20])

@@ -1,4 +1,4 @@
-"""R40 to R52: gradients, against the oracle's, the rules and finite differences."""
+"""R40 to R53: gradients, against the oracle's, the rules and finite differences."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch.autograd.gradcheck import GradcheckError
 
 from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.gaussians import SH_C0, Gaussians
 from hoigs.testing.checks import CheckError
 from hoigs.testing.compare import require, require_close, require_finite, require_zero
 from hoigs.testing.rasterizer.reference import (
@@ -247,3 +247,21 @@ def antialiased_gradients_are_the_oracles(subject: RasterizerSubject) -> None:
     """Antialiased, the picture and the gradient of every input are the oracle's, of discs too."""
     require_reference_picture(subject, thin_scene())
     require_reference_gradients(subject, thin_scene())
+
+
+@CHECKS.check("R53")
+def black_learns(subject: RasterizerSubject) -> None:
+    """A channel that is exactly 0, or below it by no more than rounding, takes its gradient."""
+    for degree in (0, 1):
+        gaussians = random_gaussians(12, degree=degree)
+        black = (0.0 - 0.5) / SH_C0
+        sh = torch.zeros_like(gaussians.sh)
+        sh[:4, 0], sh[4:8, 0], sh[8:, 0] = black, torch.tensor([1.2, black, 0.3]), black * (1 + 1e-7)
+        scene = Scene(gaussians.replace(sh=sh), a_camera())
+        _, gradients = subject.drawn(scene, lambda output: output.color.sum())
+        slopes = gradients["sh"]
+        require(slopes is not None, "no gradient reached sh")
+        assert slopes is not None
+        least = float(slopes[:, 0].min())
+        require(least > 0, f"of the coefficients of colours at 0 one has the gradient {least:g}")
+        require_reference_gradients(subject, scene, ("color",), ("sh",))

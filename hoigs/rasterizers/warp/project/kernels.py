@@ -45,7 +45,12 @@ from hoigs.rasterizers.warp.project.geometry import (
     pose_rotation,
     pose_translation,
 )
-from hoigs.rasterizers.warp.project.spherical_harmonics import sh_color, sh_color_adjoint
+from hoigs.rasterizers.warp.project.spherical_harmonics import (
+    learns,
+    not_negative,
+    sh_color,
+    sh_color_adjoint,
+)
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS, "max_unroll": 4})
 
@@ -65,12 +70,13 @@ def row_is_finite(
     stored_bases: int, active_bases: int, color: wp.vec3, features: F32, channels: int,
     offset: wp.vec2,
 ) -> bool:  # fmt: skip
-    # 0 * value is 0 for every finite value and NaN for all others; one test at the end
+    # 0 * value is 0 for every finite value and NaN for all others; one test at the end. A logit may
+    # be infinite: an opacity of 0 or 1.
     zero = (
         0.0 * (mean[0] + mean[1] * 0.0 + mean[2] * 0.0)
         + (quat[0] * 0.0 + quat[1] * 0.0 + quat[2] * 0.0 + quat[3] * 0.0)
         + (log_scale[0] * 0.0 + log_scale[1] * 0.0 + log_scale[2] * 0.0)
-        + (offset[0] * 0.0 + offset[1] * 0.0 + logit * 0.0)
+        + (offset[0] * 0.0 + offset[1] * 0.0)
     )
     # a finite colour proves its coefficients finite, and takes less time than looking at each
     zeros = 0.0 * color
@@ -82,7 +88,7 @@ def row_is_finite(
         zeros += 0.0 * sh[row * stored_bases + k]
     for k in range(channels):
         zero += 0.0 * features[row * channels + k]
-    return zero + zeros[0] + zeros[1] + zeros[2] == 0.0
+    return zero + zeros[0] + zeros[1] + zeros[2] == 0.0 and not wp.isnan(logit)
 
 
 @wp.func
@@ -184,7 +190,7 @@ def project(
     records[r + C] = HALF_LOG2E / s.yy
     records[r + LOG2_OPACITY] = log2_opacity
     for k in range(3):
-        records[r + RED + k] = wp.max(color[k], 0.0)
+        records[r + RED + k] = not_negative(color[k])
     records[r + DEPTH] = s.cam[2]
     records[r + HALF_WIDTH] = half_width
     records[r + HALF_HEIGHT] = wp.sqrt(reach * s.yy)
@@ -288,7 +294,7 @@ def project_adjoint(
     )
 
     for k in range(3):
-        if records[row * RECORD_C + RED + k] <= 0.0:
+        if not learns(records[row * RECORD_C + RED + k]):
             v_color[k] = 0.0
     for k in range(active_bases, stored_bases):
         v_sh[row * stored_bases + k] = zero3

@@ -21,6 +21,7 @@ C31 = wp.constant(sh.C3[1])
 C32 = wp.constant(sh.C3[2])
 C33 = wp.constant(sh.C3[3])
 C34 = wp.constant(sh.C3[4])
+BLACK = wp.constant(sh.BLACK)
 
 
 @wp.func
@@ -113,6 +114,20 @@ def sh_color(
     for k in range(active_bases):
         color += basis[k] * sh[first + k]
     return color
+
+
+@wp.func
+def not_negative(color: float) -> float:
+    """max(color, 0), as -0 where no gradient passes (`sh.not_negative`): a record has one place."""
+    if color < -BLACK:
+        return -0.0
+    return wp.max(color, 0.0)
+
+
+@wp.func
+def learns(shown: float) -> bool:
+    """Whether the gradient passes to a colour that `not_negative` made."""
+    return 1.0 / shown >= 0.0  # -infinity for -0
 
 
 @wp.func

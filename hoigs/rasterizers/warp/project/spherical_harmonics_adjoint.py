@@ -13,6 +13,7 @@ from hoigs.rasterizers.warp.common.records import F32, I32, M_RED, POSE, RECORD,
 from hoigs.rasterizers.warp.project.kernels import camera_center
 from hoigs.rasterizers.warp.project.spherical_harmonics import (
     Vec16,
+    learns,
     sh_basis,
     sh_direction_gradient,
 )
@@ -91,7 +92,7 @@ def harmonics_adjoint(
         if drawn[row] != 0:
             p = first_partial[row] * stride + M_RED
             for j in range(3):
-                if records[row * RECORD_C + RED + j] > 0.0:  # not clamped at zero
+                if learns(records[row * RECORD_C + RED + j]):
                     v_color[j] = partials[p + j]
             toward = means[row] - camera_center(world_to_camera)
             distance = wp.length(toward)
