@@ -38,6 +38,10 @@ class NotFiniteError(HoigsError):
     """A tensor holds NaN or infinity; the message names it."""
 
 
+class DerivativeError(HoigsError):
+    """A second derivative of kernels that have the first only; the message names what has both."""
+
+
 class Interrupted(KeyboardInterrupt):
     """Work that was stopped by Ctrl-C or SIGTERM; the message says how to go on.
 

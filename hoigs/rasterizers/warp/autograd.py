@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from hoigs.core.first_order import first_order
 from hoigs.rasterizers.warp.common.frame import Images, Inputs, Settings, TileIntersections
 
 
@@ -42,7 +43,7 @@ class Render(torch.autograd.Function):
         )  # fmt: skip
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_order("WarpRasterizer", "draw with rasterizer:torch, which has the second, too")
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
         count = len(fields(Inputs))

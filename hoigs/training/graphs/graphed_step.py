@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from hoigs.core.cuda_graphs.capture import capturing
+from hoigs.core.first_order import first_order
 
 Key = tuple[str, ...]
 Compute = Callable[[Mapping[str, Tensor]], dict[Key, Tensor]]
@@ -170,6 +170,6 @@ class _Replay(torch.autograd.Function):
         return tuple(value.detach() for value in step.differentiable.values())
 
     @staticmethod
-    @once_differentiable
+    @first_order("a training step of CUDA graphs", "train.graphs: off has the second, too")
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         return None, *ctx.step.replay_backward(gradients, ctx.replay_index)

@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 from hoigs.core.cpu_kernels.dense import kernels
 from hoigs.core.cpu_kernels.dense.source import CHUNK, FORWARD_CHUNK, HIGH, LANES, MAX_WIDTH
 from hoigs.core.cpu_kernels.workers import shared
+from hoigs.core.first_order import IN_TORCH, first_order
 
 
 def fits(*widths: int) -> bool:
@@ -51,7 +52,7 @@ class DenseLayer(torch.autograd.Function):
         return out
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_order("the CPU kernel of dense layers", IN_TORCH)
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         rows, weight, result = ctx.saved_tensors
         (count, entry), width = rows.shape, len(weight)

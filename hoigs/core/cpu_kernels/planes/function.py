@@ -10,6 +10,7 @@ from torch import Tensor
 from hoigs.core.cpu_kernels.planes import kernels
 from hoigs.core.cpu_kernels.planes.source import CHUNK
 from hoigs.core.cpu_kernels.workers import shared
+from hoigs.core.first_order import IN_TORCH, first_order
 
 
 class SampledPlanes(torch.autograd.Function):
@@ -27,7 +28,7 @@ class SampledPlanes(torch.autograd.Function):
         return out
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_order("the CPU kernel of feature planes", IN_TORCH)
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
         planes, points = ctx.saved_tensors
         with_planes, with_points = ctx.needs_input_grad

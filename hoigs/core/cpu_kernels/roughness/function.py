@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hoigs.core.cpu_kernels.roughness import kernels
 from hoigs.core.cpu_kernels.workers import shared
+from hoigs.core.first_order import IN_TORCH, first_order
 
 
 class Roughness(torch.autograd.Function):
@@ -24,7 +25,7 @@ class Roughness(torch.autograd.Function):
         return (total[0] / len(values)).to(values.dtype)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_order("the CPU kernel of roughness", IN_TORCH)
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         apart, neighbours = ctx.saved_tensors
         gradient, scale = torch.zeros_like(apart), (2 / len(apart) * upstream).view(1)

@@ -10,6 +10,7 @@ from torch import Tensor
 from hoigs.core.cpu_kernels.skin import kernels
 from hoigs.core.cpu_kernels.skin.source import CHUNK, LANES, MAX_JOINTS
 from hoigs.core.cpu_kernels.workers import shared
+from hoigs.core.first_order import IN_TORCH, first_order
 
 
 def fits(joints: int) -> bool:
@@ -32,7 +33,7 @@ class ComposedQuats(torch.autograd.Function):
         return out
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_order("the CPU kernel of skinning", IN_TORCH)
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, Tensor, None]:
         first, second = ctx.saved_tensors
         out, to_second, count = torch.empty_like(first), torch.empty_like(second), len(first)
@@ -60,7 +61,7 @@ class SkinnedGaussians(torch.autograd.Function):
         return means, turned
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_order("the CPU kernel of skinning", IN_TORCH)
     def backward(ctx: Any, to_means: Tensor, to_turned: Tensor) -> tuple[Tensor | None, ...]:
         points, quats, weights, table = ctx.saved_tensors
         *_, with_weights, with_table = ctx.needs_input_grad

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from hoigs.core.cpu_kernels.launch import prepared
+from hoigs.core.first_order import first_order
 from hoigs.rasterizers.warp.cuda.launch import CudaStreams
 from hoigs.rasterizers.warp.image_loss.kernels import backward_tiles, forward_tiles
 from hoigs.rasterizers.warp.ssim.tile_source import SIDE, THREADS
@@ -70,7 +71,7 @@ class _ImageLosses(torch.autograd.Function):
         return sums.sum(1)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_order("image_losses", 'train.loss.ssim: torch has the second, too')
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         render, *kept = ctx.saved_tensors
         whole = ctx.targets[0].pixels.shape == render.shape

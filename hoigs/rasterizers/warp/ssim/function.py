@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.errors import RenderError
+from hoigs.core.first_order import first_order
 
 INT32 = 2**31 - 1
 OTHERWISE = 'use backend="torch" (train.loss.ssim: torch)'
@@ -88,7 +89,7 @@ class _Mean(torch.autograd.Function):
         return value
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_order("SSIM by Warp kernels", f"for those {OTHERWISE}")
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         with torch.cuda.device_of(upstream[0]):
             return ctx.kernels.gradient(ctx.saved_tensors, upstream[0]), None, None, None
