@@ -28,7 +28,7 @@ from raster_scenes import (
 )
 from torch import Tensor
 
-from hoigs.core.errors import RenderError
+from hoigs.core.errors import DerivativeError, RenderError
 from hoigs.core.interfaces.rasterizer import Rasterizer, RenderRequest
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
@@ -356,3 +356,16 @@ def test_no_render_keeps_an_autograd_graph_alive(monkeypatch: pytest.MonkeyPatch
         means.data, means.grad = scene.means, None
         WarpRasterizer().render(scene.replace(means=means), a_camera()).color.sum().backward()
         assert means.grad is not None and len(means.grad) == count
+
+
+def test_second_derivatives_are_refused(device: torch.device) -> None:
+    scene = random_scene(20).to(device).map(lambda x: x.requires_grad_())
+    color = WarpRasterizer().render(scene, a_camera().to(device)).color
+    (slope,) = torch.autograd.grad(color.sum(), scene.means, create_graph=True)
+    penalty = slope.square().sum()
+    for ask in (
+        lambda: penalty.backward(retain_graph=True),
+        lambda: torch.autograd.grad(penalty, scene.quats, allow_unused=True),
+    ):
+        with pytest.raises(DerivativeError, match=r"WarpRasterizer.*rasterizer:torch"):
+            ask()

@@ -170,7 +170,7 @@ def _agreed(ratios: Float[Tensor, " R"]) -> float | None:
         return None
     logs = ratios.log()
     counts = torch.histc(logs, 150, -1.5, 1.5)  # 2 % each
-    near = torch.nn.functional.conv1d(counts[None, None], torch.ones(1, 1, 5), padding=2)[0, 0]
+    near = torch.nn.functional.conv1d(counts[None, None], counts.new_ones(1, 1, 5), padding=2)[0, 0]
     peak = -1.5 + (int(near.argmax()) + 0.5) * 0.02
     close = logs[(logs - peak).abs() < 0.06]
     return float(close.median().exp()) if len(close) > 0.25 * len(ratios) else None

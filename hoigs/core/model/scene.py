@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.interaction import InteractionModule
 from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
 from hoigs.core.model.blame import call
@@ -68,6 +69,7 @@ class SceneModel(nn.Module):
 
     Raises:
         ValueError: there are no entities.
+        HoigsError: parameters of several dtypes, or of float32 where torch's default is another.
     """
 
     def __init__(
@@ -94,6 +96,20 @@ class SceneModel(nn.Module):
                 {n: e.features.width for n, e in described.items() if e.features is not None},
                 {n: e.kind for n, e in entities.items()},
             )
+        self._check_dtypes()
+
+    def _check_dtypes(self) -> None:
+        """Clips and bodies are of float32, networks and constants of torch's default dtype."""
+        default, first = torch.get_default_dtype(), dict[torch.dtype, str]()
+        for name, parameter in self.named_parameters():
+            first.setdefault(parameter.dtype, name)
+        if len(first) > 1 or (torch.float32 in first and default != torch.float32):
+            found = " and ".join(f"{name} is {dtype}" for dtype, name in first.items())
+            raise HoigsError(
+                f"SceneModel: {found}, and torch's default dtype is {default}; expected "
+                "torch.float32 throughout: torch.set_default_dtype(torch.float32) before the "
+                "model is made and as long as it is used"
+            )
 
     def entity(self, name: str) -> Entity:
         entity = self.entities[name]
@@ -116,6 +132,8 @@ class SceneModel(nn.Module):
         Args:
             moment: on the model's device.
         """
+        if torch.get_default_dtype() != torch.float32:  # else it was checked when it was made
+            self._check_dtypes()
         names = list(self.entities if only is None else only)
         tokens: dict[str, Tokens] = {}
         residuals: Mapping[str, Residual] = {}

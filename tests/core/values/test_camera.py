@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from kornia.geometry.camera import project_points
 
+from hoigs.core.errors import CameraError
 from hoigs.core.values.camera import Camera, pinhole_pixels, pinhole_rays
 
 
@@ -137,3 +141,61 @@ def test_to_changes_both_matrices() -> None:
     camera = a_camera().to(torch.float32)
     assert camera.K.dtype == camera.world_to_camera.dtype == torch.float32
     assert (camera.width, camera.height) == (64, 48)
+
+
+NOT_PINHOLES = [
+    ("K", (0, 0), math.nan, r"K\[0, 0\] is nan"),
+    ("K", (1, 2), math.inf, r"K\[1, 2\] is inf"),
+    ("K", (0, 0), 0.0, r"K has focal lengths of 0 and "),
+    ("K", (1, 1), -50.0, r"K has focal lengths of .* and -50 "),
+    ("K", (0, 1), 0.5, r"K\[0, 1\] is 0.5"),
+    ("K", (1, 0), -0.5, r"K\[1, 0\] is -0.5"),
+    ("K", (2, 2), 2.0, r"K\[2\] is \[0.0, 0.0, 2.0\]"),
+    ("world_to_camera", (2, 3), math.nan, r"world_to_camera\[2, 3\] is nan"),
+    ("world_to_camera", (slice(3), slice(3)), 2.0, r"world_to_camera\[:3, :3\] .* is 3,"),
+    ("world_to_camera", 0, -1.0, r"world_to_camera\[:3, :3\] mirrors"),
+    ("world_to_camera", (3, 3), 0.5, r"world_to_camera\[3\] is \[0.0, 0.0, 0.0, 0.5\]"),
+]
+
+
+@pytest.mark.parametrize(("field", "place", "value", "says"), NOT_PINHOLES)
+def test_what_is_no_pinhole_is_refused(field: str, place: Any, value: float, says: str) -> None:
+    camera = a_camera().to(torch.float32)
+    wrong = getattr(camera, field).clone()
+    # rotations are scaled or mirrored, numbers set
+    wrong[place] = wrong[place] * value if wrong[place].dim() else value
+    with pytest.raises(CameraError, match=f"Camera.{says}"):
+        replace(camera, **{field: wrong})
+    # a pose that is learned is not looked at while it is, unless asked
+    with pytest.raises(CameraError, match=f"Camera.{says}"):
+        replace(camera, **{field: wrong.requires_grad_()}).check()
+
+
+@pytest.mark.parametrize("wrong", [torch.eye(4)[:3], [[1.0]], None])
+def test_shapes_are_refused_by_name(wrong: Any) -> None:
+    camera = copy.copy(a_camera())
+    object.__setattr__(camera, "world_to_camera", wrong)
+    with pytest.raises(CameraError, match=r"world_to_camera is .*expected .*\[4, 4\]"):
+        camera.check()
+
+
+def test_rounding_is_no_mistake() -> None:
+    for seed in range(20):
+        torch.manual_seed(seed)
+        camera = a_camera().moved(torch.randn(3).double(), torch.randn(3).double())
+        pose = camera.world_to_camera
+        for rounded in (pose.float(), pose.half(), (pose * 1e4).round() / 1e4):
+            Camera(camera.K.to(rounded), rounded, 64, 48).resized(640, 480).cropped(3, 4, 5, 6)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_camera_on_a_gpu_is_not_waited_for() -> None:
+    camera = a_camera().to("cuda", torch.float32)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        wrong = replace(camera, K=camera.K * 2)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    with pytest.raises(CameraError, match=r"Camera.K\[2\]"):
+        wrong.check()

@@ -186,3 +186,16 @@ def test_flat_gaussians_lie_in_the_surface(given: bool) -> None:
 def test_flat_gaussians_of_one_and_two_points() -> None:
     for count in (1, 2, 3):
         assert Gaussians.from_points(torch.rand(count, 3), thickness=0.5).quats.isfinite().all()
+
+
+@pytest.mark.parametrize("opacity", [1.0, 0.99999999])
+def test_opaque_has_a_finite_logit(opacity: float) -> None:
+    opaque = Gaussians.from_points(torch.zeros(2, 3), opacity=opacity)
+    opaque.check_finite()
+    assert float(opaque.opacities.min()) > 1 - 1e-6
+
+
+@pytest.mark.parametrize("opacity", [0.0, -0.1, 1.001, float("nan"), float("inf")])
+def test_other_opacities_are_refused(opacity: float) -> None:
+    with pytest.raises(ValueError, match=f"opacity is {opacity}"):
+        Gaussians.from_points(torch.zeros(2, 3), opacity=opacity)
