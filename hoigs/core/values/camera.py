@@ -239,7 +239,9 @@ def _intrinsics_problem(K: list[list[float]]) -> str | None:
 def _pose_problem(pose: list[list[float]]) -> str | None:
     a, b, c = R = [row[:3] for row in pose[:3]]
     off = max(
-        abs(sum(x * y for x, y in zip(R[i], R[j])) - (i == j)) for i in range(3) for j in range(i, 3)
+        abs(sum(x * y for x, y in zip(R[i], R[j])) - (i == j))
+        for i in range(3)
+        for j in range(i, 3)
     )
     mirrored = (
         a[0] * (b[1] * c[2] - b[2] * c[1])

@@ -254,9 +254,10 @@ def black_learns(subject: RasterizerSubject) -> None:
     """A channel that is exactly 0, or below it by no more than rounding, takes its gradient."""
     for degree in (0, 1):
         gaussians = random_gaussians(12, degree=degree)
-        black = (0.0 - 0.5) / SH_C0
+        black = -0.5 / SH_C0
         sh = torch.zeros_like(gaussians.sh)
-        sh[:4, 0], sh[4:8, 0], sh[8:, 0] = black, torch.tensor([1.2, black, 0.3]), black * (1 + 1e-7)
+        sh[:4, 0], sh[4:8, 0] = black, torch.tensor([1.2, black, 0.3])
+        sh[8:, 0] = black * (1 + 1e-7)
         scene = Scene(gaussians.replace(sh=sh), a_camera())
         _, gradients = subject.drawn(scene, lambda output: output.color.sum())
         slopes = gradients["sh"]

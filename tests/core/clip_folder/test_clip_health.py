@@ -147,6 +147,14 @@ def test_depth_unlike_the_points(clip: Clip, factor: float) -> None:
     assert kinds(replace(clip, depth_kind="affine-disparity")) == []
 
 
+def test_a_default_of_float64_changes_no_factor(clip: Clip) -> None:
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert depth_factor(clip) == 1.0
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
 def test_points_behind_others_do_not_hide_the_right_scale(clip: Clip) -> None:
     behind = clip.points[:1200] * torch.tensor([1.0, 1.0, 0.0]) + torch.tensor([0.0, 0.0, 6.0])
     points = torch.cat((clip.points, behind))

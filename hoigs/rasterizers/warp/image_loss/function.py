@@ -71,7 +71,7 @@ class _ImageLosses(torch.autograd.Function):
         return sums.sum(1)
 
     @staticmethod
-    @first_order("image_losses", 'train.loss.ssim: torch has the second, too')
+    @first_order("image_losses", "train.loss.ssim: torch has the second, too")
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         render, *kept = ctx.saved_tensors
         whole = ctx.targets[0].pixels.shape == render.shape
