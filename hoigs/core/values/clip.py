@@ -15,8 +15,10 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from hoigs.core.diagnostics import Diagnostic
+from hoigs.core.errors import ClipError
 from hoigs.core.files.pixel_cache import PixelCache
 from hoigs.core.maths.frame_times import FrameTimes
+from hoigs.core.names import is_plain
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind
@@ -164,6 +166,9 @@ class Clip:
         provenance: where each part came from.
         faults: what is wrong with the clip and was accepted when it was read (`clip_folder.health`
             finds more).
+
+    Raises:
+        ClipError: the name of the clip, or of an entity, holds control characters.
     """
 
     name: str
@@ -181,6 +186,11 @@ class Clip:
     depth_kind: str = "none"
     provenance: Mapping[str, Any] = field(default_factory=dict)
     faults: Sequence[Diagnostic] = ()
+
+    def __post_init__(self) -> None:
+        for what, name in (("clip", self.name), *(("entity", name) for name in self.kinds)):
+            if not is_plain(name):  # it could be trained, and its records not be read back
+                raise ClipError(f"the {what}'s name {name!r} holds control characters; rename it")
 
     def __len__(self) -> int:
         return len(self.cameras)
