@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 RULE = "use letters, digits, _, - and . , a letter or digit first"
@@ -32,6 +33,12 @@ def require_entity_name(name: str) -> None:
 def name_from(text: str, otherwise: str) -> str:
     """`text` with "-" for each run of characters that no name has; `otherwise` if none is left."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("_.-") or otherwise
+
+
+def is_plain(text: str) -> bool:
+    """Whether a text has neither control characters nor halves of characters, which files,
+    terminals and command lines do not hold."""
+    return not any(unicodedata.category(c) in ("Cc", "Cs") for c in text)
 
 
 def printable(text: str) -> str:

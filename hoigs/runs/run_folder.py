@@ -176,8 +176,12 @@ class RunFolder:
 
         Temporary folders of killed processes are removed. `overwrite` and `inputs` are as for
         `refuse_existing`.
+
+        Raises:
+            HoigsError: as `refuse_existing`; or a name in `provenance` is no text in UTF-8.
         """
         self.refuse_existing(overwrite, inputs)
+        _require_text(provenance)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         for stale in self.path.parent.glob(f".{glob.escape(self.path.name)}.*.part"):
             if not _alive(stale.name.split(".")[-2]):
@@ -259,6 +263,17 @@ class RunFolder:
     def relative(self, path: Path) -> str:
         """`path` relative to the run folder, so that both can move together."""
         return os.path.relpath(path.resolve(), self.path.resolve())
+
+
+def _require_text(provenance: dict[str, Any]) -> None:
+    """Raise HoigsError where the record could not be read back: of a path that is no UTF-8."""
+    try:
+        json.dumps(provenance, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        name = error.object[max(0, error.start - 30) : error.end]
+        raise HoigsError(
+            f"...{name!r}: a name that is not text in UTF-8; rename the file or folder"
+        ) from error
 
 
 def _alive(pid: str) -> bool:

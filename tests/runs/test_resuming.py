@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from small_clip import small_clip
 
 from hoigs.core.clip_folder.write import write_clip
-from hoigs.core.errors import CheckpointError, HoigsError, SpecError
+from hoigs.core.errors import CheckpointError, ClipError, HoigsError, SpecError
 from hoigs.core.registry.registry import default_registry
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.runs.resuming import default_out, load_spec
@@ -31,6 +33,21 @@ def clip(tmp_path: Path) -> Path:
 def run(clip: Path, tmp_path: Path) -> Path:
     Session.open(clip, "static", out=tmp_path / "run", overrides=SETTINGS).train()
     return tmp_path / "run"
+
+
+@pytest.mark.parametrize("name", ["a\0b", "a\x1b[2J", "a\udce9"])
+def test_names_that_no_record_holds_are_refused_before_training(tmp_path: Path, name: str) -> None:
+    for changes in ({"name": name}, {"kinds": {name: "object"}}):
+        with pytest.raises(ClipError, match="name") as caught:
+            replace(small_clip(), **changes)
+        assert repr(name) in str(caught.value)
+
+
+def test_paths_that_no_record_holds_are_refused_before_training(clip: Path, tmp_path: Path) -> None:
+    strange = clip.rename(tmp_path / os.fsdecode(b"caf\xe9"))
+    with pytest.raises(HoigsError, match=r"caf\\udce9"):
+        Session.open(strange, "static", out=tmp_path / "run", overrides=SETTINGS)
+    assert [p.name for p in tmp_path.iterdir()] == [strange.name]
 
 
 @pytest.mark.parametrize("name", ["x/../../../evil", "x\0y"])

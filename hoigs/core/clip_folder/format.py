@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from hoigs.core.files.json_file import parse_json, short
 from hoigs.core.files.safe_replace import Layout, one_of
-from hoigs.core.names import NAME, require_entity_name
+from hoigs.core.names import NAME, is_plain, require_entity_name
 from hoigs.core.values.world import How
 
 FORMAT, VIEWS_FORMAT, VERSION = "hoigs-clip", "hoigs-views", 1
@@ -119,6 +119,13 @@ class ClipHeader(_Strict):
             if name == "scene":
                 raise ValueError('entity name "scene": it is the implied background')
         return self
+
+    @field_validator("name")
+    @classmethod
+    def _name_is_plain(cls, name: str) -> str:
+        if not is_plain(name):
+            raise ValueError(f"{name!r} holds control characters; give the clip another name")
+        return name
 
     @field_validator("provenance")
     @classmethod

@@ -15,8 +15,10 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from hoigs.core.diagnostics import Diagnostic
+from hoigs.core.errors import ClipError
 from hoigs.core.files.pixel_cache import PixelCache
 from hoigs.core.maths.frame_times import FrameTimes
+from hoigs.core.names import is_plain
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.shown import SHOWN, html_table, one_line
@@ -188,6 +190,9 @@ class Clip:
             finds more).
         world: up, floor and unit. Where nobody knows, up is a guess by the cameras, which
             `world.known` says.
+
+    Raises:
+        ClipError: the name of the clip, or of an entity, holds control characters.
     """
 
     name: str
@@ -208,6 +213,9 @@ class Clip:
     world: World = None  # type: ignore[assignment]  # filled in below
 
     def __post_init__(self) -> None:
+        for what, name in (("clip", self.name), *(("entity", name) for name in self.kinds)):
+            if not is_plain(name):  # it could be trained, and its records not be read back
+                raise ClipError(f"the {what}'s name {name!r} holds control characters; rename it")
         if self.world is None:
             object.__setattr__(self, "world", World.guessed(self.cameras))
 

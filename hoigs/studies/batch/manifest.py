@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self, TextIO
@@ -22,12 +21,12 @@ from pydantic import (
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.files.json_file import short
 from hoigs.core.files.regular_file import regular_file
+from hoigs.core.names import is_plain
 from hoigs.core.spec.loader import MAX_BYTES, load_yaml
 from hoigs.core.storage.urls import as_url
 
 NAMES = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")  # of rows, as they name folders
 FORMATS = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:@-]{0,79}")  # likewise, with kind: and @distribution
-CONTROL = ("Cc", "Cs")  # Unicode's categories of control characters and of halves of characters
 ONE_SOURCE = "a row has either a video or a clip"
 LISTS = ("set", "prepare", "object", "export")  # in CSV, texts with ";" between
 
@@ -74,7 +73,7 @@ class Row(BaseModel):
     @classmethod
     def _has_no_control_characters(cls, value: Any) -> Any:
         for text in value if isinstance(value, tuple) else (value,):
-            if isinstance(text, str) and any(unicodedata.category(c) in CONTROL for c in text):
+            if isinstance(text, str) and not is_plain(text):
                 raise ValueError("a text without control characters is expected")
         return value
 

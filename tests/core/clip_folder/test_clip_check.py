@@ -53,6 +53,7 @@ HEADER_FAULTS = [
     (lambda h: h.update(format="other"), '"format" is \'other\', expected "hoigs-clip"'),
     (lambda h: h.update(frames=0), "frames: Input should be greater than or equal to 1 (got 0)"),
     (lambda h: h.update(colour=1), "colour: Extra inputs are not permitted"),
+    (lambda h: h.update(name="a\0b"), r"name: Value error, 'a\x00b'"),
     (lambda h: h.pop("width"), "width: Field required"),
     (lambda h: h["entities"]["ann"].update(kind="dog"), "entities.ann.kind: Input should be"),
     (lambda h: h["entities"]["ann"].pop("body"), "entities.ann: Value error, a human names its"),
