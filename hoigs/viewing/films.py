@@ -140,12 +140,12 @@ def render(
     numbers, rate = frame_numbers(loaded.clip, start, end, fps, slow)
     if name.endswith(".json") and fps is None:
         rate = rate_of(Path(name)) or rate
-    film = [
-        (moment, fitted(camera, width, height))
-        for moment, camera in film_path(loaded.model, loaded.clip, name, numbers, rate, at)
-    ]
+    views = film_path(loaded.model, loaded.clip, name, numbers, rate, at)
+    film = [(moment, fitted(camera, width, height)) for moment, camera in views]
+    several = len({(camera.width, camera.height) for camera in loaded.clip.cameras}) > 1
     return _draw(
         loaded, film, target, rate, only=chosen, compare=compare, background=background,
+        shape=(views[0][1].width, views[0][1].height) if several else None,
         report=progress or no_progress,
     )  # fmt: skip
 
@@ -168,6 +168,7 @@ def _draw(
     only: Sequence[str],
     compare: bool,
     background: str | None,
+    shape: tuple[int, int] | None,
     report: Progress,
 ) -> Film:
     camera, clear = film[0][1], background == TRANSPARENT
@@ -186,7 +187,7 @@ def _draw(
             draw_s += time.perf_counter() - began
             picture = dithered(_with_alpha(output) if clear else output.color, drawn)
             if compare:
-                source = source_frame(loaded.clip, shown[drawn], view, picture.shape[2])
+                source = source_frame(loaded.clip, shown[drawn], view, picture.shape[2], shape)
                 picture = np.concatenate((source, picture), 1)
             drawn += 1
             report(drawn / len(film), f"frame {drawn} of {len(film)}")

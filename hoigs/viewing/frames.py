@@ -12,6 +12,7 @@ from torch import Tensor
 from hoigs.core.errors import HoigsError
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
+from hoigs.viewing.viewer.pictures.fitting import placed
 
 LARGEST = 8192  # pixels of a side
 
@@ -76,11 +77,23 @@ def read_background(text: str, camera: Camera) -> Tensor:
 
 
 def source_frame(
-    clip: Clip, frame: float, camera: Camera, channels: int
+    clip: Clip,
+    frame: float,
+    camera: Camera,
+    channels: int,
+    shape: tuple[int, int] | None = None,
 ) -> UInt8[np.ndarray, "H W C"]:
-    """The nearest frame of the video, as large as the picture beside it."""
+    """The nearest frame of the video, as large as the picture beside it.
+
+    Args:
+        shape: width and height into which frames of another size are fitted whole first, as the
+            film's cameras were.
+    """
     nearest = min(range(len(clip)), key=lambda i: abs(clip.moments[i].index - frame))
-    image = _filling(clip.store.image(nearest).numpy(), camera.width, camera.height)
+    own = clip.store.image(nearest).numpy()
+    if shape is not None and shape != (own.shape[1], own.shape[0]):
+        own = placed(own, shape)
+    image = _filling(own, camera.width, camera.height)
     array: np.ndarray = (image * 255).round().to(torch.uint8).numpy()
     if channels == 4:
         array = np.concatenate((array, np.full_like(array[..., :1], 255)), -1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from torch import Tensor
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.values.between import camera_between, frame_of, moment_between
+from hoigs.core.values.between import camera_between, frame_of, in_shape, moment_between
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.moment import Moment
@@ -36,7 +37,8 @@ def film_path(
     fps: float,
     at: float | None = None,
 ) -> list[View]:
-    """The views of a film.
+    """The views of a film, all of one size: where the clip has several, that of most pictures, into
+    which the others are fitted whole, with more of the world beside them.
 
     Args:
         path: "video", "orbit", "bullet-time", "spiral", "follow NAME" (or "human" or "object"), or
@@ -47,7 +49,7 @@ def film_path(
     Raises:
         HoigsError: no such path or entity, or a camera file that cannot be read.
     """
-    path = OLDER.get(path, path)
+    path, clip = OLDER.get(path, path), _of_one_size(clip)
     if path.lower().endswith(".json"):
         return read_camera_path(Path(path), clip, frames)
     name, _, target = path.partition(" ")
@@ -64,6 +66,15 @@ def film_path(
             f"path {path!r}{did_you_mean(path, names)}; expected {', '.join(names)}, or a JSON file"
         )
     return known[name]()
+
+
+def _of_one_size(clip: Clip) -> Clip:
+    sizes = Counter((camera.width, camera.height) for camera in clip.cameras)
+    if len(sizes) == 1:
+        return clip
+    (size, _), *_ = sizes.most_common()
+    cameras = [c if (c.width, c.height) == size else in_shape(c, *size) for c in clip.cameras]
+    return replace(clip, cameras=cameras)
 
 
 def _at(clip: Clip, frames: Sequence[float], cameras: Sequence[Camera]) -> list[View]:

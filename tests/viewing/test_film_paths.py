@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import av
 import numpy as np
@@ -17,7 +18,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.values.between import frame_numbers, frame_of
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.camera_files import rate_of
-from hoigs.viewing.frames import dithered, fitted
+from hoigs.viewing.frames import dithered, fitted, source_frame
 from hoigs.viewing.paths import best_moment, film_path
 
 
@@ -35,6 +36,33 @@ def test_the_video_is_the_clip(run):
     for i, (moment, camera) in enumerate(views(run, "video")):
         assert moment.poses is run.clip.moments[i].poses and camera is run.clip.cameras[i]
     assert len(views(run, "playback")) == len(run.clip)  # its older name
+
+
+@pytest.fixture
+def two_shapes(run) -> LoadedRun:
+    """The run on upright and square pictures of the same cameras."""
+    cameras = [c.cropped(8, 0, 48, 64) if i < 5 else c for i, c in enumerate(run.clip.cameras)]
+    return replace(run, clip=replace(run.clip, cameras=cameras))
+
+
+@pytest.mark.parametrize("path", ["video", "bullet-time", "spiral", "follow object"])
+def test_pictures_of_several_shapes_make_films_of_one(two_shapes, run, path):
+    numbers, fps = frame_numbers(run.clip, slow=2.0)  # also between one shape and the other
+    film = film_path(two_shapes.model, two_shapes.clip, path, numbers, fps)
+    assert {(camera.width, camera.height) for _, camera in film} == {(64, 64)}
+    if path == "video":  # an upright picture has more of the world beside it
+        for i, (_, camera) in enumerate(film_path(run.model, run.clip, path, numbers, fps)):
+            assert torch.allclose(film[i][1].K, camera.K, atol=1e-4)
+
+
+def test_a_film_of_several_shapes_beside_the_video(two_shapes, tmp_path, monkeypatch):
+    monkeypatch.setattr(LoadedRun, "open", lambda *_, **__: two_shapes)
+    done = h.render("run", out=tmp_path / "c.mp4", compare=True, width=96, height=48, end=6.0)
+    assert (done.frames, done.width, done.height) == (7, 96, 48)
+    camera = replace(two_shapes.clip.cameras[0], width=128, height=64)
+    beside = source_frame(two_shapes.clip, 0.0, camera, 3, shape=(128, 64))
+    assert not beside[:, :32].any() and not beside[:, 96:].any()
+    assert (beside[:, 32:96] == two_shapes.clip.store.image(0).numpy()).all()
 
 
 def test_bullet_time_stands_still_while_the_camera_moves(run):

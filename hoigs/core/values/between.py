@@ -121,13 +121,21 @@ def blend_cameras(a: Camera, b: Camera, r: float) -> Camera:
     """The camera a share r of the way from `a` to `b`, in the image size of `a`."""
     if r == 0.0:
         return a
-    b = b.resized(a.width, a.height)
+    b = in_shape(b, a.width, a.height)
     before, after = (matrices_to_quats(c.world_to_camera[:3, :3]) for c in (a, b))
     rotation = quats_to_matrices(slerp(before, after, r))
     pose = torch.eye(4).to(a.world_to_camera)
     pose[:3, :3] = rotation
     pose[:3, 3] = -rotation @ torch.lerp(a.center, b.center, r)
     return Camera(torch.lerp(a.K, b.K, r), pose, a.width, a.height)
+
+
+def in_shape(camera: Camera, width: int, height: int) -> Camera:
+    """The camera with its whole image in the middle of one of another size and aspect."""
+    scale = min(width / camera.width, height / camera.height)
+    wide, high = (max(1, round(scale * side)) for side in (camera.width, camera.height))
+    left, top = (width - wide) // 2, (height - high) // 2
+    return camera.resized(wide, high).cropped(-left, -top, width, height)
 
 
 def _neighbours(clip: Clip, frame: float) -> tuple[int, int, float]:

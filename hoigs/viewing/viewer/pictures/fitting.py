@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from hoigs.core.values.between import in_shape
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
 
@@ -52,6 +53,4 @@ def inner_rectangle(image: tuple[int, int], canvas: tuple[int, int]) -> tuple[in
 
 def fitted(camera: Camera, canvas: tuple[int, int]) -> Camera:
     """The camera with its whole image in the middle of a canvas of another size and aspect."""
-    left, top, width, height = inner_rectangle((camera.width, camera.height), canvas)
-    inner = camera.resized(width, height)
-    return inner.cropped(-left, -top, *canvas)
+    return in_shape(camera, *canvas)
