@@ -24,6 +24,7 @@ _PUBLIC = {
     "Residual": "hoigs.core.values.tokens",
     "Tokens": "hoigs.core.values.tokens",
     "TopologyChange": "hoigs.core.values.topology",
+    "World": "hoigs.core.values.world",
     # interfaces
     "BodyModel": "hoigs.core.interfaces.body",
     "ClipReader": "hoigs.core.interfaces.reader",

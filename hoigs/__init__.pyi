@@ -27,6 +27,7 @@ from hoigs.core.values.moment import Moment as Moment
 from hoigs.core.values.tokens import Residual as Residual
 from hoigs.core.values.tokens import Tokens as Tokens
 from hoigs.core.values.topology import TopologyChange as TopologyChange
+from hoigs.core.values.world import World as World
 from hoigs.evaluation.evaluate import evaluate as evaluate
 from hoigs.plugins.bodies.anny import AnnyBody as AnnyBody
 from hoigs.plugins.bodies.smplx import SmplxBody as SmplxBody
