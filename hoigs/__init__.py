@@ -27,6 +27,7 @@ _PUBLIC = {
     "Tokens": "hoigs.core.values.tokens",
     "TopologyChange": "hoigs.core.values.topology",
     "HoigsError": "hoigs.core.errors",
+    "World": "hoigs.core.values.world",
     # interfaces
     "ComponentConfig": "hoigs.core.config",
     "Estimator": "hoigs.core.interfaces.estimator",

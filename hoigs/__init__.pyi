@@ -1,10 +1,5 @@
 # written by scripts/public_stub.py
 
-from pathlib import Path as _Path
-from typing import Any, Literal
-
-from torch import Tensor
-
 from hoigs import metrics as metrics
 from hoigs.annotation.annotate import annotate as annotate
 from hoigs.core.config import ComponentConfig as ComponentConfig
@@ -44,21 +39,18 @@ from hoigs.core.values.moment import Moment as Moment
 from hoigs.core.values.tokens import Residual as Residual
 from hoigs.core.values.tokens import Tokens as Tokens
 from hoigs.core.values.topology import TopologyChange as TopologyChange
+from hoigs.core.values.world import World as World
 from hoigs.evaluation.evaluate import score as score
 from hoigs.plugins.bodies.anny import AnnyBody as AnnyBody
 from hoigs.plugins.bodies.smplx import SmplxBody as _SmplxBody
-from hoigs.plugins.deformation.avatars.hexplane_skinning import (
-    HexPlaneSkinning as _HexPlaneSkinning,
-)
+from hoigs.plugins.deformation.avatars.hexplane_skinning import HexPlaneSkinning as _HexPlaneSkinning
 from hoigs.plugins.deformation.avatars.nonrigid import NonRigidConfig as _NonRigidConfig
 from hoigs.plugins.deformation.fields.embedded import Embedded as _Embedded
 from hoigs.plugins.deformation.fields.hexplane_field import HexPlaneField as _HexPlaneField
 from hoigs.plugins.deformation.fields.mlp import MlpDeformation as _MlpDeformation
 from hoigs.plugins.deformation.fields.se3_field import Se3Field as _Se3Field
 from hoigs.plugins.deformation.splines.chs import CubicHermite as _CubicHermite
-from hoigs.plugins.deformation.splines.knot_schedule import (
-    AdaptiveKnotsConfig as _AdaptiveKnotsConfig,
-)
+from hoigs.plugins.deformation.splines.knot_schedule import AdaptiveKnotsConfig as _AdaptiveKnotsConfig
 from hoigs.plugins.deformation.splines.tracked_chs import TrackedHermite as _TrackedHermite
 from hoigs.plugins.deformation.static import Static as Static
 from hoigs.plugins.density.adc import AdaptiveDensity as _AdaptiveDensity
@@ -95,6 +87,9 @@ from hoigs.workflows.evaluate import evaluate as evaluate
 from hoigs.workflows.export import export as export
 from hoigs.workflows.refine_poses import refine_poses as refine_poses
 from hoigs.workflows.train import train as train
+from pathlib import Path as _Path
+from torch import Tensor
+from typing import Any, Literal
 
 __version__: str
 
@@ -124,19 +119,19 @@ class CrossAttention(_CrossAttention):
         self,
         config: Any = ...,
         *,
-        gate: Literal["soft", "hard", "none"] = ...,
-        granularity: Literal["object", "gaussian", "part"] = ...,
-        reach_from: Literal["nearest", "pelvis"] = ...,
+        gate: Literal['soft', 'hard', 'none'] = ...,
+        granularity: Literal['object', 'gaussian', 'part'] = ...,
+        reach_from: Literal['nearest', 'pelvis'] = ...,
         reach: float = ...,
         softness: float = ...,
         width: int = ...,
-        values: Literal["gated", "swapped"] = ...,
-        pose_head: Literal["flat", "per-part"] = ...,
-        object_residual: Literal["per-gaussian", "rigid", "both"] = ...,
+        values: Literal['gated', 'swapped'] = ...,
+        pose_head: Literal['flat', 'per-part'] = ...,
+        object_residual: Literal['per-gaussian', 'rigid', 'both'] = ...,
         hidden: int = ...,
         pose_bound: float = ...,
         means_bound: float = ...,
-        places: Literal["none", "hands"] = ...,
+        places: Literal['none', 'hands'] = ...,
     ) -> None: ...
 
 class CubicHermite(_CubicHermite):
@@ -144,12 +139,12 @@ class CubicHermite(_CubicHermite):
         self,
         config: Any = ...,
         *,
-        keyframes: int | Literal["adaptive"] | None = ...,
+        keyframes: int | Literal['adaptive'] | None = ...,
         keyframe_step: int = ...,
-        tangents: Literal["learned", "finite-difference"] = ...,
+        tangents: Literal['learned', 'finite-difference'] = ...,
         light: bool = ...,
         adaptive: _AdaptiveKnotsConfig = ...,
-        opacity: Literal["keyed", "constant", "auto"] = ...,
+        opacity: Literal['keyed', 'constant', 'auto'] = ...,
         num_frames: int | None = ...,
         track: _ObjectTrack | None = ...,
         cameras: Any = ...,
@@ -170,9 +165,9 @@ class Embedded(_Embedded):
         heads: Any = ...,
         table_spread: float = ...,
         anneal: float = ...,
-        turning: Literal["composed", "added"] = ...,
+        turning: Literal['composed', 'added'] = ...,
         neighbours: int = ...,
-        table_smoothness: Literal["neighbours", "last-row"] = ...,
+        table_smoothness: Literal['neighbours', 'last-row'] = ...,
         num_frames: int | None = ...,
     ) -> None: ...
 
@@ -198,8 +193,8 @@ class HexPlaneField(_HexPlaneField):
         width: int = ...,
         depth: int = ...,
         heads: Any = ...,
-        time_span: Literal["whole", "half"] = ...,
-        turning: Literal["composed", "added"] = ...,
+        time_span: Literal['whole', 'half'] = ...,
+        turning: Literal['composed', 'added'] = ...,
         start: float = ...,
         num_frames: int | None = ...,
     ) -> None: ...
@@ -209,24 +204,24 @@ class HexPlaneSkinning(_HexPlaneSkinning):
         self,
         config: Any = ...,
         *,
-        refine_poses: bool | Literal["auto"] = ...,
+        refine_poses: bool | Literal['auto'] = ...,
         light: bool = ...,
-        fusion: Literal["paired", "product"] = ...,
+        fusion: Literal['paired', 'product'] = ...,
         resolution: int = ...,
         channels: int = ...,
         time_resolution: int | None = ...,
         box: float = ...,
         width: int = ...,
-        head: Literal["full", "exavatar"] = ...,
-        free_attributes: bool | Literal["all"] = ...,
-        scale_about: Literal["pelvis", "camera"] = ...,
-        alpha_start: Literal["one", "depth"] = ...,
+        head: Literal['full', 'exavatar'] = ...,
+        free_attributes: bool | Literal['all'] = ...,
+        scale_about: Literal['pelvis', 'camera'] = ...,
+        alpha_start: Literal['one', 'depth'] = ...,
         field_points: int = ...,
-        field_at: Literal["posed", "canonical"] = ...,
-        residual_rule: Literal["add", "compose"] = ...,
-        nonrigid: bool | Literal["auto", "shading"] = ...,
+        field_at: Literal['posed', 'canonical'] = ...,
+        residual_rule: Literal['add', 'compose'] = ...,
+        nonrigid: bool | Literal['auto', 'shading'] = ...,
         nonrigid_motion: _NonRigidConfig = ...,
-        laplacian: Literal["points", "mesh"] = ...,
+        laplacian: Literal['points', 'mesh'] = ...,
         laplacian_of: Any = ...,
         body: _BodyModel,
         entity: str = ...,
@@ -248,8 +243,8 @@ class MlpDeformation(_MlpDeformation):
         depth: int = ...,
         position_frequencies: int = ...,
         time_frequencies: int = ...,
-        space: Literal["raw", "activated"] = ...,
-        turning: Literal["composed", "added"] = ...,
+        space: Literal['raw', 'activated'] = ...,
+        turning: Literal['composed', 'added'] = ...,
         zero_heads: bool = ...,
         start: float = ...,
         time_noise: float = ...,
@@ -300,9 +295,9 @@ class SplineMotionFeatures(_SplineMotionFeatures):
         config: Any = ...,
         *,
         width: int = ...,
-        embedding: Literal["per-gaussian", "shared", "low-rank", "none"] = ...,
-        interpolation: Literal["catmull-rom", "zero-tangent", "linear"] = ...,
-        velocity: Literal["derivative", "keyframes"] = ...,
+        embedding: Literal['per-gaussian', 'shared', 'low-rank', 'none'] = ...,
+        interpolation: Literal['catmull-rom', 'zero-tangent', 'linear'] = ...,
+        velocity: Literal['derivative', 'keyframes'] = ...,
         embedding_width: int = ...,
         rank: int = ...,
         hidden: int = ...,
@@ -322,12 +317,12 @@ class TrackedHermite(_TrackedHermite):
         self,
         config: Any = ...,
         *,
-        keyframes: int | Literal["adaptive"] | None = ...,
+        keyframes: int | Literal['adaptive'] | None = ...,
         keyframe_step: int = ...,
-        tangents: Literal["learned", "finite-difference"] = ...,
+        tangents: Literal['learned', 'finite-difference'] = ...,
         light: bool = ...,
         adaptive: _AdaptiveKnotsConfig = ...,
-        opacity: Literal["keyed", "constant", "auto"] = ...,
+        opacity: Literal['keyed', 'constant', 'auto'] = ...,
         num_frames: int | None = ...,
         track: _ObjectTrack | None = ...,
         cameras: Any = ...,
@@ -338,7 +333,7 @@ class WarpRasterizer(_WarpRasterizer):
         self,
         config: Any = ...,
         *,
-        cpu_kernels: Literal["auto", "native", "portable"] = ...,
-        scheduler: Literal["threads", "openmp", "auto", "serial"] = ...,
+        cpu_kernels: Literal['auto', 'native', 'portable'] = ...,
+        scheduler: Literal['threads', 'openmp', 'auto', 'serial'] = ...,
         threads: int | None = ...,
     ) -> None: ...

@@ -156,7 +156,7 @@ class Exporter(Configurable, ABC):
             paths = sorted(path for path in unfinished.rglob("*") if path.is_file())
             if not paths:
                 raise HoigsError(f"{type(self).__name__} wrote no file for {out}")
-            said = {"lost": omitted, "supposed": self.supposed(request)}
+            said = {"lost": omitted, "supposed": self._supposed(request)}
             text = json.dumps(self.sheet(request) | said, indent=2)
             (unfinished / SHEET).write_text(text + "\n", encoding="utf-8")
             paths.append(unfinished / SHEET)
@@ -166,9 +166,9 @@ class Exporter(Configurable, ABC):
         except BaseException:
             shutil.rmtree(unfinished)
             raise
-        return Exported(out, sizes, omitted, self.supposed(request))
+        return Exported(out, sizes, omitted, self._supposed(request))
 
-    def supposed(self, request: ExportRequest) -> dict[str, str]:
+    def _supposed(self, request: ExportRequest) -> dict[str, str]:
         """What the files say that the clip only guesses: `Exported.supposed`."""
         world, found = request.clip.world, {}
         if self.up != "clip" and world.is_guess:
