@@ -11,6 +11,7 @@ from typing import Any
 from hoigs.core.errors import did_you_mean
 from hoigs.core.files.whole_files import write_whole
 from hoigs.core.values.clip import Clip
+from hoigs.core.values.shown import html_table
 from hoigs.evaluation.geometry import GEOMETRY
 from hoigs.evaluation.geometry import NOTES as GEOMETRY_NOTES
 from hoigs.evaluation.protocol import NotComputed, Protocol, Value, to_json
@@ -145,9 +146,7 @@ class Evaluation:
         return [*tables, timing_table(self.timing), size_table(self.sizes)]
 
     def _repr_html_(self) -> str:
-        from hoigs.evaluation.report.sections import table
-
-        return "".join(table(one) for one in self.tables())
+        return "".join(html_table(t.title, t.columns, t.rows, t.notes) for t in self.tables())
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values: every score with its protocol, and the reason of each that is absent."""

@@ -111,6 +111,7 @@ def test_the_page_is_whole_and_needs_nothing_else(run: Path, model: SceneModel, 
         assert command in text
     for region in ("human_object", "full"):
         assert f"{evaluation.score(region, 'psnr'):.2f} dB" in text
+        assert f"<td>{evaluation.score(region, 'psnr'):.2f}</td>" in evaluation._repr_html_()
 
 
 def pictures_of(html: str) -> list[Image.Image]:

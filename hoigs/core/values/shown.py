@@ -34,8 +34,13 @@ def _brief(value: Any) -> str:
     return repr(value) if shown_as_class else one_line(value)
 
 
-def html_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A table for `_repr_html_`, every cell escaped."""
+def html_table(
+    title: str,
+    columns: Sequence[str],
+    rows: Sequence[Sequence[object]],
+    notes: Sequence[str] = (),
+) -> str:
+    """A table for `_repr_html_` with notes below it, all text escaped."""
     head = "".join(f"<th>{escape(column)}</th>" for column in columns)
     body = "".join(
         "<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows
@@ -43,4 +48,5 @@ def html_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[objec
     return (
         f"<table><caption><b>{escape(title)}</b></caption>"
         f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        + "".join(f"<p>{escape(note)}</p>" for note in notes)
     )
