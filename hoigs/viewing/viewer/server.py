@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import io
-import ipaddress
 import socket
 from importlib.util import find_spec
 from typing import Any
 
 from hoigs.core.errors import HoigsError
+from hoigs.viewing.viewer.access import Door, guarded
 
 LOCAL = "127.0.0.1"
 
@@ -26,8 +26,6 @@ def open_server(host: str, port: int, label: str) -> Any:
     """
     require_viser()
     import viser
-
-    from hoigs.viewing.viewer.access import Door, guarded
 
     class Server(viser.ViserServer):
         def request_share_url(self, verbose: bool = True) -> str | None:
@@ -82,14 +80,6 @@ def stop(server: Any) -> None:
     """Stop a server without viser's line on stdout."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach a server bound to `host`."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _require_free(host: str, port: int) -> None:
