@@ -13,13 +13,13 @@ from hoigs.runs.clip_source import clip_folder, read_clip
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.html.page import Page, write_page
 from hoigs.viewing.splats import ClientScene
-from hoigs.viewing.viewer.addresses import LOCAL, is_loopback
+from hoigs.viewing.viewer.access import is_loopback
 from hoigs.viewing.viewer.following import FollowedRun, wait_for_checkpoint
 from hoigs.viewing.viewer.pictures.bodies import bodies_of_clip, bodies_of_run
 from hoigs.viewing.viewer.pictures.clip_drawing import ClipDrawing
 from hoigs.viewing.viewer.pictures.overlays import offered
 from hoigs.viewing.viewer.pictures.run_drawing import Drawing, RunDrawing
-from hoigs.viewing.viewer.server import open_server, stop
+from hoigs.viewing.viewer.server import LOCAL, open_server, stop
 from hoigs.viewing.viewer.viewer import Viewer
 
 Report = Callable[[str], None]
@@ -81,7 +81,7 @@ def view(
                 "file: leave them out"
             )
         loaded = LoadedRun.open(
-            runs[0], clip=clip, rasterizer=rasterizer, device=device, plugins=plugins, pixels=False
+            runs[0], clip=clip, rasterizer=rasterizer, device=device, plugins=plugins
         )
         return write_page(loaded, html, max_mb=max_mb, entities=entities, progress=progress)
     if max_mb is not None or entities:

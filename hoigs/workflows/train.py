@@ -18,7 +18,7 @@ from hoigs.evaluation.report.sections import clock
 from hoigs.training.reports import StepReport
 from hoigs.training.session import Session
 from hoigs.viewing.live import LiveView
-from hoigs.viewing.viewer.addresses import LOCAL
+from hoigs.viewing.viewer.server import LOCAL
 from hoigs.workflows.budget import plan_budget
 from hoigs.workflows.evaluate import EvaluatedRun
 from hoigs.workflows.evaluate import evaluate as evaluate_run

@@ -9,6 +9,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -17,6 +18,8 @@ import pytest
 from served import CAMERA, Visitor, controls, served, uuid_of
 
 from hoigs.core.errors import HoigsError
+from hoigs.viewing.viewer.access import Door
+from hoigs.viewing.viewer.server import open_server
 from hoigs.viewing.viewer.takes import AHEAD, FILM_FPS, Film
 from hoigs.viewing.viewer.takes import Path as TakenPath
 from hoigs.viewing.viewer.viewer import Viewer
@@ -60,8 +63,6 @@ def running(tiny_run: Path) -> Iterator[tuple[Viewer, str]]:
 def test_only_our_own_names_and_pages_are_let_in(
     host: str, asked: str, origin: str | None, good: bool
 ) -> None:
-    from hoigs.viewing.viewer.access import Door
-
     assert Door(host).admits([asked], [] if origin is None else [origin]) is good
     assert not Door(host).admits([asked, "127.0.0.1"], [])
 
@@ -100,12 +101,13 @@ def test_strangers_get_neither_page_nor_pictures(running: tuple[Viewer, str]) ->
 
 
 def test_a_viser_that_cannot_be_guarded_is_not_started(monkeypatch: pytest.MonkeyPatch) -> None:
-    from websockets.asyncio import server
+    import viser.infra._infra as viser_server
+    from websockets.asyncio import server as known
 
-    from hoigs.viewing.viewer import access
-    from hoigs.viewing.viewer.server import open_server
-
-    monkeypatch.setattr(access, "websockets", type("Elsewhere", (), {"serve": server.serve}))
+    # as of a version that does not look for `serve` where it is now
+    own = SimpleNamespace(serve=known.serve, ServerConnection=known.ServerConnection)
+    names = vars(viser_server.websockets) | {"asyncio": SimpleNamespace(server=own)}
+    monkeypatch.setattr(viser_server, "websockets", SimpleNamespace(**names))
     with pytest.raises(HoigsError, match="could not be kept out"):
         open_server("127.0.0.1", 0, "test")
 

@@ -14,18 +14,24 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from http import HTTPStatus
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from websockets.asyncio import server as websockets
-from websockets.http11 import Request, Response
+if TYPE_CHECKING:  # the rest of hoigs does without
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
 
-from hoigs.viewing.viewer.addresses import is_loopback
-from hoigs.viewing.viewer.messages import LARGEST, checked
-
-Answer = Callable[[websockets.ServerConnection, Request], Response | None]
+    Answer = Callable[[ServerConnection, Request], Response | None]
 
 _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:\d{1,5})?", re.IGNORECASE)
 _starting = threading.Lock()
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach a server bound to `host`."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 class Door:
@@ -71,7 +77,7 @@ class Door:
     def before(self, answer: Answer) -> Answer:
         """Answers a request, after the check."""
 
-        def check(connection: websockets.ServerConnection, request: Request) -> Response | None:
+        def check(connection: ServerConnection, request: Request) -> Response | None:
             hosts = request.headers.get_all("Host")
             if not self.admits(hosts, request.headers.get_all("Origin")):
                 return connection.respond(
@@ -98,11 +104,15 @@ class Door:
 
         return check
 
-    def connection(self) -> type[websockets.ServerConnection]:
+    def connection(self) -> type[ServerConnection]:
         """Connections that pass checked messages on."""
+        from websockets.asyncio.server import ServerConnection
+
+        from hoigs.viewing.viewer.messages import checked
+
         door = self
 
-        class Checked(websockets.ServerConnection):
+        class Checked(ServerConnection):
             async def recv(self, *args: Any, **options: Any) -> Any:
                 while True:
                     message = checked(await super().recv(*args, **options), door.control)
@@ -119,6 +129,10 @@ def guarded(door: Door) -> Iterator[None]:
     viser has no place for checks, and starts its server by `websockets.asyncio.server.serve`: that
     name is ours for the moment. Whoever made the server must look at `door.closed`.
     """
+
+    from websockets.asyncio import server as websockets
+
+    from hoigs.viewing.viewer.messages import LARGEST
 
     def serve(handler: Any, *args: Any, **options: Any) -> Any:
         if not str(handler.__module__).startswith("viser."):  # of another thread
