@@ -88,7 +88,7 @@ def view(
         raise HoigsError("max_mb and entities are of the file that `html` names")
     if client and not runs:
         raise HoigsError(f"--client shows the Gaussians of a run, and {what} is none")
-    report(f"starting the viewer of {' and '.join(map(str, runs or [what]))}")
+    report(f"starting the viewer of {' and '.join([str(run) for run in runs] or [str(what)])}")
     registry = default_registry(plugin_files=plugins)
     followed = []
     for path in runs:

@@ -161,7 +161,7 @@ class MediapipeEstimator(Estimator):
         if not chosen:
             empty = ~found["person"][0].any((1, 2))
             notes += _without_pose(found["fate"][0], empty, given, video.numbers)
-        notes += _changed(changed.any(0), given, video.numbers)
+        notes += _changed(np.atleast_1d(changed.any(0)), given, video.numbers)
         return Estimates(EntityMasks(masks, None, text, notes=notes), landmarks)
 
     def people(self, video: VideoRequest) -> tuple[FramePrompt, ...]:
