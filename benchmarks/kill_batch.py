@@ -214,7 +214,7 @@ def faults(out: Path, whole: Path, rows: int) -> list[str]:
     for name in names:
         ours, theirs = out / "rows" / name, whole / "rows" / name
         state = json.loads((ours / "state.json").read_text())
-        if tuple(state["done"]) != STAGES or state["failed"]:
+        if tuple(state["done"]) != STAGES or state["failed"]["why"]:
             found.append(f"{name}: {state}")
             continue
         found += [f"{name}: {fault}" for fault in _differences(ours, theirs)]

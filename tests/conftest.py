@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -50,6 +51,18 @@ jaxtyping.jaxtyped = only_arrays(jaxtyping.jaxtyped)
 def pytest_configure(config: pytest.Config) -> None:
     # two threads, or one in each of many workers: threads that wait for each other's core spin
     torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
+
+
+@pytest.fixture(autouse=True)
+def ctrl_c_is_heard() -> Iterator[None]:
+    """Ctrl-C as in a terminal for every test, and all that it starts: where the parent ignores
+    SIGINT, as of `nohup`, of a job in the background and of some CI, so would they."""
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if ignored:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    if ignored:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -27,6 +27,27 @@ def clip(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(autouse=True)
+def a_closed_terminal_is_heard():
+    """Though `nohup` has this process ignore SIGHUP; SIGINT is that of all tests."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_what_the_parent_ignores_stays_ignored(hoigs, clip, tmp_path, monkeypatch, number):
+    monkeypatch.setattr(Display, "step", lambda _, report: signal.raise_signal(number))
+    run, before = tmp_path / "run", signal.signal(number, signal.SIG_IGN)
+    try:
+        done = hoigs("train", clip, "--spec", "static", "--out", run, *SMALL, "--no-eval")
+        assert signal.getsignal(number) is signal.SIG_IGN
+    finally:
+        signal.signal(number, before)
+    assert done.code == 0, done.err
+    assert (run / "checkpoints" / "step_000009.json").is_file()
+
+
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
 )
