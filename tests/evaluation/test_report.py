@@ -163,7 +163,7 @@ def test_its_commands_name_the_run_from_the_folder_where_it_was_made(
 
 
 def test_a_clip_that_only_held_out_cameras_score(run: Path, model: SceneModel, clip: Clip) -> None:
-    evaluation = evaluate(model, clip, timing_frames=0)
+    evaluation = score(model, clip, timing_frames=0)
     alone = replace(evaluation, views=[v for v in evaluation.views if "held-out" in v.name])
     assert alone.views
     page = write_report(run, model, clip, alone).read_text()

@@ -14,7 +14,6 @@ from typing import Any, Literal, Self
 import numpy as np
 from jaxtyping import UInt8
 
-from hoigs.core.files.regular_file import regular_file
 from hoigs.preparation.video.container import open_video, unreadable
 from hoigs.preparation.video.packet_index import PacketIndex, packet_index
 from hoigs.preparation.video.pictures import FilePicture, Picture, VideoPicture
@@ -374,7 +373,7 @@ def open_frames(
     known: FrameList | None = None,
 ) -> Frames:
     """A video file's or a folder's frames; see `Frames`."""
-    kind = FolderFrames if regular_file(Path(path)).is_dir() else VideoFrames
+    kind = FolderFrames if Path(path).is_dir() else VideoFrames
     return kind(
         path, width, every, max_frames, fps=fps, pick=pick, rate=rate, span=span, known=known
     )

@@ -10,7 +10,6 @@ from typing import Any
 from hoigs.core.errors import HoigsError
 from hoigs.core.files.colmap_files import PARTS, models_in
 from hoigs.core.files.npz import holds
-from hoigs.core.files.regular_file import regular_file
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
 
@@ -95,10 +94,6 @@ def find_source(
         require_regular(path)
     folder = path if path.is_dir() else path.parent
     missing: list[str] = []
-    try:
-        regular_file(path)
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; expected a video file or a folder") from error
     video = path if path.is_file() else _find_video(folder, missing)
     if video is not None and video.is_file() and not video.stat().st_size:
         raise SourceError(f"{video} is empty: 0 bytes; copy it again")
