@@ -12,16 +12,7 @@ import math
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
-import msgspec
 from pydantic import BaseModel, Field, StrictBool, StrictStr, TypeAdapter
-from viser import (
-    GuiButtonGroupHandle,
-    GuiButtonHandle,
-    GuiCheckboxHandle,
-    GuiDropdownHandle,
-    GuiRgbHandle,
-    GuiSliderHandle,
-)
 
 LARGEST = 1 << 20  # bytes of a message
 FOV = (0.01, 3.0)  # vertical angle, radians
@@ -73,6 +64,8 @@ def checked(raw: bytes | str, control: Callable[[str], Any]) -> bytes | None:
     Args:
         raw: as it came. control: viser's handle of an id, or None.
     """
+    import msgspec
+
     if isinstance(raw, str):
         return None
     try:
@@ -101,6 +94,15 @@ def _bounded(camera: _Camera) -> _Camera | None:
 
 def _offered(update: _Update, control: Callable[[str], Any]) -> _Update | None:
     """A value that the control could have given; None otherwise."""
+    from viser import (
+        GuiButtonGroupHandle,
+        GuiButtonHandle,
+        GuiCheckboxHandle,
+        GuiDropdownHandle,
+        GuiRgbHandle,
+        GuiSliderHandle,
+    )
+
     handle, value = control(update.uuid), update.updates.value
     match handle, value:
         case ((GuiButtonHandle() | GuiCheckboxHandle()), bool()):
