@@ -187,7 +187,11 @@ class Session:
                 "device": device,
             }
             run.create(spec.dump(), provenance, overwrite, [folder])
-        save_kept(source, run.kept_clip)
+        try:
+            save_kept(source, run.kept_clip)
+        except BaseException:  # a full disk: no run that cannot be drawn from is left
+            run.remove_unstarted()
+            raise
         return cls(spec, source, run, trainer, faults, choice.key, changes)
 
     def train(self, on_step: Callable[[StepReport], None] | None = None) -> None:

@@ -100,3 +100,14 @@ def test_a_run_of_before_keeps_it_once_it_goes_on(tmp_path):
     assert not (run / "clip.npz").exists()
     Session.open(out=run, resume=True, overrides=["train.steps=8"])
     assert load_kept(run / "clip.npz").name == LoadedRun.open(run).clip.name
+
+
+def test_a_run_whose_clip_cannot_be_kept_is_not_left_behind(tmp_path, monkeypatch):
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("hoigs.training.session.save_kept", full)
+    clip = "builtin:carry?frames=4&width=32&scene_points=200"
+    with pytest.raises(OSError, match="No space"):
+        Session.open(clip, "static", out=tmp_path / "run", overrides=["model.scene.points=200"])
+    assert not (tmp_path / "run").exists()
