@@ -10,6 +10,7 @@ from typing import Any
 from hoigs.core.errors import HoigsError
 from hoigs.core.files.colmap_files import PARTS, models_in
 from hoigs.core.files.npz import holds
+from hoigs.core.files.regular_file import NotRegularError, regular_file
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
 
@@ -158,11 +159,12 @@ def require_regular(path: Path) -> None:
     Raises:
         SourceError: something is there that is no regular file.
     """
-    if path.exists() and not path.is_file():
-        raise SourceError(
-            f"{path} is no regular file (it is a pipe, a device or the like): copy its content "
-            "to a file"
-        )
+    if not path.exists():
+        return  # whoever opens it says so
+    try:
+        regular_file(path)
+    except NotRegularError as error:
+        raise SourceError(f"{path} {error}: copy its content to a file") from error
 
 
 def find_video(path: Path) -> Path | None:
