@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
+from hoigs.core.machine.python import PYTHON
 from hoigs.viewing.viewer.server import free_port, require_viser
 
 NICENESS = 10  # where processors are short, training goes first
@@ -47,7 +48,7 @@ class LiveView:
     def start(self, run: Path) -> None:
         """Show a run, once it has a checkpoint."""
         self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__, str(run), str(self.port), *self._options],
+            [*PYTHON, "-m", __name__, str(run), str(self.port), *self._options],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             start_new_session=True,

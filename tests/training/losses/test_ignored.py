@@ -143,7 +143,7 @@ def test_scores_leave_them_out_and_say_so() -> None:
         view = judged.views[0]
         return view.mean("full", "psnr"), view.protocol.ignored  # type: ignore[return-value]
 
-    painted, known = map(score, both)
+    painted, known = map(scores_of, both)
     assert painted == known
     assert abs(painted[1] - 24 * 40 / 64**2) < 1e-6
     assert scores_of(base)[1] == 0
