@@ -47,7 +47,7 @@ def serve(options: argparse.Namespace) -> None:
 
     torch.set_num_threads(options.threads)
     with suppress(ImportError):  # as the command line does, which older trees may not
-        from hoigs.core.machine.memory import keep_freed_memory
+        from hoigs.core.system.memory import keep_freed_memory
 
         keep_freed_memory()
     from hoigs.training.session import Session

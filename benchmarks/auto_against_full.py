@@ -45,7 +45,7 @@ def train(name: str, kind: str, options: argparse.Namespace) -> dict[str, Any]:
     from hoigs.runs.checkpoint import has_checkpoint
     from hoigs.runs.loaded_run import LoadedRun
     from hoigs.runs.run_folder import RunFolder
-    from hoigs.studies.needs.pruning.compact_run import compact_of
+    from hoigs.studies.needs.compress import compact_of
 
     run = run_folder(name, kind, options)
     folder, began = RunFolder(run), time.perf_counter()
@@ -141,7 +141,7 @@ def settings_of(options: argparse.Namespace) -> dict[str, Any]:
 
 def summary(options: argparse.Namespace) -> bool:
     """Print and write the table of the clips that are done; whether all three rules hold on all."""
-    from hoigs.studies.jobs.machine import Machine
+    from hoigs.studies.jobs.cost import Machine
 
     rows, good = [], True
     print("| clip | people and objects, dB: full | auto | difference | parameters | render time | "

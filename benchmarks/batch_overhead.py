@@ -12,11 +12,11 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from hoigs.studies.batch.drive import drive
+from hoigs.studies.batch.batch import drive
 from hoigs.studies.batch.folder import BatchFolder
 from hoigs.studies.batch.manifest import each_row
-from hoigs.studies.execution.executor import Needs
-from hoigs.studies.jobs.machine import cpu_model
+from hoigs.studies.execution.local import Needs
+from hoigs.studies.jobs.cost import cpu_model
 
 
 class Done:

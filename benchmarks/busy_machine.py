@@ -31,7 +31,7 @@ WAYS: dict[str, dict[str, str]] = {
 
 def worker(clip: str, steps: int, as_commands: bool) -> None:
     """Train, and print the wall and CPU seconds of the steps."""
-    from hoigs.core.machine.busy import share_processors, short_waits_when_busy
+    from hoigs.core.system.threads import share_processors, short_waits_when_busy
 
     if as_commands:
         share_processors()

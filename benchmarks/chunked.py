@@ -25,7 +25,7 @@ from torch import Tensor
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.model.compose import compose_bodies
 from hoigs.runs.loaded_run import LoadedRun
-from hoigs.workflows.train import train
+from hoigs.training.train import train
 
 REGIONS = ("full", "human", "object")
 SMALL = [

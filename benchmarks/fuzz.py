@@ -185,14 +185,14 @@ def _read_specs(folder: Path) -> None:
 
 
 def _read_options(folder: Path) -> None:
-    from hoigs.preparation.options.option_files import load_options
+    from hoigs.preparation.options import load_options
 
     for path in sorted(folder.iterdir()):
         load_options(path)
 
 
 def _read_shapes(folder: Path) -> None:
-    from hoigs.plugins.initializers.shape_files import read_points, sample_mesh
+    from hoigs.plugins.initializers.shapes import read_points, sample_mesh
 
     for path in sorted(folder.iterdir()):
         read_points(path, 0.05)
@@ -200,7 +200,7 @@ def _read_shapes(folder: Path) -> None:
 
 
 def _read_clip(folder: Path) -> None:
-    from hoigs.evaluation.truth import read_truth
+    from hoigs.evaluation.geometry import read_truth
     from hoigs.runs.clip_source import read_clip
 
     clip = read_clip(folder / "clip")

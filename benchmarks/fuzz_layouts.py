@@ -98,7 +98,7 @@ def _write_with_body(name: str, clip: Clip, folder: Path) -> Path:
     from layouts.changed import without_fingers
 
     from hoigs.plugins.bodies.anny import AnnyBody
-    from hoigs.plugins.bodies.smplh import SmplBody
+    from hoigs.plugins.bodies.smpl import SmplBody
 
     poses = clip.bodies["human"].poses
     if name == "arctic":

@@ -28,8 +28,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.at_size import machine, write
-from hoigs.core.files.npz import load_arrays
 from hoigs.core.maths.rotations import matrices_to_quats, quats_to_matrices, slerp
+from hoigs.core.system.npz import load_arrays
 from hoigs.evaluation.evaluate import score
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.synthesis.named import named_clip

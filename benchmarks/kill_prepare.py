@@ -39,9 +39,9 @@ import torch._dynamo  # what an optimizer's first step imports, for seconds
 
 from hoigs.core.clip_folder.check import check_clip
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.plugins.estimators.common.environments import MEDIAPIPE
+from hoigs.plugins.estimators.tools import MEDIAPIPE
 from hoigs.preparation.prepare import PrepareOptions, prepare, work_folder
-from hoigs.preparation.stages.plan import PLAN
+from hoigs.preparation.stages import PLAN
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/preparation"))
 from tiny import FRAMES, landmarks, make_source, picture
@@ -303,7 +303,7 @@ def same(clip: Path, unbroken: Path) -> None:
 
 
 def tiny_video(folder: Path) -> Path:
-    from hoigs.preparation.report.video_out import VideoWriter
+    from hoigs.preparation.report.overlay import VideoWriter
 
     path = folder / "tiny.mp4"
     with VideoWriter(path, fps=12, crf=8) as video:

@@ -23,11 +23,11 @@ from typing import Any
 
 from batch_overhead import Simulated  # beside this script
 
-from hoigs.studies.batch.drive import drive
+from hoigs.studies.batch.batch import drive
 from hoigs.studies.batch.folder import BatchFolder
 from hoigs.studies.batch.manifest import each_row
 from hoigs.studies.batch.summary import write_summary
-from hoigs.studies.jobs.machine import cpu_model
+from hoigs.studies.jobs.cost import cpu_model
 
 
 class Many(Simulated):

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from hoigs.preparation.report.video_out import VideoWriter
+from hoigs.preparation.report.overlay import VideoWriter
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/preparation"))
 import tiny

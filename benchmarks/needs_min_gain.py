@@ -30,8 +30,7 @@ def every_candidate(case: str, seed: int, options: argparse.Namespace) -> dict[s
     """Scores of all candidates at all steps at which a search would score them."""
     from hoigs.studies.needs.result import Answer
     from hoigs.studies.needs.search import Search
-    from hoigs.studies.needs.search_space import SearchSpace
-    from hoigs.studies.needs.successive_halving import plan
+    from hoigs.studies.needs.search_space import SearchSpace, plan
 
     found: dict[str, Any] = {}
 
@@ -59,9 +58,8 @@ def every_candidate(case: str, seed: int, options: argparse.Namespace) -> dict[s
 
 def replayed(cell: dict[str, Any], min_gain: float) -> str:
     """The candidate that successive halving chooses with a `min_gain`."""
-    from hoigs.studies.needs.criterion import Score
     from hoigs.studies.needs.result import Settings
-    from hoigs.studies.needs.successive_halving import Plan, StepBudget, successive_halving
+    from hoigs.studies.needs.search_space import Plan, Score, StepBudget, successive_halving
 
     names = list(cell["scores"])
 

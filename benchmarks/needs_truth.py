@@ -76,7 +76,7 @@ def search_of(case: Case, seed: int, options: argparse.Namespace, kind: type[Any
 
 def run(case: Case, seed: int, options: argparse.Namespace) -> dict[str, Any]:
     """One search; what was chosen, whether that is right, and what it cost."""
-    from hoigs.studies.needs.report.write import as_data
+    from hoigs.studies.needs.report import as_data
     from hoigs.studies.needs.result import summary_line
     from hoigs.studies.needs.search import Search
 

@@ -86,7 +86,7 @@ def measure(what: str, noise: tuple[float, float]) -> dict[str, Any]:
 def file_error(path: Path, truth: Any, body: Any) -> float:
     """Joints about the pelvis in the file itself, mm off: no fit and no camera is in it."""
     from hoigs.core.values.moment import BodyPose
-    from hoigs.preparation.bodies.body_file import read_bodies
+    from hoigs.preparation.body.body_files import read_bodies
 
     turns = torch.from_numpy(read_bodies(path).turns).float()
     theirs = BodyPose.zeros(len(turns), betas=body.num_betas).replace(

@@ -29,7 +29,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 from prepare_alone import evidence
 
-from hoigs.preparation.options.prepare_options import PrepareOptions
+from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.prepare import prepare_until, work_folder
 
 SHARED = Path(os.environ.get("HOIGS_SHARED", Path(__file__).resolve().parents[2] / "shared"))

@@ -42,14 +42,14 @@ from estimates.figures import draw_masks
 from estimates.training import Training, trained
 from PIL import Image
 
-from hoigs.core.files.npz import load_arrays
+from hoigs.core.system.npz import load_arrays
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.preparation.estimates.reader import FoundObject, RawEstimates
-from hoigs.preparation.options.prepare_options import PrepareOptions
-from hoigs.preparation.options.prompts import split_name
+from hoigs.preparation.kept_stages import from_result
+from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.prepare import prepare, prepare_until, work_folder
-from hoigs.preparation.saved import from_result
-from hoigs.preparation.stages.work_folder import ARRAYS, RESULT, Result
+from hoigs.preparation.prompts import split_name
+from hoigs.preparation.work_folder import ARRAYS, RESULT, Result
 
 SHARED = Path(os.environ.get("HOIGS_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 CLICKS = {

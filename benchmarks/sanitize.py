@@ -81,9 +81,9 @@ def work() -> int:
     import torch
 
     from hoigs.core.interfaces.rasterizer import RenderRequest
+    from hoigs.metrics.kernels.ssim import mean_ssim, ssim_map
     from hoigs.rasterizers.warp import WarpRasterizer
-    from hoigs.rasterizers.warp.ssim.function import mean_ssim, ssim_map
-    from hoigs.testing.rasterizer.scenes import a_camera, random_gaussians
+    from hoigs.testing.rasterizer.subject import a_camera, random_gaussians
 
     if not torch.cuda.is_available():
         print("not run: no CUDA device")

@@ -52,7 +52,7 @@ from benchmarks.at_size import (
     write,
 )
 from hoigs.core.values.clip import Clip
-from hoigs.training.graphs.graphed_scene import GraphedScene
+from hoigs.training.graphs import GraphedScene
 from hoigs.training.session import Session
 from hoigs.training.trainer import Trainer
 

@@ -87,7 +87,7 @@ def main() -> int:
     parser.add_argument("--least", type=float, default=1.8)
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
-    from hoigs.core.machine.cpus import available_cpus
+    from hoigs.core.system.threads import available_cpus
 
     gpus = given.gpus.split(",")
     threads = max(1, available_cpus() // len(gpus))  # the same for one and for two

@@ -10,7 +10,7 @@ over a network they are the limit.
 # ruff: noqa: E402
 from __future__ import annotations
 
-from hoigs.core.machine.busy import share_processors
+from hoigs.core.system.threads import share_processors
 
 share_processors()  # as the command does, before torch is imported
 
@@ -23,11 +23,10 @@ from pathlib import Path
 import torch
 from PIL import Image
 
-from hoigs.evaluation.orbits import orbit_cameras
+from hoigs.evaluation.measure import orbit_cameras
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.runs.run_folder import versions
-from hoigs.viewing.viewer.pictures.resolution import BUDGET_S, Resolution
-from hoigs.viewing.viewer.pictures.run_drawing import Look, RunDrawing
+from hoigs.viewing.viewer.run_drawing import BUDGET_S, Look, Resolution, RunDrawing
 
 WIDTHS = (256, 640, 1280)
 QUALITY = 80

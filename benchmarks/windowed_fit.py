@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from hoigs.core.maths.frame_times import Chunking
 from hoigs.core.values.camera import Camera
-from hoigs.core.windows import Chunking
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.body.fit import fit_body
 from hoigs.preparation.body.fit_values import BodyFit

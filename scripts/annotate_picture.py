@@ -18,8 +18,7 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
-from hoigs.annotation.annotate import annotate
-from hoigs.annotation.server import PageServer
+from hoigs.viewing.annotate.server import PageServer, annotate
 
 TARGET = Path(__file__).parents[1] / "docs" / "assets" / "annotate.webp"
 

@@ -28,7 +28,7 @@ MODULES = (
     "hoigs.core.interfaces.interaction",
     "hoigs.core.interfaces.rasterizer",
     "hoigs.core.interfaces.reader",
-    "hoigs.core.progress",
+    "hoigs.core.reporting",
     "hoigs.core.registry.registry",
     "hoigs.core.values.topology",
     "hoigs.metrics",

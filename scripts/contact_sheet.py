@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hoigs.evaluation.report.contact_sheet import contact_sheet
+from hoigs.evaluation.report.media import contact_sheet
 from hoigs.runs.loaded_run import LoadedRun
 
 

@@ -18,10 +18,9 @@ from PIL import Image, ImageDraw, ImageFont
 from hoigs.core.values.between import camera_between, frame_numbers
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
-from hoigs.evaluation.report.draw import picture
+from hoigs.evaluation.report.media import picture
 from hoigs.runs.loaded_run import open_run
-from hoigs.viewing.films import playback_of
-from hoigs.viewing.frames import source_frame
+from hoigs.viewing.films import playback_of, source_frame
 from hoigs.viewing.paths import film_path, frames_shown
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "assets" / "demo.webp"

@@ -20,7 +20,7 @@ from playwright.sync_api import Page, sync_playwright
 
 import hoigs
 from hoigs.runs.run_folder import RunFolder
-from hoigs.viewing.viewer.pictures.run_drawing import MODES
+from hoigs.viewing.viewer.run_drawing import MODES
 
 ASSETS = Path(__file__).resolve().parents[1] / "docs" / "assets"
 SLOW_MS = 240_000  # software rendering on a busy machine

@@ -11,8 +11,8 @@ from torch import Tensor
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.plugins.deformation.avatars.hexplane_skinning import HexPlaneSkinning
-from hoigs.testing.material.body import TinyBody
+from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
+from hoigs.testing.material import TinyBody
 
 
 def things(frames: int) -> tuple[TinyBody, Gaussians, Gaussians, ObjectTrack]:

@@ -14,7 +14,7 @@ World = tuple[np.ndarray, np.ndarray]  # rotation and shift from the clip's worl
 
 def object_figures(made: Any, truth: Any, truth_folder: Path, world: World) -> dict[str, Any]:
     """Rotation, place and shape of the object; degrees and millimetres."""
-    from hoigs.core.files.npz import load_arrays
+    from hoigs.core.system.npz import load_arrays
 
     arrays = load_arrays(truth_folder / "truth.npz")
     track = made.objects["object"]
@@ -68,7 +68,7 @@ def body_figures(made: Any, truth: Any, body: Any, world: World) -> dict[str, An
 
 def _joints(body: Any, clip: Any) -> np.ndarray:
     """The joints of body, without those of the hands."""
-    from hoigs.preparation.body.silhouette import posed
+    from hoigs.preparation.body.mask_fit import posed
 
     joints = [j.double().numpy() for _, j in posed(body, clip.bodies["human"].poses)]
     return np.stack(joints)[:, :22]

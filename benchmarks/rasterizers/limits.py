@@ -10,8 +10,9 @@ from typing import Any
 
 import torch
 
-from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
-from hoigs.rasterizers.warp.cpu.vector_source import MAX_ROWS, PASS_CHANNELS, VECTORS
+from hoigs.core.fast.launch import CPU_FLAGS
+from hoigs.core.system.quiet_warp import wp
+from hoigs.rasterizers.warp.cpu.tile_source import MAX_ROWS, PASS_CHANNELS, VECTORS
 
 F32 = wp.array(dtype=wp.float32)
 _HEAD = Template(VECTORS).substitute(MAX_ROWS=MAX_ROWS, PASS_CHANNELS=PASS_CHANNELS)

@@ -14,8 +14,8 @@ from benchmarks.rasterizers.timing import once
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.warp import WarpRasterizer
-from hoigs.rasterizers.warp.common.records import MOMENTS, RECORD
-from hoigs.rasterizers.warp.cpu.cores import Cores
+from hoigs.rasterizers.warp.cpu.workers import Cores
+from hoigs.rasterizers.warp.frame import MOMENTS, RECORD
 
 # stages by kernel, in the order in which they run
 STAGES = {

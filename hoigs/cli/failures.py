@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 from typer.core import TyperGroup
 
 from hoigs.core.errors import HoigsError, Interrupted
-from hoigs.core.names import printable
+from hoigs.core.system.files import printable
 
 # what a user does about the error of a system call
 ADVICE = {

@@ -5,32 +5,29 @@ from __future__ import annotations
 import typer
 
 from hoigs import __version__
-from hoigs.cli import (
-    annotate,
-    batch,
-    bug_report,
-    chart,
-    compress,
-    demo,
-    doctor,
-    estimators,
-    evaluate,
-    export,
-    needs,
-    plugins,
-    prepare,
-    publish,
-    refine,
-    render,
-    spec,
-    stress,
-    tables,
-    train,
-    view,
-)
+from hoigs.cli import doctor, train
+from hoigs.cli import doctor as bug_report
+from hoigs.cli import make as annotate
+from hoigs.cli import make as demo
+from hoigs.cli import make as prepare
+from hoigs.cli import make as refine
+from hoigs.cli import parts as estimators
+from hoigs.cli import parts as plugins
+from hoigs.cli import parts as spec
+from hoigs.cli import see as export
+from hoigs.cli import see as publish
+from hoigs.cli import see as render
+from hoigs.cli import see as view
+from hoigs.cli import study as batch
+from hoigs.cli import study as chart
+from hoigs.cli import study as stress
+from hoigs.cli import study as tables
+from hoigs.cli import train as compress
+from hoigs.cli import train as evaluate
+from hoigs.cli import train as needs
 from hoigs.cli.failures import GuardedGroup, failures_as_messages
-from hoigs.core.machine.busy import share_processors, short_waits_when_busy
-from hoigs.core.machine.memory import keep_freed_memory
+from hoigs.core.system.memory import keep_freed_memory
+from hoigs.core.system.threads import share_processors, short_waits_when_busy
 
 app = typer.Typer(
     name="hoigs",
@@ -58,9 +55,9 @@ app.command("chart")(chart.chart)
 app.command("stress")(stress.stress)
 app.command("needs")(needs.needs)
 app.command("compress")(compress.compress)
-app.add_typer(plugins.app, name="plugins")
-app.add_typer(spec.app, name="spec")
-app.add_typer(estimators.app, name="estimators")
+app.add_typer(plugins.plugins_app, name="plugins")
+app.add_typer(spec.spec_app, name="spec")
+app.add_typer(estimators.estimators_app, name="estimators")
 app.command("doctor")(doctor.doctor)
 app.command("bug-report")(bug_report.bug_report)
 

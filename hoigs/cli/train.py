@@ -1,4 +1,4 @@
-"""`hoigs train`: fit a spec to a clip; the result is a run folder."""
+"""The verbs that train and score: `hoigs train`, `eval`, `needs` and `compress`."""
 
 from __future__ import annotations
 
@@ -9,18 +9,92 @@ import typer
 
 from hoigs.cli.common import (
     AllowFaultsOption,
+    ClipOption,
     DeviceOption,
+    Display,
     OverwriteOption,
     PluginOption,
     RasterizerOption,
     SetOption,
+    print_scores,
     print_table,
 )
-from hoigs.cli.display import Display, print_scores
-from hoigs.cli.needs import print_needs
 
 if TYPE_CHECKING:
     from hoigs.studies.needs.after_training import After
+    from hoigs.studies.needs.result import Needs
+
+
+# `hoigs needs`: find how much of a spec a clip needs; the answer is a spec.
+
+CriterionOption = Annotated[
+    str,
+    typer.Option(
+        "--criterion",
+        help="one-se: the cheapest candidate within one standard error of the best; or bic.",
+    ),
+]
+SearchSpacesOption = Annotated[
+    Path | None,
+    typer.Option("--search-spaces", help="A YAML file of search spaces in place of hoigs's own."),
+]
+
+
+def needs(
+    clip: Annotated[
+        str, typer.Argument(help="Clip folder, as `hoigs prepare` makes it, or builtin:NAME.")
+    ],
+    spec: Annotated[
+        str, typer.Option("--spec", help="The spec to reduce: a name or a file.")
+    ] = "hoigs",
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder of the answer; default runs/needs-CLIP.")
+    ] = None,
+    criterion: CriterionOption = "one-se",
+    least: Annotated[
+        float, typer.Option("--least", min=0, help="Ignore gains below this, dB.")
+    ] = 0.1,
+    share: Annotated[
+        float,
+        typer.Option("--share", help="Share of the training frames to hold back (at least 3)."),
+    ] = 0.05,
+    search_spaces: SearchSpacesOption = None,
+    settings: SetOption = None,
+    rasterizer: RasterizerOption = None,
+    device: DeviceOption = "auto",
+    overwrite: OverwriteOption = False,
+    allow_faults: AllowFaultsOption = False,
+    plugin: PluginOption = None,
+) -> None:
+    """Find the smallest model that a clip needs, part by part, on training frames held back.
+
+    Writes spec.yaml, needs.md, needs.json, needs.png and needs.svg.
+    """
+    from hoigs.studies.needs.needs import needs as find
+    from hoigs.studies.needs.needs import needs_folder
+
+    with Display() as show:
+        found = find(
+            clip, spec, out=out, criterion=criterion, least=least, share=share,
+            search_spaces=search_spaces, overrides=settings or (), rasterizer=rasterizer,
+            device=device, overwrite=overwrite, allow_faults=allow_faults, plugins=plugin or (),
+            report=show.line,
+        )  # fmt: skip
+    print_needs(found)
+    answer = (out or needs_folder(clip)) / "spec.yaml"
+    typer.echo(f"train it: hoigs train {clip} --spec {answer}")
+
+
+def print_needs(found: Needs) -> None:
+    """A table for each search space, then the method."""
+    from hoigs.studies.needs.report import method, row
+
+    columns = ("candidate", "held-back dB", "gain over chosen dB", "parameters", "steps", "verdict")
+    for answer in found.answers:
+        if answer.steps:
+            print_table(answer.title, columns, [row(answer, step) for step in answer.steps])
+    for sentence in method(found):
+        typer.echo(sentence)
 
 
 def train(
@@ -98,7 +172,7 @@ def train(
 ) -> None:
     """Fit a model to a clip; then score it and write report.html."""
     from hoigs.studies.needs.auto import auto as train_auto
-    from hoigs.workflows.train import train as train_spec
+    from hoigs.training.train import train as train_spec
 
     with Display() as show:
         given: dict[str, Any] = {
@@ -149,3 +223,88 @@ def _print_after(after: After) -> None:
     print_table("after the training", columns, rows)
     for sentence in sentences(after):
         typer.echo(sentence)
+
+
+# `hoigs eval`: score a run on its test frames and held-out cameras.
+
+LpipsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--lpips-weights",
+        help="File of LPIPS weights; default $HOIGS_LPIPS_WEIGHTS, or else AlexNet's, shipped.",
+    ),
+]
+
+
+def evaluate(
+    run: Annotated[Path, typer.Argument(help="Run folder, as `hoigs train` makes it.")],
+    clip: ClipOption = None,
+    rasterizer: RasterizerOption = None,
+    lpips_weights: LpipsOption = None,
+    device: DeviceOption = "auto",
+    test_pose: Annotated[
+        str | None,
+        typer.Option(
+            "--test-pose",
+            help="Body poses of test frames: auto (blended if the clip's are estimates), "
+            "given, interpolated (from training frames), blended (between both) or fitted (to the "
+            "test images). "
+            "Default: the spec's.",
+        ),
+    ] = None,
+    test_camera: Annotated[
+        str | None,
+        typer.Option(
+            "--test-camera", help="Cameras of test frames: given, interpolated or fitted."
+        ),
+    ] = None,
+    fit_steps: Annotated[
+        int | None, typer.Option("--fit-steps", min=1, help="Steps for each frame with fitted.")
+    ] = None,
+    report: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html.")] = True,
+    plugin: PluginOption = None,
+) -> None:
+    """Score a run, print the table, and write evaluation.json and report.html.
+
+    Under another --test-pose or --test-camera than the spec's, only the scores are written, as
+    evaluation-POSE-CAMERA.json beside the run's own.
+    """
+    from hoigs.evaluation.evaluate_run import evaluate as evaluate_run
+
+    with Display() as show:
+        done = evaluate_run(
+            run, clip=clip, rasterizer=rasterizer, lpips_weights=lpips_weights, device=device,
+            test_pose=test_pose, test_camera=test_camera, fit_steps=fit_steps, report=report,
+            plugins=plugin or (), progress=show.fraction,
+        )  # fmt: skip
+    print_scores(done)
+    typer.echo(f"report: {done.report}" if done.report else f"scores: {done.scores}")
+
+
+# `hoigs compress`: quantise the model of a run, and print what that costs.
+
+
+def compress(
+    run: Annotated[Path, typer.Argument(help="Run folder, as `hoigs train` makes it.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder of the compressed run; default RUN-compact."),
+    ] = None,
+    clip: ClipOption = None,
+    device: DeviceOption = "auto",
+    overwrite: OverwriteOption = False,
+    plugin: PluginOption = None,
+) -> None:
+    """Quantise a trained model to 8 and 16 bits a number and compress it.
+
+    The result is a run for eval, render and view; it cannot be trained further.
+    """
+    from hoigs.studies.needs.compress import compress as compress_run
+
+    done = compress_run(
+        run, out=out, clip=clip, device=device, overwrite=overwrite, plugins=plugin or ()
+    )
+    typer.echo(str(done))
+    frames = ", ".join(map(str, done.frames))
+    typer.echo(f"scored on training frames {frames}: people and objects, and background")
+    typer.echo(f"run: {done.path}")

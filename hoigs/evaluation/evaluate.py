@@ -13,17 +13,16 @@ from torch import Tensor
 
 from hoigs.core.errors import did_you_mean
 from hoigs.core.interfaces.rasterizer import RenderOutput
-from hoigs.core.machine.busy import short_waits_when_busy
-from hoigs.core.machine.pages import PIECE, release_time_rows
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.progress import Progress, no_progress
+from hoigs.core.parameters import PIECE, release_time_rows
+from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.spec.train_schema import TestCamera, TestPoseSetting
+from hoigs.core.system.threads import short_waits_when_busy
 from hoigs.core.values.clip import CAMERAS_REFINED, Clip, Frame
 from hoigs.core.values.tokens import EntityKind
-from hoigs.evaluation.blending import own_share
 from hoigs.evaluation.geometry import measure_geometry
 from hoigs.evaluation.measure import device_name, model_size, render_time
-from hoigs.evaluation.posing import FIT_STEPS, posed_clip, source_of_poses
+from hoigs.evaluation.posing import FIT_STEPS, own_share, posed_clip, source_of_poses
 from hoigs.evaluation.protocol import NotComputed, Pixels, Protocol, TestPose, Value
 from hoigs.evaluation.scores import METRICS, Evaluation, FrameScores, ViewScores
 from hoigs.metrics.lpips import Lpips, find_weights

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import did_you_mean
-from hoigs.core.files.whole_files import write_whole
+from hoigs.core.system.files import write_whole
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.shown import html_table
 from hoigs.evaluation.geometry import GEOMETRY

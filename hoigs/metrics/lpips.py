@@ -20,8 +20,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.files.npz import load_arrays
-from hoigs.core.files.regular_file import regular_file
+from hoigs.core.system.files import regular_file
+from hoigs.core.system.npz import load_arrays
 from hoigs.metrics.inputs import check_pair
 
 Net = Literal["alex", "vgg"]

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.metrics.inputs import check_pair
-from hoigs.rasterizers.warp.ssim.definition import C1, C2, WINDOW, window
+from hoigs.metrics.kernels.definition import C1, C2, WINDOW, window
 
 Backend = Literal["torch", "warp"]
 
@@ -39,7 +39,7 @@ def ssim(
         return ssim_map(image, target).mean()
     if backend != "warp":
         raise ValueError(f'backend is {backend!r}, expected "torch" or "warp"')
-    from hoigs.rasterizers.warp.ssim import mean_ssim
+    from hoigs.metrics.kernels.ssim import mean_ssim
 
     check_pair(image, target)
     return mean_ssim(image, target)

@@ -16,13 +16,12 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import POSES_ESTIMATED
 from hoigs.preparation.cameras.camera_track import parallax
 from hoigs.preparation.cameras.multiview import angular_factor, full_factor
-from hoigs.preparation.entities.person import FittedBody
+from hoigs.preparation.entities.people import FittedBody
 from hoigs.preparation.objects.make_object import MadeObject
 from hoigs.preparation.pipeline import Pipeline
-from hoigs.preparation.report.object_picture import save_object_picture, shown_frame
-from hoigs.preparation.report.overlay import OverlayVideo, several
+from hoigs.preparation.report.overlay import OverlayVideo, save_object_picture, several, shown_frame
 from hoigs.preparation.report.report import PrepareReport
-from hoigs.preparation.stages.cleanup import Cleanup
+from hoigs.preparation.stages import Cleanup
 from hoigs.preparation.video.source import SourceError
 
 BODY_JOINTS = 22  # without the hands', which are not fitted

@@ -15,17 +15,13 @@ from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.model.standing import world_of_people
 from hoigs.core.values.clip import BodyTrack
 from hoigs.core.values.world import World
-from hoigs.preparation.bodies.file_body import FileBody
-from hoigs.preparation.body.silhouette import silhouette
+from hoigs.preparation.body.body_files import FileBody
+from hoigs.preparation.body.mask_fit import silhouette
+from hoigs.preparation.cameras.calibration import calibration_file
 from hoigs.preparation.cameras.choose import ChosenCameras, choose_cameras, known_lens
-from hoigs.preparation.cameras.known.calibration import calibration_file
 from hoigs.preparation.choose_frames import choose_frames, stored_width
-from hoigs.preparation.entities.choose_people import chosen_people
-from hoigs.preparation.entities.entity_masks import EntityMasks
-from hoigs.preparation.entities.final_masks import blank_warning, final_masks
-from hoigs.preparation.entities.fit_people import fit_people
-from hoigs.preparation.entities.nobody import nobody
-from hoigs.preparation.entities.person import FittedPeople
+from hoigs.preparation.entities.final_masks import EntityMasks, blank_warning, final_masks
+from hoigs.preparation.entities.people import FittedPeople, chosen_people, fit_people, nobody
 from hoigs.preparation.entities.place_objects import place_objects
 from hoigs.preparation.estimates.given import GivenMasks
 from hoigs.preparation.estimates.reader import (
@@ -38,21 +34,25 @@ from hoigs.preparation.estimates.reader import (
     identity,
     paths_of,
 )
-from hoigs.preparation.kept_stages import KeptStages
+from hoigs.preparation.kept_stages import (
+    KeptStages,
+    from_result,
+    load_cameras,
+    save_cameras,
+    to_result,
+)
 from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.objects.ball.track import BallTrack, load_ball, refine_ball
+from hoigs.preparation.objects.ball import BallTrack, load_ball, refine_ball
 from hoigs.preparation.objects.make_object import MadeObject
-from hoigs.preparation.options.prepare_options import PrepareOptions
-from hoigs.preparation.options.prompts import check_prompts, placed_prompts
-from hoigs.preparation.saved import from_result, load_cameras, save_cameras, to_result
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.prompts import check_prompts, placed_prompts
 from hoigs.preparation.scene.depth import POOR, DepthFit, DepthSource
 from hoigs.preparation.scene.metres import depth_in_metres, find_scene
 from hoigs.preparation.scene.scene_points import ScenePoints
-from hoigs.preparation.stages.plan import PLAN
-from hoigs.preparation.stages.progress import Stages
-from hoigs.preparation.stages.work_folder import Result, WorkFolder, fingerprint
+from hoigs.preparation.stages import PLAN, Stages
 from hoigs.preparation.video.frames import FrameList, open_frames
 from hoigs.preparation.video.source import NobodyFoundError, Source, SourceError
+from hoigs.preparation.work_folder import Result, WorkFolder, fingerprint
 
 T = TypeVar("T")
 

@@ -13,35 +13,37 @@ from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.clip_folder.format import is_clip_folder
 from hoigs.core.clip_folder.write import refuse_to_overwrite
 from hoigs.core.errors import ClipError, HoigsError
-from hoigs.core.files.whole_files import named
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.context import BuildContext
-from hoigs.core.machine.busy import short_waits_when_busy
-from hoigs.core.machine.random_state import callers_random_state
-from hoigs.core.progress import Progress, no_progress
 from hoigs.core.registry.registry import default_registry
-from hoigs.core.storage.fetch import local_path
-from hoigs.preparation.bodies.as_landmarks import BodyFileEstimator
-from hoigs.preparation.bodies.body_file import body_beside
+from hoigs.core.reporting import Progress, no_progress
+from hoigs.core.system.files import named
+from hoigs.core.system.random_state import callers_random_state
+from hoigs.core.system.threads import short_waits_when_busy
+from hoigs.core.system.urls import local_path
+from hoigs.preparation.body.body_files import BodyFileEstimator, body_beside
 from hoigs.preparation.clip_writing import write_clip_folder
-from hoigs.preparation.estimates.plan import EstimatorPlan, plan_estimators
+from hoigs.preparation.estimates.plan import (
+    Consent,
+    EstimatorPlan,
+    agree,
+    get_ready,
+    plan_estimators,
+)
 from hoigs.preparation.estimates.reader import Estimators
-from hoigs.preparation.estimates.readiness import Consent, agree, get_ready
-from hoigs.preparation.options.option_files import (
+from hoigs.preparation.options import (
+    PrepareOptions,
+    Preset,
     installed_estimators,
     load_options,
     refuse_commands,
 )
-from hoigs.preparation.options.prepare_options import PrepareOptions, Preset
-from hoigs.preparation.options.prompt_file import with_stored
-from hoigs.preparation.options.prompts import with_prompts
 from hoigs.preparation.pipeline import Pipeline
+from hoigs.preparation.prompts import with_prompts, with_stored
 from hoigs.preparation.report.report import PrepareReport
-from hoigs.preparation.stages.cleanup import Cleanup
-from hoigs.preparation.stages.plan import PLAN, check_stage, with_dependents
-from hoigs.preparation.stages.progress import Stages
-from hoigs.preparation.stages.work_folder import WorkFolder
+from hoigs.preparation.stages import PLAN, Cleanup, Stages, check_stage, with_dependents
 from hoigs.preparation.video.source import SourceError, find_source, find_video
+from hoigs.preparation.work_folder import WorkFolder
 
 __all__ = ["PrepareOptions", "PrepareReport", "prepare", "prepare_until", "work_folder"]
 

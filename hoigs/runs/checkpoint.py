@@ -13,16 +13,21 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import nn
 
-from hoigs.compression.compact import COMPOSED, read_compact
-from hoigs.compression.compact import FORMAT as COMPACT
 from hoigs.core.errors import CheckpointError
-from hoigs.core.files.json_file import read_json, short, validated
-from hoigs.core.files.regular_file import regular_file
-from hoigs.core.files.whole_files import write_whole, written_whole
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.storage.tensor_files import TensorFile, save_tensors
-from hoigs.core.time_rows import timed_parameters
-from hoigs.runs.records import CheckpointRecord, CompactRecord
+from hoigs.core.parameters import timed_parameters
+from hoigs.core.system.files import (
+    read_json,
+    regular_file,
+    short,
+    validated,
+    write_whole,
+    written_whole,
+)
+from hoigs.core.system.tensor_files import TensorFile, save_tensors
+from hoigs.runs.compact import COMPOSED, read_compact
+from hoigs.runs.compact import FORMAT as COMPACT
+from hoigs.runs.run_folder import CheckpointRecord, CompactRecord
 
 FORMAT = "hoigs-checkpoint"
 VERSION = 2

@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from hoigs.core.errors import ClipError
-from hoigs.core.files.npz import load_arrays
-from hoigs.core.files.whole_files import write_whole
+from hoigs.core.system.files import write_whole
+from hoigs.core.system.npz import load_arrays
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment

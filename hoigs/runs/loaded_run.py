@@ -11,12 +11,12 @@ from typing import Any
 import torch
 
 from hoigs.core.errors import CheckpointError, HoigsError
-from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.model.camera_refinement import CameraRefinement
 from hoigs.core.model.compose import compose
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.schema import Spec
+from hoigs.core.system.random_state import callers_random_state
 from hoigs.core.values.clip import Clip
 from hoigs.runs.checkpoint import (
     load_newest,
@@ -24,9 +24,8 @@ from hoigs.runs.checkpoint import (
     restore_model,
 )
 from hoigs.runs.choices import pick_device, with_rasterizer
-from hoigs.runs.clip_source import clip_folder, read_clip, recorded_folder
+from hoigs.runs.clip_source import clip_folder, read_clip, recorded_folder, recorded_reader
 from hoigs.runs.kept_clip import load_kept
-from hoigs.runs.reader_choice import recorded_reader
 from hoigs.runs.resuming import load_spec
 from hoigs.runs.run_folder import RunFolder
 

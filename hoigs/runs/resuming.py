@@ -9,10 +9,16 @@ from typing import Any
 from hoigs.core.errors import HoigsError, SpecError
 from hoigs.core.registry.registry import Registry
 from hoigs.core.spec.loader import load_yaml
-from hoigs.core.spec.older import with_present_names
-from hoigs.core.spec.schema import Spec
-from hoigs.runs.clip_source import clip_folder, clip_name, recorded_folder, require_folder
-from hoigs.runs.reader_choice import ReaderChoice, choose_reader, recorded_reader
+from hoigs.core.spec.schema import Spec, with_present_names
+from hoigs.runs.clip_source import (
+    ReaderChoice,
+    choose_reader,
+    clip_folder,
+    clip_name,
+    recorded_folder,
+    recorded_reader,
+    require_folder,
+)
 from hoigs.runs.run_folder import RunFolder
 
 DEFAULT_SPEC = "hoigs"

@@ -15,21 +15,22 @@ import numpy as np
 import torch
 
 from hoigs.core.clip_folder.write import ClipWriter
-from hoigs.core.environments.cache import made
 from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.system.downloads import made
 from hoigs.core.values.clip import POSES_EXACT, BodyTrack, ObjectTrack, uniform_test_split
 from hoigs.core.values.world import World
-from hoigs.synthesis.clips import name_of
-from hoigs.synthesis.config import SceneConfig
-from hoigs.synthesis.degradation.damage import damage, with_frames_dropped
-from hoigs.synthesis.degradation.noise import (
+from hoigs.synthesis.choreography import betas_of
+from hoigs.synthesis.config import SceneConfig, name_of
+from hoigs.synthesis.degradation import (
+    damage,
     noisy_camera,
     noisy_depth,
     noisy_mask,
     noisy_poses,
     noisy_track,
+    with_frames_dropped,
+    with_shutter,
 )
-from hoigs.synthesis.degradation.shutter import with_shutter
 from hoigs.synthesis.generate import (
     ENTITIES,
     SyntheticScene,
@@ -38,7 +39,6 @@ from hoigs.synthesis.generate import (
     generate,
     unproject,
 )
-from hoigs.synthesis.person.choreography import betas_of
 
 PROVENANCE = "synthetic truth"
 SOURCES_OF_POINTS = 8  # frames from which the initial scene points are back-projected

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Literal, Self
+from collections.abc import Mapping
+from typing import Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -13,7 +14,6 @@ CameraPathName = Literal["orbit", "pan", "static"]
 ObjectMotionName = Literal[
     "held", "thrown", "pushed", "bending", "static", "carried", "gliding", "figure-eight"
 ]
-
 MOST_FRAMES = 100_000  # names of frames have five digits
 MOST_PIXELS = 8192  # a side
 MOST_POINTS = 10_000_000
@@ -253,3 +253,37 @@ class SceneConfig(ComponentConfig):
         unset = set() if self.held_out_degrees else {"held_out_degrees"}  # as before there was one
         text = "\n".join((self.model_dump_json(exclude=unset), *more))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+# CLIPS: the built-in clips by name.
+
+
+# what each clip sets; the rest is a default of SceneConfig
+CLIPS: Mapping[str, Mapping[str, Any]] = {
+    "lift-and-swing": {},
+    "carry": {
+        "frames": 80,
+        "object": {"motion": "carried", "size": (0.36, 0.30, 0.26)},
+        "camera": {
+            "azimuth_degrees": 0.0,
+            "arc_degrees": 30.0,
+            "distance": 3.7,
+            "target": (0.0, 0.88, -0.1),
+        },
+    },
+    "throw-and-catch": {"object": {"motion": "thrown"}},
+    "still-box": {"object": {"motion": "static"}},
+    "glide": {"object": {"motion": "gliding"}},
+    "figure-eight": {"object": {"motion": "figure-eight"}},
+    "bending-bar": {"object": {"motion": "bending", "size": (0.70, 0.12, 0.12)}},
+    "jolted-push": {"object": {"motion": "pushed", "jolt_metres": 0.03}},
+}
+
+
+def name_of(config: SceneConfig) -> str:
+    """The name of the built-in clip whose object moves as in `config`; else that motion's."""
+    motions = {
+        str(settings.get("object", {}).get("motion", SceneConfig().object.motion)): name
+        for name, settings in CLIPS.items()
+    }
+    return motions.get(config.object.motion, config.object.motion)

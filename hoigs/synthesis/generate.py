@@ -14,20 +14,17 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
 from hoigs.core.interfaces.body import BodyModel
-from hoigs.core.machine.quiet_warp import wp
+from hoigs.core.system.quiet_warp import wp
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
+from hoigs.synthesis.choreography import Choreographer
+from hoigs.synthesis.clothes import DressedBody, dress
 from hoigs.synthesis.config import SceneConfig
-from hoigs.synthesis.motion.object_motions import MOTIONS
-from hoigs.synthesis.motion.object_script import ObjectScript, bent_mesh
-from hoigs.synthesis.person.choreography import Choreographer
-from hoigs.synthesis.person.clothes import DressedBody, dress
-from hoigs.synthesis.rendering.paths import camera_path, held_out_views
-from hoigs.synthesis.rendering.raycast import Layer, RayCaster, fine_array
-from hoigs.synthesis.room.designs import crate_faces, faded
-from hoigs.synthesis.room.meshes import TexturedMesh, box, smooth_normals
-from hoigs.synthesis.room.room import HIGH, LOW, Palette, Room, Stand, build_room
-from hoigs.synthesis.room.textures import TextureAtlas, to_srgb
+from hoigs.synthesis.meshes import TexturedMesh, box, smooth_normals
+from hoigs.synthesis.object_motions import MOTIONS, ObjectScript, bent_mesh
+from hoigs.synthesis.raycast import Layer, RayCaster, camera_path, fine_array, held_out_views
+from hoigs.synthesis.room import HIGH, LOW, Palette, Room, Stand, build_room
+from hoigs.synthesis.textures import TextureAtlas, crate_faces, faded, to_srgb
 
 Array = np.ndarray
 ENTITIES = ("human", "object")  # numbers 1 and 2 in entity images; 0 is the scene

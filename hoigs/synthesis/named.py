@@ -13,8 +13,7 @@ from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.spec.errors import explain
 from hoigs.core.spec.loader import Document
 from hoigs.synthesis.builtin import Progress, builtin_clip
-from hoigs.synthesis.clips import CLIPS
-from hoigs.synthesis.config import SceneConfig
+from hoigs.synthesis.config import CLIPS, SceneConfig
 
 PREFIX = "builtin:"
 

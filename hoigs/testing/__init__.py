@@ -16,8 +16,7 @@ and importing this module loads no torch.
 from __future__ import annotations
 
 from hoigs.testing.checks import Check, CheckError, CheckList, Outcome, Report, Result, run_checks
-from hoigs.testing.pytest_plugin import conformance
-from hoigs.testing.runner import Options, check, check_plugin
+from hoigs.testing.runner import Options, check, check_plugin, conformance
 
 __all__ = [
     "Check",

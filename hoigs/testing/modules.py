@@ -14,8 +14,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from hoigs.core.values.topology import AxisChange, TopologyChange
-from hoigs.testing.checks import CheckError, Component, ComponentSubject
-from hoigs.testing.compare import require_finite
+from hoigs.testing.checks import CheckError, Component, ComponentSubject, require_finite
 
 Made = TypeVar("Made")
 Module = TypeVar("Module", bound=nn.Module)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from hoigs.core.errors import NotFiniteError
-from hoigs.core.model.blame import name_of
+from hoigs.core.model.entity import name_of
 from hoigs.core.model.scene import SceneModel, SceneState
 from hoigs.core.values.gaussians import Gaussians
 

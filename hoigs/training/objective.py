@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from hoigs.core.cuda_graphs.device_constants import constant
+from hoigs.core.fast.graphs import constant
 from hoigs.core.interfaces.density import DensityControl
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.model.camera_refinement import CameraRefinement
@@ -22,11 +22,9 @@ from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.metrics.lpips import Lpips
 from hoigs.metrics.regions import dilate
-from hoigs.training.graphs.graphed_scene import Deformed, GraphedScene
-from hoigs.training.losses.comparison import Comparison, image_losses
-from hoigs.training.losses.crops import Crop, union
-from hoigs.training.losses.face import FaceTexture, face_loss, visible
-from hoigs.training.losses.terms import depth_loss, term_weights
+from hoigs.training.face import FaceTexture, face_loss, visible
+from hoigs.training.graphs import Deformed, GraphedScene
+from hoigs.training.losses import Comparison, Crop, depth_loss, image_losses, term_weights, union
 from hoigs.training.views import TrainingView
 
 RESIDUAL_PENALTIES = ("residual_pose", "residual_means")  # on corrections by the interaction

@@ -10,13 +10,12 @@ from typing import Any
 import torch
 
 from hoigs.core.clip_folder.health import examine, require_useful
-from hoigs.core.diagnostics import Diagnostic
 from hoigs.core.errors import HoigsError
-from hoigs.core.files.safe_replace import refuse_within
 from hoigs.core.model.compose import compose, compose_density
 from hoigs.core.registry.registry import Registry, default_registry
-from hoigs.core.spec.fits import require_fitting
-from hoigs.core.spec.schema import Spec
+from hoigs.core.reporting import Diagnostic
+from hoigs.core.spec.schema import Spec, require_fitting
+from hoigs.core.system.safe_replace import refuse_within
 from hoigs.core.values.clip import Clip
 from hoigs.metrics.lpips import Lpips, find_weights
 from hoigs.runs.checkpoint import has_checkpoint, load_newest
@@ -32,8 +31,7 @@ from hoigs.runs.resuming import (
     own_spec,
 )
 from hoigs.runs.run_folder import RunFolder, command_line, versions
-from hoigs.training.reports import StepReport
-from hoigs.training.trainer import Trainer
+from hoigs.training.trainer import StepReport, Trainer
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """Training in windows: of parameters with rows for times of the clip, those of one are in memory.
 
-A parameter that has rows for times (`hoigs.core.time_rows.TimeRows`) grows with the clip, and with
+A parameter that has rows for times (`hoigs.core.parameters.TimeRows`) grows with the clip, and with
 it its gradient and two moments of Adam. A step reads the rows about one time. So the clip's time is
 cut into windows; before a step the rows of its frame's window, with their moments, are read from
 files, and after it they are written there. Frames come in the order in which they would come
@@ -30,8 +30,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.storage.tensor_files import TensorFile
-from hoigs.core.time_rows import TimeRows, timed_parameters
+from hoigs.core.parameters import TimeRows, timed_parameters
+from hoigs.core.system.tensor_files import TensorFile
 from hoigs.core.values.moment import Moment
 from hoigs.training.optimizer import GroupedAdam, Schedule
 

@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import shlex
+import signal
+import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from types import FrameType, TracebackType
+from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from hoigs.core.clip_folder.health import depth_factor
 from hoigs.core.errors import Interrupted
 from hoigs.core.interfaces.deformation import DeformationModel, StepStatistics
 from hoigs.core.interfaces.density import DensityControl, check_rasterizer
-from hoigs.core.machine.busy import short_waits_when_busy
 from hoigs.core.model.camera_refinement import CameraRefinement, check_camera_gradients
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.train_schema import TrainSpec
+from hoigs.core.system.threads import short_waits_when_busy
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip, Frame
 from hoigs.core.values.moment import Moment
 from hoigs.metrics.lpips import Lpips
+from hoigs.metrics.psnr import psnr, region_psnr
 from hoigs.runs.checkpoint import Checkpoint
 from hoigs.runs.run_folder import RunFolder
-from hoigs.training.checkpointing import CheckpointWriter
-from hoigs.training.density_update import EntityDensity, evolve
-from hoigs.training.losses.face import unwrap_faces
+from hoigs.training.checkpointing import CheckpointWriter, EpochSampler, checkpoint_of, restore
+from hoigs.training.density import EntityDensity, evolve
+from hoigs.training.face import unwrap_faces
 from hoigs.training.nan_guard import (
     NanGuard,
     first_not_finite,
@@ -34,13 +44,110 @@ from hoigs.training.nan_guard import (
 )
 from hoigs.training.objective import JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
-from hoigs.training.reports import StepReport, preview_scores
-from hoigs.training.sampler import EpochSampler
-from hoigs.training.stop_request import StopRequest, resume_command
 from hoigs.training.time_windows import TimeWindows
-from hoigs.training.training_state import checkpoint_of, restore
 from hoigs.training.unseen import Filling
 from hoigs.training.views import TrainingViews
+
+# What training reports of itself: logged steps, and PSNR of previews.
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """One logged step: a line of `metrics.jsonl`, and the argument of `on_step`.
+
+    Attributes:
+        time_s: of training since the run began, previews aside. loss: the weighted sum.
+        losses: unweighted terms. counts: Gaussians by entity. psnr: of previews by split, dB.
+    """
+
+    step: int
+    time_s: float
+    loss: float
+    losses: dict[str, float]
+    counts: dict[str, int]
+    psnr: dict[str, float] = field(default_factory=dict)
+
+    def record(self) -> dict[str, Any]:
+        record = dict(vars(self))
+        if not self.psnr:
+            del record["psnr"]
+        return record
+
+
+@torch.no_grad()
+def preview_scores(
+    clip: Clip, draw: Callable[[Frame], Float[Tensor, "H W 3"]], frames: int = 4
+) -> dict[str, float]:
+    """PSNR of a few frames of each split, in dB, for the curves of the report.
+
+    Args:
+        draw: the picture of a frame, by the model as it is now.
+    """
+    scores = {}
+    for split, positions in clip.split.items():
+        stride = max(1, len(positions) // frames)
+        values = []
+        for position in list(positions)[::stride][:frames]:
+            frame = clip[position]
+            color = draw(frame).cpu().clamp(0, 1)
+            if frame.ignored is None:
+                values.append(float(psnr(color, frame.rgb)))
+            elif not frame.ignored.all():
+                values.append(float(region_psnr(color, frame.rgb, ~frame.ignored)))
+        if values:
+            scores[split] = sum(values) / len(values)
+    return scores
+
+
+# StopRequest: Ctrl-C, SIGTERM and a closed terminal end a training after its present step.
+
+SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
+NOTICE = b"\nstopping after this step, with a checkpoint; once more to stop at once\n"
+
+
+class StopRequest:
+    """Inside, the first SIGINT, SIGTERM or SIGHUP is kept in `signal`; a second one acts as usual.
+
+    Python handles signals in the main thread alone; in another one nothing changes.
+
+    Attributes:
+        signal: number of the signal that came, or None.
+    """
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> StopRequest:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.getsignal(number) for number in SIGNALS}
+            for number, before in self._before.items():
+                if before is not signal.SIG_IGN:  # nohup, or a shell's background job
+                    signal.signal(number, self._request)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        self._restore()
+
+    def _request(self, number: int, _: FrameType | None) -> None:
+        self.signal = number
+        self._restore()
+        with contextlib.suppress(OSError):  # the terminal may be gone
+            os.write(2, NOTICE)  # print may be interrupted in the middle of its own buffer
+
+    def _restore(self) -> None:
+        for number, before in self._before.items():
+            signal.signal(number, signal.SIG_DFL if before is None else before)
+        self._before = {}
+
+
+def resume_command(run: RunFolder) -> str:
+    """The command that continues the run in a folder."""
+    return f"hoigs train --resume --out {shlex.quote(str(run.path))}"
 
 
 class Trainer:

@@ -9,7 +9,7 @@ import torch
 
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip, Frame
-from hoigs.training.losses.crops import Crop, crop_around
+from hoigs.training.losses import Crop, crop_around
 
 DEVICE_SHARE = 0.25  # of a CUDA device's free memory when training starts, for views
 

@@ -11,14 +11,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from hoigs.core.cuda_graphs.capture import capturing
 from hoigs.core.errors import PluginError, RenderError
+from hoigs.core.fast.graphs import capturing
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.model.scene import SceneModel, SceneState
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.core.values.moment import Moment
-from hoigs.core.values.moment_layout import MomentLayout
+from hoigs.core.values.moment import Moment, MomentLayout
 
 Mode = Literal["auto", "graph", "cached", "plain"]
 

@@ -10,9 +10,9 @@ import torch
 
 from hoigs.core.maths.rotations import normalize_quats, quats_to_matrices
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.viewing.html.tracks import RIGID_M, STEADY, pose_of, remaining, rgba_of
-from hoigs.viewing.viewer.pictures.run_drawing import RunDrawing
-from hoigs.viewing.viewer.settings import Settings
+from hoigs.viewing.player.page import RIGID_M, STEADY, pose_of, remaining, rgba_of
+from hoigs.viewing.viewer.controls import Settings
+from hoigs.viewing.viewer.run_drawing import RunDrawing
 
 GROWN = 50.0  # viser keeps covariances in float16, in which those of millimetres would be lost
 LARGEST = 60_000.0  # of a covariance in it

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import threading
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from types import TracebackType
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.progress import Progress
 from hoigs.core.registry.registry import default_registry
+from hoigs.core.reporting import Progress
+from hoigs.core.system.environments import PYTHON
 from hoigs.runs.clip_source import clip_folder, read_clip
 from hoigs.runs.loaded_run import LoadedRun
-from hoigs.viewing.html.page import Page, write_page
+from hoigs.viewing.player.page import Page, write_page
 from hoigs.viewing.splats import ClientScene
 from hoigs.viewing.viewer.access import is_loopback
+from hoigs.viewing.viewer.clip_drawing import ClipDrawing
 from hoigs.viewing.viewer.following import FollowedRun, wait_for_checkpoint
-from hoigs.viewing.viewer.pictures.bodies import bodies_of_clip, bodies_of_run
-from hoigs.viewing.viewer.pictures.clip_drawing import ClipDrawing
-from hoigs.viewing.viewer.pictures.overlays import offered
-from hoigs.viewing.viewer.pictures.run_drawing import Drawing, RunDrawing
-from hoigs.viewing.viewer.server import LOCAL, open_server, stop
+from hoigs.viewing.viewer.overlays import bodies_of_clip, bodies_of_run, offered
+from hoigs.viewing.viewer.run_drawing import Drawing, RunDrawing
+from hoigs.viewing.viewer.server import LOCAL, free_port, open_server, require_viser, stop
 from hoigs.viewing.viewer.viewer import Viewer
 
 Report = Callable[[str], None]
@@ -154,3 +159,86 @@ def _newer(
             drawings[i], changed = RunDrawing(loaded), True
             report(f"{run.path}: step {loaded.step}")
     return drawings if changed else None
+
+
+# LiveView: `hoigs view` of a run in training, in a process that ends with the training's.
+
+NICENESS = 10  # where processors are short, training goes first
+
+
+class LiveView:
+    """A viewer in its own process, so that drawing never holds the training's interpreter.
+
+    The process ends when its standard input does: on leaving the context, and also when the
+    training is killed. It is in a session of its own, since Ctrl-C is the training's to answer.
+
+    Args:
+        port: 0 finds a free one. device, rasterizer, plugins: as for `hoigs.view`.
+
+    Attributes:
+        port: of its address on this machine.
+
+    Raises:
+        HoigsError: viser is not installed, or the port is in use.
+    """
+
+    def __init__(
+        self,
+        port: int,
+        *,
+        device: str = "auto",
+        rasterizer: str | None = None,
+        plugins: Sequence[Path | str] = (),
+    ) -> None:
+        require_viser()
+        self.port = free_port(port)
+        self._options = [device, rasterizer or "", *map(str, plugins)]
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self, run: Path) -> None:
+        """Show a run, once it has a checkpoint."""
+        self._process = subprocess.Popen(
+            [*PYTHON, "-m", __name__, str(run), str(self.port), *self._options],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+
+    def __enter__(self) -> LiveView:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        if self._process is None:
+            return
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        try:
+            self._process.wait(10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def _end_with_input() -> None:
+    """End this process when its standard input does; a viewer has nothing to put in order."""
+    sys.stdin.buffer.read()
+    os._exit(0)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The process of the viewer: RUN PORT DEVICE RASTERIZER [PLUGIN …]."""
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    if hasattr(os, "nice"):
+        os.nice(NICENESS)
+
+    run, port, device, rasterizer, *plugins = arguments
+    view(
+        run, port=int(port), device=device, rasterizer=rasterizer or None, plugins=plugins,
+        report=lambda line: None,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -16,11 +16,10 @@ from browser import in_thread
 from PIL import Image
 from tiny import BALL, FRAMES, landmarks, masks, picture
 
-from hoigs.annotation.annotate import annotate
-from hoigs.annotation.server import PageServer
 from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.errors import HoigsError
-from hoigs.preparation.report.video_out import VideoWriter
+from hoigs.preparation.report.overlay import VideoWriter
+from hoigs.viewing.annotate.server import PageServer, annotate
 
 QUICK = (  # what is tested here is neither the fit nor the scene
     "fit_steps=2", "overlay_width=0", "object_track=outline", "scene_points=200", "camera=static",

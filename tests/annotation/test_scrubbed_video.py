@@ -9,9 +9,9 @@ import av
 import numpy as np
 import pytest
 
-from hoigs.annotation.video import ScrubbedVideo
 from hoigs.core.errors import HoigsError
 from hoigs.preparation.video.frames import VideoFrames
+from hoigs.viewing.annotate.video import ScrubbedVideo
 
 
 def test_any_order(tmp_path: Path) -> None:

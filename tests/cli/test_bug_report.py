@@ -8,7 +8,7 @@ import socket
 import zipfile
 from pathlib import Path
 
-from hoigs.workflows.bug_report import without_names
+from hoigs.studies.doctor import without_names
 
 
 def test_a_report_of_a_run_that_failed(hoigs, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from hoigs.core.errors import RenderError
 from hoigs.core.registry.manager import PluginManager
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.rasterizers.oracle import OracleRasterizer
-from hoigs.workflows.doctor import (
+from hoigs.studies.doctor import (
     _draw,
     codec_rows,
     cuda_rows,
@@ -74,7 +74,7 @@ def registry(tmp_path, monkeypatch):
         manager = PluginManager({})
         manager.load_file(path)
         made = Registry(manager)
-        for module in ("environments", "registry"):
+        for module in ("registry",):
             name = f"hoigs.core.registry.{module}.default_registry"
             monkeypatch.setattr(name, lambda: made)
         return made
@@ -86,8 +86,8 @@ def registry(tmp_path, monkeypatch):
 def no_cuda(monkeypatch, tmp_path):
     """A machine without NVIDIA's driver."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr("hoigs.workflows.doctor.DRIVER", tmp_path / "none")
-    monkeypatch.setattr("hoigs.workflows.doctor.shutil.which", lambda program: None)
+    monkeypatch.setattr("hoigs.studies.doctor.DRIVER", tmp_path / "none")
+    monkeypatch.setattr("hoigs.studies.doctor.shutil.which", lambda program: None)
 
 
 def test_a_backend_without_a_device_here_is_no_failure(hoigs, registry, no_cuda):
@@ -147,7 +147,7 @@ def test_a_check_that_fails_costs_only_itself(hoigs, registry, no_cuda, monkeypa
 
     registry("good")
     whole = len(json.loads(hoigs("doctor", "--json").out))
-    monkeypatch.setattr(f"hoigs.workflows.doctor.{name}", fail)
+    monkeypatch.setattr(f"hoigs.studies.doctor.{name}", fail)
     outcome = hoigs("doctor", "--json")
     rows = json.loads(outcome.out)
     assert outcome.code == 1 and len(rows) > whole / 2
@@ -160,7 +160,7 @@ def test_the_driver_of_a_machine_whose_torch_has_no_cuda(monkeypatch, no_cuda, t
     version.write_text(
         f"NVRM version: NVIDIA UNIX{kind} Kernel Module for x86_64  560.35.03  Rel\n"
     )
-    monkeypatch.setattr("hoigs.workflows.doctor.DRIVER", version)
+    monkeypatch.setattr("hoigs.studies.doctor.DRIVER", version)
     monkeypatch.setattr(torch.version, "cuda", None)
     driver, cuda = cuda_rows()
     assert driver == ("NVIDIA driver", "560.35.03", "") and cuda.found == "none"
@@ -173,7 +173,7 @@ def test_the_driver_by_nvidia_smi(monkeypatch, tmp_path):
     program = tmp_path / "nvidia-smi"
     program.write_text("#!/bin/sh\necho 570.133.20\n")
     program.chmod(0o755)
-    monkeypatch.setattr("hoigs.workflows.doctor.DRIVER", tmp_path / "absent")
+    monkeypatch.setattr("hoigs.studies.doctor.DRIVER", tmp_path / "absent")
     monkeypatch.setenv("PATH", str(tmp_path))
     assert driver_version() == "570.133.20"
     program.unlink()

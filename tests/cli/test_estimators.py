@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from hoigs.cli.main import app
 from hoigs.core.errors import HoigsError
-from hoigs.core.registry.environments import environment_named
+from hoigs.core.registry.registry import environment_named
 
 
 def test_environments_are_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

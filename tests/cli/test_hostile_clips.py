@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from hoigs.core.clip_folder.check import check_clip
-from hoigs.core.files.npz import array_headers, load_array, load_arrays
+from hoigs.core.system.npz import array_headers, load_array, load_arrays
 
 
 def header(clip, **keys):

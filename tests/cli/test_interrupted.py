@@ -10,7 +10,7 @@ import sys
 import pytest
 from small_clip import small_clip
 
-from hoigs.cli.display import Display
+from hoigs.cli.common import Display
 from hoigs.core.clip_folder.write import write_clip
 from hoigs.core.errors import HoigsError
 
@@ -117,7 +117,7 @@ def test_a_signal_within_the_import_of_an_extension(hoigs, monkeypatch, number, 
         except KeyboardInterrupt as stop:
             raise ImportError("initialization failed") from stop
 
-    monkeypatch.setattr("hoigs.workflows.doctor.doctor", fails)
+    monkeypatch.setattr("hoigs.studies.doctor.doctor", fails)
     stopped = hoigs("doctor")
     assert (stopped.code, stopped.err) == (code, "stopped\n")
 
@@ -133,7 +133,7 @@ def test_a_signal_that_compiled_code_turns_into_an_error_of_its_own(
             signal.raise_signal(number)
         raise HoigsError("damaged")
 
-    monkeypatch.setattr("hoigs.workflows.doctor.doctor", fails)
+    monkeypatch.setattr("hoigs.studies.doctor.doctor", fails)
     stopped = hoigs("doctor")
     assert (stopped.code, stopped.err) == (code, "stopped\n")
 
@@ -152,6 +152,6 @@ def test_a_trained_run_that_is_not_yet_scored(hoigs, clip, tmp_path, monkeypatch
     def stop(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("hoigs.workflows.train.evaluate_run", stop)
+    monkeypatch.setattr("hoigs.training.train.evaluate_run", stop)
     stopped = hoigs("train", clip, "--spec", "static", "--out", tmp_path / "run", *SMALL)
     assert stopped.code == 130 and f"hoigs eval {tmp_path / 'run'}" in stopped.err

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hoigs.cli.plugins_new import NewKind
+from hoigs.cli.parts import NewKind
 
 ROOT = Path(__file__).parents[2]
 RUFF = [sys.executable, "-m", "ruff"]

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from hoigs.cli.common import print_table
-from hoigs.cli.prepare import _announce
+from hoigs.cli.make import _announce
 from hoigs.preparation.estimates.plan import Choice, EstimatorPlan
 
 WIDE = [f"a column with a long title, number {i}" for i in range(9)]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from hoigs.core.spec.schema import Spec, builtin_specs
+from hoigs.core.spec.files import builtin_specs
+from hoigs.core.spec.schema import Spec
 
 
 def test_list(hoigs):

@@ -9,8 +9,7 @@ import sys
 import pytest
 
 from hoigs.cli.failures import message_of
-from hoigs.core.files.whole_files import written_whole
-from hoigs.core.names import printable
+from hoigs.core.system.files import printable, written_whole
 from hoigs.runs.run_folder import RunFolder
 
 SMALL = ["--device", "cpu", "--set", "train.steps=2", "--set", "train.preview_every=0", "--no-eval"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from hoigs.core.errors import HoigsError, SpecError
-from hoigs.workflows.budget import ENOUGH, MOST, StepTime, choose, plan_budget, seconds_of
-from hoigs.workflows.train import train
+from hoigs.training.budget import ENOUGH, MOST, StepTime, choose, plan_budget, seconds_of
+from hoigs.training.train import train
 
 STEP = StepTime(0.02, 1e-6)  # 85 ms at 256x256
 NATIVE = (1280, 720)

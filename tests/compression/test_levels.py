@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from hoigs.compression.levels import bits_of, quantise, restore
-from hoigs.compression.packed import pack, unpack
 from hoigs.core.errors import CheckpointError
+from hoigs.runs.compact import bits_of, pack, quantise, restore, unpack
 
 
 @pytest.mark.parametrize("bits", [8, 16])

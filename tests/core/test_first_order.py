@@ -8,12 +8,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from hoigs.core.cpu_kernels.choose import native
 from hoigs.core.errors import DerivativeError
+from hoigs.core.fast.choose import native
 from hoigs.core.maths import networks
 from hoigs.core.maths.feature_planes import sample_planes
 from hoigs.core.maths.skinning import skin_gaussians
-from hoigs.rasterizers.warp.image_loss import Target, image_losses
+from hoigs.metrics.kernels.image_loss import Target, image_losses
 
 
 def planes(x: Tensor) -> Tensor:

@@ -13,9 +13,7 @@ import fsspec
 import pytest
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.storage.fetch import fetched, local_path
-from hoigs.core.storage.publish import COMPLETE, publish
-from hoigs.core.storage.urls import SCHEMES, as_url
+from hoigs.core.system.urls import COMPLETE, SCHEMES, as_url, fetched, local_path, publish
 
 
 @pytest.fixture(autouse=True)

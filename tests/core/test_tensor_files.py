@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file
 
-from hoigs.core.storage.tensor_files import TensorFile, save_tensors
+from hoigs.core.system.tensor_files import TensorFile, save_tensors
 
 
 def test_rows_are_written_and_read(tmp_path: Path) -> None:

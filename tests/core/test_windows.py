@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from hoigs.core.windows import Chunking
+from hoigs.core.maths.frame_times import Chunking
 
 
 @pytest.mark.parametrize("frames", [1, 40, 41, 97, 1000, 4999])

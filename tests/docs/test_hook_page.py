@@ -42,6 +42,6 @@ def test_every_method_stands_there_with_its_arguments(kind):
 
 
 def test_the_kinds_a_newcomer_can_start_with_are_there():
-    from hoigs.cli.plugins_new import NewKind
+    from hoigs.cli.parts import NewKind
 
     assert {str(kind) for kind in NewKind} <= set(SECTIONS)

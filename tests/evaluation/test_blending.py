@@ -13,12 +13,10 @@ from hoigs.core.model.compose import compose
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import POSES_ESTIMATED, Clip, FrameStore
-from hoigs.evaluation.blending import blended, own_share
 from hoigs.evaluation.evaluate import score
-from hoigs.evaluation.interpolation import pose_between
-from hoigs.evaluation.posing import posed_clip
+from hoigs.evaluation.posing import blended, own_share, pose_between, posed_clip
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.plugins.deformation.avatars.body.skinned_body import SkinnedBody
+from hoigs.plugins.deformation.skinned_body import SkinnedBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.synthesis import SceneConfig, builtin_clip
 

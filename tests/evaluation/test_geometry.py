@@ -22,15 +22,16 @@ from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.evaluation.geometry import (
     GEOMETRY,
+    Truth,
     best_hand,
     chamfer_squared,
     measure_geometry,
+    read_truth,
     rigid_motion,
     surface_error,
 )
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.evaluation.scores import geometry_table
-from hoigs.evaluation.truth import Truth, read_truth
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.readers.clip import ClipFolderReader

@@ -8,7 +8,7 @@ import torch
 
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.clip import Clip
-from hoigs.evaluation.orbits import orbit_cameras, pivot, turned
+from hoigs.evaluation.measure import orbit_cameras, pivot, turned
 
 
 def test_pivot_keeps_its_pixel_and_its_distance(model: SceneModel, clip: Clip) -> None:

@@ -18,8 +18,13 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import POSES_ESTIMATED, Clip, FrameStore
 from hoigs.core.values.moment import BodyPose
 from hoigs.evaluation.evaluate import score
-from hoigs.evaluation.interpolation import camera_between, pose_between
-from hoigs.evaluation.posing import fit_frame, posed_clip, source_of_poses
+from hoigs.evaluation.posing import (
+    camera_between,
+    fit_frame,
+    pose_between,
+    posed_clip,
+    source_of_poses,
+)
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.synthesis import SceneConfig, builtin_clip

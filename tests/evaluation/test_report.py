@@ -21,9 +21,8 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.clip import Clip
 from hoigs.evaluation.evaluate import score
 from hoigs.evaluation.report import write_report
-from hoigs.evaluation.report.contact_sheet import contact_sheet
 from hoigs.evaluation.report.curves import smoothed
-from hoigs.evaluation.report.media import evenly, key_position, within
+from hoigs.evaluation.report.media import contact_sheet, evenly, key_position, within
 from hoigs.evaluation.report.sections import clock, short
 from hoigs.evaluation.report.write import in_shell
 from hoigs.runs.run_folder import RunFolder

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from hoigs.core.errors import DerivativeError
+from hoigs.metrics.kernels import ssim as function
+from hoigs.metrics.kernels import ssim as kernels
 from hoigs.metrics.ssim import ssim, ssim_map
-from hoigs.rasterizers.warp import ssim as kernels
-from hoigs.rasterizers.warp.ssim import function
 
 NO_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 CUDA = pytest.param("cuda", marks=[pytest.mark.gpu, NO_CUDA])
@@ -25,7 +25,7 @@ CUDA = pytest.param("cuda", marks=[pytest.mark.gpu, NO_CUDA])
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> torch.device:
     """The CPU's kernel; CUDA's kernels run on the CPU; CUDA."""
     if request.param == "portable":
-        from hoigs.rasterizers.warp.ssim.tiles import TileKernels
+        from hoigs.metrics.kernels.tiles import TileKernels
 
         monkeypatch.setattr(function, "_kernels", lambda _: TileKernels())
     return torch.device("cuda" if request.param == "cuda" else "cpu")
@@ -261,7 +261,7 @@ def test_what_it_cannot_do_it_refuses(device: torch.device) -> None:
 def test_importing_is_light() -> None:
     code = """
 import sys
-import hoigs.metrics.ssim, hoigs.rasterizers.warp.ssim
+import hoigs.metrics.ssim, hoigs.metrics.kernels.ssim
 assert "warp" not in sys.modules
 """
     root = Path(__file__).parents[2]
@@ -272,7 +272,7 @@ assert "warp" not in sys.modules
 def test_where_the_cpu_kernel_does_not_compile_others_say_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from hoigs.rasterizers.warp.ssim import strips, tiles
+    from hoigs.metrics.kernels import strips, tiles
 
     def fail(*arguments: object) -> Tensor:
         raise Exception("CPU kernel build failed with error code -1")
@@ -308,8 +308,8 @@ for shape in ((300, 260, 3), (7, 400, 3), (2, 33, 65, 1)):
 @pytest.mark.slow
 def test_kernels_compile_for_cuda(tmp_path: Path) -> None:
     """No GPU is needed to compile; to run them see the tests on "cuda"."""
-    from hoigs.core.cpu_kernels.runtime import wp
-    from hoigs.rasterizers.warp.ssim import tile_kernels
+    from hoigs.core.system.quiet_warp import wp
+    from hoigs.metrics.kernels import tiles as tile_kernels
 
     wp.compile_aot_module(tile_kernels, arch=80, module_dir=str(tmp_path))
     assert list(tmp_path.glob("*.cubin")) or list(tmp_path.glob("*.ptx"))

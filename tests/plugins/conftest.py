@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from hoigs.core.values.moment import BodyPose
-from hoigs.testing.material.body import TinyBody
+from hoigs.testing.material import TinyBody
 
 
 @pytest.fixture(scope="session")

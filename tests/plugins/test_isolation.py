@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from hoigs.cli.plugins_show import as_text, describe_all
+from hoigs.cli.parts import as_text, describe_all
 from hoigs.core.errors import PluginError
 from hoigs.core.registry.manager import GROUP, PluginManager
 from hoigs.core.registry.registry import Registry
@@ -242,7 +242,7 @@ def test_the_page_of_a_component(registry):
     text = as_text(page)
     for line in (
         "component:         deformation:chs@hoigs",
-        "target:            hoigs.plugins.deformation.splines.chs:CubicHermite",
+        "target:            hoigs.plugins.deformation.chs:CubicHermite",
         "    keyframe_step: int >= 1; default 4",
         "        Frames between knots (the paper's 4).",
         "    adaptive.begin: float >= 0 and <= 1; default 0.2",

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from tiny import FRAMES, make_source, picture
 
-from hoigs.preparation.report.video_out import VideoWriter
+from hoigs.preparation.report.overlay import VideoWriter
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,6 @@ from tiny import FRAMES, HEIGHT, WIDTH, landmarks, masks, picture
 from tiny_mediapipe import FAKE, FAKE_CV2, FAKE_LOOK
 
 from hoigs.core.clip_folder.check import check_clip
-from hoigs.core.environments.managed import MARKER, EnvironmentAbsentError
 from hoigs.core.errors import HoigsError, SpecError
 from hoigs.core.interfaces.estimator import (
     EntityMasks,
@@ -24,14 +23,15 @@ from hoigs.core.interfaces.estimator import (
     Landmarks,
     LazyFrames,
 )
+from hoigs.core.system.environments import MARKER, EnvironmentAbsentError
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.plugins.estimators.common.environments import MEDIAPIPE
+from hoigs.plugins.estimators.tools import MEDIAPIPE
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.preparation.estimates.plan import EstimatorPlan, plan_estimators
-from hoigs.preparation.options.prepare_options import PrepareOptions
-from hoigs.preparation.options.prompts import with_prompts
+from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.prepare import prepare, work_folder
-from hoigs.preparation.stages.plan import PLAN
+from hoigs.preparation.prompts import with_prompts
+from hoigs.preparation.stages import PLAN
 from hoigs.preparation.video.source import SourceError, find_source
 
 pytestmark = pytest.mark.usefixtures("one_thread")

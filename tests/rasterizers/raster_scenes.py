@@ -7,9 +7,9 @@ from torch import Tensor
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.testing.compare import require_close, require_close_gradient
-from hoigs.testing.rasterizer.reference import ORACLE, reference
-from hoigs.testing.rasterizer.scenes import (
+from hoigs.testing.checks import require_close, require_close_gradient
+from hoigs.testing.rasterizer.subject import (
+    ORACLE,
     RAW,
     Scene,
     a_camera,
@@ -17,9 +17,10 @@ from hoigs.testing.rasterizer.scenes import (
     front_camera,
     images,
     one_gaussian,
+    reference,
 )
-from hoigs.testing.rasterizer.scenes import random_gaussians as random_scene
 from hoigs.testing.rasterizer.subject import RasterizerSubject as Backend
+from hoigs.testing.rasterizer.subject import random_gaussians as random_scene
 
 CUT = ORACLE.rasterizer
 

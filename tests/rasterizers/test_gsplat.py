@@ -20,7 +20,7 @@ from hoigs.rasterizers import gsplat as adapter
 from hoigs.rasterizers.gsplat import GsplatRasterizer
 from hoigs.testing.checks import Check
 from hoigs.testing.rasterizer import RasterizerSubject
-from hoigs.testing.rasterizer.scenes import a_camera, random_gaussians
+from hoigs.testing.rasterizer.subject import a_camera, random_gaussians
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 

@@ -251,7 +251,7 @@ def test_without_openmp_threads_are_used_and_reported(monkeypatch: pytest.Monkey
 def test_where_native_kernels_do_not_compile_portable_ones_run_with_a_warning(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from hoigs.rasterizers.warp.cpu import choose
+    from hoigs.rasterizers.warp.cpu import workers as choose
 
     def fail() -> int:
         raise Exception("CPU kernel build failed with error code -1")
@@ -338,7 +338,7 @@ def test_kernels_compile_for_cuda(name: str, tmp_path: Path) -> None:
     """No GPU is needed to compile; to run them see the conformance tests on "cuda"."""
     import importlib
 
-    from hoigs.core.cpu_kernels.runtime import wp
+    from hoigs.core.system.quiet_warp import wp
 
     module = importlib.import_module(f"hoigs.rasterizers.warp.{name}")
     wp.compile_aot_module(module, arch=80, module_dir=str(tmp_path))
@@ -347,7 +347,7 @@ def test_kernels_compile_for_cuda(name: str, tmp_path: Path) -> None:
 
 def test_no_render_keeps_an_autograd_graph_alive(monkeypatch: pytest.MonkeyPatch) -> None:
     """Density control gives a parameter more rows: a graph of the old size must be gone by then."""
-    from hoigs.core.cpu_kernels import launch as cpu_launch
+    from hoigs.core.fast import launch as cpu_launch
 
     monkeypatch.setattr(cpu_launch, "_launches", {})  # as in a process that has drawn nothing yet
     means = torch.nn.Parameter(random_scene(8).means)

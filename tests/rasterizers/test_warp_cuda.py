@@ -14,7 +14,7 @@ from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.warp import WarpRasterizer
-from hoigs.testing.rasterizer.scenes import on
+from hoigs.testing.rasterizer.subject import on
 
 CUDA = torch.device("cuda", 0)
 pytestmark = [
@@ -111,7 +111,7 @@ def test_long_lists_are_in_order() -> None:
     faint = gaussians.replace(opacity_logits=gaussians.opacity_logits * 0.0 - 4.0)
     rasterizer = WarpRasterizer()
     pipeline = rasterizer.pipeline(CUDA)
-    from hoigs.rasterizers.warp.common.frame import Inputs
+    from hoigs.rasterizers.warp.frame import Inputs
 
     settings, tensors = rasterizer.inputs.prepare(faint, camera, request)
     projected = pipeline.project(Inputs(*tensors), settings)

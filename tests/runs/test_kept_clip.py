@@ -18,7 +18,7 @@ from hoigs.core.values.world import World
 from hoigs.evaluation.evaluate import score
 from hoigs.runs.kept_clip import load_kept, save_kept
 from hoigs.runs.loaded_run import LoadedRun
-from hoigs.testing.material.clip import tiny_clip
+from hoigs.testing.material import tiny_clip
 from hoigs.training.session import Session
 
 SMALL = [

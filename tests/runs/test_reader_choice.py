@@ -10,7 +10,7 @@ import pytest
 from hoigs.core.errors import ClipError, PluginError
 from hoigs.core.registry.manager import PluginManager
 from hoigs.core.registry.registry import Registry, default_registry
-from hoigs.runs.reader_choice import ReaderChoice, choose_reader, recorded_reader
+from hoigs.runs.clip_source import ReaderChoice, choose_reader, recorded_reader
 
 
 @pytest.fixture

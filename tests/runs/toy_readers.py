@@ -9,8 +9,7 @@ from pydantic import Field
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.reader import ClipReader
-from hoigs.core.registry.component import Component
-from hoigs.core.registry.hookspecs import hookimpl
+from hoigs.core.registry.component import Component, hookimpl
 from hoigs.core.values.clip import Clip
 
 

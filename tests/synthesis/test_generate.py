@@ -7,8 +7,8 @@ import torch
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.synthesis import SceneConfig, SyntheticScene, TrueView, generate
 from hoigs.synthesis.generate import canonical, unproject
-from hoigs.synthesis.motion.object_motions import MOTIONS
-from hoigs.synthesis.rendering.paths import camera_path, held_out_views
+from hoigs.synthesis.object_motions import MOTIONS
+from hoigs.synthesis.raycast import camera_path, held_out_views
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 from hoigs.core.errors import ClipError
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.synthesis import SceneConfig, builtin_clip
-from hoigs.synthesis.clips import CLIPS
+from hoigs.synthesis.config import CLIPS
 from hoigs.synthesis.named import clip_config, is_named, named_clip
 
 

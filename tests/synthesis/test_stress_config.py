@@ -9,11 +9,9 @@ import torch
 from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.synthesis import NoiseConfig, SceneConfig, generate
-from hoigs.synthesis.degradation.noise import noisy_mask, noisy_poses
-from hoigs.synthesis.degradation.shutter import mean_image, with_shutter
-from hoigs.synthesis.motion.object_motions import MOTIONS
-from hoigs.synthesis.motion.object_script import Track
-from hoigs.synthesis.room.designs import crate_faces, faded
+from hoigs.synthesis.degradation import mean_image, noisy_mask, noisy_poses, with_shutter
+from hoigs.synthesis.object_motions import MOTIONS, Track
+from hoigs.synthesis.textures import crate_faces, faded
 
 
 def script(motion: str, frames: int = 48, **thing: object):

@@ -8,7 +8,7 @@ import torch
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.body import BodyOutput
-from hoigs.testing.material.body import TinyBody
+from hoigs.testing.material import TinyBody
 
 
 class TinyConfig(ComponentConfig):

@@ -12,11 +12,8 @@ from torch import nn
 from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.deformation import DeformationModel
 from hoigs.core.values.topology import reindex
-from hoigs.plugins.deformation.avatars.hexplane_skinning import (
-    HexPlaneSkinning,
-    HexPlaneSkinningConfig,
-)
-from hoigs.plugins.deformation.avatars.lbs import Lbs, LbsConfig
+from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning, HexPlaneSkinningConfig
+from hoigs.plugins.deformation.lbs import Lbs, LbsConfig
 
 # a counter instead of random numbers: two instances in a row always differ, deterministically
 BUILT = itertools.count()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.model.exporter import Exported, Exporter
-from hoigs.core.progress import no_progress
+from hoigs.core.reporting import no_progress
 
 
 class RightConfig(ComponentConfig):

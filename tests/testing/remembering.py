@@ -13,7 +13,7 @@ from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderReq
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.testing.rasterizer.scenes import forged
+from hoigs.testing.rasterizer.subject import forged
 
 RAW = tuple(f.name for f in fields(Gaussians))
 ASKED = ("features", "screen_offsets", "background", "absolute_gradients")

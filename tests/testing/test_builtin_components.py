@@ -6,7 +6,7 @@ import pytest
 
 from hoigs.core.registry.registry import default_registry
 from hoigs.testing import Options, Outcome
-from hoigs.testing.plugin.imports import probe_targets
+from hoigs.testing.plugin import probe_targets
 from hoigs.testing.runner import KINDS, Candidate
 
 REGISTRY = default_registry()

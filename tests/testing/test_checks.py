@@ -5,8 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
-from hoigs.testing.checks import CheckError, CheckList, Outcome, run_checks
-from hoigs.testing.compare import require_close, require_close_gradient, require_finite
+from hoigs.testing.checks import (
+    CheckError,
+    CheckList,
+    Outcome,
+    require_close,
+    require_close_gradient,
+    require_finite,
+    run_checks,
+)
 
 CHECKS: CheckList[int] = CheckList("T")
 

@@ -15,7 +15,7 @@ import reader_mutants
 from hoigs.plugins.readers.clip import ClipFolderReader, ClipFolderReaderConfig
 from hoigs.testing import body, density, exporter, features, interaction, reader
 from hoigs.testing.checks import run_checks
-from hoigs.testing.material.body import TinyBody
+from hoigs.testing.material import TinyBody
 
 # kind: checks, subject, mutants, the correct component, settings
 KINDS: dict[str, tuple[Any, ...]] = {

@@ -14,8 +14,7 @@ from hoigs.core.errors import PluginError
 from hoigs.core.registry.manager import GROUP, PluginManager
 from hoigs.core.registry.registry import Registry
 from hoigs.testing import Options, Outcome, check, check_plugin, conformance
-from hoigs.testing.plugin import CHECKS, subject
-from hoigs.testing.plugin.imports import probe_targets
+from hoigs.testing.plugin import CHECKS, probe_targets, subject
 
 HOOK = """
 import hoigs

@@ -15,7 +15,7 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.synthesis import SceneConfig
-from hoigs.synthesis.motion.object_motions import MOTIONS
+from hoigs.synthesis.object_motions import MOTIONS
 
 
 class Recorded(FrameStore):

@@ -14,7 +14,7 @@ from hoigs.core.values.clip import BodyTrack, Clip, FrameStore
 from hoigs.core.values.gaussians import SH_C0, Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.plugins.deformation.avatars.hexplane_skinning import HexPlaneSkinning
+from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
 from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 

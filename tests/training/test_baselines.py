@@ -8,7 +8,8 @@ from matched import matched, score
 from hoigs.core.interfaces.deformation import DeformationModel
 from hoigs.core.interfaces.density import DensityControl
 from hoigs.core.model.compose import compose, compose_density
-from hoigs.core.spec.schema import Spec, builtin_summary
+from hoigs.core.spec.files import builtin_summary
+from hoigs.core.spec.schema import Spec
 from hoigs.core.spec.train_schema import RatesSpec
 from hoigs.core.values.moment import Moment
 from hoigs.training.trainer import Trainer

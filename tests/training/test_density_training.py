@@ -14,16 +14,14 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.train_schema import LossSpec, RatesSpec, TrainSpec
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.plugins.deformation.splines.chs import CubicHermite
+from hoigs.plugins.deformation.chs import CubicHermite
 from hoigs.plugins.deformation.static import Static
-from hoigs.plugins.density.absgrad import AbsoluteGradientDensity
-from hoigs.plugins.density.adc import AdaptiveDensity
+from hoigs.plugins.density.adc import AbsoluteGradientDensity, AdaptiveDensity
 from hoigs.plugins.density.budget import BudgetDensity
 from hoigs.plugins.density.mcmc import McmcDensity
 from hoigs.plugins.density.none import NoDensity
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.training.reports import StepReport
-from hoigs.training.trainer import Trainer
+from hoigs.training.trainer import StepReport, Trainer
 
 STEPS, SHORT, CAP = 60, 20, 150
 # several times the usual rates, so that tens of steps tell

@@ -12,13 +12,13 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.train_schema import RatesSpec, WarmupSpec
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
-from hoigs.plugins.deformation.splines.chs import CubicHermite
+from hoigs.plugins.deformation.chs import CubicHermite
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.density.adc import AdaptiveDensity
 from hoigs.plugins.density.budget import BudgetDensity
 from hoigs.plugins.density.mcmc import McmcDensity
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.training.density_update import EntityDensity
+from hoigs.training.density import EntityDensity
 from hoigs.training.optimizer import GroupedAdam
 
 COUNT, MOMENT = 40, Moment(0.4)

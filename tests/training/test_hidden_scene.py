@@ -7,7 +7,7 @@ import torch
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.deformation.static import Static
-from hoigs.training.unseen.hidden_scene import MOST, OPAQUE, fill_hidden
+from hoigs.training.unseen import MOST, OPAQUE, fill_hidden
 
 CAMERA = [torch.zeros(3)]
 

@@ -8,7 +8,8 @@ from matched import matched
 
 from hoigs.core.model.compose import compose, compose_density
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.spec.schema import Spec, builtin_summary
+from hoigs.core.spec.files import builtin_summary
+from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
 from hoigs.metrics.psnr import psnr
 from hoigs.training.trainer import Trainer

@@ -11,9 +11,9 @@ from hoigs.core.values.clip import BodyTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.plugins.deformation.rigid.articulated import Articulated
-from hoigs.plugins.deformation.rigid.rigid_spline import RigidSpline
-from hoigs.plugins.deformation.splines.chs import CubicHermite
+from hoigs.plugins.deformation.articulated import Articulated
+from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.plugins.deformation.rigid_spline import RigidSpline
 from hoigs.training.trainer import Trainer
 
 FRAMES = 4

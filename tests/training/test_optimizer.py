@@ -11,7 +11,7 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.train_schema import RatesSpec, WarmupSpec
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.splines.chs import CubicHermite
+from hoigs.plugins.deformation.chs import CubicHermite
 from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.training.optimizer import GroupedAdam, Schedule, named_rates

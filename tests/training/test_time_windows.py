@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from hoigs.core.errors import SpecError
 from hoigs.core.model.scene import SceneModel
+from hoigs.core.parameters import TimeRows
 from hoigs.core.spec.schema import Spec
-from hoigs.core.time_rows import TimeRows
 from hoigs.core.values.clip import Clip
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.training.optimizer import Schedule

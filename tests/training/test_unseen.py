@@ -21,9 +21,15 @@ from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.rasterizers.warp import WarpRasterizer
 from hoigs.synthesis import SceneConfig, builtin_clip
-from hoigs.training.unseen import fill_unseen, filling
-from hoigs.training.unseen.neighbours import opposite_points, spread
-from hoigs.training.unseen.weights import blending_weights, confidence, seen_weights
+from hoigs.training import unseen as filling
+from hoigs.training.unseen import (
+    blending_weights,
+    confidence,
+    fill_unseen,
+    opposite_points,
+    seen_weights,
+    spread,
+)
 
 
 def ring(count: int) -> torch.Tensor:

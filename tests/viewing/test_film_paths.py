@@ -17,9 +17,8 @@ import hoigs as h
 from hoigs.core.errors import HoigsError
 from hoigs.core.values.between import frame_numbers, frame_of
 from hoigs.runs.loaded_run import LoadedRun
-from hoigs.viewing.camera_files import rate_of
-from hoigs.viewing.frames import dithered, fitted, source_frame
-from hoigs.viewing.paths import best_moment, film_path
+from hoigs.viewing.films import dithered, fitted, source_frame
+from hoigs.viewing.paths import best_moment, film_path, rate_of
 
 
 @pytest.fixture(scope="module")

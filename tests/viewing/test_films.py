@@ -8,7 +8,7 @@ import av
 import numpy as np
 import pytest
 
-from hoigs.viewing.films import write_video
+from hoigs.core.system.video_files import write_video
 
 
 def test_frames_come_back(tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import Residual
-from hoigs.plugins.deformation.splines.tracked_chs import TrackedHermite
 from hoigs.plugins.deformation.static import Static
+from hoigs.plugins.deformation.tracked_chs import TrackedHermite
 from hoigs.plugins.features.body_parts import BodyPartFeatures
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.plugins.interaction.cross_attention import CrossAttention

@@ -16,10 +16,8 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.maths.rotations import axis_angle_to_quats, multiply_quats, quats_to_matrices
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.runs.loaded_run import LoadedRun
-from hoigs.viewing.html.packing import packed
-from hoigs.viewing.html.page import write_page
-from hoigs.viewing.html.tracks import key_frames, track_of
-from hoigs.viewing.viewer.pictures.run_drawing import Look, RunDrawing
+from hoigs.viewing.player.page import key_frames, packed, track_of, write_page
+from hoigs.viewing.viewer.run_drawing import Look, RunDrawing
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 EYES = [torch.tensor((0.0, 0.0, -4.0))]
@@ -154,7 +152,7 @@ def test_the_page_plays_offline_and_draws_what_we_draw(
         drawn_after(page, before)
         seen[frame] = opened.pixels()
         from hoigs.core.values.between import camera_between
-        from hoigs.viewing.viewer.pictures.fitting import fitted
+        from hoigs.viewing.viewer.panes import fitted
 
         view = fitted(camera_between(loaded.clip, frame), (640, 480))
         ours = drawing.draw(frame, view, Look(entities=everything)).image.astype(np.float64)

@@ -16,13 +16,11 @@ from hoigs.core.values.between import camera_between
 from hoigs.core.values.camera import Camera
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.viewer import eyes
-from hoigs.viewing.viewer.clock import Clock
+from hoigs.viewing.viewer.clip_drawing import ClipDrawing
+from hoigs.viewing.viewer.controls import Clock
 from hoigs.viewing.viewer.eyes import Eye
-from hoigs.viewing.viewer.pictures.clip_drawing import ClipDrawing
-from hoigs.viewing.viewer.pictures.fitting import fitted, inner_rectangle
-from hoigs.viewing.viewer.pictures.panes import joined
-from hoigs.viewing.viewer.pictures.resolution import Resolution
-from hoigs.viewing.viewer.pictures.run_drawing import FAR, MODES, Look, RunDrawing
+from hoigs.viewing.viewer.panes import fitted, inner_rectangle, joined
+from hoigs.viewing.viewer.run_drawing import FAR, MODES, Look, Resolution, RunDrawing
 from hoigs.viewing.viewer.takes import Path as TakenPath
 from hoigs.viewing.viewer.takes import turned_to
 from hoigs.viewing.viewer.views import View

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-import hoigs.workflows.demo as demonstration
+import hoigs.training.demo as demonstration
 from hoigs.core.spec.schema import Spec
 from hoigs.synthesis.named import clip_config
 

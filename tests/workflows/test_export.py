@@ -16,7 +16,7 @@ import hoigs as h
 from hoigs.core.errors import HoigsError
 from hoigs.core.values.between import frame_of
 from hoigs.runs.loaded_run import LoadedRun
-from hoigs.workflows.export import export_moments
+from hoigs.viewing.export import export_moments
 
 
 def test_a_file_and_what_was_kept_beside_it(hoigs, tmp_path):

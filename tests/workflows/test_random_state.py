@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import hoigs as h
-from hoigs.core.machine.random_state import callers_random_state
+from hoigs.core.system.random_state import callers_random_state
 from hoigs.synthesis import SceneConfig, builtin_clip
 
 FEW = ["train.steps=1", "train.preview_every=0", "model.scene.points=20"]

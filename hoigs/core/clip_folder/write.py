@@ -11,11 +11,11 @@ from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
 from torch import Tensor
 
-from hoigs.core.clip_folder.check import check_clip
-from hoigs.core.clip_folder.diagnostics import summarize
+from hoigs.core.clip_folder.check import check_clip, summarize
 from hoigs.core.clip_folder.format import (
     CLIP,
     HEADER,
@@ -26,23 +26,152 @@ from hoigs.core.clip_folder.format import (
     SplitHeader,
     ViewsHeader,
     WorldHeader,
+    depth_path,
+    ignored_path,
     is_clip_folder,
+    mask_path,
+    stem,
 )
-from hoigs.core.clip_folder.frame_files import (
-    Depth,
-    FrameFiles,
-    Image8,
-    ImageFormat,
-    Mask,
-    as_array,
-)
-from hoigs.core.clip_folder.track_files import save_body, save_object
 from hoigs.core.errors import ClipError
-from hoigs.core.files.safe_replace import refuse_unwritable, require_replaceable
-from hoigs.core.files.whole_files import failures_named
+from hoigs.core.system.files import failures_named
+from hoigs.core.system.safe_replace import refuse_unwritable, require_replaceable
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, ObjectTrack, uniform_test_split
 from hoigs.core.values.world import World
+
+# FrameFiles writes what a clip folder has of each frame: image, masks, depth, and the cameras.
+
+Image8 = UInt8[Tensor, "H W 3"] | UInt8[np.ndarray, "H W 3"]
+Mask = Bool[Tensor, "H W"] | Bool[np.ndarray, "H W"]
+Depth = Float[Tensor, "H W"] | Float[np.ndarray, "H W"]
+ImageFormat = Literal["png", "jpg"]
+
+
+def as_array(values: Any, dtype: type = np.float32) -> np.ndarray:
+    """Values of a tensor on any device, or of an array, for a file."""
+    if isinstance(values, Tensor):
+        values = values.detach().cpu().numpy()
+    return np.asarray(values, dtype=dtype)
+
+
+def _save_mask(path: Path, mask: Mask) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(as_array(mask, np.bool_).astype(np.uint8) * 255).save(path, compress_level=3)
+
+
+class FrameFiles:
+    """The frames of the clip itself, or of its held_out folder.
+
+    Attributes:
+        cameras: of the frames written so far. size: width and height of all, pixels.
+    """
+
+    def __init__(self, root: Path, image_format: ImageFormat, quality: int) -> None:
+        self.root, self.image_format, self.quality = root, image_format, quality
+        self.cameras: list[Camera] = []
+        self.size: tuple[int, int] | None = None
+
+    def add(
+        self,
+        image: Image8,
+        camera: Camera,
+        masks: Mapping[str, Mask],
+        depth: Depth | None,
+        depth_dtype: type,
+        ignored: Mask | None = None,
+    ) -> int:
+        frame = len(self.cameras)
+        pixels = as_array(image, np.uint8)
+        height, width = pixels.shape[:2]
+        self.size = self.size or (width, height)
+        if (width, height) != self.size or (camera.width, camera.height) != self.size:
+            raise ClipError(
+                f"frame {frame}: image is {width}x{height} and its camera "
+                f"{camera.width}x{camera.height}, but the clip is {self.size[0]}x{self.size[1]}"
+            )
+        self._save_image(pixels, frame)
+        for name, mask in masks.items():
+            _save_mask(mask_path(self.root, name, frame), mask)
+        if ignored is not None and as_array(ignored, np.bool_).any():
+            _save_mask(ignored_path(self.root, frame), ignored)
+        if depth is not None:
+            path = depth_path(self.root, frame)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savez_compressed(path, depth=as_array(depth, depth_dtype))
+        self.cameras.append(camera)
+        return frame
+
+    def _save_image(self, pixels: np.ndarray, frame: int) -> None:
+        folder = self.root / "images"
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{stem(frame)}.{self.image_format}"
+        if self.image_format == "jpg":
+            # 4:4:4: chroma subsampling would smear the borders that masks cut along
+            Image.fromarray(pixels).save(path, quality=self.quality, subsampling=0)
+        else:
+            Image.fromarray(pixels).save(path, compress_level=3)
+
+    def save_cameras(self) -> None:
+        np.savez_compressed(
+            self.root / "cameras.npz",
+            K=np.stack([as_array(c.K) for c in self.cameras]),
+            world_to_camera=np.stack([as_array(c.world_to_camera) for c in self.cameras]),
+        )
+
+
+# The npz files of a clip folder's bodies and objects.
+
+
+def save_body(path: Path, track: BodyTrack) -> None:
+    """Write a body's poses and shape.
+
+    Raises:
+        ClipError: the shape is not the same for all frames.
+    """
+    path.parent.mkdir(exist_ok=True)
+    poses = track.poses
+    if poses.betas.dim() != 1:
+        raise ClipError(f"betas have shape {list(poses.betas.shape)}; a clip shares one [B]")
+    # numpy declares these keywords as its own options
+    special: dict[str, Any] = {}
+    if track.gender is not None:
+        special["gender"] = np.array(track.gender)
+    if track.template is not None:
+        special["template"] = as_array(track.template)
+    np.savez_compressed(
+        path,
+        **special,
+        global_orient=as_array(poses.global_orient),
+        body=as_array(poses.body),
+        left_hand=as_array(poses.left_hand),
+        right_hand=as_array(poses.right_hand),
+        transl=as_array(poses.transl),
+        betas=as_array(poses.betas),
+        hand_pose_convention=np.array(poses.hand_pose_convention),
+        model=np.array(track.model),
+        provenance=np.array(track.provenance),
+    )
+
+
+def save_object(path: Path, track: ObjectTrack) -> None:
+    """Write an object's points and poses."""
+    path.parent.mkdir(exist_ok=True)
+    # numpy declares these keywords as its own options
+    parts: dict[str, Any] = {}
+    if track.moving is not None:
+        parts["moving"] = as_array(track.moving, np.bool_)
+    if not track.rotation_known:
+        parts["rotation_known"] = np.array(False)
+    np.savez_compressed(
+        path,
+        **parts,
+        points=as_array(track.points),
+        colors=as_array(track.colors),
+        rotations=as_array(track.rotations),
+        translations=as_array(track.translations),
+        observed=as_array(track.observed, np.bool_),
+        provenance=np.array(track.provenance),
+    )
 
 
 class ClipWriter:

@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from hoigs.core.interfaces.configurable import Configurable
-from hoigs.core.maths.knots import Knots
-from hoigs.core.time_rows import TimeRows
+from hoigs.core.maths.splines import Knots
+from hoigs.core.parameters import TimeRows
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
@@ -73,7 +73,7 @@ class DeformationModel(Configurable, nn.Module, ABC):
         time_rows: parameters of this module that have rows for times of the clip (TimeRows); those
             of modules in it are declared there.
         cuda_graph_safe: whether a CUDA graph may capture it; the conditions are in
-            `hoigs.core.cuda_graphs.eligibility`.
+            `hoigs.core.fast.graphs`.
         progress: done share of the training run, in [0, 1]; see `set_progress`.
         transient: attributes that hold results of a pass (a cache, outputs kept for
             `regularizers`) to the values they have in a copy or a pickle of the model: torch

@@ -1,6 +1,6 @@
 """DensityControl: which Gaussians of an entity are cloned, split, pruned or relocated, and when.
 
-A DensityControl decides and returns a Refinement; `hoigs.training.density_update` applies it.
+A DensityControl decides and returns a Refinement; `hoigs.training.density` applies it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.cuda_graphs.device_constants import constant
 from hoigs.core.errors import RenderError
+from hoigs.core.fast.graphs import constant
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.rasterizer import Rasterizer

@@ -16,9 +16,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from hoigs.core.environments.managed import ManagedEnvironment
 from hoigs.core.interfaces.configurable import Configurable
-from hoigs.core.progress import Progress, no_progress
+from hoigs.core.reporting import Progress, no_progress
+from hoigs.core.system.environments import ManagedEnvironment
 
 Frames = Sequence[Any]  # one array a frame: a list, or LazyFrames
 EstimateKind = Literal["masks", "landmarks", "depth"]

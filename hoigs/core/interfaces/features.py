@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.interfaces.deformation import DeformationModel
-from hoigs.core.time_rows import TimeRows
+from hoigs.core.parameters import TimeRows
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import TokenKind, Tokens

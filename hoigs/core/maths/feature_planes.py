@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hoigs.core.cpu_kernels.choose import native
-from hoigs.core.cuda_graphs.device_constants import Time, constant, filled
-from hoigs.core.time_rows import TimeRows
+from hoigs.core.fast.choose import native
+from hoigs.core.fast.graphs import Time, constant, filled
+from hoigs.core.parameters import TimeRows
 
 # Axes (0 x, 1 y, 2 z) of the space planes xy, xz, yz, and the axis that each time plane pairs
 # with time so that the product of the two sees all four coordinates: xy*zt, xz*yt, yz*xt

@@ -1,14 +1,17 @@
-"""Frame numbers of times, where frames need not be evenly spaced."""
+"""Values over the frames of a video: frame numbers of times, gaps, noise, and windows."""
 
 from __future__ import annotations
 
 from bisect import bisect_right
+from dataclasses import dataclass
 from typing import overload
 
+import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hoigs.core.cuda_graphs.device_constants import Time, constant
+from hoigs.core.fast.graphs import Time, constant
 
 FrameTimes = tuple[float, ...] | None  # of each frame, from 0 to 1, ascending; None: evenly spaced
 
@@ -43,3 +46,72 @@ def time_of(frame: float, count: int, times: FrameTimes) -> float:
         return frame / max(count - 1, 1)
     k = min(int(frame), count - 2)
     return times[k] + (frame - k) * (times[k + 1] - times[k])
+
+
+# Values over the frames of a video: gaps interpolated, noise smoothed.
+
+
+def fill_gaps(
+    values: Float[np.ndarray, "F *shape"], known: Bool[np.ndarray, " F"]
+) -> Float[np.ndarray, "F *shape"]:
+    """Linear between known values, constant before the first and after the last."""
+    frames, columns = np.arange(len(values)), values.reshape(len(values), -1).T
+    filled = [np.interp(frames, frames[known], column[known]) for column in columns]
+    return np.stack(filled, 1).reshape(values.shape)
+
+
+def smooth(values: Float[np.ndarray, "F *shape"], window: int = 9) -> Float[np.ndarray, "F *shape"]:
+    """A median of 5 frames against outliers, then parabolas over `window` frames against noise
+    (Savitzky and Golay 1964); the median of all values where there are fewer than 5."""
+    from scipy import signal  # on use: scipy takes a while to import
+
+    count = len(values)
+    if count < 5:
+        return np.broadcast_to(np.median(values, axis=0), values.shape).copy()
+    padded = np.pad(values, ((2, 2), *((0, 0),) * (values.ndim - 1)), mode="edge")
+    median = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0), axis=-1)
+    window = min(window, count if count % 2 else count - 1)
+    return signal.savgol_filter(median, window, 2, axis=0, mode="interp")
+
+
+# A long clip in windows: pieces of equal length that overlap.
+
+LONGEST = 50  # frames of overlap, where none is given
+LEAST = 4  # frames of overlap with which windows can be joined
+
+
+@dataclass(frozen=True)
+class Chunking:
+    """How a clip is cut into windows.
+
+    Attributes:
+        chunk: frames of a window, at most. overlap: frames that neighbours share.
+
+    Raises:
+        ValueError: the windows are too short, share too little to be joined, or more than half.
+    """
+
+    chunk: int
+    overlap: int
+
+    @staticmethod
+    def of(chunk: int, overlap: int | None = None) -> Chunking:
+        """Without an overlap, a quarter of the window's frames, 50 at most."""
+        return Chunking(chunk, max(LEAST, min(LONGEST, chunk // 4)) if overlap is None else overlap)
+
+    def __post_init__(self) -> None:
+        if self.chunk < 2 * LEAST:
+            raise ValueError(f"a chunk of {self.chunk} frames; windows need {2 * LEAST} or more")
+        if not LEAST <= self.overlap <= self.chunk // 2:
+            raise ValueError(
+                f"an overlap of {self.overlap} frames; windows of {self.chunk} frames have to share"
+                f" {LEAST} or more to be joined, and may share {self.chunk // 2}, half of them"
+            )
+
+    def windows(self, frames: int) -> list[slice]:
+        """Windows over `frames` frames, in order; one alone where all frames fit in it."""
+        stride = self.chunk - self.overlap
+        count = max(1, -(-(frames - self.overlap) // stride))
+        starts = [k * (frames - self.overlap) // count for k in range(count)]
+        stops = [start + self.overlap for start in starts[1:]] + [frames]
+        return [slice(a, b) for a, b in zip(starts, stops, strict=True)]

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hoigs.core.cpu_kernels.choose import native
+from hoigs.core.fast.choose import native
 
 WORTHWHILE = 256  # rows: fewer take as long either way
 

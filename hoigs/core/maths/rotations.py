@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.cpu_kernels.choose import native
-from hoigs.core.cuda_graphs.device_constants import constant
+from hoigs.core.fast.choose import native
+from hoigs.core.fast.graphs import constant
 
 # Products of quaternions, and the matrices of their rotations, are sums of a few products a_i b_j.
 # A table of coefficients makes each of them two operations on all rows instead of thirty.

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.cpu_kernels.choose import native
-from hoigs.core.cuda_graphs.device_constants import constant
+from hoigs.core.fast.choose import native
+from hoigs.core.fast.graphs import constant
 from hoigs.core.maths.rotations import (
     axis_angle_to_matrices,
     matrices_to_quats,

@@ -17,12 +17,12 @@ from hoigs.core.interfaces.deformation import DeformationModel
 from hoigs.core.interfaces.density import DensityControl, check_rasterizer
 from hoigs.core.interfaces.initializer import ObjectInitializer, check_track
 from hoigs.core.interfaces.rasterizer import Rasterizer
-from hoigs.core.maths.denser import denser
+from hoigs.core.maths.nearest import denser
 from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.names import require_entity_name
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.schema import ComponentSpec, EntitySpec, Spec
+from hoigs.core.system.files import require_entity_name
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.tokens import EntityKind

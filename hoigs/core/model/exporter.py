@@ -18,7 +18,7 @@ from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.progress import Progress, no_progress
+from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import EntityKind

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hoigs.core.interfaces.deformation import HasKnots
-from hoigs.core.maths.knots import uniform_times
+from hoigs.core.maths.splines import uniform_times
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import Gaussians

@@ -21,8 +21,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hoigs.core.maths.series import fill_gaps
-from hoigs.core.maths.series import smooth as smoothed
+from hoigs.core.maths.frame_times import fill_gaps
+from hoigs.core.maths.frame_times import smooth as smoothed
 from hoigs.core.values.camera import Camera, pinhole_pixels, pinhole_rays
 from hoigs.core.values.clip import ObjectTrack
 

@@ -12,9 +12,8 @@ from hoigs.core.errors import HoigsError, require_type
 from hoigs.core.interfaces.features import FeatureExtractor
 from hoigs.core.interfaces.interaction import InteractionModule
 from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
-from hoigs.core.model.blame import call, require_residuals, require_tokens
-from hoigs.core.model.entity import Entity
-from hoigs.core.names import require_entity_name
+from hoigs.core.model.entity import Entity, call, require_residuals, require_tokens
+from hoigs.core.system.files import require_entity_name
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment

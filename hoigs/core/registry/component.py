@@ -5,9 +5,12 @@ from __future__ import annotations
 import ast
 import importlib.util
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+
+import pluggy
 
 from hoigs.core.errors import PluginError, did_you_mean
 
@@ -27,7 +30,6 @@ INTERFACES: dict[str, str] = {
     "exporter": "hoigs.core.model.exporter:Exporter",
 }
 KINDS = tuple(INTERFACES)
-
 _KEY = re.compile(r"[a-z]+:[a-z0-9]+(?:[-_.][a-z0-9]+)*")
 _TARGET = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
@@ -153,3 +155,16 @@ def _outline(path: Path) -> tuple[set[str], set[str]]:
             elif isinstance(node, ast.Import | ast.ImportFrom):
                 names.update(alias.asname or alias.name for alias in node.names)
     return names, packages
+
+
+# The hooks that a plugin can implement, and the marker with which it does.
+
+
+PROJECT = "hoigs"
+hookspec = pluggy.HookspecMarker(PROJECT)
+hookimpl = pluggy.HookimplMarker(PROJECT)
+
+
+@hookspec
+def hoigs_components() -> Iterable[Component]:  # type: ignore[empty-body]
+    """What this plugin offers. Called once; must be quick and import nothing heavy."""

@@ -10,10 +10,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
-from hoigs.core.errors import PluginError, did_you_mean
+from hoigs.core.errors import HoigsError, PluginError, did_you_mean
 from hoigs.core.registry.component import INTERFACES, KINDS, Component, missing_target
 from hoigs.core.registry.import_watch import limited, traceback_tail
 from hoigs.core.registry.manager import Offer, PluginManager, Status, describe, normal_name
+from hoigs.core.system.environments import ManagedEnvironment
 
 
 class UsesComponents(Protocol):
@@ -221,3 +222,35 @@ def default_registry(plugin_files: Iterable[str | Path] = ()) -> Registry:
     for path in plugin_files:
         registry.manager.load_file(path)
     return registry
+
+
+# The environments that the installed estimators name.
+
+
+def known_environments(registry: Registry | None = None) -> dict[str, ManagedEnvironment]:
+    """By name; estimators that lack an extra are passed over."""
+    registry = registry or default_registry()
+    found = {}
+    for key in registry.keys("estimator"):
+        try:
+            environment = registry.get(key).environment
+        except PluginError:
+            continue
+        if environment is not None:
+            found[environment.name] = environment
+    return found
+
+
+def environment_named(name: str, registry: Registry | None = None) -> ManagedEnvironment:
+    """One of them.
+
+    Raises:
+        HoigsError: there is no such environment.
+    """
+    known = known_environments(registry)
+    if name not in known:
+        raise HoigsError(
+            f"there is no environment {name!r}{did_you_mean(name, known)}; there are: "
+            f"{', '.join(known) or 'none'}"
+        )
+    return known[name]

@@ -8,8 +8,8 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from hoigs.core.errors import did_you_mean
-from hoigs.core.files.json_file import short
 from hoigs.core.spec.loader import Document, Place
+from hoigs.core.system.files import short
 
 FORMER_KEYS = {"priors": "estimators"}  # of options files, before they were renamed
 

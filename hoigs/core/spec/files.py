@@ -12,8 +12,8 @@ from typing import Any
 
 import hoigs
 from hoigs.core.errors import SpecError, did_you_mean
-from hoigs.core.names import name_from
 from hoigs.core.spec.loader import Document, Place, read_document
+from hoigs.core.system.files import name_from
 
 BUILTIN_SPECS = Path(hoigs.__file__).parent / "plugins" / "specs"
 SHARED_PROFILES = BUILTIN_SPECS / "profiles"

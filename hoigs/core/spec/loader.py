@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from hoigs.core.errors import SpecError
-from hoigs.core.files.regular_file import regular_file
+from hoigs.core.system.files import regular_file
 
 Place = tuple[str | int, ...]
 LONGEST_INTEGER = 1000  # digits; Python writes no number of more than 4300, as messages have to

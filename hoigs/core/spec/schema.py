@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,30 +23,54 @@ from pydantic import (
 )
 
 from hoigs.core.errors import PluginError, SpecError
-from hoigs.core.names import NAME, RULE
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.errors import explain
 from hoigs.core.spec.files import (
     BUILTIN_SPECS,
-    builtin_specs,
-    builtin_summary,
     extended,
     read_spec,
-    spec_profiles,
 )
 from hoigs.core.spec.loader import Document, Place, dump_yaml, load_overrides, load_yaml
-from hoigs.core.spec.older import with_present_names
 from hoigs.core.spec.train_schema import EvaluationSpec, TrainSpec
+from hoigs.core.system.files import NAME, RULE
 
-__all__ = [
-    "BUILTIN_SPECS",
-    "ComponentSpec",
-    "EntitySpec",
-    "Spec",
-    "builtin_specs",
-    "builtin_summary",
-    "spec_profiles",
-]
+# Names that specs of version 0.1 used, read as the present ones.
+#
+# A run folder keeps the spec that it was trained with, so what `hoigs train` wrote before a rename
+# must still open.
+
+OLD, NEW = "prior", "initializer"  # of an entity's block, and the kind of its component
+
+
+def with_present_names(document: Document) -> Document:
+    """`document` with the keys that specs have today; positions in the file are kept."""
+    model = document.data.get("model")
+    blocks = model.items() if isinstance(model, dict) else ()
+    old = {name for name, block in blocks if isinstance(block, dict) and OLD in block}
+    if not old:
+        return document
+
+    def place(at: Place) -> Place:
+        renamed = len(at) > 2 and at[0] == "model" and at[1] in old and at[2] == OLD
+        return (*at[:2], NEW, *at[3:]) if renamed else at
+
+    return replace(
+        document,
+        data=document.data | {"model": {name: _block(block) for name, block in blocks}},
+        keys={place(at): where for at, where in document.keys.items()},
+        values={place(at): where for at, where in document.values.items()},
+    )
+
+
+def _block(block: Any) -> Any:
+    if not isinstance(block, dict) or OLD not in block:
+        return block
+    part = block[OLD]
+    if isinstance(part, dict) and isinstance(part.get("use"), str):
+        kind, _, name = part["use"].partition(":")
+        part = part | {"use": f"{NEW if kind == OLD else kind}:{name}"}
+    return {NEW if key == OLD else key: part if key == OLD else v for key, v in block.items()}
+
 
 # sections that decide which tensors a model has; a checkpoint belongs to these
 MODEL_SECTIONS = ("interaction", "entities", "model")
@@ -311,3 +336,40 @@ def _settings(
         return config_class.model_validate(part.settings).model_dump(mode="json"), []
     except ValidationError as error:
         return {}, explain(error, config_class, document, place)
+
+
+# Components of one block that do not fit each other, by what their classes declare.
+
+KINDS = ("scene", "human", "object")  # blocks of other names are of one entity, of any kind
+
+
+def require_fitting(spec: Spec, registry: Registry) -> None:
+    """Refuse a deformation of other kinds of entity, and features that require what it lacks.
+
+    `compose` refuses both, too; here no clip is needed. A spec is not checked when it is loaded: a
+    search changes one component after the other.
+
+    Raises:
+        SpecError: a line for each, with its position.
+    """
+    if found := [line for name in spec.model for line in _misfits(spec, name, registry)]:
+        raise SpecError("\n".join(found))
+
+
+def _misfits(spec: Spec, name: str, registry: Registry) -> Iterator[str]:
+    from hoigs.core.interfaces.features import check_provided
+
+    block = spec.model[name]
+    deformation = registry.get(block.deformation.use)
+    places = [spec.at("model", name, part, "use") for part in ("deformation", "features")]
+    if name in KINDS and name not in deformation.kinds:
+        yield (
+            f"{places[0]}: {deformation.__name__} deforms entities of kind "
+            f"{' or '.join(sorted(deformation.kinds))}, not {name}"
+        )
+    elif block.features is not None:
+        try:
+            check_provided(registry.get(block.features.use), deformation)
+        except ValueError as error:
+            # of the two, the one that a user wrote
+            yield f"{min(places, key=lambda at: at.startswith(str(BUILTIN_SPECS)))}: {error}"

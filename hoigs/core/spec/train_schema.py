@@ -68,7 +68,7 @@ class LossSpec(_Strict):
     lpips_net: Literal["alex", "vgg"] | None = None
     """"vgg" (ExAvatar) or "alex"; None takes the first that is found on disk."""
     face: float = Field(default=0.0, ge=0)
-    """Weight of L_face, the textured face mesh against the video (hoigs/training/losses/face.py).
+    """Weight of L_face, the textured face mesh against the video (hoigs/training/face.py).
     """
     depth_fit: Literal["auto", "scale", "affine"] = "auto"
     """How L_depth aligns the depth prior with the render. "auto" takes metric depth as it is, or by

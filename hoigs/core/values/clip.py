@@ -14,11 +14,11 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from hoigs.core.diagnostics import Diagnostic
 from hoigs.core.errors import ClipError
-from hoigs.core.files.pixel_cache import PixelCache
 from hoigs.core.maths.frame_times import FrameTimes
-from hoigs.core.names import is_plain
+from hoigs.core.reporting import Diagnostic
+from hoigs.core.system.files import is_plain
+from hoigs.core.system.video_files import PixelCache
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.shown import SHOWN, html_table, one_line

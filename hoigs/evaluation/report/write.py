@@ -12,13 +12,13 @@ from string import Template
 from typing import Any
 
 import hoigs
-from hoigs.core.files.whole_files import write_whole
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.progress import Progress, no_progress
+from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.spec.loader import load_yaml
+from hoigs.core.system.files import write_whole
 from hoigs.core.values.clip import Clip
 from hoigs.evaluation.report import curves, media, sections
-from hoigs.evaluation.report.draw import ERROR_FULL, depth_colors, error_colors
+from hoigs.evaluation.report.media import ERROR_FULL, depth_colors, error_colors
 from hoigs.evaluation.scores import Evaluation, Table, score_table, size_table, timing_table
 from hoigs.runs.run_folder import RunFolder
 

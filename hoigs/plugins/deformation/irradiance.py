@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hoigs.core.cuda_graphs.device_constants import constant
+from hoigs.core.fast.graphs import constant
 from hoigs.core.maths.nearest import surface_normals
 from hoigs.core.maths.rotations import quats_to_matrices, relative_quats
 from hoigs.core.values.gaussians import SH_C0, Gaussians

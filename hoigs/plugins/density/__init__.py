@@ -1,6 +1,6 @@
 """Density control: which Gaussians are cloned, split, pruned or relocated, and when.
 
-These classes decide; `hoigs.training.density_update` applies a decision to a model in training.
+These classes decide; `hoigs.training.density` applies a decision to a model in training.
 
 - `adc.AdaptiveDensity`: clone, split and prune (3DGS). `absgrad.AbsoluteGradientDensity`: the same
   by absolute screen gradients (AbsGS).

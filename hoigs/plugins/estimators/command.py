@@ -24,12 +24,12 @@ from hoigs.core.interfaces.estimator import (
     Estimator,
     VideoRequest,
 )
-from hoigs.core.progress import Progress, no_progress
-from hoigs.plugins.estimators.common.frame_files import absent
-from hoigs.plugins.estimators.common.subprocess import run_tool, settings_key
+from hoigs.core.reporting import Progress, no_progress
 from hoigs.plugins.estimators.depth_files import DepthFilesConfig, DepthFilesEstimator
+from hoigs.plugins.estimators.frame_files import absent
 from hoigs.plugins.estimators.landmarks_files import LandmarksFilesConfig, LandmarksFilesEstimator
 from hoigs.plugins.estimators.masks_files import MasksFilesConfig, MasksFilesEstimator
+from hoigs.plugins.estimators.tools import run_tool, settings_key
 
 PLACES = ("frames", "out", "video", "folder", "width", "height", "count", "fps")
 

@@ -19,12 +19,12 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.maths.spherical_harmonics import mean_colors
 from hoigs.core.model.exporter import Exporter, ExportRequest
-from hoigs.core.progress import Progress
+from hoigs.core.reporting import Progress
 from hoigs.core.values.between import camera_between, frame_of
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import SH_C0, Gaussians
-from hoigs.plugins.exporters.common.ply_file import parse_ply, ply_bytes
-from hoigs.plugins.exporters.common.world import Move
+from hoigs.plugins.exporters.ply import parse_ply, ply_bytes
+from hoigs.plugins.exporters.posed import Move
 
 FLAGS, ANTIALIASED = 14, 1  # the byte of an SPZ header, and its bit
 EYES = 8  # cameras of the video, of which a colour is the mean

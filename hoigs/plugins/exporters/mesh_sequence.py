@@ -16,10 +16,9 @@ from torch import Tensor
 from hoigs.core.config import ComponentConfig
 from hoigs.core.maths.nearest import nearest
 from hoigs.core.model.exporter import Exporter, ExportRequest
-from hoigs.core.progress import Progress
+from hoigs.core.reporting import Progress
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.plugins.exporters.common.bodies import body_motion
-from hoigs.plugins.exporters.common.world import AXES, Up, world_move
+from hoigs.plugins.exporters.posed import AXES, Up, body_motion, world_move
 
 
 class MeshSequenceConfig(ComponentConfig):

@@ -11,10 +11,10 @@ from jaxtyping import UInt8
 from pydantic import Field
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.files.video_files import write_video
 from hoigs.core.interfaces.rasterizer import RenderOutput
 from hoigs.core.model.exporter import Exporter, ExportRequest
-from hoigs.core.progress import Progress
+from hoigs.core.reporting import Progress
+from hoigs.core.system.video_files import write_video
 from hoigs.core.values.between import camera_between, frame_of
 
 SUFFIXES = {"prores": ".mov", "vp9": ".webm", "png": ".zip"}

@@ -12,9 +12,8 @@ import torch
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.model.exporter import Exporter, ExportRequest
-from hoigs.core.progress import Progress
-from hoigs.plugins.exporters.common.bodies import BodyMotion, body_motions
-from hoigs.plugins.exporters.common.world import AXES, Up, world_move
+from hoigs.core.reporting import Progress
+from hoigs.plugins.exporters.posed import AXES, BodyMotion, Up, body_motions, world_move
 
 
 class SmplxNpzConfig(ComponentConfig):

@@ -18,11 +18,16 @@ from hoigs.core.interfaces.body import LEFT_HAND_PART, RIGHT_HAND_PART
 from hoigs.core.maths.nearest import nearest
 from hoigs.core.maths.rotations import matrices_to_quats
 from hoigs.core.model.exporter import Exporter, ExportRequest
-from hoigs.core.progress import Progress
+from hoigs.core.reporting import Progress
 from hoigs.core.values.between import camera_between, frame_of
 from hoigs.core.values.camera import Camera
-from hoigs.plugins.exporters.common.bodies import BodyMotion, body_motion
-from hoigs.plugins.exporters.common.objects import SEEN, ObjectMotion, object_motions
+from hoigs.plugins.exporters.posed import (
+    SEEN,
+    BodyMotion,
+    ObjectMotion,
+    body_motion,
+    object_motions,
+)
 
 HANDS = {"left": LEFT_HAND_PART, "right": RIGHT_HAND_PART}
 POSE = ("qw", "qx", "qy", "qz", "x", "y", "z")

@@ -15,13 +15,19 @@ from torch import Tensor
 from hoigs.core.config import ComponentConfig
 from hoigs.core.maths.rotations import axis_angle_to_quats
 from hoigs.core.model.exporter import Exporter, ExportRequest
-from hoigs.core.progress import Progress
+from hoigs.core.reporting import Progress
 from hoigs.core.values.between import camera_between, frame_of
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.plugins.exporters.common.bodies import BodyMotion, body_motion
-from hoigs.plugins.exporters.common.objects import ObjectMotion, object_motions
-from hoigs.plugins.exporters.common.world import AXES, Move, world_move
+from hoigs.plugins.exporters.posed import (
+    AXES,
+    BodyMotion,
+    Move,
+    ObjectMotion,
+    body_motion,
+    object_motions,
+    world_move,
+)
 
 INFLUENCES = 8  # joints that may move a vertex
 FILM = 36.0  # width of the camera's aperture, millimetres

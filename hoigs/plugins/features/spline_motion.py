@@ -11,19 +11,19 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.cuda_graphs.device_constants import Time, filled
+from hoigs.core.fast.graphs import Time, filled
 from hoigs.core.interfaces.deformation import DeformationModel, ProvidesVelocity
 from hoigs.core.interfaces.features import FeatureExtractor
-from hoigs.core.maths.knots import Knots
 from hoigs.core.maths.networks import dense
 from hoigs.core.maths.splines import (
+    Knots,
     catmull_rom,
     hermite_weights,
     knot_pair,
     lerp,
     linear,
 )
-from hoigs.core.time_rows import TimeRows
+from hoigs.core.parameters import TimeRows
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Tokens

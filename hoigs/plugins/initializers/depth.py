@@ -18,8 +18,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.initializer import ObjectInitializer, training_frames
 from hoigs.core.values.clip import Clip, ObjectTrack
-from hoigs.plugins.initializers.alignment import moving_part, require_metric_depth
-from hoigs.plugins.initializers.outliers import inliers
+from hoigs.plugins.initializers.alignment import inliers, moving_part, require_metric_depth
 
 
 class DepthInitializerConfig(ComponentConfig):

@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from hoigs.core.clip_folder.check import usable_clip
-from hoigs.core.clip_folder.diagnostics import summarized_for_training
+from hoigs.core.clip_folder.check import summarized_for_training, usable_clip
 from hoigs.core.clip_folder.format import (
     HEADER,
     VIEWS,
@@ -26,17 +25,17 @@ from hoigs.core.clip_folder.format import (
     parse_header,
 )
 from hoigs.core.errors import ClipError
-from hoigs.core.files.npz import load_arrays
-from hoigs.core.files.pixel_cache import PixelCache
-from hoigs.core.files.regular_file import regular_file
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.maths.frame_times import FrameTimes, time_of
+from hoigs.core.system.files import regular_file
+from hoigs.core.system.npz import load_arrays
+from hoigs.core.system.video_files import PixelCache
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind
 from hoigs.core.values.world import World
-from hoigs.plugins.readers.common.config import ReaderConfig
+from hoigs.plugins.readers.checked_files import ReaderConfig
 
 LEAST_BRIGHT = 16  # of a mask's brightest pixel, unless it is empty
 

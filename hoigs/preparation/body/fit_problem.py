@@ -18,10 +18,9 @@ from hoigs.preparation.body.kinematics import Kinematics, Posed, nearest_turn
 from hoigs.preparation.body.landmarks import FEET, TORSO, LandmarkPoints, LandmarkTrack, points_of
 from hoigs.preparation.body.mask_fit import MaskFit, Masks, Project
 from hoigs.preparation.body.normal_equations import REACH, NormalEquations
-from hoigs.preparation.body.priors.motion import MotionPrior
-from hoigs.preparation.body.priors.noise import Noise, robust_weights
-from hoigs.preparation.body.priors.pose import LASTS, PosePrior
-from hoigs.preparation.body.start.torso import Start, first_guess
+from hoigs.preparation.body.priors import REST_LASTS as LASTS
+from hoigs.preparation.body.priors import MotionPrior, Noise, PosePrior, robust_weights
+from hoigs.preparation.body.start import Start, first_guess
 
 GAP = 12  # frames between landmarks that smoothness carries a pose across
 CARRIED = 0.6  # of the steps, in which frames farther off begin one after another

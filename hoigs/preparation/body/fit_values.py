@@ -12,8 +12,8 @@ from torch import Tensor
 from hoigs.core.maths.rotations import axis_angle_to_quats, multiply_quats, quats_to_axis_angle
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.kinematics import nearest_turn
-from hoigs.preparation.body.priors.noise import Noise
-from hoigs.preparation.body.start.torso import Start
+from hoigs.preparation.body.priors import Noise
+from hoigs.preparation.body.start import Start
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.diagnostics import ranges
+from hoigs.core.reporting import ranges
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.lens import Lens
-from hoigs.core.values.undistortion import Undistortion
+from hoigs.core.values.lens import Lens, Undistortion
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import SourceError, frame_number
 
@@ -112,7 +111,7 @@ def colmap_cameras(video: Frames, model: Path, *, partial: bool = False) -> Came
     Raises:
         SourceError: the model is unreadable, lacks frames, or has cameras of several kinds.
     """
-    from hoigs.core.machine.colmap import read_model
+    from hoigs.core.system.colmap import read_model
 
     try:
         model_read = read_model(model)

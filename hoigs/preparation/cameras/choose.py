@@ -8,27 +8,25 @@ from pathlib import Path
 
 import numpy as np
 
-from hoigs.core.diagnostics import ranges
-from hoigs.core.files.colmap_files import choice_told
-from hoigs.core.files.npz import holds
+from hoigs.core.reporting import ranges
+from hoigs.core.system.colmap_files import choice_told
+from hoigs.core.system.npz import holds
 from hoigs.core.values.lens import Lens
-from hoigs.preparation.bodies.file_body import FileBody
+from hoigs.preparation.body.body_files import FileBody
+from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
 from hoigs.preparation.cameras.camera_track import (
     CameraTrack,
     colmap_cameras,
     pinhole,
     static_cameras,
 )
-from hoigs.preparation.cameras.focal.still_camera import static_focal
-from hoigs.preparation.cameras.known.calibration import fitting, given_intrinsics, read_calibration
-from hoigs.preparation.cameras.known.given_cameras import given_cameras
-from hoigs.preparation.cameras.known.megasam import megasam_cameras
-from hoigs.preparation.cameras.known.vggt import vggt_cameras
+from hoigs.preparation.cameras.focal import static_focal
+from hoigs.preparation.cameras.known import given_cameras, megasam_cameras, vggt_cameras
 from hoigs.preparation.cameras.motion import BackgroundMotion, background_motion
 from hoigs.preparation.cameras.sfm import structure_from_motion
 from hoigs.preparation.cameras.turning_cameras import turning_cameras
 from hoigs.preparation.estimates.given import GivenMasks, RawLandmarks
-from hoigs.preparation.options.prepare_options import PrepareOptions
+from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import MEGASAM, VGGT, SourceError
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -11,18 +12,33 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from scipy import ndimage
 
-from hoigs.preparation.cameras.colmap_log import quiet_colmap
 from hoigs.preparation.cameras.turning import SHARE, Pair, turn_share
 from hoigs.preparation.estimates.given import GivenMasks
 from hoigs.preparation.video.frames import Frames
-from hoigs.preparation.video.resizing import shrink, shrink_mask
+from hoigs.preparation.video.pictures import shrink, shrink_mask
+
+# COLMAP without lines of its log in the terminal.
+
+
+@contextmanager
+def quiet_colmap() -> Iterator[None]:
+    """COLMAP logs nothing in this block: an attempt that fails is followed by others, and if all do
+    there is an error of ours."""
+    from hoigs.core.system.colmap import pycolmap
+
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
 
 FRAMES = 6  # compared with the first; SIFT takes about half a second each
 WIDTH = 640  # at which they are
 FEATURES, ENOUGH = 1500, 25  # of an image; matches that make a pair count
 STILL = 1.0  # pixels at WIDTH: codecs and rolling light move features by a few tenths
 MARGIN = 0.01  # of the width: masks are grown by it
-
 Features = tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 128"]]
 
 
@@ -94,7 +110,7 @@ def background_features(
 ) -> Iterator[Features]:
     """SIFT's of the chosen frames, outside the masks: positions, pixels at WIDTH, and unit
     descriptors."""
-    from hoigs.core.machine.colmap import pycolmap
+    from hoigs.core.system.colmap import pycolmap
 
     options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1)
     options.sift.max_num_features = FEATURES

@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from hoigs.core.diagnostics import ranges
+from hoigs.core.reporting import ranges
 from hoigs.core.values.lens import Lens
 from hoigs.preparation.cameras.camera_track import ASSUMED_FOCAL
-from hoigs.preparation.cameras.colmap_log import quiet_colmap
-from hoigs.preparation.cameras.motion import grown
+from hoigs.preparation.cameras.motion import grown, quiet_colmap
 from hoigs.preparation.estimates.given import GivenMasks
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import SourceError
@@ -57,7 +56,7 @@ def structure_from_motion(
     Raises:
         SourceError: less than half of the frames were given a camera, and why that may be.
     """
-    from hoigs.core.machine.colmap import pycolmap
+    from hoigs.core.system.colmap import pycolmap
 
     report = progress or (lambda _done: None)
     images, features = folder / "images", folder / "features.db"

@@ -15,10 +15,10 @@ import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
-from hoigs.core.diagnostics import ranges
+from hoigs.core.reporting import ranges
 from hoigs.core.values.lens import Lens
 from hoigs.preparation.cameras.camera_track import CameraTrack, pinhole, static_cameras
-from hoigs.preparation.cameras.focal.still_camera import StaticFocal
+from hoigs.preparation.cameras.focal import StaticFocal
 from hoigs.preparation.cameras.motion import (
     ENOUGH,
     WIDTH,

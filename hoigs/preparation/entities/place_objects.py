@@ -6,16 +6,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
-from hoigs.core.diagnostics import ranges
+from hoigs.core.reporting import ranges
 from hoigs.core.values.camera import Camera
-from hoigs.preparation.entities.entity_masks import EntityMasks
-from hoigs.preparation.entities.person import FittedPeople
+from hoigs.preparation.entities.final_masks import EntityMasks
+from hoigs.preparation.entities.people import FittedPeople
 from hoigs.preparation.estimates.reader import UndistortedEstimates
 from hoigs.preparation.masks.separate import Images
-from hoigs.preparation.objects.doubts import doubts
 from hoigs.preparation.objects.hands import nearest_person
-from hoigs.preparation.objects.make_object import MadeObject, make_object
-from hoigs.preparation.options.prepare_options import PrepareOptions
+from hoigs.preparation.objects.make_object import MadeObject, doubts, make_object
+from hoigs.preparation.options import PrepareOptions
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hoigs.core.interfaces.estimator import Landmarks
-from hoigs.core.values.undistortion import Undistortion
+from hoigs.core.values.lens import Undistortion
 from hoigs.preparation.body.landmarks import FrameFates, LandmarkTrack
 from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.objects.ball.track import BallTrack
+from hoigs.preparation.objects.ball import BallTrack
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import NobodyFoundError
 

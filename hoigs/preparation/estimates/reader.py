@@ -27,12 +27,12 @@ from hoigs.core.interfaces.estimator import Frames as FrameArrays
 from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.estimates.given import GivenMasks, RawLandmarks, chosen_landmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.objects.ball.track import BallTrack
-from hoigs.preparation.options.prepare_options import Place, PrepareOptions, PromptAt
-from hoigs.preparation.stages.work_folder import digest
+from hoigs.preparation.objects.ball import BallTrack
+from hoigs.preparation.options import Place, PrepareOptions, PromptAt
 from hoigs.preparation.video.frames import Frames
-from hoigs.preparation.video.resizing import resized_mask
+from hoigs.preparation.video.pictures import resized_mask
 from hoigs.preparation.video.source import Source, SourceError
+from hoigs.preparation.work_folder import digest
 
 Estimators = Mapping[Place, Estimator]
 

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import tempfile
 import zlib
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
+
+from hoigs.core.maths.frame_times import fill_gaps
+from hoigs.preparation.video.source import SourceError
 
 LEVEL = 1  # of zlib, its fastest
 
@@ -82,3 +88,116 @@ def largest_parts(mask: Bool[np.ndarray, "H W"], smallest: float = 0.05) -> Bool
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
     return (sizes >= smallest * sizes.max())[labels] & mask
+
+
+# Measures of a mask's outline: middle, length and direction of its long axis.
+
+SMALL = 0.25  # of the median area: a segmenter that lost the object leaves such crumbs
+ELONGATED = 1.2  # length over breadth from which a long axis has a direction
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """Measures of a mask over the frames.
+
+    Attributes:
+        centers: centroids, pixels, interpolated where not observed.
+        lengths: of the long axis (four standard deviations), pixels; NaN where not whole.
+        angles: direction of the long axis, radians in (-pi/2, pi/2], image axes; NaN where not
+            whole, or as broad as long.
+        areas: pixels. observed: not empty, nor a crumb. whole: observed, and not cut by the
+            image's border.
+    """
+
+    centers: Float[np.ndarray, "F 2"]
+    lengths: Float[np.ndarray, " F"]
+    angles: Float[np.ndarray, " F"]
+    areas: Float[np.ndarray, " F"]
+    observed: Bool[np.ndarray, " F"]
+    whole: Bool[np.ndarray, " F"]
+
+
+def outlines_of(masks: MaskStack) -> Outlines:
+    """Measures of every mask.
+
+    Raises:
+        SourceError: all masks are empty.
+    """
+    areas = np.array([float(m.sum()) for m in masks])
+    if not areas.any():
+        raise SourceError("the object's mask is empty in every frame: there is nothing to track")
+    observed = areas >= SMALL * np.median(areas[areas > 0])
+    count = len(masks)
+    centers, lengths, angles = np.zeros((count, 2)), np.full(count, np.nan), np.full(count, np.nan)
+    whole = np.zeros(count, dtype=bool)
+    for i in np.flatnonzero(observed).tolist():
+        mask = masks[i]
+        xy = np.argwhere(mask)[:, ::-1] + 0.5
+        centers[i] = xy.mean(0)
+        whole[i] = not cut_off(mask)
+        if whole[i]:
+            lengths[i], angles[i] = long_axis(xy)
+    filled = fill_gaps(centers, observed)
+    return Outlines(filled, lengths, angles, areas, observed, whole)
+
+
+def long_axis(xy: Float[np.ndarray, "N 2"]) -> tuple[float, float]:
+    """Length (four standard deviations) and direction of some pixels' long axis; the direction is
+    NaN if they are about as broad as long."""
+    offset = xy - xy.mean(0)
+    variances, axes = np.linalg.eigh(offset.T @ offset / len(xy))
+    length = 4 * float(np.sqrt(variances[1]))
+    if variances[1] < ELONGATED**2 * variances[0]:
+        return length, float("nan")
+    x, y = axes[:, 1]
+    return length, float(np.arctan2(y, x) if x > 0 or (x == 0 and y > 0) else np.arctan2(-y, -x))
+
+
+def cut_off(mask: Bool[np.ndarray, "H W"]) -> bool:
+    """Whether the mask touches the image's border."""
+    return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
+
+
+# Arrays of one shape, one a frame, in a nameless temporary file: memory holds one at a time.
+
+
+class FrameFile:
+    """Reads and writes whole frames; a memory map's pages would count as the process's memory.
+
+    The system deletes the file when this object goes, however the process ends.
+    """
+
+    def __init__(self, folder: Path | None, frames: Iterable[np.ndarray]) -> None:
+        """Writes `frames`, all of one shape and type.
+
+        Args:
+            folder: where the file lies; None: the system's temporary folder.
+        """
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
+        self._shape: tuple[int, ...] = ()
+        self._type = np.dtype(np.uint8)
+        self._count = 0
+        for frame in frames:
+            if not self._count:
+                self._shape, self._type = frame.shape, frame.dtype
+            if (frame.shape, frame.dtype) != (self._shape, self._type):
+                raise ValueError(
+                    f"frame {self._count}: expected {self._shape} of {self._type}, as the frames "
+                    f"before, got {frame.shape} of {frame.dtype}"
+                )
+            self._file.write(np.ascontiguousarray(frame).data)
+            self._count += 1
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, frame: int) -> np.ndarray:
+        if not 0 <= frame < self._count:
+            raise IndexError(f"frame {frame} of {self._count}")
+        found = np.empty(self._shape, self._type)
+        self._file.seek(frame * found.nbytes)
+        self._file.readinto(found.data.cast("B"))
+        return found
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return (self[i] for i in range(self._count))

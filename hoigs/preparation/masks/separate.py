@@ -10,9 +10,8 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from scipy import ndimage
 
-from hoigs.preparation.masks.frame_file import FrameFile
-from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.video.resizing import shrink, shrink_mask
+from hoigs.preparation.masks.mask_stack import FrameFile, MaskStack
+from hoigs.preparation.video.pictures import shrink, shrink_mask
 
 BINS = 24  # a colour channel
 WORK_SIDE = 480  # pixels; masks need no more to be separated, and time grows with area

@@ -13,7 +13,7 @@ from scipy import ndimage
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
-from hoigs.core.maths.series import fill_gaps
+from hoigs.core.maths.frame_times import fill_gaps
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.masks.separate import Images

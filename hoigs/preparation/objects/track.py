@@ -10,13 +10,12 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
+from hoigs.core.maths.frame_times import fill_gaps, smooth
 from hoigs.core.maths.rotations import axis_angle_to_matrices
-from hoigs.core.maths.series import fill_gaps, smooth
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
-from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.masks.outlines import Outlines, long_axis, outlines_of
-from hoigs.preparation.objects.shape.first_points import inflated_outline
+from hoigs.preparation.masks.mask_stack import MaskStack, Outlines, long_axis, outlines_of
+from hoigs.preparation.objects.shape import inflated_outline
 from hoigs.preparation.video.source import SourceError
 
 # An object keeps its size but shows other sides; a wrist fitted to one view is off by as much as

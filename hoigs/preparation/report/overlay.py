@@ -2,19 +2,106 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
+from PIL import Image, ImageDraw
 from scipy import ndimage
 from torch import Tensor
 
+from hoigs.core.system.video_files import coded, declare_colors
 from hoigs.core.values.camera import Camera
-from hoigs.preparation.report.mesh_overlay import overlay_frame
-from hoigs.preparation.report.video_out import VideoWriter
-from hoigs.preparation.video.resizing import shrink, shrink_mask
+from hoigs.preparation.video.pictures import shrink, shrink_mask
+
+# A shaded mesh over a picture, by the painter's algorithm: enough to judge a fit.
+
+TINT = np.array((90, 200, 255))
+
+
+def overlay_frame(
+    image: UInt8[np.ndarray, "H W 3"],
+    camera: Camera,
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    strength: float | Float[np.ndarray, "H W"] = 0.6,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """`image` with a mesh blended over it.
+
+    Args:
+        vertices: world, metres. strength: 0 shows only the image, 1 only the mesh; of all pixels
+            or of each.
+    """
+    strength = np.asarray(strength)[..., None]
+    with torch.no_grad():
+        pixels, depth = camera.project(vertices)
+        corners = pixels[faces]
+        a, b, c = corners.unbind(1)
+        turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+        cam = camera.to_camera(vertices)[faces]
+        normals = torch.linalg.cross(cam[:, 1] - cam[:, 0], cam[:, 2] - cam[:, 0])
+        normals = torch.nn.functional.normalize(normals, dim=-1)
+        toward = (normals * torch.nn.functional.normalize(cam.mean(1), dim=-1)).sum(-1)
+        middle = depth[faces].mean(1)
+        shown = (depth[faces] > 0.05).all(1) & (toward < 0) & (turn.abs() > 1e-6)
+        order = middle[shown].argsort(descending=True)
+        polygons = corners[shown][order].flatten(1).tolist()
+        shade = (0.35 + 0.65 * -toward[shown][order]).clamp(0, 1).numpy()
+    layer = Image.fromarray(image)
+    draw = ImageDraw.Draw(layer)
+    for polygon, light in zip(polygons, shade, strict=True):
+        draw.polygon(polygon, fill=tuple((TINT * light).astype(int)))
+    mixed = strength * np.asarray(layer, float) + (1 - strength) * image
+    return mixed.round().astype(np.uint8)
+
+
+# RGB frames to an mp4 that browsers play.
+
+
+class VideoWriter:
+    """H.264, yuv420p; an odd last row or column is dropped, as the format demands.
+
+    >>> with VideoWriter("overlay.mp4", fps=24) as video:
+    ...     video.add(image)
+
+    Args:
+        path: to write. fps: frames a second. crf: quality, lower is better (18 is near lossless).
+    """
+
+    def __init__(self, path: str | Path, fps: float | int, crf: int = 23) -> None:
+        self.path, self.fps, self.crf = Path(path), fps, crf
+        self._stream: Any = None
+
+    def __enter__(self) -> VideoWriter:
+        import av
+
+        self._container = av.open(str(self.path), "w")
+        return self
+
+    def add(self, image: UInt8[np.ndarray, "H W 3"]) -> None:
+        height, width = (n - n % 2 for n in image.shape[:2])
+        if self._stream is None:
+            rate = Fraction(self.fps).limit_denominator(1000)
+            self._stream = self._container.add_stream("libx264", rate=rate)
+            self._stream.width, self._stream.height = width, height
+            self._stream.pix_fmt = "yuv420p"
+            self._stream.options = {"crf": str(self.crf), "preset": "veryfast"}
+            declare_colors(self._stream)
+        frame = coded(np.ascontiguousarray(image[:height, :width]), self._stream)
+        self._container.mux(self._stream.encode(frame))
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        if self._stream is not None and kind is None:
+            self._container.mux(self._stream.encode())
+        self._container.close()
+
 
 HUMAN_COLOR, OBJECT_COLOR, TRACK_COLOR = (64, 220, 120), (255, 210, 40), (255, 60, 200)
 SHOWN_POINTS = 150
@@ -116,3 +203,33 @@ def draw_points(
     for column, row in xy[depth > 0].round().long().tolist():
         if 0 < column <= camera.width and 0 < row <= camera.height:
             image[row - 1 : row + 1, column - 1 : column + 1] = color
+
+
+# object.jpg: the object as it was taken to be, in one frame, so that a wrong choice is seen.
+
+
+NAME, LONGEST, DIM = "object.jpg", 960, 0.45
+
+
+def shown_frame(numbers: Sequence[int], boxes: Sequence[Sequence[float]], prompted: Sequence[int],
+                coverage: Sequence[float]) -> int:  # fmt: skip
+    """Position among the chosen frames `numbers` of the one to show: where the object was proposed
+    or prompted, if its mask is there, else where its mask is largest."""
+    for number in [int(box[0]) for box in boxes] + list(prompted):
+        nearest = int(np.abs(np.asarray(numbers) - number).argmin())
+        if coverage[nearest] > 0:
+            return nearest
+    return int(np.argmax(coverage))
+
+
+def save_object_picture(
+    folder: Path, image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]
+) -> None:
+    """The frame with everything but the object dimmed, and its outline."""
+    width = max(1, round(max(image.shape) / 400))
+    border = ndimage.binary_dilation(mask, iterations=width) & ~mask
+    shown = np.where(mask[..., None], image, (DIM * image).astype(np.uint8))
+    shown[border] = OBJECT_COLOR
+    picture = Image.fromarray(shown)
+    picture.thumbnail((LONGEST, LONGEST))
+    picture.save(folder / NAME, quality=88)

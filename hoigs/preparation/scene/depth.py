@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hoigs.core.interfaces.estimator import DepthKind, DepthMaps
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.undistortion import Undistortion
+from hoigs.core.values.lens import Undistortion
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import SourceError
 

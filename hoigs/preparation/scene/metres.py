@@ -11,10 +11,10 @@ from jaxtyping import Float
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.cameras.camera_track import CameraTrack
-from hoigs.preparation.entities.entity_masks import EntityMasks
-from hoigs.preparation.entities.person import FittedPeople
+from hoigs.preparation.entities.final_masks import EntityMasks
+from hoigs.preparation.entities.people import FittedPeople
 from hoigs.preparation.masks.separate import Images
-from hoigs.preparation.options.prepare_options import PrepareOptions
+from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.scene.depth import (
     DepthFit,
     DepthSource,

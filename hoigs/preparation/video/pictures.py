@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
+from PIL import Image
+from scipy import ndimage
 
-from hoigs.core.files.images import eight_bits
+from hoigs.core.system.images import eight_bits
 from hoigs.preparation.video.colors import converted
 from hoigs.preparation.video.source import SourceError
 
@@ -128,3 +130,54 @@ def orientation(frame: Any) -> tuple[bool, int, int]:
     if abs(a) + abs(d) >= abs(b) + abs(c):
         return False, -1 if d < 0 else 1, -1 if a < 0 else 1
     return True, -1 if b < 0 else 1, -1 if c < 0 else 1
+
+
+# Images and masks at another size.
+
+
+def shrink(
+    image: UInt8[np.ndarray, "H W 3"], width: int, height: int
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The image at another size, area-averaged."""
+    if (width, height) == image.shape[1::-1]:
+        return image
+    return np.array(Image.fromarray(image).resize((width, height), Image.Resampling.BOX))
+
+
+def shrink_mask(mask: Bool[np.ndarray, "H W"], width: int, height: int) -> Bool[np.ndarray, "h w"]:
+    """The mask at another size, by nearest pixel."""
+    if (width, height) == mask.shape[1::-1]:
+        return mask
+    grey = Image.fromarray(mask.astype(np.uint8) * 255)
+    return np.array(grey.resize((width, height), Image.Resampling.NEAREST)) > 127
+
+
+def resized_mask(mask: Bool[np.ndarray, "H W"], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """The mask at another (width, height): pixels of which it covers half."""
+    if mask.shape[::-1] == size:
+        return mask
+    grey = Image.fromarray(mask.astype(np.uint8) * 255)
+    return np.asarray(grey.resize(size, Image.Resampling.BOX)) > 127
+
+
+# How sharp a frame is, compared with its neighbours.
+
+WIDTH = 640  # at which frames are compared: motion blur that matters shows there
+
+
+class Grey(Protocol):
+    """A picture that gives its brightness at a width."""
+
+    def grey(self, width: int) -> UInt8[np.ndarray, "h w"]: ...
+
+
+def sharpness(picture: Grey) -> float:
+    """Standard deviation of the Laplacian over that of the brightness, at a width of 640.
+
+    The variance of the Laplacian (Pech-Pacheco et al. 2000), divided by the contrast so that a
+    change of exposure is not taken for blur. It compares frames of one scene; between scenes it
+    means nothing. 0 for a frame of one colour.
+    """
+    grey = picture.grey(WIDTH).astype(np.float32)
+    contrast = float(grey.std())
+    return float(ndimage.laplace(grey).std()) / contrast if contrast > 0 else 0.0

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.files.colmap_files import PARTS, models_in
-from hoigs.core.files.npz import holds
-from hoigs.core.files.regular_file import NotRegularError, regular_file
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
+from hoigs.core.system.colmap_files import PARTS, models_in
+from hoigs.core.system.files import NotRegularError, regular_file
+from hoigs.core.system.npz import holds
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hoigs.core.first_order import first_order
-from hoigs.rasterizers.warp.common.frame import Images, Inputs, Settings, TileIntersections
+from hoigs.rasterizers.warp.frame import Images, Inputs, Settings, TileIntersections
 
 
 class Render(torch.autograd.Function):

@@ -8,12 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.core.cuda_graphs.capture import capturing
 from hoigs.core.errors import RenderError
+from hoigs.core.fast.graphs import capturing
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.rasterizers.warp.common.frame import Inputs, Settings
+from hoigs.rasterizers.warp.frame import Inputs, Settings
 
 Prepare = Callable[[Gaussians, Camera, RenderRequest], tuple[Settings, list[Tensor]]]
 

@@ -13,8 +13,8 @@ from hoigs.core.interfaces.rasterizer import Capabilities, Rasterizer, RenderOut
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.warp.autograd import Render
+from hoigs.rasterizers.warp.frame import InputValidation
 from hoigs.rasterizers.warp.graph_capture import CapturedRender
-from hoigs.rasterizers.warp.input_validation import InputValidation
 
 
 class WarpConfig(ComponentConfig):
@@ -144,9 +144,7 @@ class WarpRasterizer(Rasterizer):
 
             self._report |= {"warp": warp.config.version, "cuda": "pixel kernels"}
             return CudaPipeline(device)
-        from hoigs.rasterizers.warp.cpu.choose import choose_kernels
-        from hoigs.rasterizers.warp.cpu.cores import Cores
-        from hoigs.rasterizers.warp.cpu.workers import make_workers
+        from hoigs.rasterizers.warp.cpu.workers import Cores, choose_kernels, make_workers
 
         kernels, why = choose_kernels(self.config.cpu_kernels)
         workers, reason = make_workers(self.config.scheduler)
@@ -159,9 +157,9 @@ class WarpRasterizer(Rasterizer):
         }
         cores = Cores(workers, self.config.threads)
         if kernels == "portable":
-            from hoigs.rasterizers.warp.cpu.portable import PortablePipeline
+            from hoigs.rasterizers.warp.cpu.pipeline import PortablePipeline
 
             return PortablePipeline(cores)
-        from hoigs.rasterizers.warp.cpu.native import NativePipeline
+        from hoigs.rasterizers.warp.cpu.pipeline import NativePipeline
 
         return NativePipeline(cores)

@@ -5,17 +5,24 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import chain
 from pathlib import Path
 
+from pydantic import TypeAdapter, ValidationError
+
 from hoigs.core.errors import HoigsError
-from hoigs.core.files.folder_lock import FolderLock
-from hoigs.core.files.json_file import json_value
-from hoigs.core.files.regular_file import regular_file
-from hoigs.core.files.whole_files import written_whole
+from hoigs.core.system.files import (
+    json_value,
+    parse_json,
+    problems_of,
+    regular_file,
+    write_whole,
+    written_whole,
+)
+from hoigs.core.system.folder_lock import FolderLock
 from hoigs.studies.batch.manifest import Row
 
 BATCH = "batch.jsonl"
@@ -145,3 +152,163 @@ def _head(fan_out: bool) -> str:
 
 def _damaged(path: Path, line: int) -> HoigsError:
     return HoigsError(f"{path}:{line}: damaged; `hoigs batch` writes it again")
+
+
+# Stages of a row: one `hoigs` command each, with the path that it makes.
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A command of a row.
+
+    Attributes:
+        name: as in the log's name. command: arguments of `hoigs`. result: what it makes.
+        locks: the folder whose lock the command takes.
+        again: replaces `command` where the result, or a part of it, exists already.
+        resume: replaces `command` where this very command was interrupted after a checkpoint.
+        clear: whether an existing result is removed first, as the command replaces none.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    result: Path
+    locks: Path
+    again: tuple[str, ...] = ()
+    resume: tuple[str, ...] = ()
+    clear: bool = False
+
+
+def stages_of(row: Row, folder: Path) -> list[Stage]:
+    """The stages of `row` in order, all of them below its folder."""
+    run, clip = folder / "run", Path(row.clip)
+    stages = []
+    if row.video:
+        clip = folder / "clip"
+        work = clip.with_name("clip.prepare")  # `preparation.prepare.work_folder`, without torch
+        prepare = ("prepare", row.video, "--out", str(clip), "--yes",
+                   *_each("--set", row.prepare), *_each("--object", row.object))  # fmt: skip
+        stages.append(Stage("prepare", prepare, clip, work, again=(*prepare, "--overwrite")))
+    named = row.clip or str(clip)
+    train = ("train", named, "--spec", row.spec, "--out", str(run), "--device", row.device,
+             "--no-eval", *(["--auto"] if row.auto else []), *_each("--set", row.set))  # fmt: skip
+    stages.append(
+        Stage("train", train, run, run, again=(*train, "--overwrite"), resume=(*train, "--resume"))
+    )
+    device = ("--device", row.device)
+    stages.append(Stage("eval", ("eval", str(run), *device), run / "evaluation.json", run))
+    for format in row.export:
+        target = folder / "exports" / format
+        export = ("export", str(run), "--format", format, "--out", str(target), *device)
+        stages.append(Stage(f"export-{format}", export, target, target, clear=True))
+    if row.publish:
+        only = _each("--only", ("run", "exports") if row.export else ("run",))
+        command = ("publish", str(folder), f"{row.publish.rstrip('/')}/{row.name}", *only)
+        stages.append(Stage("publish", command, run, run))
+    return stages
+
+
+def _each(option: str, values: tuple[str, ...]) -> list[str]:
+    return [word for value in values for word in (option, value)]
+
+
+# State of a row on disk: which stages are done, and why the last attempt failed.
+
+STATE = "state.json"
+
+
+@dataclass
+class Done:
+    """A finished stage."""
+
+    command: list[str]
+    seconds: float
+    device: str
+    host: str
+
+
+@dataclass
+class Failed:
+    """Why the last attempt failed; `when` in seconds since 1970. Empty unless it did."""
+
+    stage: str = ""
+    why: str = ""
+    when: float = 0.0
+
+
+@dataclass
+class State:
+    """`state.json` of a row's folder.
+
+    Attributes:
+        done: each finished stage by its name.
+        begun: command of the stage that was started last, by its name.
+        failed: of the last attempt.
+        attempts: started stages by name, over all drivers.
+    """
+
+    done: dict[str, Done] = field(default_factory=dict)
+    begun: dict[str, list[str]] = field(default_factory=dict)
+    failed: Failed = field(default_factory=Failed)
+    attempts: dict[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, folder: Path) -> State:
+        """Of a row that was not started yet: empty.
+
+        Raises:
+            HoigsError: the file is damaged.
+        """
+        path = folder / STATE
+        try:
+            return _STATE.validate_python(parse_json(path))
+        except FileNotFoundError:
+            return cls()
+        except ValueError as error:  # pydantic's too
+            why = problems_of(error) if isinstance(error, ValidationError) else error
+            raise HoigsError(f"{path}: damaged ({why}); remove it to do the row again") from error
+
+    @classmethod
+    def known(cls, folder: Path) -> State:
+        """As `read`; a damaged record is a failure of its row."""
+        try:
+            return cls.read(folder)
+        except HoigsError as error:
+            return cls(failed=Failed(why=str(error)))
+
+    def write(self, folder: Path) -> None:
+        write_whole(folder / STATE, json.dumps(asdict(self), indent=1))
+
+    def todo(self, stages: Sequence[Stage]) -> Sequence[Stage]:
+        """The first stage that is not done by its present command, and all after it."""
+        for i, stage in enumerate(stages):
+            record = self.done.get(stage.name)
+            same = record is not None and record.command == list(stage.command)
+            if not same or not stage.result.exists():
+                return stages[i:]
+        return ()
+
+    def command(self, stage: Stage) -> tuple[str, ...]:
+        """The command to run for a stage, by what lies on disk."""
+        interrupted = self.begun.get(stage.name) == list(stage.command)
+        checkpoints = stage.result / "checkpoints"
+        if stage.resume and interrupted and any(checkpoints.glob("step_*.safetensors")):
+            return stage.resume
+        return stage.again if stage.again and stage.result.exists() else stage.command
+
+    def begin(self, todo: Sequence[Stage]) -> None:
+        """Note that the first of `todo` has started; what follows from it has to be done again."""
+        stage = todo[0]
+        self.begun[stage.name] = list(stage.command)
+        self.attempts[stage.name] = self.attempts.get(stage.name, 0) + 1
+        self.failed = Failed()
+        for later in todo:
+            self.done.pop(later.name, None)
+
+    def end(self, stage: Stage, seconds: float, device: str, host: str) -> None:
+        self.done[stage.name] = Done(list(stage.command), round(seconds, 3), device, host)
+
+    def fail(self, stage: Stage, why: str) -> None:
+        self.failed = Failed(stage.name, why, time.time())
+
+
+_STATE = TypeAdapter(State)

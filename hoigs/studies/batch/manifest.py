@@ -19,11 +19,9 @@ from pydantic import (
 )
 
 from hoigs.core.errors import HoigsError, did_you_mean
-from hoigs.core.files.json_file import short
-from hoigs.core.files.regular_file import regular_file
-from hoigs.core.names import is_plain
 from hoigs.core.spec.loader import MAX_BYTES, load_yaml
-from hoigs.core.storage.urls import as_url
+from hoigs.core.system.files import is_plain, regular_file, short
+from hoigs.core.system.urls import as_url
 
 NAMES = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")  # of rows, as they name folders
 FORMATS = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:@-]{0,79}")  # likewise, with kind: and @distribution

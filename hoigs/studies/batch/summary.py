@@ -12,11 +12,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from hoigs.core.files.whole_files import written_whole
-from hoigs.studies.batch.folder import BatchFolder, in_turn
+from hoigs.core.system.files import written_whole
+from hoigs.studies.batch.folder import BatchFolder, State, in_turn, stages_of
 from hoigs.studies.batch.manifest import Row
-from hoigs.studies.batch.stages import stages_of
-from hoigs.studies.batch.states import State
 
 METRICS = ("psnr", "ssim", "lpips")
 VIEW, REGION = "test frames", "full"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any, Literal
 from hoigs.core.errors import HoigsError
 from hoigs.evaluation.protocol import NotComputed, Value, from_json, to_json
 from hoigs.studies.jobs.results import ALL_CLIPS, Spread
+from hoigs.studies.plots import MARKERS, PALETTE
 
 FORMAT, VERSION = "hoigs-chart", 1
 
@@ -50,7 +52,6 @@ COST = (
     Axis("memory_mb", "peak memory of training (MB)", "lower", 0, timed=True),
 )
 AXES = {axis.name: axis for axis in (*ACCURACY, *COST)}
-
 CurvePoint = tuple[int, float, float]  # step, seconds of training, dB
 
 
@@ -254,3 +255,160 @@ def merged_about(abouts: Mapping[Path, Mapping[str, Any]]) -> dict[str, Any]:
         else:
             merged |= {f"{kind} ({path})": value for path, value in found.items()}
     return merged
+
+
+# Points of one spec, rasterizer and machine, at any budgets: an entry of the legend.
+
+
+@dataclass(frozen=True)
+class Series:
+    """One entry of the legend.
+
+    Attributes:
+        name: the spec, with rasterizer and machine where they differ between series.
+        color, marker: of matplotlib. points: fewest steps first.
+    """
+
+    name: str
+    color: str
+    marker: str
+    points: tuple[Point, ...]
+
+
+def series_of(points: Sequence[Point]) -> list[Series]:
+    """Series in order of appearance. The colour is the spec's; so is the marker, unless there are
+    several rasterizers or machines: then it is theirs."""
+    specs = list(dict.fromkeys(p.spec for p in points))
+    groups: dict[tuple[str, str, str], list[Point]] = {}
+    for p in points:
+        groups.setdefault((p.spec, p.rasterizer, p.machine), []).append(p)
+    setups = list(dict.fromkeys((rasterizer, machine) for _, rasterizer, machine in groups))
+    found = []
+    for (spec, *setup), own in groups.items():
+        color = specs.index(spec)
+        marker = setups.index((setup[0], setup[1])) if len(setups) > 1 else color
+        ordered = tuple(sorted(own, key=lambda p: p.steps))
+        found.append(Series(name_of(own[0], points), PALETTE[color % len(PALETTE)],
+                            MARKERS[marker % len(MARKERS)], ordered))  # fmt: skip
+    return found
+
+
+def name_of(point: Point, points: Sequence[Point], steps: bool = False) -> str:
+    """A point's name among these: rasterizer, machine and `steps` only where they differ."""
+    words, found = [point.spec], machines(points)
+    if len({p.rasterizer for p in points}) > 1:
+        words.append(point.rasterizer)
+    if len(found) > 1:
+        words.append(f"machine {letter(found.index(point.machine))}")
+    if steps and len({p.steps for p in points}) > 1:
+        words.append(f"{point.steps} steps")
+    return ", ".join(words)
+
+
+def machines(points: Sequence[Point]) -> list[str]:
+    """Descriptions of the machines, sorted: a machine has one letter however points are ordered."""
+    return sorted({p.machine for p in points})
+
+
+def machine_sentences(points: Sequence[Point]) -> list[str]:
+    """Which machine measured the points, or that there are several, and which is which."""
+    found = machines(points)
+    if len(found) == 1:
+        return [f"Measured on {found[0]}."]
+    each = [f"machine {letter(i)}: {words}" for i, words in enumerate(found)]
+    differ = "times, joules and memory cannot be compared between them"
+    return [f"Points of {len(found)} machines; {differ}.", *each]
+
+
+def letter(index: int) -> str:
+    """Machine A, B … Z, then A1, B1 …"""
+    return chr(ord("A") + index % 26) + (str(index // 26) if index >= 26 else "")
+
+
+# Pareto front of points on two axes, and which points dominate which on several axes.
+#
+# Pure functions over points. Means are compared; where the seeds' spread is larger than what
+# separates two points, a dominance is called unsure.
+
+
+@dataclass(frozen=True)
+class Dominance:
+    """`winner` is no worse on every axis and better on one at least.
+
+    Attributes:
+        sure: on every axis where they differ the lead is above the standard deviation, over
+            seeds, of the difference; False where each point has a single seed, and so no spread.
+    """
+
+    winner: Point
+    loser: Point
+    sure: bool
+
+
+def comparable(points: Sequence[Point], axes: Sequence[Axis]) -> list[Point]:
+    """Those that have a number on every axis."""
+    return [p for p in points if all(p.number(axis) is not None for axis in axes)]
+
+
+def front(points: Sequence[Point], axes: Sequence[Axis]) -> list[Point]:
+    """Points that no other dominates, cheapest (by the first axis) first."""
+    found = comparable(points, axes)
+    kept = [p for p in found if not any(dominates(q, p, axes) for q in found if q is not p)]
+    return sorted(kept, key=lambda p: _known(p, axes[0]))
+
+
+def dominates(a: Point, b: Point, axes: Sequence[Axis]) -> bool:
+    """No worse on all axes, better on one; False where either lacks a number."""
+    if len(comparable((a, b), axes)) < 2:
+        return False
+    pairs = [(axis, _known(a, axis), _known(b, axis)) for axis in axes]
+    return all(axis.no_worse(x, y) for axis, x, y in pairs) and any(x != y for _, x, y in pairs)
+
+
+def dominances(points: Sequence[Point], axes: Sequence[Axis]) -> list[Dominance]:
+    """Every pair of which one dominates the other."""
+    return [
+        Dominance(a, b, _sure(a, b, axes))
+        for b in points
+        for a in points
+        if a is not b and dominates(a, b, axes)
+    ]
+
+
+def _sure(a: Point, b: Point, axes: Sequence[Axis]) -> bool:
+    if len(a.seeds) < 2 and len(b.seeds) < 2:
+        return False
+    leads = [(axis, abs(_known(a, axis) - _known(b, axis))) for axis in axes]
+    return all(
+        lead == 0 or lead > math.hypot(a.spread(axis), b.spread(axis)) for axis, lead in leads
+    )
+
+
+def _known(point: Point, axis: Axis) -> float:
+    value = point.number(axis)
+    assert value is not None, f"{point.spec} has no {axis.name}"
+    return value
+
+
+def usable_axes(
+    points: Sequence[Point], axes: Sequence[Axis], mix_machines: bool
+) -> tuple[list[Axis], dict[str, str]]:
+    """Axes that can be drawn, and why the others cannot, by their title.
+
+    Axes of time and energy are left out for points of several machines, unless `mix_machines`.
+    """
+    kept, refused = [], {}
+    several = len(machines(points)) > 1
+    for axis in axes:
+        having = [p for p in points if p.number(axis) is not None]
+        if not having:
+            reasons = {str(p.values[axis.name]) for p in points if axis.name in p.values}
+            refused[axis.title] = "; ".join(sorted(reasons)) or "not computed: no run is done"
+        elif several and axis.timed and not mix_machines:
+            refused[axis.title] = (
+                f"not drawn: measured on {len(machines(points))} machines, whose times cannot be "
+                "compared; --mix-machines draws it all the same"
+            )
+        else:
+            kept.append(axis)
+    return kept, refused

@@ -10,11 +10,21 @@ from itertools import product
 from typing import Any
 
 from hoigs.core.errors import HoigsError
-from hoigs.studies.chart.data import ACCURACY, AXES, COST, Axis, Cell, Point
-from hoigs.studies.chart.pareto import front, usable_axes
-from hoigs.studies.chart.series import Series, machine_sentences, series_of
+from hoigs.studies.chart.data import (
+    ACCURACY,
+    AXES,
+    COST,
+    Axis,
+    Cell,
+    Point,
+    Series,
+    front,
+    machine_sentences,
+    series_of,
+    usable_axes,
+)
 from hoigs.studies.jobs.results import Spread
-from hoigs.studies.plotting.style import FAINT, FRONT, INK, is_log, short_number
+from hoigs.studies.plots import FAINT, FRONT, INK, is_log, short_number
 
 SYMBOLS = {"o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "v": "triangle-down",
            "P": "cross", "X": "x", "h": "hexagon"}  # fmt: skip

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hoigs.core.files.whole_files import write_whole
+from hoigs.core.system.files import write_whole
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.studies.chart.data import (
     ACCURACY,
@@ -19,11 +19,15 @@ from hoigs.studies.chart.data import (
     Cell,
     Point,
     all_clips,
+    dominances,
     dump_cells,
+    front,
+    letter,
+    machines,
+    name_of,
     points_of,
+    usable_axes,
 )
-from hoigs.studies.chart.pareto import dominances, front, usable_axes
-from hoigs.studies.chart.series import letter, machines, name_of
 from hoigs.studies.jobs.results import Spread
 
 
@@ -64,9 +68,8 @@ def write_chart(
 
 
 def _figures(clip: str, points: Sequence[Point], mix_machines: bool) -> dict[str, bytes]:
-    from hoigs.studies.chart.curves import curve_chart
-    from hoigs.studies.chart.panels import accuracy_chart
-    from hoigs.studies.plotting.files import figure_files
+    from hoigs.studies.chart.panels import accuracy_chart, curve_chart
+    from hoigs.studies.plots import figure_files
 
     stem = f"chart-{slug(clip)}"
     drawn = accuracy_chart(points, f"{clip}: accuracy against cost", mix_machines=mix_machines)

@@ -13,7 +13,7 @@ import threading
 import time
 from pathlib import Path
 
-from hoigs.core.files.folder_lock import is_held
+from hoigs.core.system.folder_lock import is_held
 
 PARENT_POLL_S = 0.25
 LEASE_POLLS = 4  # looks at the parent for one at the lease, which may lie on a slow disk

@@ -18,9 +18,10 @@ from typing import Any
 
 import hoigs
 from hoigs.core.errors import HoigsError
-from hoigs.studies.execution.executor import Needs, Process
 from hoigs.studies.execution.local import (
     PROGRAM,
+    Needs,
+    Process,
     end_group,
     gpu_share,
     start_process,

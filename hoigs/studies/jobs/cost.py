@@ -3,20 +3,195 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hoigs.core.files.whole_files import write_whole
+from hoigs.core.system.files import write_whole
 from hoigs.evaluation.protocol import NotComputed, Value, from_json, to_json
-from hoigs.studies.jobs.energy import EnergyMeter, energy_meter, spent
 from hoigs.studies.jobs.job import Job
-from hoigs.studies.jobs.machine import Machine
-from hoigs.studies.jobs.memory import peak_memory, start_peak
 
 if TYPE_CHECKING:
     from hoigs.training.session import Session
+
+
+# Energy in joules: of an NVIDIA board by NVML, of CPU packages by RAPL.
+
+POWERCAP = Path("/sys/class/powercap")
+NVML = "GPU board, by NVML"
+RAPL = "CPU packages, by RAPL; all that ran on them"
+
+
+class EnergyMeter:
+    """Sums energy counters, which wrap around at their range.
+
+    Args:
+        source: what is measured. read: joules by counter.
+        ranges: joules at which a counter wraps around.
+
+    `sample` must be called at least once in a range (RAPL: some tens of minutes).
+    """
+
+    def __init__(
+        self,
+        source: str,
+        read: Callable[[], Mapping[str, float]],
+        ranges: Mapping[str, float] | None = None,
+    ) -> None:
+        self.source, self._read, self._ranges = source, read, dict(ranges or {})
+        self._last = dict(read())
+        self.joules = 0.0
+
+    def sample(self) -> None:
+        now = dict(self._read())
+        for name, value in now.items():
+            spent = value - self._last[name]
+            self.joules += spent + (self._ranges.get(name, 0.0) if spent < 0 else 0.0)
+        self._last = now
+
+
+def energy_meter(device: str) -> EnergyMeter | NotComputed:
+    """A meter of the GPU board for "cuda", else of the CPU packages."""
+    return nvml_meter(device) if device.startswith("cuda") else rapl_meter()
+
+
+def rapl_meter(root: Path = POWERCAP) -> EnergyMeter | NotComputed:
+    """The counters of Linux for Intel and AMD CPUs, which only root can read on most systems."""
+    if not root.is_dir():
+        return NotComputed(f"this machine has no {root}, which reports the energy of the CPU")
+    packages = [
+        folder
+        for folder in sorted(root.iterdir())
+        if (folder / "energy_uj").exists()
+        and (folder / "name").is_file()
+        and (folder / "name").read_text().startswith("package")
+    ]
+    if not packages:
+        return NotComputed(f"{root} has no counter of a CPU package")
+
+    def read() -> dict[str, float]:
+        return {f.name: int((f / "energy_uj").read_text()) * 1e-6 for f in packages}
+
+    try:
+        ranges = {f.name: int((f / "max_energy_range_uj").read_text()) * 1e-6 for f in packages}
+        return EnergyMeter(RAPL, read, ranges)
+    except PermissionError as error:
+        return NotComputed(f"{error.filename} may be read by root only")
+
+
+def nvml_meter(device: str) -> EnergyMeter | NotComputed:
+    """The board's counter since its driver was loaded (Volta and later)."""
+    try:
+        import pynvml
+    except ModuleNotFoundError:
+        return NotComputed("no NVML for Python: pip install nvidia-ml-py")
+    import torch
+
+    try:
+        pynvml.nvmlInit()
+        uuid = str(torch.cuda.get_device_properties(device).uuid)
+        handle = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid.removeprefix('GPU-')}")
+        return EnergyMeter(
+            NVML, lambda: {uuid: pynvml.nvmlDeviceGetTotalEnergyConsumption(handle) * 1e-3}
+        )
+    except pynvml.NVMLError as error:
+        return NotComputed(f"NVML: {error}")
+
+
+def spent(meter: EnergyMeter | NotComputed) -> Value:
+    """Joules since the meter was made, or why they are not known."""
+    if isinstance(meter, NotComputed):
+        return meter
+    meter.sample()
+    return meter.joules
+
+
+# Peak memory of a training: what torch reserved on its GPU, or the process's resident memory.
+
+STATUS = Path("/proc/self/status")
+GPU = "most that PyTorch reserved on the GPU, captured graphs included, the CUDA context not"
+CPU = "most of the process's resident memory, libraries included"
+
+
+def start_peak(device: str) -> None:
+    """Forget the GPU's peak until now; what is in use stays counted."""
+    if device.startswith("cuda"):
+        import torch
+
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def peak_memory(device: str, status: Path = STATUS) -> tuple[Value, str]:
+    """Peak in MB (10^6 bytes), of the GPU since `start_peak`, and what that measures.
+
+    The process's is the system's own (VmHWM): `getrusage` counts the parent's before exec, too.
+    """
+    if device.startswith("cuda"):
+        import torch
+
+        return torch.cuda.max_memory_reserved(device) / 1e6, GPU
+    try:
+        lines = status.read_text().splitlines()
+    except OSError:
+        return NotComputed(f"this system has no {status}, which reports the peak"), ""
+    kib = next((line.split()[1] for line in lines if line.startswith("VmHWM:")), None)
+    if kib is None:
+        return NotComputed(f"{status} has no VmHWM"), ""
+    return int(kib) * 1024 / 1e6, CPU
+
+
+# Fingerprint of the machine that a number was measured on.
+
+CPUINFO = Path("/proc/cpuinfo")
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What the duration of a training depends on.
+
+    Attributes:
+        cpu: model. cores: threads that torch computes with. gpu: name, None where none was used.
+        torch, warp: versions.
+    """
+
+    cpu: str
+    cores: int
+    gpu: str | None
+    torch: str
+    warp: str
+
+    @staticmethod
+    def here(device: str) -> Machine:
+        """This process on this machine, computing on `device`."""
+        import torch
+
+        gpu = torch.cuda.get_device_name(device) if device.startswith("cuda") else None
+        cores = torch.get_num_threads()
+        return Machine(cpu_model(), cores, gpu, torch.__version__, metadata.version("warp-lang"))
+
+    @property
+    def words(self) -> str:
+        """The fingerprint as text."""
+        cores = f"{self.cores} core{'s' if self.cores > 1 else ''}"
+        where = f"{self.gpu}, with " if self.gpu else ""
+        return f"{where}{self.cpu}, {cores}; torch {self.torch}, warp {self.warp}"
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def cpu_model(cpuinfo: Path = CPUINFO) -> str:
+    """As the system names it; the architecture where it names none."""
+    if cpuinfo.is_file():
+        for line in cpuinfo.read_text().splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() == "model name" and value.strip():
+                return " ".join(value.split())
+    return platform.processor() or platform.machine()
+
 
 STUDY = "study.json"
 OLD = "this run was made before costs were kept; delete its folder to train it again"

@@ -10,9 +10,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from hoigs.core.errors import CheckpointError, SpecError
-from hoigs.core.files.whole_files import write_whole
+from hoigs.core.errors import CheckpointError, ClipError, SpecError
 from hoigs.core.spec.schema import Spec
+from hoigs.core.system.files import write_whole
 
 RECORD = "job.json"
 SCORES = "evaluation.json"
@@ -153,3 +153,29 @@ def digest_folder(folder: Path) -> str:
 def write_record(folder: Path, identity: Mapping[str, str]) -> None:
     """Mark a run folder as this job's."""
     write_whole(folder / RECORD, json.dumps(dict(identity)))
+
+
+# The clips of a study: folder, label and digest of each.
+
+
+class ClipFolders:
+    """Folder, label and digest of each clip, found once."""
+
+    def __init__(self) -> None:
+        self.known: dict[str, tuple[Path, str, str]] = {}
+
+    def get(self, clip: str) -> tuple[Path, str, str]:
+        """Of a CLIP argument; a built-in clip is generated unless it is cached.
+
+        Raises:
+            ClipError: a clip that does not exist.
+        """
+        from hoigs.runs.clip_source import clip_folder, clip_name
+
+        if clip not in self.known:
+            folder = clip_folder(clip)
+            if not folder.is_dir():
+                raise ClipError(f"{clip}: no such clip folder; `hoigs prepare` makes one")
+            folder = folder.resolve()
+            self.known[clip] = (folder, clip_name(clip), digest_folder(folder))
+        return self.known[clip]

@@ -12,16 +12,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.files.folder_lock import FolderLock
-from hoigs.studies.execution.executor import (
+from hoigs.core.system.folder_lock import FolderLock
+from hoigs.studies.execution.local import (
     LOST_RETRIES,
     Executor,
+    LocalExecutor,
     Needs,
     Process,
     stop_all,
     why_failed,
 )
-from hoigs.studies.execution.local import LocalExecutor
 from hoigs.studies.jobs.job import Job, JobState
 
 POLL_S = 0.05

@@ -17,13 +17,11 @@ from hoigs.core.registry.registry import default_registry
 from hoigs.runs.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.runs.run_folder import RunFolder
-from hoigs.studies.needs.pruning.compact_run import Compacted, compress
-from hoigs.studies.needs.pruning.prune import Cut, Pruning
+from hoigs.studies.needs.compress import Compacted, compress
+from hoigs.studies.needs.prune import Cut, Pruning
 from hoigs.studies.needs.result import AFTER
-from hoigs.studies.needs.selection import sealed_view, selection_frames
-from hoigs.studies.needs.successive_halving import StepBudget
-from hoigs.studies.needs.trained import Trained
-from hoigs.studies.needs.validator import Scores, Validator
+from hoigs.studies.needs.search_space import StepBudget
+from hoigs.studies.needs.trial import Scores, Trained, Validator, sealed_view, selection_frames
 
 LEAST = 40  # steps of budget that pruning needs, however short the training
 HEADING = "## After the training"

@@ -7,19 +7,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.files.whole_files import named
-from hoigs.core.machine.random_state import callers_random_state
-from hoigs.core.progress import Progress
+from hoigs.core.reporting import Progress
+from hoigs.core.system.files import named
+from hoigs.core.system.random_state import callers_random_state
+from hoigs.evaluation.evaluate_run import evaluate as evaluate_run
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_name
 from hoigs.runs.resuming import DEFAULT_SPEC
 from hoigs.runs.run_folder import RunFolder
 from hoigs.studies.needs.after_training import After, add_to_answer, finish
+from hoigs.studies.needs.compress import compact_of
 from hoigs.studies.needs.needs import needs
-from hoigs.studies.needs.pruning.compact_run import compact_of
 from hoigs.studies.needs.result import Needs
-from hoigs.workflows.evaluate import evaluate as evaluate_run
-from hoigs.workflows.train import OnStart, OnStep, Report, TrainedRun, silent, train
+from hoigs.training.train import OnStart, OnStep, Report, TrainedRun, silent, train
 
 
 @dataclass(frozen=True)

@@ -6,17 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError, did_you_mean
-from hoigs.core.machine.random_state import callers_random_state
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import Spec
+from hoigs.core.system.random_state import callers_random_state
 from hoigs.runs.choices import pick_device, with_rasterizer
 from hoigs.runs.clip_source import clip_name, read_clip
-from hoigs.studies.needs.criterion import CRITERIA
-from hoigs.studies.needs.report.write import require_new, write_needs
+from hoigs.studies.needs.report import require_new, write_needs
 from hoigs.studies.needs.result import Needs, Settings
 from hoigs.studies.needs.search import Search
-from hoigs.studies.needs.search_space import load_search_spaces
-from hoigs.workflows.train import Report, silent
+from hoigs.studies.needs.search_space import CRITERIA, load_search_spaces
+from hoigs.training.train import Report, silent
 
 
 def needs_folder(clip: Path | str) -> Path:

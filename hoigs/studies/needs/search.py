@@ -13,8 +13,6 @@ from hoigs.core.errors import SpecError
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
-from hoigs.studies.needs.criterion import gain
-from hoigs.studies.needs.refit import cheapest_refit
 from hoigs.studies.needs.result import (
     AFTER,
     FINAL,
@@ -24,27 +22,26 @@ from hoigs.studies.needs.result import (
     Needs,
     Settings,
     Step,
+    cheapest_refit,
     summary_line,
 )
 from hoigs.studies.needs.search_space import (
-    Candidate,
-    Overrides,
-    SearchSpace,
-    as_settings,
-    expanded,
-    merged,
-    multiplied,
-)
-from hoigs.studies.needs.selection import SELECTION, selection_view
-from hoigs.studies.needs.successive_halving import (
     SCORING,
     BudgetError,
+    Candidate,
     Halving,
+    Overrides,
+    SearchSpace,
     StepBudget,
+    as_settings,
+    expanded,
+    gain,
+    merged,
+    multiplied,
     plan,
     successive_halving,
 )
-from hoigs.studies.needs.trial import Trial, isolated
+from hoigs.studies.needs.trial import SELECTION, Trial, isolated, selection_view
 
 Report = Callable[[str], None]
 

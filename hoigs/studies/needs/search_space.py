@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import mean, stdev
 from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import HoigsError, did_you_mean
-from hoigs.core.files.regular_file import regular_file
 from hoigs.core.spec.loader import load_yaml
+from hoigs.core.system.files import regular_file
 
 BUILTIN = Path(__file__).with_name("search_spaces.yaml")
-
 Kind = Literal["scene", "human", "object", "pair"]
 Region = Literal["own", "background", "contact"]
 Overrides = dict[str, Any]  # dotted key of a spec to its value
@@ -187,3 +189,267 @@ def _within(block: dict[str, Any], place: Sequence[str], value: Any) -> dict[str
 def as_settings(overrides: Mapping[str, Any]) -> list[str]:
     """Overrides as `Spec.load` takes them: "a.b=value"."""
     return [f"{key}={json.dumps(value)}" for key, value in overrides.items()]
+
+
+# Choosing a candidate: the cheapest within one standard error of the best, or the least BIC.
+
+Criterion = Literal["one-se", "bic"]
+CRITERIA: tuple[Criterion, ...] = ("one-se", "bic")
+# pixels that count as one observation: a square of twice the radius of a small splat's blur
+CORRELATED = (2 * 1.5) ** 2
+MSE_FLOOR = 1e-10
+PATIENCE = 1.5  # standard errors within which a candidate is kept before the last round
+
+
+@dataclass(frozen=True)
+class Score:
+    """A candidate on the selection frames, in the region of its search space.
+
+    Attributes:
+        psnr: dB, one a frame; all candidates of a search space have the same frames.
+        squares: summed squared error of a frame's region, mean over RGB. pixels: of the region.
+        parameters: trained numbers of the trial's model.
+    """
+
+    psnr: tuple[float, ...]
+    squares: tuple[float, ...]
+    pixels: tuple[int, ...]
+    parameters: int
+
+    @property
+    def mean(self) -> float:
+        return mean(self.psnr)
+
+    @property
+    def mse(self) -> float:
+        return sum(self.squares) / sum(self.pixels)
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Mean difference of two candidates over the same frames and its standard error, dB."""
+
+    mean: float
+    error: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:+.2f} ± {self.error:.2f} dB"
+
+
+def gain(of: Score, over: Score) -> Gain:
+    """How much better `of` is than `over`, frame by frame.
+
+    Raises:
+        ValueError: fewer than two frames, or not the same number.
+    """
+    if len(of.psnr) != len(over.psnr) or len(of.psnr) < 2:
+        raise ValueError(
+            f"a paired standard error needs the same two or more frames: {len(of.psnr)} and "
+            f"{len(over.psnr)}"
+        )
+    differences = [a - b for a, b in zip(of.psnr, over.psnr, strict=True)]
+    return Gain(mean(differences), stdev(differences) / math.sqrt(len(differences)))
+
+
+def bic(score: Score) -> float:
+    """n log(MSE) + p log(n), with n the roughly independent pixels (Schwarz 1978)."""
+    count = max(2.0, sum(score.pixels) / CORRELATED)
+    return count * math.log(max(score.mse, MSE_FLOOR)) + score.parameters * math.log(count)
+
+
+def near_best(
+    scores: Sequence[Score], least: float = 0.0, min_gain: float = 0.0, errors: float = 1.0
+) -> list[bool]:
+    """Whether each score is as good as the best: within `errors` standard errors of the paired
+    difference, within `least` dB, or within `min_gain` dB for every doubling of trained parameters
+    up to those of the best."""
+    best = max(scores, key=lambda score: score.mean)
+
+    def tolerance(score: Score) -> float:
+        larger = max(best.parameters, 1) / max(score.parameters, 1)
+        return max(least, min_gain * math.log2(max(larger, 1.0)))
+
+    gains = [gain(best, score) for score in scores]
+    return [
+        g.mean <= max(errors * g.error, tolerance(s)) for g, s in zip(gains, scores, strict=True)
+    ]
+
+
+def choose(
+    scores: Sequence[Score],
+    criterion: Criterion = "one-se",
+    least: float = 0.0,
+    min_gain: float = 0.0,
+) -> int:
+    """Index of the candidate to keep; scores are in order of cost."""
+    if criterion == "bic":
+        values = [bic(score) for score in scores]
+        return values.index(min(values))
+    return near_best(scores, least, min_gain).index(True)
+
+
+def ranked(
+    scores: Sequence[Score], criterion: Criterion, least: float, min_gain: float = 0.0
+) -> list[int]:
+    """Indices from the likeliest choice to the least likely: candidates that may be as good as the
+    best by cost, then the others by score. The best itself is always among the first two.
+
+    Early scores show which candidate learns fast rather than which is sufficient, so a candidate
+    may be `PATIENCE` standard errors behind here, where the final choice allows one. With few
+    frames that can be several dB, and without the place kept for the best, cheap candidates would
+    exclude the one that they have to be compared with.
+    """
+    places = range(len(scores))
+    if criterion == "bic":
+        return sorted(places, key=lambda k: (bic(scores[k]), k))
+    near = near_best(scores, least, min_gain, PATIENCE)
+    order = sorted(places, key=lambda k: (not near[k], k if near[k] else -scores[k].mean))
+    best = max(places, key=lambda k: scores[k].mean)
+    if order.index(best) > 1:
+        order.remove(best)
+        order.insert(1, best)
+    return order
+
+
+# Successive halving under a budget (Jamieson & Talwalkar 2016, arXiv:1502.07943).
+
+FINALISTS = 2  # more rounds would leave nothing to choose from
+SCORING = 0.4  # of a step: one frame drawn once, without gradients
+FEWEST = 8  # steps before the first score; earlier ones carry no information
+Advance = Callable[[int, int], Score]  # index and step: train to that step, and score
+
+
+class BudgetError(HoigsError):
+    """A search would cost more than it may."""
+
+
+@dataclass
+class StepBudget:
+    """The cost so far, in training steps of the full spec.
+
+    Attributes:
+        limit: the most that may be spent. entries: purpose and cost of each expense.
+    """
+
+    limit: float
+    entries: list[tuple[str, float]] = field(default_factory=list)
+
+    @property
+    def spent(self) -> float:
+        return sum(cost for _, cost in self.entries)
+
+    @property
+    def left(self) -> float:
+        return self.limit - self.spent
+
+    def spend(self, what: str, cost: float) -> None:
+        """To be called before the work is done.
+
+        Raises:
+            BudgetError: the cost exceeds what is left.
+        """
+        if cost > self.left + 1e-6:
+            raise BudgetError(
+                f"{what} would cost {cost:.0f} steps, but {self.left:.0f} of {self.limit:.0f} are "
+                "left"
+            )
+        self.entries.append((what, cost))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Rounds of one search: how many candidates each trains, and to which step."""
+
+    alive: tuple[int, ...]
+    until: tuple[int, ...]
+
+    @property
+    def steps(self) -> int:
+        return self.until[-1]
+
+
+def rounds(count: int) -> tuple[int, ...]:
+    """How many of `count` candidates each round trains: half, then half of these, down to two."""
+    alive = [count]
+    while alive[-1] > FINALISTS:
+        alive.append(max(FINALISTS, -(-alive[-1] // 2)))
+    return tuple(alive)
+
+
+def plan(costs: Sequence[float], budget: float, frames: int, most: int) -> Plan:
+    """The longest rounds, each twice as long as all before, that fit a budget whichever candidates
+    remain.
+
+    Args:
+        costs: of a step of each candidate. budget: steps of the full spec.
+        frames: scored each round. most: steps that no trial goes beyond.
+
+    Raises:
+        BudgetError: the shortest rounds exceed the budget.
+    """
+    alive = rounds(len(costs))
+    dearest = sorted(costs, reverse=True)
+    scoring = sum(SCORING * frames * sum(dearest[:n]) for n in alive)
+    unit = sum(sum(dearest[:n]) * (1 if r == 0 else 2 ** (r - 1)) for r, n in enumerate(alive))
+    first = int((budget - scoring) / unit + 1e-9)
+    first = min(first, max(1, most // 2 ** (len(alive) - 1)))
+    if first < FEWEST:
+        wanted = scoring + FEWEST * unit
+        raise BudgetError(
+            f"{len(costs)} candidates need {wanted:.0f} steps at least, but get {budget:.0f}: "
+            "give a training more steps (--set train.steps=…), or a search space fewer candidates"
+        )
+    return Plan(alive, tuple(first * 2**r for r in range(len(alive))))
+
+
+@dataclass(frozen=True)
+class Halving:
+    """Result of a successive halving.
+
+    Attributes:
+        chosen: index of the candidate. scores: of each candidate, by step.
+    """
+
+    chosen: int
+    scores: tuple[dict[int, Score], ...]
+
+    def last_common(self, one: int, other: int) -> tuple[int, Score, Score]:
+        """The last step at which both were scored, and their scores there."""
+        step = max(self.scores[one].keys() & self.scores[other].keys())
+        return step, self.scores[one][step], self.scores[other][step]
+
+
+def successive_halving(
+    plan: Plan,
+    costs: Sequence[float],
+    frames: int,
+    advance: Advance,
+    budget: StepBudget,
+    *,
+    what: str = "",
+    criterion: Criterion = "one-se",
+    least: float = 0.0,
+    min_gain: float = 0.0,
+) -> Halving:
+    """Halve until two candidates are left, and choose between them.
+
+    Args:
+        plan: from `plan`. costs: of a step of each candidate, the cheapest first.
+        frames: number of frames scored in each round. advance: trains and scores a candidate.
+        budget: each training is entered before it runs, as `what`.
+
+    Raises:
+        BudgetError: the plan exceeds the budget; no training beyond it has run.
+    """
+    scores: list[dict[int, Score]] = [{} for _ in costs]
+    alive, before = list(range(len(costs))), 0
+    for count, until in zip(plan.alive, plan.until, strict=True):
+        if len(alive) > count:
+            order = ranked([scores[k][before] for k in alive], criterion, least, min_gain)
+            alive = sorted(alive[place] for place in order[:count])
+        for k in alive:
+            budget.spend(f"{what}[{k}]", costs[k] * (until - before + SCORING * frames))
+            scores[k][until] = advance(k, until)
+        before = until
+    chosen = alive[choose([scores[k][before] for k in alive], criterion, least, min_gain)]
+    return Halving(chosen, tuple(scores))

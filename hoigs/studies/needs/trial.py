@@ -2,26 +2,123 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import mean
 from typing import Any
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from hoigs.core.errors import HoigsError
+from hoigs.core.errors import ClipError, HoigsError
+from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.model.scene import SceneModel
 from hoigs.core.registry.registry import Registry
 from hoigs.core.spec.schema import Spec
-from hoigs.core.values.clip import Clip, Frame
+from hoigs.core.values.clip import Clip, Frame, FrameStore
 from hoigs.metrics.psnr import psnr_from_mse
-from hoigs.metrics.regions import dilate
-from hoigs.studies.needs.criterion import Score
-from hoigs.studies.needs.search_space import Kind, Overrides, Region
-from hoigs.studies.needs.selection import SELECTION
+from hoigs.metrics.regions import default_band, dilate, region_masks
+from hoigs.studies.needs.search_space import (
+    SCORING,
+    Kind,
+    Overrides,
+    Region,
+    Score,
+    StepBudget,
+    as_settings,
+)
 from hoigs.training.trainer import Trainer
+
+# The clip of a search: some training frames are held back, test frames are sealed.
+
+SELECTION = "selection"  # name of the split
+
+
+class SealedFrameError(RuntimeError):
+    """A test frame was read during the choice of a model."""
+
+
+class SealedStore(FrameStore):
+    """Another store, some frames of which cannot be read.
+
+    Args:
+        base: the other store. sealed: positions whose frames raise SealedFrameError.
+    """
+
+    def __init__(self, base: FrameStore, sealed: Iterable[int]) -> None:
+        self.base, self.sealed = base, frozenset(sealed)
+        self.root = base.root
+
+    def _open(self, position: int) -> FrameStore:
+        if position in self.sealed:
+            raise SealedFrameError(
+                f"frame {position} is a test frame, and a model may not be chosen by it: the "
+                "component that read it (an initializer, for example) may read clip.split['train'] "
+                "only"
+            )
+        return self.base
+
+    def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
+        return self._open(position).image(position)
+
+    def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
+        return self._open(position).mask(entity, position)
+
+    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
+        return self._open(position).depth(position)
+
+    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
+        return self._open(position).ignored(position)
+
+    def mask_known(self, entity: str, position: int) -> bool:
+        return self._open(position).mask_known(entity, position)
+
+
+def selection_frames(train: Sequence[int], share: float = 0.05, least: int = 3) -> list[int]:
+    """Training positions to hold back: a share, at least `least`, evenly spaced, no first or last.
+
+    Raises:
+        ClipError: too few training frames to hold any back.
+    """
+    count = max(least, round(share * len(train)))
+    if len(train) < 2 * count + 2:
+        raise ClipError(
+            f"{len(train)} training frames are too few to hold {count} back: at least "
+            f"{2 * count + 2} are needed to choose a model"
+        )
+    return [sorted(train)[int((k + 0.5) * len(train) / count)] for k in range(count)]
+
+
+def selection_view(clip: Clip, share: float = 0.05, least: int = 3) -> Clip:
+    """`clip` with the frames that are held back moved from the split "train" to "selection".
+
+    It has no "test" split and no held-out view; pixels, masks and depth of all other frames cannot
+    be read. Cameras, poses and tracks are unchanged.
+
+    Raises:
+        ClipError: as `selection_frames`.
+    """
+    held = selection_frames(clip.split["train"], share, least)
+    train = [p for p in clip.split["train"] if p not in set(held)]
+    return replace(sealed_view(clip), split={"train": train, SELECTION: held})
+
+
+def sealed_view(clip: Clip) -> Clip:
+    """`clip` with its training split alone; images, masks and depth of other frames are sealed."""
+    sealed = set(range(len(clip))) - set(clip.split["train"])
+    return replace(
+        clip,
+        store=SealedStore(clip.store, sealed),
+        split={"train": clip.split["train"]},
+        held_out=None,
+    )
+
 
 CONTACT = 0.05  # of the longer side: how far from an object a human's pixels count as contact
 
@@ -160,3 +257,149 @@ def region_of(
         people = union([n for n in masks if clip.kinds[n] == "human"])
         found = objects | (people & dilate(objects, max(2, round(CONTACT * max(empty.shape)))))
     return found if frame.ignored is None else found & ~frame.ignored
+
+
+# Validator: PSNR of a few frames by region, to measure what pruning costs.
+
+WATCHED = ("human_object", "background")
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Mean PSNR, dB, over the frames that show a region; by region, at least one."""
+
+    psnr: Mapping[str, float]
+
+    def drop_to(self, other: Scores) -> float:
+        """How much worse `other` is, dB, in the region where that is most."""
+        return max(self.psnr[region] - other.psnr[region] for region in self.psnr)
+
+
+@dataclass
+class Validator:
+    """Scores models on validation frames; each scoring is entered in a budget.
+
+    Args:
+        clip: at training width. positions: of the frames. budget: in steps of the full spec.
+    """
+
+    clip: Clip
+    positions: Sequence[int]
+    budget: StepBudget
+
+    @property
+    def cost(self) -> float:
+        """Of one scoring, in steps of the full spec."""
+        return SCORING * len(self.positions)
+
+    @property
+    def affordable(self) -> bool:
+        return self.budget.left >= self.cost
+
+    @torch.no_grad()
+    def score(self, model: SceneModel, subset: Bool[Tensor, " N"] | None = None) -> Scores:
+        """Render every frame and score it.
+
+        Args:
+            subset: rows of the joined Gaussians to render; None renders all.
+
+        Raises:
+            HoigsError: no frame shows any region. BudgetError: it exceeds the budget.
+        """
+        self.budget.spend("scoring", self.cost)
+        values: dict[str, list[float]] = {}
+        for position in self.positions:
+            frame = self.clip[position]
+            output = model.render(
+                frame.moment.to(model.device),
+                frame.camera.to(model.device),
+                request=RenderRequest(subset=subset),
+            )
+            squares = _squares(output.color, frame.rgb)
+            masks = region_masks(
+                frame, self.clip.kinds, default_band(frame.camera.width, frame.camera.height)
+            )
+            for region in WATCHED:
+                if masks[region].any():
+                    error = squares[masks[region]].mean()
+                    values.setdefault(region, []).append(float(psnr_from_mse(error)))
+        if not values:
+            raise HoigsError(
+                f"frames {list(self.positions)} show neither people, objects nor background: "
+                "the model cannot be scored on them"
+            )
+        return Scores({region: mean(found) for region, found in values.items()})
+
+
+def _squares(color: Tensor, target: Tensor) -> Float[Tensor, "H W"]:
+    """Squared error of each pixel, mean over RGB."""
+    return (color.cpu().clamp(0, 1) - target).square().mean(-1)
+
+
+# A trained model with its spec, and the same model composed anew under a smaller spec.
+
+
+@dataclass(frozen=True)
+class Trained:
+    """Input and result of pruning.
+
+    Attributes:
+        clip: at training width. model: in eval mode, at the end of its training.
+    """
+
+    spec: Spec
+    model: SceneModel
+    clip: Clip
+    registry: Registry
+
+    def blocks(self) -> dict[str, list[str]]:
+        """Entities of the model by key of their block in the spec."""
+        found: dict[str, list[str]] = {}
+        for name in self.model.entities:
+            block = self.spec.block(name, self.model.entity(name).kind)
+            assert block is not None  # it was composed from this spec
+            found.setdefault(block[0], []).append(name)
+        return found
+
+    def recomposed(
+        self, overrides: Mapping[str, Any], changed: Mapping[str, Tensor] | None = None
+    ) -> Trained:
+        """The same model composed anew under another spec.
+
+        Args:
+            overrides: of the spec. changed: tensors that replace those of the model, by name.
+                Tensors that the new model does not have are dropped.
+
+        Raises:
+            KeyError: the new model needs a tensor that neither has.
+        """
+        spec = overridden(self.spec, overrides, self.registry)
+        model = compose(spec, self.clip, self.registry).to(self.model.device)
+        for name in model.entities:
+            model.entity(name).resize(len(self.model.entity(name)))
+        state = self.model.state_dict() | dict(changed or {})
+        missing = [key for key in model.state_dict() if key not in state]
+        if missing:
+            raise KeyError(f"the model with {', '.join(overrides)} lacks {', '.join(missing)}")
+        model.load_state_dict({key: state[key] for key in model.state_dict()})
+        model.eval()
+        model.set_progress(1.0)
+        return replace(self, spec=spec, model=model)
+
+
+def overridden(spec: Spec, overrides: Mapping[str, Any], registry: Registry) -> Spec:
+    """A spec with some keys set anew, name and summary kept."""
+    with tempfile.TemporaryDirectory(prefix="hoigs-spec-") as folder:
+        path = Path(folder) / "spec.yaml"
+        path.write_text(spec.dump(), encoding="utf-8")
+        return Spec.load(path, overrides=as_settings(overrides), registry=registry)
+
+
+def state_prefix(entity: str) -> str:
+    """How an entity's tensors are named in the model's state."""
+    return f"entities.{entity}."
+
+
+def cloned(tensor: Tensor) -> Tensor:
+    with torch.no_grad():
+        return tensor.detach().clone()

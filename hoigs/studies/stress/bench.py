@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import torch
 
@@ -17,9 +18,169 @@ from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.moment import Moment
-from hoigs.studies.stress.capability import Capability, capabilities
-from hoigs.studies.stress.sizes import small_settings
 from hoigs.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from hoigs.core.model.entity import Entity
+
+
+# Capabilities of a composed model: a case concerns models by these, not by the spec's name.
+
+Capability = Literal[
+    "scene", "body", "object", "whole picture", "moves", "interaction", "density", "depth loss",
+    "masks", "knots", "turning knots", "rigid knots", "free knots", "time planes", "planes",
+    "networks", "embedding", "keyed opacity", "refined poses", "keyframe rate",
+]  # fmt: skip
+MEANING: Mapping[Capability, str] = {
+    "scene": "Gaussians of the background",
+    "body": "a human on a skeleton",
+    "object": "an object with Gaussians of its own",
+    "whole picture": "people and objects modelled as part of the scene",
+    "moves": "something whose Gaussians move",
+    "interaction": "a module between human and object",
+    "density": "density control with a cap",
+    "depth loss": "a depth prior in the loss",
+    "masks": "entities compared within their masks",
+    "knots": "positions at keyframes",
+    "turning knots": "rotations at keyframes",
+    "rigid knots": "keyframes of one rigid motion of a whole entity",
+    "free knots": "keyframes of each Gaussian",
+    "time planes": "feature planes over space and time",
+    "planes": "feature planes",
+    "networks": "networks that deform",
+    "embedding": "a code for each Gaussian",
+    "keyed opacity": "opacity that depends on time",
+    "refined poses": "body poses that training corrects",
+    "keyframe rate": "keyframes with a learning rate of their own",
+}
+assert set(MEANING) == set(get_args(Capability))
+
+
+def capabilities(
+    spec: Spec, model: SceneModel, density: Mapping[str, DensityControl]
+) -> frozenset[Capability]:
+    """Capabilities of a model composed for a clip with one human and one object."""
+    return frozenset(_found(spec, model, density))
+
+
+def _found(
+    spec: Spec, model: SceneModel, density: Mapping[str, DensityControl]
+) -> Iterator[Capability]:
+    from hoigs.training.losses import term_weights
+
+    names = {kind: model.names(kind) for kind in ("scene", "human", "object")}
+    if names["scene"]:
+        yield "scene"
+    if names["human"]:
+        yield "body"
+    if names["object"]:
+        yield "object"
+    if names["scene"] and not names["human"] and not names["object"]:
+        yield "whole picture"
+    if names["human"] or names["object"]:
+        yield "masks"
+    if model.interaction is not None and any(True for _ in model.interaction.parameters()):
+        yield "interaction"
+    if any(control.cap is not None for control in density.values()):
+        yield "density"
+    if term_weights(spec.train.loss)["depth"] > 0:
+        yield "depth loss"
+    for name in model.entities:
+        yield from _of_entity(model.entity(name))
+
+
+def _of_entity(entity: Entity) -> Iterator[Capability]:
+    """Capabilities by the learning rates of the deformation's parameters."""
+    deformation = entity.deformation
+    parameters = dict(deformation.named_parameters())
+    if parameters or entity.kind != "scene":
+        yield "moves"
+    keyed = getattr(deformation, "knot_axes", {})
+    for name, parameter in parameters.items():
+        rate = rate_of(name, deformation.rates)
+        if rate == "keyframes":
+            yield "keyframe rate"
+        turns = rate == "keyframe_rotation" or (name in keyed and name.endswith("quats"))
+        if turns:
+            yield "turning knots"
+        elif rate == "keyframes" or (name in keyed and rate == "pose"):
+            yield "knots"
+            free = parameter.dim() > 2 or name in deformation.per_gaussian
+            yield "free knots" if free else "rigid knots"
+        elif rate == "planes":
+            yield "planes"
+            if "time" in name:
+                yield "time planes"
+        elif rate == "networks":
+            yield "networks"
+        elif rate == "embedding":
+            yield "embedding"
+        elif rate == "pose" and entity.kind == "human":
+            yield "refined poses"
+        if name.endswith(("opacity_logits", "centers")) and parameter.dim() > 1:
+            yield "keyed opacity"
+
+
+def rate_of(name: str, rates: Mapping[str, str]) -> str:
+    """Name of the learning rate of a deformation's parameter."""
+    prefixes = [prefix for prefix in rates if name.startswith(prefix)]
+    return rates[max(prefixes, key=len)] if prefixes else "networks"
+
+
+# Settings that adapt a spec to a small clip and a short training.
+
+
+# shares of all points, where a spec has such a block
+SHARES = {"human": 0.3, "object": 0.1}
+ROOM = 2.0  # cap of the scene's Gaussians, times those at the start
+# settings of components that are counted in steps, by place
+COUNTED = {
+    "density": ("interval", "reset_every"),
+    "deformation": ("promote_from", "promote_every", "promote_until"),
+}
+
+
+def small_settings(spec: Spec, points: int, steps: int) -> list[str]:
+    """Overrides for a short training on a small clip; the same rules for all methods.
+
+    All entities together start with `points` Gaussians, and the scene's cap is twice its own.
+    Settings in steps are scaled with the length of the training. The LPIPS and face losses, which
+    need files or larger images, are off.
+    """
+    settings = {
+        "train.steps": steps,
+        "train.preview_every": 0,
+        "train.loss.lpips": 0.0,
+        "train.loss.face": 0.0,
+        "train.checkpoint_every": steps,
+    }
+    shrink = steps / spec.train.steps
+    if spec.train.sh_interval is not None:
+        settings["train.sh_interval"] = max(1, round(shrink * spec.train.sh_interval))
+    blocks = dict(modelled(spec))
+    scene = 1.0 - sum(SHARES[kind] for kind in blocks.values() if kind in SHARES)
+    for name, kind in blocks.items():
+        count = round(points * SHARES.get(kind, scene))
+        settings[f"model.{name}.points"] = count
+        block = spec.model[name]
+        if "cap" in block.density.settings:
+            settings[f"model.{name}.density.cap"] = round(ROOM * count)
+        for part, keys in COUNTED.items():
+            own: dict[str, Any] = getattr(block, part).settings
+            for key in keys:
+                if own.get(key) is not None:
+                    least = 10 if key == "interval" else 1
+                    settings[f"model.{name}.{part}.{key}"] = max(least, round(shrink * own[key]))
+    return [f"{key}={value}" for key, value in settings.items()]
+
+
+def modelled(spec: Spec) -> Iterator[tuple[str, str]]:
+    """Name and kind of each model block that a clip with "human" and "object" makes use of."""
+    for entity in ("scene", "human", "object"):
+        block = spec.block(entity, entity)
+        if block is not None and spec.selects(entity, entity):
+            yield block[0], entity
+
 
 TINY = (
     "builtin:figure-eight?frames=12&width=48&fps=6&samples=1&edge_samples=1&held_out_views=0"

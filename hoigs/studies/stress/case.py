@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -12,13 +13,12 @@ from pydantic import Field, ValidationError, model_validator
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.spec.loader import load_yaml
-from hoigs.studies.stress.capability import Capability
+from hoigs.studies.stress.bench import Capability
 from hoigs.studies.stress.measures import MEASURES
 
 FOLDER = Path(__file__).with_name("cases")
 FAMILIES = ("motion", "camera", "human", "interaction", "optimisation")
 COUNT = 56
-
 Kind = Literal["unit", "per spec", "sweep", "not applicable"]
 
 
@@ -220,3 +220,14 @@ def choose_cases(text: str) -> tuple[Case, ...]:
             )
         wanted |= {case.id for case in by_word[key]}
     return tuple(case for case in known if case.id in wanted)
+
+
+# CheckResult: whether a check passed, and by which numbers.
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """Result of one check. measured: in words, with the deciding numbers."""
+
+    passed: bool
+    measured: str

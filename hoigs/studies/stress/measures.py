@@ -6,6 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.model.scene import SceneModel
+from hoigs.core.values.clip import Clip, Frame
+from hoigs.evaluation.geometry import read_truth
 from hoigs.evaluation.protocol import NotComputed, Value, from_json
 from hoigs.studies.jobs.results import Measure, measures_of
 
@@ -61,3 +70,93 @@ def scored_values(evaluation: Mapping[str, Any]) -> dict[str, Value]:
             continue
         found[name] = from_json(own[name])
     return found
+
+
+# Measures beyond those of evaluation: outlines, coverage, and drift of the object.
+
+KINDS = ("scene", "human", "object")
+SHORTEST_PATH = 0.01  # metres
+
+
+@torch.no_grad()
+def observe(
+    model: SceneModel, clip: Clip, geometry: Mapping[str, Value]
+) -> dict[str, float | dict[str, str]]:
+    """Measures of a model on a clip's test frames that `evaluate` lacks, as JSON values.
+
+    Args:
+        geometry: of the evaluation on the same frames.
+    """
+    frames = [clip[p] for p in clip.split["test"]]
+    shares = [_shares(model, frame) for frame in frames]
+    found: dict[str, Value] = {
+        "iou_object": _iou(model, clip, frames, shares, "object"),
+        "iou_human": _iou(model, clip, frames, shares, "human"),
+        "scene_over_human": _covered(model, clip, frames, shares),
+        "drift_of_path": _drift(clip, geometry["object_translation"]),
+    }
+    return {
+        name: {"not_computed": v.reason} if isinstance(v, NotComputed) else round(v, 6)
+        for name, v in found.items()
+    }
+
+
+def _shares(model: SceneModel, frame: Frame) -> Float[Tensor, "H W 3"]:
+    """Composited share of scene, humans and objects in each pixel."""
+    state = model(frame.moment.to(model.device))
+    rows = [
+        torch.eye(3)[KINDS.index(model.entity(name).kind)].expand(len(gaussians), 3)
+        for name, gaussians in state.gaussians.items()
+    ]
+    request = RenderRequest(features=torch.cat(rows).to(model.device))
+    output = model.draw(state.joined(), frame.camera.to(model.device), request)
+    assert output.features is not None
+    return output.features.cpu()
+
+
+def _iou(
+    model: SceneModel,
+    clip: Clip,
+    frames: list[Frame],
+    shares: list[Float[Tensor, "H W 3"]],
+    kind: str,
+) -> Value:
+    """Mean IoU over frames that show the kind: pixels with a share above 0.5 against its masks."""
+    if not model.names(kind):
+        return NotComputed(f"the model does not separate the {kind} from the rest")
+    values = []
+    for frame, share in zip(frames, shares, strict=True):
+        masks = [m for name, m in frame.masks.items() if clip.kinds[name] == kind]
+        true = torch.stack(masks).any(0)
+        drawn = share[..., KINDS.index(kind)] > 0.5
+        if true.any():
+            values.append(float((true & drawn).sum() / (true | drawn).sum()))
+    return float(np.mean(values)) if values else NotComputed(f"no test frame shows the {kind}")
+
+
+def _covered(
+    model: SceneModel, clip: Clip, frames: list[Frame], shares: list[Float[Tensor, "H W 3"]]
+) -> Value:
+    """Mean share of the scene in pixels of the human's mask."""
+    if not model.names("human") or not model.names("scene"):
+        return NotComputed("the model does not separate the human from the scene")
+    values = []
+    for frame, share in zip(frames, shares, strict=True):
+        masks = [m for name, m in frame.masks.items() if clip.kinds[name] == "human"]
+        true = torch.stack(masks).any(0)
+        if true.any():
+            values.append(float(share[..., 0][true].mean()))
+    return float(np.mean(values)) if values else NotComputed("no test frame shows the human")
+
+
+def _drift(clip: Clip, error: Value) -> Value:
+    """The object's position error, relative to the length of its path."""
+    if isinstance(error, NotComputed):
+        return error
+    truth = read_truth(clip)
+    if isinstance(truth, NotComputed):
+        return truth
+    path = float(np.linalg.norm(np.diff(truth.translations, axis=0), axis=-1).sum())
+    if path < SHORTEST_PATH:
+        return NotComputed("the object stands still")
+    return error / 1000 / path

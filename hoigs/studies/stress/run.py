@@ -2,26 +2,270 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
 
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import Spec
+from hoigs.core.system.environments import safe_children
 from hoigs.evaluation.protocol import Value
-from hoigs.studies.execution.executor import Executor
+from hoigs.studies.execution.local import Executor
 from hoigs.studies.jobs.cost import read_cost
-from hoigs.studies.jobs.job import Job, JobState
-from hoigs.studies.jobs.protocol import protocol_of
+from hoigs.studies.jobs.job import ClipFolders, Job, JobState, make_job
+from hoigs.studies.jobs.results import Row, protocol_of
 from hoigs.studies.jobs.run_jobs import Report, run_jobs
-from hoigs.studies.stress.bench import TINY, Bench
-from hoigs.studies.stress.capability import MEANING, Capability
-from hoigs.studies.stress.case import Case
-from hoigs.studies.stress.check_result import CheckResult
-from hoigs.studies.stress.direct import STATIC, Composed, make_clips, run_direct
+from hoigs.studies.stress.bench import MEANING, TINY, Bench, Capability, modelled, small_settings
+from hoigs.studies.stress.case import Case, CheckResult, Sweep
+from hoigs.studies.stress.checks import check, per_spec
 from hoigs.studies.stress.measures import scored_values
-from hoigs.studies.stress.plan import Chain, StressStudy, clip_names, plan_chains
 from hoigs.studies.stress.verdict import Level, Seed, Verdict, level_of, verdict_of
+
+# StressJob: one short training at one value of a sweep, and the clip that scores it.
+
+
+@dataclass(frozen=True)
+class StressJob(Job):
+    """A Job that may be scored on another clip.
+
+    Attributes:
+        scoring_clip: folder of the clip whose test frames score the model; "" is the training clip.
+        allow_faults: train in spite of faults of the clip.
+    """
+
+    worker: ClassVar[str] = "hoigs.studies.stress.worker"
+
+    scoring_clip: str = ""
+    allow_faults: bool = False
+
+    @property
+    def identity(self) -> dict[str, str]:
+        scoring = {"judge": Path(self.scoring_clip).name} if self.scoring_clip else {}
+        return super().identity | scoring
+
+
+# The trainings of a stress study: for each sweep, spec and seed a chain of harder values.
+
+
+# settings of every clip, which those of the sweep override
+BASE = (
+    "width=96&frames=24&fps=6&edge_samples=4&held_out_views=4&test_frames=6&scene_points=5000"
+    "&object_points=1000"
+)
+
+
+@dataclass(frozen=True)
+class StressStudy:
+    """A study to run.
+
+    Attributes:
+        cases: chosen. specs: of `jobs.variants.parse_variants`. seeds: how many, from 0.
+        steps, points: of every training; Gaussians at its start.
+        base: settings of every clip. whole: run every value even after a seed has failed one.
+        settings: overrides of every spec. out, device, plugins: as for other studies.
+    """
+
+    cases: Sequence[Case]
+    specs: Sequence[Row]
+    out: Path
+    seeds: int = 3
+    steps: int = 300
+    points: int = 4000
+    base: str = BASE
+    whole: bool = False
+    settings: tuple[str, ...] = ()
+    device: str = "cpu"
+    plugins: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The trainings of one case, spec and seed, from the easiest value to the hardest."""
+
+    case: Case
+    spec: Row
+    seed: int
+    jobs: tuple[StressJob, ...]
+
+    @property
+    def sweep(self) -> Sweep:
+        assert self.case.sweep is not None
+        return self.case.sweep
+
+
+def clip_names(sweep: Sweep, base: str) -> list[str]:
+    """The built-in clip of each value of a sweep; one clip if the sweep varies the spec."""
+    start, _, own = sweep.clip.partition("?")
+    found = []
+    for value in sweep.values:
+        varied = [setting.replace("{}", f"{value:g}") for setting in sweep.sets]
+        found.append(f"builtin:{start}?" + "&".join([base, *filter(None, [own]), *varied]))
+    return found
+
+
+def plan_chains(
+    study: StressStudy, capabilities: Mapping[str, frozenset[Capability]]
+) -> list[Chain]:
+    """Every chain whose case concerns its spec; built-in clips are generated unless cached.
+
+    Args:
+        capabilities: of each spec, by label.
+    """
+    from hoigs.core.registry.registry import default_registry
+
+    folders, registry = ClipFolders(), default_registry(list(study.plugins))
+    own = {
+        row.label: Spec.load(
+            str(row.spec), overrides=[*study.settings, *row.settings], registry=registry
+        )
+        for row in study.specs
+    }
+    return [
+        _chain(study, case, row, own[row.label], seed, folders)
+        for case in study.cases
+        if case.sweep is not None
+        for row in study.specs
+        if set(case.concerns) <= capabilities[row.label]
+        for seed in range(study.seeds)
+    ]
+
+
+def _chain(
+    study: StressStudy, case: Case, row: Row, spec: Spec, seed: int, folders: ClipFolders
+) -> Chain:
+    sweep = case.sweep
+    assert sweep is not None and row.spec is not None
+    given = [*study.settings, *row.settings]
+    small = small_settings(spec, study.points, study.steps)
+    names = clip_names(sweep, study.base)
+    first = folders.get(names[0])[0]
+    jobs = []
+    for name, value in zip(names, sweep.values, strict=True):
+        folder, _, digest = folders.get(name)
+        scoring = str(first) if sweep.scored_on == "first" and folder != first else ""
+        # by content of the clip: cases that share their first clip share its training
+        key = folder.name.removeprefix("builtin-")[:8]
+        label = f"{sweep.clip.partition('?')[0]}-{key}" + ("-judged" if scoring else "")
+        settings = [*small, *given, *block_settings(spec, sweep, value), f"train.seed={seed}"]
+        job = make_job(
+            study.out, folder, label, digest, row.spec, settings, kind=StressJob,
+            device=study.device, plugins=tuple(map(str, study.plugins)), scoring_clip=scoring,
+            allow_faults=sweep.faults,
+        )  # fmt: skip
+        assert isinstance(job, StressJob)
+        jobs.append(job)
+    return Chain(case, row, seed, tuple(jobs))
+
+
+def block_settings(spec: Spec, sweep: Sweep, value: float) -> list[str]:
+    """Overrides by a sweep of the spec, in each component of a model block with such a setting."""
+    found = []
+    for name, _ in modelled(spec):
+        for place, template in sweep.blocks.items():
+            part, _, key = place.partition(".")
+            if key in getattr(spec.model[name], part).settings:
+                found.append(f"model.{name}.{place}={template.replace('{}', f'{value:g}')}")
+    return found
+
+
+# Direct checks of a study, several at a time, in worker processes.
+
+STATIC = f"{TINY}&camera.path=static"  # of composed:static_camera
+Composed = tuple[str, tuple[str, ...], tuple[str, ...]]  # spec, overrides, plugin files
+OnResult = Callable[[str, str, CheckResult], None]
+
+
+@contextmanager
+def processes(workers: int, tasks: int) -> Iterator[ProcessPoolExecutor]:
+    """A pool whose processes compute with one thread each."""
+    spawn = multiprocessing.get_context("spawn")
+    count = max(1, min(workers, tasks))
+    with safe_children(), ProcessPoolExecutor(count, spawn, _one_thread) as pool:
+        yield pool
+
+
+def make_clips(
+    names: Sequence[str], workers: int, log: Callable[[str], None] = lambda line: None
+) -> None:
+    """Generate the built-in clips that are not cached yet."""
+    unique = list(dict.fromkeys(names))
+    with processes(workers, len(unique)) as pool:
+        waiting = [pool.submit(_make_clip, name) for name in unique]
+        for i, done in enumerate(as_completed(waiting)):
+            done.result()
+            if (i + 1) % 10 == 0 or i + 1 == len(unique):
+                log(f"{i + 1} of {len(unique)} clips")
+
+
+def run_direct(
+    cases: Sequence[Case],
+    specs: Mapping[str, Composed],
+    has: Mapping[str, frozenset[Capability]],
+    workers: int,
+    on_result: OnResult = lambda case, spec, result: None,
+) -> dict[tuple[str, str], CheckResult]:
+    """Results by case and label of the spec; those of hoigs' own code have the label "".
+
+    Args:
+        specs: what is composed, by label. has: capabilities of each, by label.
+        on_result: called with each result as it is known.
+    """
+    own = [(case.id, "", case.check) for case in cases if case.check is not None]
+    composed = [
+        (case.id, label, case.per_spec)
+        for label in specs
+        for case in cases
+        if case.per_spec is not None and set(case.concerns) <= has[label]
+    ]
+    found: dict[tuple[str, str], CheckResult] = {}
+    if not own and not composed:
+        return found
+    with processes(workers, len(own) + len(composed)) as pool:
+        waiting = {pool.submit(run_check, name): (case, label) for case, label, name in own}
+        waiting |= {
+            pool.submit(run_composed_check, name, specs[label]): (case, label)
+            for case, label, name in composed
+        }
+        for done in as_completed(waiting):
+            found[waiting[done]] = done.result()
+            on_result(*waiting[done], done.result())
+    return found
+
+
+def run_check(name: str) -> CheckResult:
+    """Run a check of hoigs' own code."""
+    return _result(check(name))
+
+
+def run_composed_check(name: str, composed: Composed) -> CheckResult:
+    """Run a check of a model that is composed for it."""
+    source, overrides, plugins = composed
+    return _result(lambda: per_spec(name)(Bench.compose(source, overrides, plugins)))
+
+
+def _result(run: Callable[[], CheckResult]) -> CheckResult:
+    """A check that raises has failed; its result has the error."""
+    try:
+        return run()
+    except Exception as error:
+        return CheckResult(False, f"{type(error).__name__}: {error}")
+
+
+def _one_thread() -> None:
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def _make_clip(name: str) -> None:
+    from hoigs.runs.clip_source import clip_folder
+
+    clip_folder(name)
 
 
 @dataclass

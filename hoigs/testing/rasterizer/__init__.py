@@ -9,7 +9,11 @@ The rules are those of `hoigs.core.maths.projection`; the reference is `rasteriz
 from __future__ import annotations
 
 from hoigs.testing.checks import run_checks
-from hoigs.testing.rasterizer import bad_rows, contract, gradients, pictures, rows, rules
+from hoigs.testing.rasterizer import contract, gradients
+from hoigs.testing.rasterizer import contract as bad_rows
+from hoigs.testing.rasterizer import drawing as pictures
+from hoigs.testing.rasterizer import drawing as rows
+from hoigs.testing.rasterizer import drawing as rules
 from hoigs.testing.rasterizer.subject import CHECKS, RasterizerSubject, subject
 
 FAMILIES = (rules, pictures, rows, gradients, bad_rows, contract)  # importing them fills CHECKS

@@ -11,34 +11,29 @@ from torch.autograd.gradcheck import GradcheckError
 from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import SH_C0, Gaussians
-from hoigs.testing.checks import CheckError
-from hoigs.testing.compare import require, require_close, require_finite, require_zero
-from hoigs.testing.rasterizer.reference import (
+from hoigs.testing.checks import CheckError, require, require_close, require_finite, require_zero
+from hoigs.testing.rasterizer.subject import (
+    CHECKS,
     ORACLE,
     PARTS,
-    reference,
-    require_reference_gradients,
-    require_reference_picture,
-    weighing,
-)
-from hoigs.testing.rasterizer.scenes import (
     RAW,
+    RasterizerSubject,
     Scene,
     a_camera,
+    absolute_gradients,
+    camera_gradients,
+    float64,
+    free,
     front_camera,
     images,
     on,
     one_gaussian,
     random_gaussians,
     random_scene,
-)
-from hoigs.testing.rasterizer.subject import (
-    CHECKS,
-    RasterizerSubject,
-    absolute_gradients,
-    camera_gradients,
-    float64,
-    free,
+    reference,
+    require_reference_gradients,
+    require_reference_picture,
+    weighing,
 )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hoigs.viewing.viewer.pictures.resolution import Resolution
+from hoigs.viewing.viewer.run_drawing import Resolution
 from hoigs.viewing.viewer.views import View
 
 STILL_S = 0.25  # a picture is drawn in full once nothing has changed for so long

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.files.folder_lock import FolderLock
+from hoigs.core.system.folder_lock import FolderLock
 from hoigs.runs.checkpoint import has_checkpoint, latest_checkpoint
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.runs.run_folder import RunFolder

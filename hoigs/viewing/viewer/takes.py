@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from hoigs.core.files.video_files import write_video
 from hoigs.core.maths.rotations import matrices_to_quats, quats_to_matrices, slerp
+from hoigs.core.system.video_files import write_video
 from hoigs.core.values.clip import Clip
-from hoigs.viewing.viewer.pictures.fitting import nearest_position
-from hoigs.viewing.viewer.pictures.run_drawing import Drawing, RunDrawing
+from hoigs.viewing.viewer.panes import nearest_position
+from hoigs.viewing.viewer.run_drawing import Drawing, RunDrawing
 from hoigs.viewing.viewer.views import Vector, View
 
 FILM_FPS = 30

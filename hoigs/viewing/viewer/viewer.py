@@ -15,15 +15,11 @@ from jaxtyping import UInt8
 from hoigs.core.values.between import camera_between, frame_of, moment_between
 from hoigs.core.values.camera import Camera
 from hoigs.viewing.viewer import takes
-from hoigs.viewing.viewer.clock import Clock
-from hoigs.viewing.viewer.controls import Controls
+from hoigs.viewing.viewer.controls import Clock, Controls, Settings
 from hoigs.viewing.viewer.eyes import STILL_S, Eye
-from hoigs.viewing.viewer.pictures.bodies import PosedBody
-from hoigs.viewing.viewer.pictures.fitting import fitted, source_frame
-from hoigs.viewing.viewer.pictures.overlays import Overlays
-from hoigs.viewing.viewer.pictures.panes import joined
-from hoigs.viewing.viewer.pictures.run_drawing import Drawing, Picture, RunDrawing
-from hoigs.viewing.viewer.settings import Settings
+from hoigs.viewing.viewer.overlays import Overlays, PosedBody
+from hoigs.viewing.viewer.panes import fitted, joined, source_frame
+from hoigs.viewing.viewer.run_drawing import Drawing, Picture, RunDrawing
 from hoigs.viewing.viewer.views import View
 
 IDLE_S = 0.05  # between looks at the clock and the cameras while nothing happens

@@ -11,7 +11,7 @@ from test_clip_folder import write
 
 from hoigs.core.clip_folder.check import usable_clip
 from hoigs.core.errors import ClipError
-from hoigs.core.files.npz import load_arrays
+from hoigs.core.system.npz import load_arrays
 from hoigs.core.values.clip import Clip
 from hoigs.metrics.regions import region_masks
 from hoigs.plugins.readers.clip import ClipFolderReader

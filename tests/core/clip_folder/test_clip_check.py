@@ -12,11 +12,10 @@ import pytest
 from PIL import Image
 from test_clip_folder import HEIGHT, WIDTH, write
 
-from hoigs.core.clip_folder.check import check_clip, require_clip
-from hoigs.core.clip_folder.diagnostics import summarize, wrong
-from hoigs.core.clip_folder.docs import with_tables
+from hoigs.core.clip_folder.check import check_clip, require_clip, summarize, wrong
+from hoigs.core.clip_folder.format import with_tables
 from hoigs.core.errors import ClipError
-from hoigs.core.files.npz import load_arrays
+from hoigs.core.system.npz import load_arrays
 
 PAGE = Path(__file__).parents[3] / "docs/reference/clip.md"
 
@@ -222,5 +221,5 @@ def test_summary_keeps_different_messages_apart() -> None:
 def test_the_page_agrees_with_the_constants() -> None:
     text = PAGE.read_text(encoding="utf-8")
     assert with_tables(text) == text, (
-        "run: python -m hoigs.core.clip_folder.docs docs/reference/clip.md"
+        "run: python -m hoigs.core.clip_folder.format docs/reference/clip.md"
     )

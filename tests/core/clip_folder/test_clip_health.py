@@ -12,8 +12,8 @@ from torch import Tensor
 
 from hoigs.core.clip_folder import health
 from hoigs.core.clip_folder.health import depth_factor, examine, raggedness
-from hoigs.core.diagnostics import Diagnostic, ranges
 from hoigs.core.errors import ClipError
+from hoigs.core.reporting import Diagnostic, ranges
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment
@@ -124,7 +124,7 @@ def test_masks_that_are_not_known_are_not_called_empty(clip: Clip) -> None:
 
 def test_ragged_masks(clip: Clip) -> None:
     from hoigs.synthesis import NoiseConfig
-    from hoigs.synthesis.degradation.noise import noisy_mask
+    from hoigs.synthesis.degradation import noisy_mask
 
     rng, noise = np.random.default_rng(0), NoiseConfig(mask_boundary=0.2)
     rough = [torch.from_numpy(noisy_mask(DISC.numpy(), noise, rng)) for _ in range(FRAMES)]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from hoigs.core.cpu_kernels import choose
+from hoigs.core.fast import choose
 from hoigs.core.maths.feature_planes import sample_planes
 
 
@@ -21,7 +21,7 @@ def test_only_float32_on_cpus() -> None:
 
 
 def test_where_kernels_do_not_compile_torch_does_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    from hoigs.core.cpu_kernels.runtime import wp
+    from hoigs.core.system.quiet_warp import wp
 
     planes, points = torch.randn(2, 5, 4, 3), torch.rand(2, 20, 2) * 2 - 1
     wanted = sample_planes(planes, points)

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import pytest
 
-from hoigs.core.cpu_kernels.workers import SerialWorkers, ThreadWorkers
+from hoigs.core.fast.launch import SerialWorkers, ThreadWorkers
 
 
 class Launch:
@@ -80,7 +80,7 @@ def test_an_error_of_a_worker_reaches_the_caller() -> None:
 
 STOPPED = """
 import threading
-from hoigs.core.cpu_kernels.workers import ThreadWorkers
+from hoigs.core.fast.launch import ThreadWorkers
 
 start = threading.Thread.start
 

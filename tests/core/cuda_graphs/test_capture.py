@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from hoigs.core.cuda_graphs.capture import capturing, no_garbage_collection
+from hoigs.core.fast.graphs import capturing, no_garbage_collection
 
 
 class Circle:

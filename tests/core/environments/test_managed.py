@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from hoigs.core.environments.managed import EnvironmentAbsentError, ManagedEnvironment
-from hoigs.core.environments.npm_file import NpmFile, registry
 from hoigs.core.errors import HoigsError
+from hoigs.core.system.downloads import NpmFile, registry
+from hoigs.core.system.environments import EnvironmentAbsentError, ManagedEnvironment
 
 VERSION = f"{sys.version_info[0]}.{sys.version_info[1]}"
 MODEL = b"the weights"

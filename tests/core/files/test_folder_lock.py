@@ -16,13 +16,13 @@ from pathlib import Path
 import pytest
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.files.folder_lock import STALE_S, FolderLock, _began
+from hoigs.core.system.folder_lock import STALE_S, FolderLock, _began
 
 SCRIPT = """
 import sys, time
 from pathlib import Path
 from hoigs.core.errors import HoigsError
-from hoigs.core.files.folder_lock import FolderLock
+from hoigs.core.system.folder_lock import FolderLock
 try:
     with FolderLock(Path(sys.argv[1]), "racing"):
         time.sleep(1.0)

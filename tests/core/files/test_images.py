@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hoigs.core.files.images import eight_bits, mask_values
+from hoigs.core.system.images import eight_bits, mask_values
 
 RAMP = np.arange(256, dtype=np.uint8).reshape(16, 16)
 

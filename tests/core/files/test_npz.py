@@ -4,8 +4,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from hoigs.core.files import npz
-from hoigs.core.files.npz import load_arrays
+from hoigs.core.system import npz
+from hoigs.core.system.npz import load_arrays
 
 
 def test_arrays_are_those_of_numpy(tmp_path):

@@ -9,23 +9,22 @@ import socket
 import pytest
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.files.json_file import parse_json
-from hoigs.core.files.npz import array_headers, load_array, load_arrays
-from hoigs.core.files.regular_file import NotRegularError, regular_file
 from hoigs.core.spec.loader import read_document
-from hoigs.core.unpickling.joblib_file import load_joblib
-from hoigs.core.unpickling.pickles import load_pickle, load_pickled_npy
+from hoigs.core.system.files import NotRegularError, parse_json, regular_file
+from hoigs.core.system.joblib_file import load_joblib
+from hoigs.core.system.npz import array_headers, load_array, load_arrays
+from hoigs.core.system.unpickling import load_pickle, load_pickled_npy
 from hoigs.metrics.lpips import _read_tensors
-from hoigs.plugins.estimators.common import frame_files
-from hoigs.plugins.estimators.common.depth_images import read_exr, read_png16
-from hoigs.plugins.estimators.common.frame_files import FileDiagnostics, npz_shapes
-from hoigs.plugins.estimators.common.mask_images import read_video_masks
-from hoigs.plugins.readers.common.lazy_frames import image_size, opened
-from hoigs.plugins.readers.common.numbers import read_lines
-from hoigs.preparation.bodies.body_file import read_bodies
-from hoigs.preparation.options.prompt_file import read_prompts
+from hoigs.plugins.estimators import frame_files
+from hoigs.plugins.estimators.depth_files import read_exr, read_png16
+from hoigs.plugins.estimators.frame_files import FileDiagnostics, npz_shapes
+from hoigs.plugins.estimators.masks_files import read_video_masks
+from hoigs.plugins.readers.checked_files import read_lines
+from hoigs.plugins.readers.lazy_frames import image_size, opened
+from hoigs.preparation.body.body_files import read_bodies
+from hoigs.preparation.prompts import read_prompts
 from hoigs.studies.needs.search_space import load_search_spaces
-from hoigs.viewing.camera_files import rate_of
+from hoigs.viewing.paths import rate_of
 
 
 def test_what_is_no_file_of_bytes_is_named(tmp_path):

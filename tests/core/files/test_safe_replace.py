@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hoigs.core.errors import ClipError, HoigsError
-from hoigs.core.files.safe_replace import Layout, one_of, put_in_place, require_replaceable
+from hoigs.core.system.safe_replace import Layout, one_of, put_in_place, require_replaceable
 
 LAYOUT = Layout(
     "thing", "hoigs", ("a.txt", "parts"), one_of(r"a\.txt", r"parts/\d+"), one_of("parts")

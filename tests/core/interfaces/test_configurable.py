@@ -8,7 +8,7 @@ import pytest
 
 import hoigs as h
 from hoigs.core.registry.registry import default_registry
-from hoigs.testing.material.clip import object_track
+from hoigs.testing.material import object_track
 
 TRACK = object_track()
 

@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
-from hoigs.core.machine import busy
-from hoigs.core.machine.cpus import available_cpus
+from hoigs.core.system import threads as busy
+from hoigs.core.system.threads import available_cpus
 
 NAMES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OMP_NUM_THREADS")
 
@@ -55,7 +55,7 @@ def test_a_machine_is_busy_where_threads_queue(monkeypatch, ran, queued, short):
 
 TRIAL = """
 import json, os, sys, threading, time
-from hoigs.core.machine import busy
+from hoigs.core.system import threads as busy
 
 busy.INTERVAL = 0.2
 if "command" in sys.argv:
@@ -108,7 +108,7 @@ def test_threads_that_queue_do_not_spin(how):
 IMPORTS = """
 import faulthandler, os
 faulthandler.dump_traceback_later(60, exit=True)
-from hoigs.core.machine import busy
+from hoigs.core.system import threads as busy
 
 os.environ["GOMP_SPINCOUNT"] = busy.SHORT_SPIN
 busy.INTERVAL = 0.0001

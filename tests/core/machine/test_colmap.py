@@ -14,7 +14,7 @@ import signal, sys
 from hoigs.cli.failures import failures_as_messages
 
 with failures_as_messages():
-    from hoigs.core.machine.colmap import pycolmap
+    from hoigs.core.system.colmap import pycolmap
     signal.raise_signal(signal.SIGTERM)
 """
 
@@ -28,4 +28,4 @@ def test_every_module_takes_pycolmap_from_one_place():
     imports = re.compile(r"^\s*(import|from) pycolmap", re.MULTILINE)
     root = Path(hoigs.__file__).parent
     found = [p for p in root.rglob("*.py") if imports.search(p.read_text(encoding="utf-8"))]
-    assert found == [root / "core/machine/colmap.py"]
+    assert found == [root / "core/system/colmap.py"]

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from hoigs.core.machine import cpus
+from hoigs.core.system import threads as cpus
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from hoigs.core.machine.pages import release_pages
+from hoigs.core.parameters import release_pages
 
 SIZE = 32 << 20  # bytes
 

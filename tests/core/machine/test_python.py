@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 import hoigs
-from hoigs.core.machine.python import PYTHON
-from hoigs.studies.execution.executor import Needs
-from hoigs.studies.execution.local import LocalExecutor
+from hoigs.core.system.environments import PYTHON
+from hoigs.studies.execution.local import LocalExecutor, Needs
 
 ROOT = Path(hoigs.__file__).parent
 SAFE = {"-P", "-I"}
@@ -69,7 +68,7 @@ def test_a_job_imports_nothing_from_its_folder(trap):
 
 def test_a_pool_imports_nothing_from_its_folder(trap):
     code = (
-        "from hoigs.studies.stress import direct\n"
+        "from hoigs.studies.stress import run as direct\n"
         "direct._one_thread = int\n"
         "if __name__ == '__main__':\n"
         "    with direct.processes(1, 1) as pool: print(pool.submit(abs, -3).result())\n"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from hoigs.core.maths.denser import LEAST, denser
+from hoigs.core.maths.nearest import LEAST, denser
 
 
 def sphere(count: int) -> torch.Tensor:

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from hoigs.core.cpu_kernels.choose import native
+from hoigs.core.fast.choose import native
 from hoigs.core.maths.feature_planes import PairedPlanes, ProductPlanes, roughness, sample_planes
 
 

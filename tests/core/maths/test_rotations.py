@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from hoigs.core.cpu_kernels.choose import native
+from hoigs.core.fast.choose import native
 from hoigs.core.maths import rotations as R
 
 AXIS = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.81]).double(), dim=0)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hoigs.core.cpu_kernels.choose import native
+from hoigs.core.fast.choose import native
 from hoigs.core.maths.rotations import axis_angle_to_matrices, multiply_quats, quats_to_matrices
 from hoigs.core.maths.skinning import (
     ancestor_table,

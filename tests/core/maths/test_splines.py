@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from hoigs.core.maths import splines
-from hoigs.core.maths.knots import Knots, uniform_times
 from hoigs.core.maths.rotations import quats_to_matrices, slerp
+from hoigs.core.maths.splines import Knots, uniform_times
 
 
 def test_basis_by_hand():

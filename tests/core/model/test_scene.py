@@ -8,10 +8,9 @@ from torch import nn
 
 import hoigs as h
 from hoigs.core.errors import PluginError, SpecError
-from hoigs.preparation.options.prepare_options import PrepareOptions
-from hoigs.preparation.options.prompts import with_prompts
-from hoigs.testing.material.clip import camera_at, moment_at
-from hoigs.testing.material.motion import TinyMotion
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.prompts import with_prompts
+from hoigs.testing.material import TinyMotion, camera_at, moment_at
 
 COUNT = 20
 

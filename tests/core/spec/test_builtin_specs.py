@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from hoigs.core.spec.schema import Spec, builtin_specs, builtin_summary
+from hoigs.core.spec.files import builtin_specs, builtin_summary
+from hoigs.core.spec.schema import Spec
 
 
 def test_every_builtin_spec_has_a_summary():

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from hoigs.core.errors import SpecError
-from hoigs.core.spec.files import split_profile
-from hoigs.core.spec.schema import Spec, spec_profiles
+from hoigs.core.spec.files import spec_profiles, split_profile
+from hoigs.core.spec.schema import Spec
 from hoigs.core.spec.train_schema import RatesSpec
 
 TEXT = """\

@@ -20,9 +20,8 @@ import pytest
 import torch
 
 from hoigs.core.errors import ClipError
-from hoigs.core.unpickling.calls import Calls
-from hoigs.core.unpickling.joblib_file import load_joblib
-from hoigs.core.unpickling.pickles import load_pickle
+from hoigs.core.system.joblib_file import load_joblib
+from hoigs.core.system.unpickling import Calls, load_pickle
 
 
 class Name(NamedTuple):
@@ -283,7 +282,7 @@ def test_what_attacks_is_refused_at_once(tmp_path: Path, opcodes: bytes, fact: s
 def test_what_is_made_again_and_again_is_bounded_by_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opcodes: bytes
 ) -> None:
-    monkeypatch.setattr("hoigs.core.unpickling.calls.SMALL_BYTES", 2**20)
-    monkeypatch.setattr("hoigs.core.unpickling.calls.MOST_RATIO", 10)
+    monkeypatch.setattr("hoigs.core.system.unpickling.SMALL_BYTES", 2**20)
+    monkeypatch.setattr("hoigs.core.system.unpickling.MOST_RATIO", 10)
     with pytest.raises(ClipError, match=f"{len(opcodes) + 1} bytes unfold to more than"):
         read(tmp_path / "x.pkl", opcodes)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from hoigs.core.errors import ClipError
-from hoigs.core.unpickling import joblib_file
-from hoigs.core.unpickling.joblib_file import load_joblib
+from hoigs.core.system import joblib_file
+from hoigs.core.system.joblib_file import load_joblib
 
 joblib = pytest.importorskip("joblib", reason="pip install joblib: it writes what is read here")
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from hoigs.core.errors import ClipError
-from hoigs.core.unpickling.pickles import load_pickle, load_pickled_npy
+from hoigs.core.system.unpickling import load_pickle, load_pickled_npy
 
 VALUE = {
     "a": {"K": np.eye(3), "s": np.float32(2.5), "name": "x", "ids": [1, 2], "raw": b"\x00\xff"},

@@ -11,7 +11,7 @@ import torch
 
 from hoigs.core.maths.frame_times import frame_at
 from hoigs.core.values.clip import Clip
-from hoigs.testing.material.clip import FRAMES, HUMAN, OBJECT, tiny_clip
+from hoigs.testing.material import FRAMES, HUMAN, OBJECT, tiny_clip
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import torch
 
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.values.world import World
-from hoigs.testing.material.clip import tiny_clip
+from hoigs.testing.material import tiny_clip
 
 
 def test_up_is_a_unit_vector_and_comes_back_from_json():

@@ -27,9 +27,15 @@ from hoigs.core.model.smpl_params import (
 )
 from hoigs.core.values.clip import BodyTrack
 from hoigs.core.values.moment import BodyPose
-from hoigs.plugins.bodies.model_files import file_gender
-from hoigs.plugins.bodies.smplh import SmplBody, SmplConfig, SmplhBody, SmplhConfig
-from hoigs.plugins.bodies.smplx import SmplxBody, SmplxConfig
+from hoigs.plugins.bodies.corrected import file_gender
+from hoigs.plugins.bodies.smpl import (
+    SmplBody,
+    SmplConfig,
+    SmplhBody,
+    SmplhConfig,
+    SmplxBody,
+    SmplxConfig,
+)
 
 
 @pytest.fixture(scope="module")

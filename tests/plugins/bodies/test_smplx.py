@@ -14,7 +14,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.values.moment import BodyPose
-from hoigs.plugins.bodies.smplx import SmplxBody, SmplxConfig
+from hoigs.plugins.bodies.smpl import SmplxBody, SmplxConfig
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,9 @@ from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.avatars.hexplane_skinning import (
-    HexPlaneSkinning,
-    HexPlaneSkinningConfig,
-)
+from hoigs.plugins.deformation.articulated import Articulated
+from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning, HexPlaneSkinningConfig
 from hoigs.plugins.deformation.irradiance import (
     TERMS,
     Irradiance,
@@ -23,11 +22,9 @@ from hoigs.plugins.deformation.irradiance import (
     outward_normals,
     turned_normals,
 )
-from hoigs.plugins.deformation.rigid.articulated import Articulated
-from hoigs.plugins.deformation.rigid.rigid_spline import RigidSpline
-from hoigs.plugins.deformation.splines.chs import CubicHermite
-from hoigs.plugins.deformation.splines.keyframed import Keyframed
-from hoigs.plugins.deformation.splines.tracked_chs import TrackedHermite
+from hoigs.plugins.deformation.keyframes import Keyframed
+from hoigs.plugins.deformation.rigid_spline import RigidSpline
+from hoigs.plugins.deformation.tracked_chs import TrackedHermite
 
 TURNS = torch.tensor([[0.0, 0, 0], [0.0, 0, 1.2], [0.0, 0, 2.4]])  # of the ball, radians
 SUN = normalize(torch.tensor([0.3, 0.8, -0.5]), dim=0)

@@ -10,8 +10,11 @@ from hoigs.core.errors import RenderError
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.density import DensityStatistics, check_rasterizer
 from hoigs.core.interfaces.rasterizer import Capabilities
-from hoigs.plugins.density.absgrad import AbsoluteGradientConfig, AbsoluteGradientDensity
-from hoigs.plugins.density.adc import AdaptiveDensity
+from hoigs.plugins.density.adc import (
+    AbsoluteGradientConfig,
+    AbsoluteGradientDensity,
+    AdaptiveDensity,
+)
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 
 SMALL, LARGE = 0.01, 0.5

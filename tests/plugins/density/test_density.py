@@ -13,7 +13,7 @@ from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
-from hoigs.plugins.deformation.splines.chs import CubicHermite
+from hoigs.plugins.deformation.chs import CubicHermite
 from hoigs.plugins.density.adc import AdaptiveDensity, AdaptiveDensityConfig
 from hoigs.plugins.density.none import NoDensity, NoDensityConfig
 

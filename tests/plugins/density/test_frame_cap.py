@@ -9,7 +9,7 @@ import pytest
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.density.adc import AdaptiveDensity, AdaptiveDensityConfig
-from hoigs.plugins.density.frame_cap import LEAST, MOST, resolve_cap
+from hoigs.plugins.density.children import LEAST, MOST, resolve_cap
 from hoigs.plugins.density.mcmc import McmcDensity, McmcDensityConfig
 from hoigs.runs.clip_source import read_clip
 from hoigs.synthesis import SceneConfig, builtin_clip

@@ -10,9 +10,8 @@ from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.maths.rotations import quats_to_matrices
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.moment import Moment
-from hoigs.plugins.deformation.splines.chs import CubicHermite
-from hoigs.plugins.density.mcmc import McmcDensity, McmcDensityConfig
-from hoigs.plugins.density.relocation import relocation_shrink
+from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.plugins.density.mcmc import McmcDensity, McmcDensityConfig, relocation_shrink
 
 
 def test_dead_rows_move_to_the_living() -> None:

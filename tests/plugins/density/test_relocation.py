@@ -13,7 +13,7 @@ from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.topology import share_opacity
 from hoigs.plugins.density.children import Window, drawn_rows
-from hoigs.plugins.density.relocation import MAX_COPIES, relocation_shrink, shared_among
+from hoigs.plugins.density.mcmc import MAX_COPIES, relocation_shrink, shared_among
 from hoigs.rasterizers.oracle import OracleRasterizer
 
 OPACITIES = (0.01, 0.3, 0.9, 0.999)

@@ -13,8 +13,7 @@ from PIL import Image
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import checked
-from hoigs.plugins.estimators.common.depth_images import read_exr
-from hoigs.plugins.estimators.depth_files import DepthFilesEstimator
+from hoigs.plugins.estimators.depth_files import DepthFilesEstimator, read_exr
 
 
 def made_depth_files(**settings: Any) -> DepthFilesEstimator:

@@ -19,12 +19,12 @@ from hoigs.core.interfaces.estimator import (
     LazyFrames,
     checked,
 )
-from hoigs.core.progress import no_progress
 from hoigs.core.registry.registry import default_registry
+from hoigs.core.reporting import no_progress
 from hoigs.core.spec.schema import Spec
 from hoigs.plugins.estimators.command import CommandEstimator
 from hoigs.plugins.estimators.masks_files import MasksFilesEstimator
-from hoigs.preparation.options.option_files import installed_estimators, load_options
+from hoigs.preparation.options import installed_estimators, load_options
 
 DOC = (Path(__file__).parents[3] / "docs/reference/estimators.md").read_text()
 BLOCKS = re.findall(r"```yaml\n(.*?)```", DOC, re.S)

@@ -18,14 +18,18 @@ from pathlib import Path
 import pytest
 from estimator_cases import FRAMES, HEIGHT, WIDTH, request
 
-from hoigs.core.environments import hub
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import EntityRequest
-from hoigs.core.progress import no_progress
-from hoigs.preparation.estimates.plan import HUB_LICENCES, EstimatorPlan, plan_estimators
-from hoigs.preparation.estimates.readiness import agree, get_ready
-from hoigs.preparation.options.option_files import installed_estimators
-from hoigs.preparation.options.prepare_options import PrepareOptions
+from hoigs.core.reporting import no_progress
+from hoigs.core.system import downloads as hub
+from hoigs.preparation.estimates.plan import (
+    HUB_LICENCES,
+    EstimatorPlan,
+    agree,
+    get_ready,
+    plan_estimators,
+)
+from hoigs.preparation.options import PrepareOptions, installed_estimators
 from hoigs.preparation.video.source import find_source
 
 pytest.importorskip("transformers", reason="the extra hoigs[estimators]")

@@ -15,8 +15,7 @@ from hoigs.core.interfaces.estimator import (
     EntityRequest,
     checked,
 )
-from hoigs.plugins.estimators.common.keypoints import WHOLE_BODY_133
-from hoigs.plugins.estimators.landmarks_files import LandmarksFilesEstimator
+from hoigs.plugins.estimators.landmarks_files import WHOLE_BODY_133, LandmarksFilesEstimator
 
 
 def person(count: int, i: int, x: float = 0.0) -> np.ndarray:

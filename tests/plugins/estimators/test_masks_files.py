@@ -16,8 +16,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.estimator import EntityRequest, checked
 from hoigs.core.registry.registry import default_registry
-from hoigs.plugins.estimators.common.mask_images import voc_palette
-from hoigs.plugins.estimators.masks_files import MasksFilesEstimator
+from hoigs.plugins.estimators.masks_files import MasksFilesEstimator, voc_palette
 
 
 def made_masks_files(**settings: Any) -> MasksFilesEstimator:

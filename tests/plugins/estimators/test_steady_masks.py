@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hoigs.plugins.estimators.common.steady_masks import SteadyMasks
+from hoigs.plugins.estimators.steady_masks import SteadyMasks
 
 FRAMES, H, W = 40, 90, 160
 TRUNK, TABLE = np.s_[20:70, 60:100], np.s_[70:88, 20:140]

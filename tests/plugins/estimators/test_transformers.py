@@ -20,7 +20,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import COCO_17_LANDMARKS, EntityRequest, checked
 from hoigs.core.registry.registry import default_registry
 from hoigs.plugins.estimators.transformers.depth_anything import TransformersDepthEstimator
-from hoigs.plugins.estimators.transformers.detector import Detection, Detector, follow, overlap
+from hoigs.plugins.estimators.transformers.models import Detection, Detector, follow, overlap
 from hoigs.plugins.estimators.transformers.sam2 import TransformersSam2Estimator
 from hoigs.plugins.estimators.transformers.vitpose import TransformersPoseEstimator
 

@@ -14,7 +14,7 @@ from hoigs.core.model.compose import compose_bodies
 from hoigs.core.model.exporter import ExportRequest
 from hoigs.core.values.world import World
 from hoigs.runs.loaded_run import LoadedRun
-from hoigs.workflows.export import export_moments
+from hoigs.viewing.export import export_moments
 
 
 @pytest.fixture(scope="session")

@@ -15,11 +15,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.plugins.exporters.common.bodies import body_motion
-from hoigs.plugins.exporters.common.objects import object_motion
-from hoigs.plugins.exporters.common.world import Move
-from hoigs.plugins.exporters.gltf_body import GltfBodyExporter
-from hoigs.plugins.exporters.gltf_splat import NAME, GltfSplatExporter
+from hoigs.plugins.exporters.glb import NAME, GltfBodyExporter, GltfSplatExporter
+from hoigs.plugins.exporters.posed import Move, body_motion, object_motion
 
 SCRIPT = """
 const validator = require('gltf-validator');

@@ -7,12 +7,12 @@ import pytest
 import torch
 import trimesh
 
-from hoigs.plugins.exporters.common.bodies import body_motion
 from hoigs.plugins.exporters.mesh_sequence import (
     MeshSequenceConfig,
     MeshSequenceExporter,
     alpha_shape,
 )
+from hoigs.plugins.exporters.posed import body_motion
 
 
 @pytest.mark.parametrize("file", ["ply", "obj", "glb"])

@@ -11,8 +11,7 @@ import torch
 from hoigs.core.errors import HoigsError
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.maths.spherical_harmonics import rotate_sh, sh_basis
-from hoigs.plugins.exporters.common.ply_file import parse_ply, ply_bytes, read_ply
-from hoigs.plugins.exporters.ply import PlyConfig, PlyExporter
+from hoigs.plugins.exporters.ply import PlyConfig, PlyExporter, parse_ply, ply_bytes, read_ply
 
 
 def test_the_picture_is_ours(request_of, psnr_to_ours, tmp_path):

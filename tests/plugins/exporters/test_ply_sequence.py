@@ -9,8 +9,7 @@ from exported_run import tiny_run
 
 import hoigs as h
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.plugins.exporters.common.ply_file import parse_ply, read_ply
-from hoigs.plugins.exporters.ply_sequence import PlySequenceConfig, PlySequenceExporter
+from hoigs.plugins.exporters.ply import PlySequenceConfig, PlySequenceExporter, parse_ply, read_ply
 
 
 @pytest.mark.parametrize("merged", [True, False])

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from hoigs.core.interfaces.body import PELVIS
 from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.exporters.bvh import BvhConfig, BvhExporter
-from hoigs.plugins.exporters.common.bodies import body_motion
+from hoigs.plugins.exporters.posed import body_motion
 from hoigs.plugins.exporters.smpl_npz import AmassExporter, SmplxExporter
 
 

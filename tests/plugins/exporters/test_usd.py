@@ -8,9 +8,7 @@ import torch
 
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.plugins.exporters.common.bodies import body_motion
-from hoigs.plugins.exporters.common.objects import object_motion
-from hoigs.plugins.exporters.common.world import Move
+from hoigs.plugins.exporters.posed import Move, body_motion, object_motion
 
 WHY = "usd-core is not installed: hoigs[usd]"
 Gf, Usd, UsdGeom, UsdSkel, UsdVol = (

@@ -11,9 +11,9 @@ from hoigs.core.model.entity import Entity
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.avatars.hexplane_skinning import HexPlaneSkinning
-from hoigs.plugins.deformation.fields.mlp import MlpDeformation
-from hoigs.plugins.deformation.splines.chs import CubicHermite
+from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
+from hoigs.plugins.deformation.mlp import MlpDeformation
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.features.body_parts import BodyPartConfig, BodyPartFeatures, part_averages
 from hoigs.plugins.features.embedding import EmbeddingConfig, EmbeddingFeatures

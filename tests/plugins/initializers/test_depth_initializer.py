@@ -9,13 +9,13 @@ import torch
 import trimesh
 
 from hoigs.core.values.clip import Clip, FrameStore
+from hoigs.plugins.initializers.alignment import inliers
 from hoigs.plugins.initializers.depth import (
     DepthInitializer,
     DepthInitializerConfig,
     shrunk,
     steady,
 )
-from hoigs.plugins.initializers.outliers import inliers
 
 
 class Spoilt(FrameStore):

@@ -9,7 +9,7 @@ import trimesh
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.values.gaussians import SH_C0
-from hoigs.plugins.initializers.shape_files import read_points, sample_mesh
+from hoigs.plugins.initializers.shapes import read_points, sample_mesh
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.random((50, 3)).astype("f4")

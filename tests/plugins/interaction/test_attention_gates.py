@@ -10,7 +10,7 @@ from attention_scene import ARM, module, part_of_joint, person, run, thing
 
 from hoigs.core.interfaces.body import PART_NAMES
 from hoigs.core.values.tokens import Role, Tokens
-from hoigs.plugins.interaction.gates import DistanceGateConfig, log_gate
+from hoigs.plugins.interaction.cross_attention import DistanceGateConfig, log_gate
 
 
 @pytest.mark.parametrize("gate", ["hard", "soft"])

@@ -13,8 +13,8 @@ from hoigs.core.model.entity import Entity
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import Role, Tokens
-from hoigs.plugins.deformation.avatars.hexplane_skinning import HexPlaneSkinning
-from hoigs.plugins.deformation.splines.chs import CubicHermite
+from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
 from hoigs.plugins.features.body_parts import BodyPartFeatures
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.plugins.interaction.cross_attention import CrossAttention

@@ -18,9 +18,9 @@ from hoigs.core.errors import ClipError, HoigsError
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.values.clip import Clip
-from hoigs.plugins.bodies.smplx import SmplxBody, SmplxConfig
-from hoigs.plugins.readers.arctic import ArcticReader
+from hoigs.plugins.bodies.smpl import SmplxBody, SmplxConfig
 from hoigs.plugins.readers.clip import ClipFolderReader
+from hoigs.plugins.readers.zoo.arctic import ArcticReader
 
 
 @pytest.fixture(scope="module")

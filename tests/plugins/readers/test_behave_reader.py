@@ -14,10 +14,10 @@ from same import same_cameras, same_poses
 from torch import Tensor
 
 from hoigs.core.errors import ClipError
-from hoigs.core.unpickling.pickles import load_pickle
+from hoigs.core.system.unpickling import load_pickle
 from hoigs.core.values.clip import Clip
-from hoigs.plugins.bodies.smplh import SmplhBody
-from hoigs.plugins.readers.behave.reader import BehaveReader
+from hoigs.plugins.bodies.smpl import SmplhBody
+from hoigs.plugins.readers.zoo.behave import BehaveReader
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from PIL import Image
 
 from hoigs.core.errors import ClipError
 from hoigs.core.values.clip import Clip
-from hoigs.plugins.readers.davis import DavisReader
+from hoigs.plugins.readers.zoo.davis import DavisReader
 
 
 @pytest.mark.parametrize("folders", [False, True])

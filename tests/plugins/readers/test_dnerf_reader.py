@@ -14,7 +14,7 @@ from same import same_cameras
 
 from hoigs.core.errors import ClipError
 from hoigs.core.values.clip import Clip
-from hoigs.plugins.readers.dnerf import DnerfReader
+from hoigs.plugins.readers.zoo.dnerf import DnerfReader
 
 
 def edit(path: Path, change: Any) -> None:

@@ -16,7 +16,7 @@ from same import same_cameras, same_poses
 from hoigs.core.errors import ClipError, HoigsError
 from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.plugins.readers.exavatar.reader import ExavatarReader
+from hoigs.plugins.readers.zoo.exavatar import ExavatarReader
 
 
 @pytest.fixture(scope="module")

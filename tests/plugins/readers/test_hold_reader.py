@@ -15,7 +15,7 @@ from same import same_cameras
 from hoigs.core.errors import ClipError
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.values.clip import Clip
-from hoigs.plugins.readers.hold import HoldReader, decomposed
+from hoigs.plugins.readers.zoo.hold import HoldReader, decomposed
 
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 

@@ -17,10 +17,10 @@ from layouts.changed import picked, without_fingers
 from same import same_cameras, same_poses
 
 from hoigs.core.errors import ClipError
-from hoigs.core.unpickling.pickles import load_pickle
+from hoigs.core.system.unpickling import load_pickle
 from hoigs.core.values.clip import Clip
-from hoigs.plugins.bodies.smplh import SmplBody
-from hoigs.plugins.readers.hosnerf import HosnerfReader, published_split
+from hoigs.plugins.bodies.smpl import SmplBody
+from hoigs.plugins.readers.zoo.hosnerf import HosnerfReader, published_split
 
 
 @pytest.fixture(scope="module")

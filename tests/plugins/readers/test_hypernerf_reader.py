@@ -16,7 +16,7 @@ from same import same_cameras
 
 from hoigs.core.errors import ClipError
 from hoigs.core.values.clip import Clip
-from hoigs.plugins.readers.hypernerf import HypernerfReader
+from hoigs.plugins.readers.zoo.hypernerf import HypernerfReader
 
 
 def edit(path: Path, change: Any) -> None:

@@ -12,7 +12,7 @@ from PIL import Image
 from hoigs.core.errors import ClipError
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.lens import Lens
-from hoigs.plugins.readers.common.lazy_frames import DepthFiles, LazyFrames, MaskFiles, dark
+from hoigs.plugins.readers.lazy_frames import DepthFiles, LazyFrames, MaskFiles, dark
 
 W, H = 24, 16
 CAMERA = Camera(torch.tensor([[20.0, 0, 13], [0, 20.0, 7], [0, 0, 1]]), torch.eye(4), W, H)

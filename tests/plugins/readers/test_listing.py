@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hoigs.core.errors import ClipError
-from hoigs.plugins.readers.common.listing import Need, require_files
+from hoigs.plugins.readers.checked_files import Need, require_files
 
 NEEDS = [
     Need.of("cameras.pkl", maker="cameras come from the authors"),

@@ -19,7 +19,7 @@ from hoigs.core.errors import ClipError
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.plugins.readers.neuman import NeumanReader
+from hoigs.plugins.readers.zoo.neuman import NeumanReader
 
 joblib = pytest.importorskip("joblib", reason="pip install joblib: NeuMan's files are its")
 

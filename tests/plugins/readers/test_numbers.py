@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from hoigs.core.errors import ClipError
-from hoigs.core.unpickling.pickles import load_pickled_npy
-from hoigs.plugins.readers.common.numbers import entry, numbers, read_lines
-from hoigs.plugins.readers.common.template_mesh import load_mesh
+from hoigs.core.system.unpickling import load_pickled_npy
+from hoigs.plugins.readers.checked_files import entry, numbers, read_lines
+from hoigs.plugins.readers.points import load_mesh
 
 
 def test_numbers_of_a_shape():

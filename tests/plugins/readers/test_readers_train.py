@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from hoigs.cli.main import app
 from hoigs.core.values.clip import Clip
-from hoigs.plugins.bodies.smplh import SmplBody, SmplhBody
+from hoigs.plugins.bodies.smpl import SmplBody, SmplhBody
 
 SMALL = ["--set", "train.steps=1", "--set", "train.preview_every=0", "--rasterizer", "torch",
          "--device", "cpu", "--no-eval"]  # fmt: skip

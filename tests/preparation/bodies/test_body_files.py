@@ -16,11 +16,14 @@ from tiny import FRAMES, HEIGHT, WIDTH, make_source
 
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.preparation.bodies.as_landmarks import BodyFileEstimator
-from hoigs.preparation.bodies.body_file import body_beside, read_bodies
-from hoigs.preparation.bodies.programs import SMPL_PELVIS, SMPLX_PELVIS
-from hoigs.preparation.body.priors.joint_limits import beyond
-from hoigs.preparation.body.priors.pose import PosePrior
+from hoigs.preparation.body.body_files import (
+    SMPL_PELVIS,
+    SMPLX_PELVIS,
+    BodyFileEstimator,
+    body_beside,
+    read_bodies,
+)
+from hoigs.preparation.body.priors import PosePrior, beyond
 from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until
 from hoigs.preparation.video.source import SourceError
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from hoigs.preparation.body.priors.acceleration_spread import JITTER, SLOWEST, acceleration_spreads
-from hoigs.preparation.body.priors.motion import _second_differences
+from hoigs.preparation.body.priors import JITTER, _second_differences, acceleration_spreads
+from hoigs.preparation.body.priors import SLOWEST_POINT as SLOWEST
 
 FRAMES, STEP, NOISE = 300, 1 / 30, 0.01
 

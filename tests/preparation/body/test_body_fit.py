@@ -27,10 +27,10 @@ from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Unknowns
 from hoigs.preparation.body.ground_scale import ground_scale
 from hoigs.preparation.body.landmarks import FrameFates, LandmarkTrack, points_of
 from hoigs.preparation.body.normal_equations import NormalEquations
-from hoigs.preparation.body.priors.joint_limits import beyond
-from hoigs.preparation.body.start.limbs import limb_pose
-from hoigs.preparation.entities.person import fates_said, stature
-from hoigs.preparation.report.mesh_overlay import overlay_frame
+from hoigs.preparation.body.priors import beyond
+from hoigs.preparation.body.start import limb_pose
+from hoigs.preparation.entities.people import fates_said, stature
+from hoigs.preparation.report.overlay import overlay_frame
 
 FRAMES, WIDTH, HEIGHT, FOCAL = 9, 640, 480, 600.0
 QUICK = FitOptions(steps=60)

@@ -20,8 +20,7 @@ from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_
 from hoigs.preparation.body.fit import fit_body
 from hoigs.preparation.body.fit_values import BodyFit
 from hoigs.preparation.body.landmarks import ENOUGH, SOLID, USED, LandmarkTrack
-from hoigs.preparation.body.start.flat import flat_start, relaxed
-from hoigs.preparation.body.start.placing import place
+from hoigs.preparation.body.start import flat_start, place, relaxed
 
 
 def flat(targets: tuple[int, ...]) -> LandmarkTrack:

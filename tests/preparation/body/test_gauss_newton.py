@@ -14,7 +14,7 @@ from hoigs.preparation.body.fit_problem import FitProblem
 from hoigs.preparation.body.kinematics import PER_FRAME, Kinematics
 from hoigs.preparation.body.landmarks import points_of
 from hoigs.preparation.body.normal_equations import NormalEquations
-from hoigs.preparation.body.priors.motion import MotionPrior
+from hoigs.preparation.body.priors import MotionPrior
 
 STEP = 1e-6
 

@@ -12,9 +12,8 @@ from hoigs.preparation.body.fit import fit_body
 from hoigs.preparation.body.fit_values import BodyFit
 from hoigs.preparation.body.kinematics import PER_FRAME
 from hoigs.preparation.body.landmarks import LandmarkTrack
-from hoigs.preparation.body.mask_fit import MaskFit
+from hoigs.preparation.body.mask_fit import MaskFit, posed, silhouette
 from hoigs.preparation.body.normal_equations import NormalEquations
-from hoigs.preparation.body.silhouette import posed, silhouette
 
 UNSEEN = slice(5, FRAMES)
 KNEE, ANKLE, WRIST = 5, 8, 20

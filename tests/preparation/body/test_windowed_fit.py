@@ -10,14 +10,13 @@ import pytest
 import torch
 from test_body_fit import body, camera, joint_errors, seen_by
 
+from hoigs.core.maths.frame_times import Chunking
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
-from hoigs.core.windows import Chunking
-from hoigs.preparation.body.fit import fit_body
+from hoigs.preparation.body.fit import fit_body, spread
 from hoigs.preparation.body.fit_values import BodyFit, FitOptions
 from hoigs.preparation.body.landmarks import LandmarkTrack
 from hoigs.preparation.body.normal_equations import NormalEquations
-from hoigs.preparation.body.windowed_fit import spread
 
 FRAMES, CHUNKING, QUICK = 48, Chunking(24, 10), FitOptions(steps=20)
 

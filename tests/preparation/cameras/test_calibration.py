@@ -12,12 +12,11 @@ from tiny import FRAMES, HEIGHT, WIDTH
 
 from hoigs.core.errors import SpecError
 from hoigs.core.values.lens import Lens
+from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
 from hoigs.preparation.cameras.choose import choose_cameras
-from hoigs.preparation.cameras.known.calibration import fitting, given_intrinsics, read_calibration
 from hoigs.preparation.estimates.given import GivenMasks, RawLandmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.options.option_files import load_options
-from hoigs.preparation.options.prepare_options import PrepareOptions
+from hoigs.preparation.options import PrepareOptions, load_options
 from hoigs.preparation.video.frames import VideoFrames
 from hoigs.preparation.video.source import SourceError
 

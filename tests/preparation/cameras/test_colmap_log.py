@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hoigs.preparation.cameras.colmap_log import quiet_colmap
+from hoigs.preparation.cameras.motion import quiet_colmap
 
 pycolmap = pytest.importorskip("pycolmap")
 

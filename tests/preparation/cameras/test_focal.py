@@ -10,9 +10,14 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from tiny import FRAMES, landmarks, picture
 
-from hoigs.preparation.cameras.focal.from_person import LONGEST, SHORTEST, FocalCurve, focal_curve
-from hoigs.preparation.cameras.focal.metadata import focal_of_metadata
-from hoigs.preparation.cameras.focal.still_camera import static_focal
+from hoigs.preparation.cameras.focal import (
+    LONGEST,
+    SHORTEST,
+    FocalCurve,
+    focal_curve,
+    focal_of_metadata,
+    static_focal,
+)
 from hoigs.preparation.estimates.given import RawLandmarks
 from hoigs.preparation.video.frames import VideoFrames, open_frames
 

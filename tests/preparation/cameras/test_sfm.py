@@ -17,7 +17,7 @@ from hoigs.preparation.cameras.motion import background_motion
 from hoigs.preparation.cameras.sfm import _what_to_do, structure_from_motion
 from hoigs.preparation.estimates.given import GivenMasks, RawLandmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.options.prepare_options import PrepareOptions
+from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames, open_frames
 from hoigs.preparation.video.source import SourceError
 

@@ -9,11 +9,10 @@ import pytest
 import torch
 from tiny import BALL, FRAMES, HEIGHT, WIDTH, masks
 
-from hoigs.core.maths.series import smooth
-from hoigs.core.values.undistortion import Undistortion
+from hoigs.core.maths.frame_times import smooth
+from hoigs.core.values.lens import Undistortion
 from hoigs.preparation.cameras.camera_track import pinhole, static_cameras
-from hoigs.preparation.objects.ball.sphere import outline_rays
-from hoigs.preparation.objects.ball.track import ball_centers, load_ball, refine_ball
+from hoigs.preparation.objects.ball import ball_centers, load_ball, outline_rays, refine_ball
 from hoigs.preparation.video.frames import VideoFrames
 from hoigs.preparation.video.source import SourceError
 

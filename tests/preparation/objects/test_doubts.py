@@ -9,8 +9,8 @@ import torch
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.objects.doubts import doubts, silhouette_ious
-from hoigs.preparation.objects.shape.first_points import sphere_points
+from hoigs.preparation.objects.make_object import doubts, silhouette_ious
+from hoigs.preparation.objects.shape import sphere_points
 
 FRAMES, WIDTH, HEIGHT = 6, 80, 60
 

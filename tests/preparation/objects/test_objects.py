@@ -7,13 +7,8 @@ import pytest
 import torch
 
 from hoigs.core.values.camera import Camera
-from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.masks.outlines import long_axis, outlines_of
-from hoigs.preparation.objects.shape.first_points import (
-    ColorSampler,
-    inflated_outline,
-    sphere_points,
-)
+from hoigs.preparation.masks.mask_stack import MaskStack, long_axis, outlines_of
+from hoigs.preparation.objects.shape import ColorSampler, inflated_outline, sphere_points
 from hoigs.preparation.objects.track import apparent_size, hand_depths, held_object
 from hoigs.preparation.video.source import SourceError
 

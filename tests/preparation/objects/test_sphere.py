@@ -8,7 +8,7 @@ import torch
 
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.objects.ball.sphere import (
+from hoigs.preparation.objects.ball import (
     FLESH,
     NoBallError,
     ball_cones,

@@ -7,17 +7,17 @@ from pathlib import Path
 import pytest
 
 from hoigs.core.errors import SpecError
-from hoigs.preparation.options.prepare_options import PrepareOptions
-from hoigs.preparation.options.prompt_file import (
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.prepare import work_folder
+from hoigs.preparation.prompts import (
     StoredPrompts,
     prompt_file,
+    with_prompts,
     with_stored,
     write_prompts,
 )
-from hoigs.preparation.options.prompts import with_prompts
-from hoigs.preparation.prepare import work_folder
 from hoigs.studies.needs.auto import needs_of
-from hoigs.studies.needs.pruning.compact_run import compact_of
+from hoigs.studies.needs.compress import compact_of
 
 TEXTS = ("30,20@0", "-10,5@0", "1,2,30,40@4")
 

@@ -7,13 +7,8 @@ from dataclasses import replace
 import pytest
 
 from hoigs.core.errors import SpecError
-from hoigs.preparation.options.prepare_options import PrepareOptions
-from hoigs.preparation.options.prompts import (
-    check_prompts,
-    parse_prompts,
-    placed_prompts,
-    with_prompts,
-)
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.prompts import check_prompts, parse_prompts, placed_prompts, with_prompts
 from hoigs.preparation.video.frames import FrameList
 
 FOUND = FrameList(64, 48, 30.0, 30.0, 10, list(range(10)), [1.0] * 10)

@@ -8,11 +8,10 @@ import numpy as np
 import torch
 
 from hoigs.core.values.camera import Camera
-from hoigs.preparation.body.silhouette import silhouette
-from hoigs.preparation.report.overlay import OverlayVideo, draw_outline, draw_points
-from hoigs.preparation.report.video_out import VideoWriter
+from hoigs.preparation.body.mask_fit import silhouette
+from hoigs.preparation.report.overlay import OverlayVideo, VideoWriter, draw_outline, draw_points
 from hoigs.preparation.video.frames import VideoFrames
-from hoigs.preparation.video.resizing import shrink, shrink_mask
+from hoigs.preparation.video.pictures import shrink, shrink_mask
 
 
 def camera() -> Camera:

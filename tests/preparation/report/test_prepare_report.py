@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hoigs.preparation.report.report import PrepareReport
-from hoigs.preparation.stages.progress import Stages
+from hoigs.preparation.stages import Stages
 
 
 def report() -> PrepareReport:

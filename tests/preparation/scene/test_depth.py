@@ -12,7 +12,7 @@ from tiny import FRAMES, HEIGHT, WIDTH, masks
 
 from hoigs.core.interfaces.estimator import DepthMaps, Estimates, Estimator
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.undistortion import Undistortion
+from hoigs.core.values.lens import Undistortion
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.preparation.prepare import PrepareOptions, prepare

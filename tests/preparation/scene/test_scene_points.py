@@ -12,12 +12,12 @@ from tiny import FRAMES, HEIGHT, WIDTH, background, masks, picture
 
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.scene.background_points import (
+    PlateView,
     background_plate,
     plate_points,
     quadtree,
     supposed_depth,
 )
-from hoigs.preparation.scene.plate_view import PlateView
 from hoigs.preparation.video.source import SourceError
 
 

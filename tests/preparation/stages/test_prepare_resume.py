@@ -16,8 +16,8 @@ from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.errors import ClipError, HoigsError
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until, work_folder
-from hoigs.preparation.stages.plan import PLAN, with_dependents
-from hoigs.preparation.stages.work_folder import Result, WorkFolder, digest, fingerprint
+from hoigs.preparation.stages import PLAN, with_dependents
+from hoigs.preparation.work_folder import Result, WorkFolder, digest, fingerprint
 
 OPTIONS = PrepareOptions(fit_steps=3, overlay_width=0, max_frames=6)
 REPOSITORY = Path(__file__).resolve().parents[3]

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from av.filter import Graph
 
-from hoigs.annotation.video import ScrubbedVideo
 from hoigs.preparation.video.colors import converted
 from hoigs.preparation.video.frames import open_frames
 from hoigs.preparation.video.pictures import VideoPicture
 from hoigs.preparation.video.source import SourceError, find_source
+from hoigs.viewing.annotate.video import ScrubbedVideo
 
 WIDTH, HEIGHT = 64, 48
 LIMIT = 2.0  # of 255, mean

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from tiny import FRAMES
 
-from hoigs.preparation.video.header import missing_frames, video_header
+from hoigs.preparation.video.container import missing_frames, video_header
 
 
 def test_a_video_that_is_shorter_than_its_header_says(tiny_video: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hoigs.core.files.colmap_files import choice_told
+from hoigs.core.system.colmap_files import choice_told
 from hoigs.preparation.video.source import SourceError, find_source
 
 

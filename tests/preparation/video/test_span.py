@@ -11,9 +11,9 @@ import pytest
 from tiny import FRAMES, picture
 
 from hoigs.core.errors import SpecError
-from hoigs.preparation.options.prepare_options import PrepareOptions
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.video.container import missing_frames
 from hoigs.preparation.video.frames import VideoFrames
-from hoigs.preparation.video.header import missing_frames
 from hoigs.preparation.video.source import SourceError
 from hoigs.preparation.video.span import Place, Span, parse_place
 

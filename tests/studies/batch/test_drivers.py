@@ -215,7 +215,7 @@ class Ended:
 
 @pytest.mark.parametrize(("losses", "state"), [(3, "done"), (4, "failed")])
 def test_a_machine_that_is_lost_is_no_failure_of_a_stage(tmp_path, monkeypatch, losses, state):
-    monkeypatch.setattr("hoigs.studies.batch.drive.RETRY_S", 0.0)
+    monkeypatch.setattr("hoigs.studies.batch.batch.RETRY_S", 0.0)
     batches = Batches(tmp_path, ["a"])
 
     class Losing:

@@ -12,9 +12,8 @@ import pytest
 
 from hoigs.core.errors import HoigsError
 from hoigs.studies.batch import manifest
-from hoigs.studies.batch.folder import BATCH, BatchFolder
+from hoigs.studies.batch.folder import BATCH, BatchFolder, stages_of
 from hoigs.studies.batch.manifest import ManifestError, each_row, read_manifest
-from hoigs.studies.batch.stages import stages_of
 from hoigs.studies.batch.summary import write_summary
 
 

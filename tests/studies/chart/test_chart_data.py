@@ -13,14 +13,16 @@ from hoigs.evaluation.protocol import NotComputed
 from hoigs.studies.chart.data import (
     AXES,
     all_clips,
+    dominances,
+    dominates,
     dump_cells,
+    front,
     load_chart,
     merged_about,
     points_of,
+    usable_axes,
 )
-from hoigs.studies.chart.pareto import dominances, dominates, front, usable_axes
-from hoigs.studies.jobs.results import ALL_CLIPS, Spread
-from hoigs.studies.jobs.variants import definition, parse_variants
+from hoigs.studies.jobs.results import ALL_CLIPS, Spread, definition, parse_variants
 
 PSNR, TIME, JOULES = AXES["psnr_human_object"], AXES["train_s"], AXES["joules"]
 LPIPS = AXES["lpips_full"]

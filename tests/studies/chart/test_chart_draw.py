@@ -15,13 +15,11 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from hoigs.core.errors import HoigsError
-from hoigs.studies.chart.curves import curve_chart
-from hoigs.studies.chart.data import load_chart, points_of
+from hoigs.studies.chart.data import load_chart, machine_sentences, points_of, series_of
 from hoigs.studies.chart.interactive import details, page
-from hoigs.studies.chart.panels import accuracy_chart
-from hoigs.studies.chart.series import machine_sentences, series_of
+from hoigs.studies.chart.panels import accuracy_chart, curve_chart
 from hoigs.studies.chart.write import by_clip, write_chart
-from hoigs.studies.plotting.style import is_log, short_number
+from hoigs.studies.plots import is_log, short_number
 
 FEW = {name: METHODS[name] for name in ("hoigs", "4dgs", "static-3dgs")}
 

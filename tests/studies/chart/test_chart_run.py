@@ -15,9 +15,8 @@ from pathlib import Path
 import pytest
 
 from hoigs.core.errors import HoigsError
-from hoigs.studies.chart.plan import ChartStudy, plan
-from hoigs.studies.chart.rerun import find_cell
-from hoigs.studies.jobs.variants import parse_variants
+from hoigs.studies.chart.run import ChartStudy, find_cell, plan
+from hoigs.studies.jobs.results import parse_variants
 
 CLIP = "builtin:carry?frames=8&width=32&samples=1&edge_samples=1&held_out_views=0&test_frames=2"
 SPECS = "static,few=static+model.scene.points=60"

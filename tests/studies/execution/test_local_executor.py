@@ -11,9 +11,16 @@ from pathlib import Path
 import pytest
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.files.folder_lock import FolderLock
-from hoigs.studies.execution.executor import Needs, Process, make_executor, stop_all, why_failed
-from hoigs.studies.execution.local import LocalExecutor, visible_gpus
+from hoigs.core.system.folder_lock import FolderLock
+from hoigs.studies.execution.local import (
+    LocalExecutor,
+    Needs,
+    Process,
+    make_executor,
+    stop_all,
+    visible_gpus,
+    why_failed,
+)
 
 PRINTS = """
 import os, time
@@ -143,7 +150,7 @@ def test_a_process_ends_when_its_lease_is_anothers(tmp_path, monkeypatch):
 HOLDER = """
 import sys, time
 from pathlib import Path
-from hoigs.core.files.folder_lock import FolderLock
+from hoigs.core.system.folder_lock import FolderLock
 lock = FolderLock(Path(sys.argv[1]), "hoigs batch").acquire()
 print(lock.lease, flush=True)
 time.sleep(60)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from hoigs.core.errors import HoigsError
-from hoigs.studies.execution.executor import Needs, make_executor, why_failed
+from hoigs.studies.execution.local import Needs, make_executor, why_failed
 from hoigs.studies.execution.ray_tasks import RayExecutor
 
 PRINTS = """
@@ -134,7 +134,7 @@ def test_what_hoigs_starts_ends_when_a_worker_is_killed(ray, tmp_path):
 def test_no_cluster_at_an_address(ray):
     """In a process of its own: Ray can be initialised once in each."""
     text = (
-        "from hoigs.studies.execution.executor import make_executor\n"
+        "from hoigs.studies.execution.local import make_executor\n"
         "make_executor('ray', address='127.0.0.1:1')\n"
     )
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
@@ -145,7 +145,7 @@ def test_workers_import_nothing_from_the_folder_where_ray_is_started(ray, tmp_pa
     """In a process of its own: Ray can be initialised once in each."""
     text = (
         "import sys\n"
-        "from hoigs.studies.execution.executor import make_executor\n"
+        "from hoigs.studies.execution.local import make_executor\n"
         "make_executor('ray')\n"
         "import ray\n"
         "print(ray.get(ray.remote(lambda: sys.path).remote()))\n"
@@ -159,7 +159,7 @@ def test_by_default_nothing_listens_but_on_loopback(ray):
     """In a process of its own, as Ray reads its settings when it is imported."""
     text = (
         "import socket\n"
-        "from hoigs.studies.execution.executor import make_executor\n"
+        "from hoigs.studies.execution.local import make_executor\n"
         "make_executor('ray')\n"
         "import ray\n"
         "host, _, port = ray.get_runtime_context().gcs_address.rpartition(':')\n"

@@ -6,10 +6,18 @@ import json
 from pathlib import Path
 
 from hoigs.evaluation.protocol import NotComputed
-from hoigs.studies.jobs.cost import INTERRUPTED, NO_MEMORY, OLD, read_cost
-from hoigs.studies.jobs.energy import EnergyMeter, rapl_meter, spent
-from hoigs.studies.jobs.machine import Machine, cpu_model
-from hoigs.studies.jobs.memory import peak_memory
+from hoigs.studies.jobs.cost import (
+    INTERRUPTED,
+    NO_MEMORY,
+    OLD,
+    EnergyMeter,
+    Machine,
+    cpu_model,
+    peak_memory,
+    rapl_meter,
+    read_cost,
+    spent,
+)
 
 MACHINE = Machine("Xeon", 2, None, "2.13", "1.19")
 

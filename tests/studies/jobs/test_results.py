@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from hoigs.evaluation.protocol import NotComputed
-from hoigs.studies.jobs.results import ALL_CLIPS, RowResult, Spread, mean_of_clips, measures_of
-from hoigs.studies.jobs.rows import Row
-from hoigs.studies.tables.paper import published
-from hoigs.studies.tables.sets import TABLE_SETS, choose_sets
+from hoigs.studies.jobs.results import ALL_CLIPS, Row, RowResult, Spread, mean_of_clips, measures_of
+from hoigs.studies.tables.run import TABLE_SETS, choose_sets
+from hoigs.studies.tables.write import published
 
 ROW = Row("a", "hoigs")
 PSNR, LPIPS = ("test frames", "full", "psnr"), ("test frames", "full", "lpips")

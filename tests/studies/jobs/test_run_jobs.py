@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import pytest
 
-from hoigs.core.files.folder_lock import FolderLock
+from hoigs.core.system.folder_lock import FolderLock
 from hoigs.studies.execution.local import LocalExecutor
 from hoigs.studies.jobs import run_jobs as module
 from hoigs.studies.jobs.job import Job

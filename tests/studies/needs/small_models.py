@@ -8,9 +8,8 @@ from hoigs.core.model.compose import compose
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
-from hoigs.studies.needs.successive_halving import StepBudget
-from hoigs.studies.needs.trained import Trained
-from hoigs.studies.needs.validator import Validator
+from hoigs.studies.needs.search_space import StepBudget
+from hoigs.studies.needs.trial import Trained, Validator
 
 NAME = (
     "builtin:lift-and-swing?frames=14&width=32&fps=4&samples=1&edge_samples=1&held_out_views=0"

@@ -10,23 +10,22 @@ import torch
 from small_models import NAME, as_composed
 
 from hoigs.core.interfaces.deformation import has_knots
-from hoigs.core.maths.knots import Knots
+from hoigs.core.maths.splines import Knots
 from hoigs.core.model.entity import Entity
 from hoigs.core.model.knot_refit import KnotTrial, as_movable, screen_of
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
-from hoigs.plugins.deformation.rigid.rigid_spline import RigidSpline
+from hoigs.plugins.deformation.rigid_spline import RigidSpline
 from hoigs.plugins.deformation.static import Static
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.rasterizers.oracle import OracleRasterizer
 from hoigs.runs.clip_source import read_clip
-from hoigs.studies.needs.pruning.knots import fewer_uniform
-from hoigs.studies.needs.pruning.prune import Pruning
-from hoigs.studies.needs.refit import cheapest_refit
+from hoigs.studies.needs.prune import Pruning, fewer_uniform
+from hoigs.studies.needs.result import cheapest_refit
 from hoigs.studies.needs.search_space import Candidate
-from hoigs.studies.needs.validator import Scores
+from hoigs.studies.needs.trial import Scores
 
 
 @pytest.fixture(scope="module")

@@ -13,13 +13,11 @@ from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip, FrameStore
 from hoigs.runs.clip_source import read_clip
 from hoigs.studies.needs import search as search_module
-from hoigs.studies.needs.criterion import Score
-from hoigs.studies.needs.report.write import FILES, as_data, page, require_new, row, write_needs
+from hoigs.studies.needs.report import FILES, as_data, page, require_new, row, write_needs
 from hoigs.studies.needs.result import SETTLE, SETTLES, Needs, summary_line
 from hoigs.studies.needs.search import Search
-from hoigs.studies.needs.search_space import Candidate, SearchSpace
-from hoigs.studies.needs.selection import SealedFrameError, selection_view
-from hoigs.studies.needs.trial import Trial, region_of
+from hoigs.studies.needs.search_space import Candidate, Score, SearchSpace
+from hoigs.studies.needs.trial import SealedFrameError, Trial, region_of, selection_view
 
 NAME = (
     "builtin:lift-and-swing?frames=14&width=32&fps=4&samples=1&edge_samples=1&held_out_views=0"

@@ -7,18 +7,26 @@ import math
 import pytest
 
 from hoigs.core.errors import ClipError, HoigsError
-from hoigs.studies.needs.criterion import PATIENCE, Score, bic, choose, gain, near_best, ranked
-from hoigs.studies.needs.search_space import expanded, load_search_spaces, merged
-from hoigs.studies.needs.selection import selection_frames
-from hoigs.studies.needs.successive_halving import (
+from hoigs.studies.needs.search_space import (
     FEWEST,
+    PATIENCE,
     SCORING,
     BudgetError,
+    Score,
     StepBudget,
+    bic,
+    choose,
+    expanded,
+    gain,
+    load_search_spaces,
+    merged,
+    near_best,
     plan,
+    ranked,
     rounds,
     successive_halving,
 )
+from hoigs.studies.needs.trial import selection_frames
 
 
 def score(*psnr: float, parameters: int = 100, pixels: int = 900) -> Score:

@@ -22,15 +22,21 @@ from hoigs.rasterizers.oracle import OracleRasterizer
 from hoigs.runs.checkpoint import latest_checkpoint, load_checkpoint
 from hoigs.runs.clip_source import read_clip
 from hoigs.runs.loaded_run import LoadedRun
+from hoigs.studies.needs import prune
 from hoigs.studies.needs.after_training import add_to_answer, finish, table
-from hoigs.studies.needs.pruning import prune
-from hoigs.studies.needs.pruning.compact_run import compress
-from hoigs.studies.needs.pruning.planes import as_one, from_one, time_planes
-from hoigs.studies.needs.pruning.prune import Cut, Pruning
-from hoigs.studies.needs.pruning.splats import removable_rows, remove_rows, sensitivities
-from hoigs.studies.needs.selection import SealedFrameError, sealed_view
-from hoigs.studies.needs.successive_halving import StepBudget
-from hoigs.studies.needs.validator import Validator
+from hoigs.studies.needs.compress import compress
+from hoigs.studies.needs.prune import (
+    Cut,
+    Pruning,
+    as_one,
+    from_one,
+    removable_rows,
+    remove_rows,
+    sensitivities,
+    time_planes,
+)
+from hoigs.studies.needs.search_space import StepBudget
+from hoigs.studies.needs.trial import SealedFrameError, Validator, sealed_view
 from hoigs.training.session import Session
 from hoigs.training.trainer import Trainer
 

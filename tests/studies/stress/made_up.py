@@ -7,8 +7,7 @@ import random
 from hoigs.evaluation.protocol import NotComputed, Value
 from hoigs.studies.stress.case import Case, all_cases
 from hoigs.studies.stress.measures import MEASURES
-from hoigs.studies.stress.report.table import Table, make_table
-from hoigs.studies.stress.verdict import Seed, Verdict, level_of, verdict_of
+from hoigs.studies.stress.verdict import Seed, Table, Verdict, level_of, make_table, verdict_of
 
 MACHINE = "Xeon A, 2 cores; torch 2.13.0, warp 1.19.0"
 PROTOCOL = ("6 frames of split 'test' from training cameras.", "96x96, float pixels.")

@@ -9,10 +9,10 @@ from hoigs.core.maths.rotations import normalize_quats
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.studies.stress.case import COUNT, Case, Criterion, Sweep, all_cases, choose_cases
 from hoigs.studies.stress.checks import CHECKS, PER_SPEC, check, density, motion
-from hoigs.studies.stress.plan import BASE, clip_names
-from hoigs.synthesis.motion.object_motions import MOTIONS
+from hoigs.studies.stress.run import BASE, clip_names
+from hoigs.synthesis.choreography import Choreographer
 from hoigs.synthesis.named import clip_config
-from hoigs.synthesis.person.choreography import Choreographer
+from hoigs.synthesis.object_motions import MOTIONS
 
 CASES = all_cases()
 

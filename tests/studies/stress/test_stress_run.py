@@ -11,13 +11,11 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.spec.schema import Spec
 from hoigs.studies.execution.local import LocalExecutor
 from hoigs.studies.jobs.job import Job
-from hoigs.studies.jobs.variants import parse_variants
-from hoigs.studies.stress.bench import Bench
+from hoigs.studies.jobs.results import parse_variants
+from hoigs.studies.stress.bench import Bench, small_settings
 from hoigs.studies.stress.case import Case, choose_cases
 from hoigs.studies.stress.checks import PER_SPEC, per_spec
-from hoigs.studies.stress.plan import StressStudy, block_settings, plan_chains
-from hoigs.studies.stress.run import run_stress
-from hoigs.studies.stress.sizes import small_settings
+from hoigs.studies.stress.run import StressStudy, block_settings, plan_chains, run_stress
 
 BASE = (
     "width=32&frames=8&fps=4&samples=1&edge_samples=1&held_out_views=1&test_frames=2"

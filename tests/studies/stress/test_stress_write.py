@@ -11,8 +11,8 @@ from made_up import MACHINE, PROTOCOL, SPECS, table
 from PIL import Image
 
 from hoigs.studies.stress.case import COUNT, choose_cases
-from hoigs.studies.stress.report.table import in_short, rate_of
-from hoigs.studies.stress.report.write import as_csv, as_json, as_markdown, write_stress
+from hoigs.studies.stress.report import as_csv, as_json, as_markdown, write_stress
+from hoigs.studies.stress.verdict import in_short, rate_of
 
 
 def test_all_files_are_written_whole(tmp_path: Path) -> None:

@@ -13,12 +13,11 @@ from hoigs.cli.main import main
 from hoigs.core.errors import HoigsError
 from hoigs.studies.execution.local import LocalExecutor
 from hoigs.studies.jobs.job import Job, JobState, digest_folder
-from hoigs.studies.jobs.rows import Row, TableSet
+from hoigs.studies.jobs.results import Row, TableSet
 from hoigs.studies.jobs.run_jobs import run_jobs
 from hoigs.studies.jobs.worker import run_job
 from hoigs.studies.tables import run as studies
-from hoigs.studies.tables.run import ONLY_BUILTIN, Study, plan, run_study
-from hoigs.studies.tables.sets import TABLE_SETS
+from hoigs.studies.tables.run import ONLY_BUILTIN, TABLE_SETS, Study, plan, run_study
 from hoigs.studies.tables.write import write_tables
 from hoigs.training.session import Session
 from hoigs.training.trainer import Trainer

@@ -15,7 +15,7 @@ from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.synthesis import NoiseConfig, SceneConfig, SyntheticScene
 from hoigs.synthesis.builtin import write_scene
-from hoigs.synthesis.degradation.damage import damage, frames_kept, with_frames_dropped
+from hoigs.synthesis.degradation import damage, frames_kept, with_frames_dropped
 
 
 @pytest.fixture

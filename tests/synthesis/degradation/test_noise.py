@@ -8,14 +8,14 @@ from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.synthesis import NoiseConfig
-from hoigs.synthesis.degradation.noise import (
+from hoigs.synthesis.degradation import (
     noisy_camera,
     noisy_depth,
     noisy_mask,
     noisy_poses,
     noisy_track,
 )
-from hoigs.synthesis.motion.object_script import Track
+from hoigs.synthesis.object_motions import Track
 
 DISC = np.hypot(*(np.mgrid[0:60, 0:60] - 30)) < 18
 CAMERA = Camera.look_at(

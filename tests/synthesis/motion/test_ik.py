@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.synthesis.generate import SyntheticScene
-from hoigs.synthesis.motion.ik import (
+from hoigs.synthesis.kinematics import (
     about,
     forward_kinematics,
     frame_of,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hoigs.synthesis import SceneConfig
-from hoigs.synthesis.motion.object_motions import GRAVITY, MOTIONS
+from hoigs.synthesis.object_motions import GRAVITY, MOTIONS
 
 
 def _config(motion: str, **more: object) -> SceneConfig:

@@ -7,9 +7,9 @@ import pytest
 
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.synthesis import SyntheticScene, generate
-from hoigs.synthesis.motion.object_motions import MOTIONS
-from hoigs.synthesis.motion.walking import STANCE, standing, walking
 from hoigs.synthesis.named import clip_config
+from hoigs.synthesis.object_motions import MOTIONS
+from hoigs.synthesis.walking import STANCE, standing, walking
 
 KEYS = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.5, 90, 0.5], [0.9, 30, 1], [1.0, 30, 1]])
 SMALL = "frames=24&width=64&samples=1&edge_samples=1&held_out_views=0"

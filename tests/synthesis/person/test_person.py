@@ -7,9 +7,8 @@ import torch
 from hoigs.core.errors import HoigsError
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.synthesis import SceneConfig, SyntheticScene
-from hoigs.synthesis.motion.object_motions import MOTIONS
-from hoigs.synthesis.motion.object_script import ObjectScript
-from hoigs.synthesis.person.choreography import WRISTS, Choreographer, hand_targets, palms
+from hoigs.synthesis.choreography import WRISTS, Choreographer, hand_targets, palms
+from hoigs.synthesis.object_motions import MOTIONS, ObjectScript
 
 ARM_PARTS = (6, 7, 8, 9)
 

@@ -9,15 +9,9 @@ import torch
 from hoigs.core.values.camera import Camera
 from hoigs.synthesis import LightConfig, SyntheticScene
 from hoigs.synthesis.generate import unproject
-from hoigs.synthesis.rendering.raycast import (
-    FINE,
-    Layer,
-    RayCaster,
-    fine_barycentrics,
-    pixel_samples,
-)
-from hoigs.synthesis.room.meshes import TexturedMesh, box, quad
-from hoigs.synthesis.room.textures import TextureAtlas, to_srgb
+from hoigs.synthesis.meshes import TexturedMesh, box, quad
+from hoigs.synthesis.raycast import FINE, Layer, RayCaster, fine_barycentrics, pixel_samples
+from hoigs.synthesis.textures import TextureAtlas, to_srgb
 
 ROOM = ((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0))
 DARK = LightConfig(sun=0.0, ambient=1.0, shadows=0.0, occlusion=0.0)
@@ -176,7 +170,7 @@ def test_mesh_colours_are_linear_on_a_face() -> None:
     assert weights.shape == ((FINE + 1) * (FINE + 2) // 2, 3)
     points = np.einsum("nk,fkc->fnc", weights, wall.vertices[wall.faces])
     colors = (points + 2) / 4  # a function that is linear in the place
-    from hoigs.synthesis.rendering.raycast import fine_array
+    from hoigs.synthesis.raycast import fine_array
 
     things = Layer.build(wall, np.ones(2, int), fine_array(colors.astype(np.float32)))
     behind = Layer.build(quad(corners - [0, 0, 1], 0), np.zeros(2, int))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from hoigs.synthesis.motion.object_script import bend_points, bent_mesh
-from hoigs.synthesis.room.meshes import TexturedMesh, ball, box, cylinder, lathe, smooth_normals
-from hoigs.synthesis.room.room import Palette, Stand, build_room
+from hoigs.synthesis.meshes import TexturedMesh, ball, box, cylinder, lathe, smooth_normals
+from hoigs.synthesis.object_motions import bend_points, bent_mesh
+from hoigs.synthesis.room import Palette, Stand, build_room
 
 SOLIDS = {
     "box": lambda: box((0.3, 0.2, 0.5), 0),

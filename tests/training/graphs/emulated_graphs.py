@@ -108,7 +108,7 @@ def _capturing(graph: EmulatedGraph, **settings: Any) -> Iterator[None]:
 def emulate(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replace the CUDA graphs of torch.cuda by emulated ones."""
     # an emulated graph replays torch operations; kernels of the CPU alone are none, nor on CUDA
-    monkeypatch.setattr("hoigs.core.cpu_kernels.choose._compiled", lambda name: None)
+    monkeypatch.setattr("hoigs.core.fast.choose._compiled", lambda name: None)
     monkeypatch.setattr(torch.cuda, "CUDAGraph", EmulatedGraph)
     monkeypatch.setattr(torch.cuda, "graph", _capturing)
     monkeypatch.setattr(torch.cuda, "Stream", _Stream)

@@ -18,21 +18,21 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment
-from hoigs.plugins.deformation.avatars.lbs import Lbs
-from hoigs.plugins.deformation.rigid.articulated import Articulated
-from hoigs.plugins.deformation.rigid.rigid_residual import RigidResidual
-from hoigs.plugins.deformation.rigid.rigid_spline import RigidSpline
-from hoigs.plugins.deformation.splines.chs import CubicHermite
-from hoigs.plugins.deformation.splines.keyframed import Keyframed
-from hoigs.plugins.deformation.splines.tracked_chs import TrackedHermite
+from hoigs.plugins.deformation.articulated import Articulated
+from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.plugins.deformation.keyframes import Keyframed
+from hoigs.plugins.deformation.lbs import Lbs
+from hoigs.plugins.deformation.rigid_residual import RigidResidual
+from hoigs.plugins.deformation.rigid_spline import RigidSpline
 from hoigs.plugins.deformation.static import Static
+from hoigs.plugins.deformation.tracked_chs import TrackedHermite
 from hoigs.plugins.features.body_parts import BodyPartFeatures
 from hoigs.plugins.features.embedding import EmbeddingFeatures
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 from hoigs.plugins.interaction.cross_attention import CrossAttention
 from hoigs.plugins.interaction.none import NoInteraction
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.training.graphs.graphed_scene import GraphedScene
+from hoigs.training.graphs import GraphedScene
 
 FRAMES = 6
 

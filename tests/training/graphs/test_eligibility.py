@@ -10,10 +10,10 @@ import torch
 from graphed_cases import FRAMES, VARIANTS, at, scene
 from torch.overrides import TorchFunctionMode
 
-from hoigs.core.cuda_graphs.eligibility import why_not_cuda_graph_safe
+from hoigs.core.fast.graphs import why_not_cuda_graph_safe
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import Spec
-from hoigs.training.graphs.graphed_scene import components_of
+from hoigs.training.graphs import components_of
 
 TENSOR = torch.Tensor
 FROM_THE_HOST = {torch.tensor, torch.as_tensor, TENSOR.new_tensor}

@@ -16,7 +16,7 @@ from hoigs.core.spec.train_schema import LossSpec, TrainSpec, WarmupSpec
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip, FrameStore
 from hoigs.plugins.density.adc import AdaptiveDensity
-from hoigs.training.graphs.graphed_scene import GraphedScene
+from hoigs.training.graphs import GraphedScene
 from hoigs.training.trainer import Trainer
 
 SIZE, STEPS = 24, 30

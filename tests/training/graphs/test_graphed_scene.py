@@ -28,10 +28,10 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
-from hoigs.plugins.deformation.avatars.triplane_avatar import TriplaneAvatar
 from hoigs.plugins.deformation.static import Static
+from hoigs.plugins.deformation.zoo.triplane_avatar import TriplaneAvatar
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.training.graphs.graphed_scene import GraphedScene
+from hoigs.training.graphs import GraphedScene
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

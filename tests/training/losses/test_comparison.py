@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from hoigs.core.spec.train_schema import LossSpec
-from hoigs.training.losses import comparison
-from hoigs.training.losses.comparison import Comparison, image_losses
+from hoigs.training import losses as comparison
+from hoigs.training.losses import Comparison, image_losses
 
 CUDA = pytest.param(
     "cuda",

@@ -22,8 +22,8 @@ from hoigs.metrics.image_loss import image_loss
 from hoigs.metrics.lpips import STACKS
 from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.training.losses.crops import crop_around
-from hoigs.training.losses.face import face_loss, lookup, unwrap_faces, visible
+from hoigs.training.face import face_loss, lookup, unwrap_faces, visible
+from hoigs.training.losses import crop_around
 from hoigs.training.objective import JointObjective
 from hoigs.training.session import lpips_term
 

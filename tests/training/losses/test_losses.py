@@ -8,7 +8,7 @@ import torch
 from hoigs.core.spec.train_schema import LossSpec
 from hoigs.metrics.image_loss import image_loss
 from hoigs.metrics.ssim import ssim
-from hoigs.training.losses.terms import align_depth, depth_loss, term_weights
+from hoigs.training.losses import align_depth, depth_loss, term_weights
 
 
 def test_supplement_weights_and_overrides():

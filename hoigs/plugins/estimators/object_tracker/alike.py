@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from hoigs.plugins.estimators.object_tracker.footage import Footage
 from hoigs.plugins.estimators.object_tracker.path import center_of
-from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage
-from hoigs.plugins.estimators.object_tracker.pixels.scene import Scene
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overlap
 from hoigs.plugins.estimators.object_tracker.propagation import Track
+from hoigs.plugins.estimators.object_tracker.scene import Scene
 from hoigs.plugins.estimators.object_tracker.tracker import followed
 
 SAME = 0.5  # intersection over union from which two masks are of one thing

@@ -9,10 +9,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from hoigs.plugins.estimators.object_tracker.pixels.colors import bins_of, histogram, odds_of
-from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage
-from hoigs.plugins.estimators.object_tracker.pixels.held import HIPS, SEEN, SHOULDERS, torso_length
-from hoigs.plugins.estimators.object_tracker.pixels.scene import Scene
+from hoigs.plugins.estimators.object_tracker.footage import (
+    HIPS,
+    SEEN,
+    SHOULDERS,
+    Footage,
+    bins_of,
+    histogram,
+    odds_of,
+    torso_length,
+)
+from hoigs.plugins.estimators.object_tracker.scene import Scene
 
 WRISTS = (15, 16)  # among MediaPipe's landmarks
 # Pairs of landmarks between which the body itself is seen, if anything of it is: what lies farther

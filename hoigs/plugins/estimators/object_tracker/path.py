@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from hoigs.plugins.estimators.object_tracker.pixels.colors import ColorModel, bins_of, histogram
-from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage
-from hoigs.plugins.estimators.object_tracker.pixels.scene import MovingScene, Scene, median_of
+from hoigs.plugins.estimators.object_tracker.footage import ColorModel, Footage, bins_of, histogram
+from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, median_of
 
 CANDIDATES = 8
 ABSENT = 1.1  # cost of a frame in which the object is not seen

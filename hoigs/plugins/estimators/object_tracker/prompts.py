@@ -2,23 +2,64 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy import ndimage
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import cg
 
 from hoigs.core.interfaces.estimator import FramePrompt
-from hoigs.plugins.estimators.object_tracker.pixels.colors import (
+from hoigs.plugins.estimators.object_tracker.footage import (
     ColorModel,
+    Footage,
+    Window,
     bins_of,
     histogram,
     odds_of,
 )
-from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage
-from hoigs.plugins.estimators.object_tracker.pixels.scene import Scene, median_of
-from hoigs.plugins.estimators.object_tracker.pixels.walker import walked
-from hoigs.plugins.estimators.object_tracker.pixels.windows import Window
+from hoigs.plugins.estimators.object_tracker.scene import (
+    Scene,
+    StaticScene,
+    median_of,
+    scene_behind,
+)
+
+# A soft mask that follows edges: a random walker with priors.
+
+
+def walked(
+    odds: Float[np.ndarray, "n n"],
+    colors: Float[np.ndarray, "n n 3"],
+    pull: float = 0.06,
+    sharpness: float = 1.0,
+) -> Float[np.ndarray, "n n"]:
+    """Probability of each pixel to be inside (Grady 2005, multilabel random walks with priors).
+
+    It minimises the sum over neighbours of w (p_i - p_j)^2 and over pixels of pull (p_i - q_i)^2,
+    where q is the probability that `odds` gives, and w falls with the difference of colour.
+    """
+    smooth = ndimage.gaussian_filter(colors, (0.6, 0.6, 0))
+    across = ((smooth[:, 1:] - smooth[:, :-1]) ** 2).sum(-1)
+    down = ((smooth[1:] - smooth[:-1]) ** 2).sum(-1)
+    # the scale of differences comes from the window itself
+    unit = 2.0 * (across.mean() + down.mean()) / 2 + 2.0
+    across, down = np.exp(-sharpness * across / unit * 2), np.exp(-sharpness * down / unit * 2)
+    across, down = across + 1e-3, down + 1e-3
+    n, m = odds.shape
+    index = np.arange(n * m).reshape(n, m)
+    i = np.concatenate((index[:, :-1].ravel(), index[:-1].ravel()))
+    j = np.concatenate((index[:, 1:].ravel(), index[1:].ravel()))
+    w = np.concatenate((across.ravel(), down.ravel()))
+    links = sparse.coo_matrix((w, (i, j)), shape=(n * m, n * m)).tocsr()
+    links = links + links.T
+    total = np.asarray(links.sum(1)).ravel() + pull
+    system = sparse.diags(total) - links
+    prior = 1 / (1 + np.exp(-odds.astype(float).ravel()))
+    jacobi = sparse.diags(1 / total)
+    solved, _ = cg(system, pull * prior, x0=prior, rtol=1e-3, maxiter=60, M=jacobi)
+    return solved.reshape(n, m).clip(0, 1).astype(np.float32)
+
 
 RADII = (0.025, 0.04, 0.06, 0.09, 0.13, 0.19)  # of the object, in diagonals of the image
 ROUNDS = 4
@@ -254,3 +295,97 @@ def set_off(mask: np.ndarray, colors: np.ndarray, bins: np.ndarray, valid: np.nd
     inner = histogram(bins, (mask & ~shrunk) * 1.0)
     apart = 1 - float(np.sqrt(ring * inner).sum())
     return float((0.5 * crisp + 0.5 * apart) * (1 - 0.5 * border))
+
+
+# An object against what is behind it: the scene, and people who keep still.
+
+UNKNOWN = 0.3  # share of the object's pixels of which the scene without people says nothing
+AROUND = 0.8  # of the object's radius: so much beside its mask may be its own
+SURE = 4.0  # largest log-odds
+STILL = 0.9  # how probable it is that what is not the object is what was there before
+PEAK = 0.3  # share of a colour's own bin among those that differ from it by noise alone
+
+
+@dataclass(frozen=True)
+class Behind:
+    """What an object that is known roughly passes in front of.
+
+    Attributes:
+        scene: what was there while the object was elsewhere, people who keep still included.
+    """
+
+    footage: Footage
+    scene: StaticScene
+
+    @classmethod
+    def of(
+        cls, footage: Footage, scene: StaticScene, masks: Bool[np.ndarray, "F h w"]
+    ) -> Behind | None:
+        """None where the scene without people says enough."""
+        seen = np.flatnonzero(masks.any((1, 2)))
+        some = seen[:: max(1, len(seen) // 24)]
+        hidden = [np.isnan(scene.difference(i)[masks[i]]).mean() for i in some]
+        if not hidden or np.mean(hidden) < UNKNOWN:
+            return None
+        radius = float(np.sqrt(masks[seen].sum((1, 2)).mean() / np.pi))
+        return cls(footage, scene_behind(footage, masks, AROUND * radius))
+
+    def odds(
+        self,
+        i: int,
+        window: Window,
+        colors: Float[np.ndarray, "n n 3"],
+        inside: Float[np.ndarray, "B"],
+        outside: Bool[np.ndarray, "n n"],
+    ) -> Float[np.ndarray, "n n"]:
+        """Log-odds of a window's pixels: the object's colours against those of the place, and of
+        all else that moves `outside` it. NaN where the place is never seen."""
+        away = window.cut(self.scene.difference(i))
+        spread = window.cut(self.scene.spread, outside=1.5)
+        bins = bins_of(colors)
+        moved = np.nan_to_num(1 - np.exp(-((away / 3) ** 2) / 2))
+        others = histogram(bins, outside * moved)[bins]
+        # the wider colours vary at a place, the less one of them says
+        same = PEAK * np.exp(-(away**2) / 2) * (1.5 / spread) ** 3
+        rest = STILL * same + (1 - STILL) * others
+        return np.log((inside[bins] + 2e-4) / (rest + 2e-4)).clip(-SURE, SURE)
+
+    def regrown(self, prompt: PromptedMask) -> PromptedMask:
+        """A prompted mask with all that is connected to it and was not there before."""
+        soft = prompt.soft
+        for _ in range(ROUNDS):
+            y, x = np.nonzero(soft > 0.5)
+            half = 1.1 * max(np.ptp(x), np.ptp(y)) + 4
+            window = Window.around((x.min() + x.max() + 1) / 2, (y.min() + y.max() + 1) / 2, half)
+            soft = window.paste(self._grown(prompt, window, window.cut(soft)), soft.shape)
+            soft = soft / np.float32(255)
+            if not (soft > 0.5).any():
+                return prompt
+        return replace(prompt, soft=soft)
+
+    def _grown(self, prompt: PromptedMask, window: Window, soft: np.ndarray) -> np.ndarray:
+        colors = window.cut(self.footage.colors(prompt.frame))
+        valid = window.inside(self.footage.shape)
+        mask = soft > 0.5
+        apart = ndimage.distance_transform_edt(~mask)
+        inside = histogram(bins_of(colors), np.where(mask, soft, 0))
+        odds = self.odds(prompt.frame, window, colors, inside, (apart > 2) & valid)
+        radius = np.sqrt(mask.sum() / np.pi)
+        depth = ndimage.distance_transform_edt(mask)
+        place = np.where(mask, np.minimum(depth / 4, 1), -0.3 - 0.2 * apart / radius)
+        odds = np.where(np.isnan(odds), 3 * place, odds) + place
+        odds = np.where(valid & (window.cut(prompt.barred) < 0.5), odds, -9)
+        grown = walked(odds, colors)
+        labels, _ = ndimage.label(grown > 0.5)
+        own = np.bincount(labels.ravel(), mask.ravel() * 1.0)
+        own[0] = 0
+        whole = filled(labels == own.argmax())
+        return np.where(whole, np.maximum(grown, 0.6), np.where(labels > 0, 0, grown))
+
+
+def filled(mask: Bool[np.ndarray, "n n"], largest: float = 0.03) -> Bool[np.ndarray, "n n"]:
+    """A mask without its holes, but those that are `largest` of it or more."""
+    holes, _ = ndimage.label(ndimage.binary_fill_holes(mask) & ~mask)
+    big = np.bincount(holes.ravel()) > largest * mask.sum()
+    big[0] = True
+    return mask | ~big[holes]

@@ -10,11 +10,10 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from hoigs.core.interfaces.estimator import FramePrompt, PromptPoint
+from hoigs.plugins.estimators.object_tracker.footage import ColorModel, Footage, bins_of, histogram
 from hoigs.plugins.estimators.object_tracker.likeness import Likeness
-from hoigs.plugins.estimators.object_tracker.pixels.colors import ColorModel, bins_of, histogram
-from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage
-from hoigs.plugins.estimators.object_tracker.pixels.scene import Scene, carried
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, prompted_mask
+from hoigs.plugins.estimators.object_tracker.scene import Scene, carried
 
 SAMPLES = 24  # frames that are searched
 AREA = (0.0003, 0.12)  # of the image, least and largest

@@ -2,26 +2,72 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
+from pathlib import Path as FilePath
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hoigs.plugins.estimators.object_tracker.anchors import anchors
-from hoigs.plugins.estimators.object_tracker.behind import Behind
-from hoigs.plugins.estimators.object_tracker.path import Path, found_path, path_of
-from hoigs.plugins.estimators.object_tracker.pixels.colors import ColorModel, bins_of, histogram
-from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage
-from hoigs.plugins.estimators.object_tracker.pixels.scene import (
-    MovingScene,
-    Scene,
-    StaticScene,
-    median_of,
+from hoigs.core.interfaces.estimator import (
+    EntityMasks,
+    FramePrompt,
+    LazyFrames,
+    PromptPoint,
+    VideoRequest,
 )
-from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overlap
-from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Track
+from hoigs.plugins.estimators.object_tracker.footage import ColorModel, Footage, bins_of, histogram
+from hoigs.plugins.estimators.object_tracker.path import Path, found_path, path_of
+from hoigs.plugins.estimators.object_tracker.prompts import Behind, PromptedMask, overlap, set_off
+from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Track, window_of
+from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, StaticScene, median_of
+
+# Frames in which an object was found best, from which it is followed again.
+#
+# What it looks like from other sides is known then, and a mistake ends at the next such frame.
+
+APART = 8  # anchors are at least this part of the video from each other, and from prompts
+AROUND = 10  # parts of the video before and after a frame that say how large the object is there
+GOOD = 0.6  # of what the best tenth of the frames reach
+
+
+def anchors(footage: Footage, track: Track, prompts: Sequence[PromptedMask]) -> list[PromptedMask]:
+    """Its masks in the best frames of a track, away from the prompted ones."""
+    quality = _quality(footage, track)
+    least = GOOD * np.quantile(quality, 0.9)
+    taken, found = [p.frame for p in prompts], []
+    for i in np.argsort(-quality).tolist():
+        near = min(abs(i - frame) for frame in taken) < len(footage) / APART
+        if quality[i] > least and not near:
+            taken.append(i)
+            soft = track.soft[i] / np.float32(255)
+            found.append(PromptedMask(i, soft, float(quality[i]), False, footage.blank[i]))
+    return found
+
+
+def _quality(footage: Footage, track: Track) -> Float[np.ndarray, " F"]:
+    """Of each frame's mask, 0 to 1: how sure it is, how well set off, how usual its size is, and
+    how little of it the body may be."""
+    masks = track.soft > 127
+    area = masks.sum((1, 2)).astype(float)
+    seen = np.where(area > 0, area, np.nan)
+    reach = max(1, len(masks) // AROUND)
+    found = np.zeros(len(masks))
+    for i in np.flatnonzero(area).tolist():
+        usual = np.nanmedian(seen[max(0, i - reach) : i + reach + 1])
+        size = min(area[i], usual) / max(area[i], usual)
+        body = (footage.body(i) & masks[i]).sum() / area[i]
+        found[i] = track.confidence[i] * _set_off(footage, i, masks[i]) * size**2 * (1 - 0.5 * body)
+    return found
+
+
+def _set_off(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]) -> float:
+    window = window_of(mask)
+    colors, valid = window.cut(footage.colors(i)), window.inside(footage.shape)
+    return set_off(window.cut(mask) > 0.5, colors, bins_of(colors), valid)
+
 
 SAME = 0.7  # intersection over union from which two passes agree on a frame
 
@@ -168,3 +214,77 @@ def _walks(known: list[int], count: int) -> list[tuple[int, range]]:
         middle = (a + b) // 2
         walks += [(a, range(a + 1, middle + 1)), (b, range(b - 1, middle, -1))]
     return [*walks, (known[-1], range(known[-1] + 1, count))]
+
+
+# Tracks in a file, so that a video is tracked once.
+
+
+def write_tracks(
+    file: FilePath,
+    video: VideoRequest,
+    footage: Footage,
+    tracks: dict[str, Track | None],
+    chosen: dict[str, list[FramePrompt]],
+    notes: list[str],
+) -> None:
+    """Everything that `read_tracks` needs, under a temporary name first."""
+    arrays: dict[str, np.ndarray] = {}
+    none = np.zeros(footage.lab.shape[:3], np.uint8)
+    soft = {n: none if t is None else t.soft for n, t in tracks.items()}
+    strongest = np.max(list(soft.values()), axis=0)
+    for name, track in tracks.items():
+        arrays[f"soft {name}"] = np.where(soft[name] == strongest, soft[name], 0)
+        confidence = np.full(video.frames, np.nan, np.float32)
+        confidence[list(footage.numbers)] = 0.0 if track is None else track.confidence
+        arrays[f"confidence {name}"] = confidence
+    about = {
+        "numbers": footage.numbers,
+        "notes": notes,
+        "chosen": {
+            n: [[p.frame, [[q.x, q.y, q.inside] for q in p.points], p.box] for p in prompts]
+            for n, prompts in chosen.items()
+            if prompts
+        },
+    }
+    file.parent.mkdir(parents=True, exist_ok=True)
+    half = file.with_suffix(".part")
+    with half.open("wb") as out:
+        np.savez_compressed(out, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
+    half.replace(file)
+
+
+def read_tracks(file: FilePath, video: VideoRequest, names: Sequence[str]) -> EntityMasks:
+    """The masks of objects by name, at the video's size and empty in frames that were not wanted,
+    with the prompts and notes of `write_tracks`."""
+    with np.load(file, allow_pickle=False) as saved:
+        about = json.loads(str(saved["about"]))
+        soft = {n: saved[f"soft {n}"] for n in names}
+        confidence = {n: saved[f"confidence {n}"] for n in names}
+    row = {number: k for k, number in enumerate(about["numbers"])}
+    masks = {n: LazyFrames(video.frames, partial(_mask_at, soft[n], row, video)) for n in names}
+    chosen = {
+        n: tuple(
+            FramePrompt(frame, tuple(PromptPoint(*p) for p in points), tuple(box) if box else None)
+            for frame, points, box in prompts
+        )
+        for n, prompts in about["chosen"].items()
+    }
+    return EntityMasks(
+        masks, None, "object tracker without a network", confidence, chosen, tuple(about["notes"])
+    )
+
+
+def _mask_at(soft: np.ndarray, row: dict[int, int], video: VideoRequest, i: int) -> np.ndarray:
+    return _enlarged(soft, row.get(i), video)
+
+
+def _enlarged(soft: np.ndarray, row: int | None, video: VideoRequest) -> np.ndarray:
+    """A mask at the video's size; empty in frames that were not wanted."""
+    from PIL import Image
+
+    if row is None or not soft[row].any():
+        return np.zeros((video.height, video.width), bool)
+    image = Image.fromarray(soft[row]).resize(
+        (video.width, video.height), Image.Resampling.BILINEAR
+    )
+    return np.asarray(image) > 127

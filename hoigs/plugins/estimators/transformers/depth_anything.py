@@ -22,8 +22,8 @@ from hoigs.core.interfaces.estimator import (
     LazyFrames,
     VideoRequest,
 )
-from hoigs.core.progress import Progress, no_progress
-from hoigs.plugins.estimators.common.subprocess import settings_key
+from hoigs.core.reporting import Progress, no_progress
+from hoigs.plugins.estimators.tools import settings_key
 from hoigs.plugins.estimators.transformers.models import (
     ModelConfig,
     device_of,

@@ -28,10 +28,12 @@ from hoigs.core.interfaces.estimator import (
     PromptPoint,
     VideoRequest,
 )
-from hoigs.core.progress import Progress, no_progress
-from hoigs.plugins.estimators.common.subprocess import settings_key
-from hoigs.plugins.estimators.transformers.detector import Box, Detection, Detector
+from hoigs.core.reporting import Progress, no_progress
+from hoigs.plugins.estimators.tools import settings_key
 from hoigs.plugins.estimators.transformers.models import (
+    Box,
+    Detection,
+    Detector,
     ModelConfig,
     device_of,
     library,

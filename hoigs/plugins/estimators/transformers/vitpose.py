@@ -21,19 +21,16 @@ from hoigs.core.interfaces.estimator import (
     VideoRequest,
     landmarks_from_keypoints,
 )
-from hoigs.core.progress import Progress, no_progress
-from hoigs.plugins.estimators.common.frame_files import (
-    FileDiagnostics,
-    absent,
-    load_array,
-    require_count,
-)
-from hoigs.plugins.estimators.common.keypoints import CONVENTIONS
-from hoigs.plugins.estimators.common.subprocess import settings_key
-from hoigs.plugins.estimators.transformers.detector import Box, Detector, follow
+from hoigs.core.reporting import Progress, no_progress
+from hoigs.plugins.estimators.frame_files import FileDiagnostics, absent, load_array, require_count
+from hoigs.plugins.estimators.landmarks_files import CONVENTIONS
+from hoigs.plugins.estimators.tools import settings_key
 from hoigs.plugins.estimators.transformers.models import (
+    Box,
+    Detector,
     ModelConfig,
     device_of,
+    follow,
     library,
     load,
     place_of,

@@ -2,8 +2,8 @@
 # (Warp's arrays annotate as values)
 """CUDA kernels that clear and sum the partial gradients; see `common.records`."""
 
-from hoigs.core.cpu_kernels.runtime import wp
-from hoigs.rasterizers.warp.common.records import F32, I32
+from hoigs.core.system.quiet_warp import wp
+from hoigs.rasterizers.warp.frame import F32, I32
 
 wp.set_module_options({"enable_backward": False})
 

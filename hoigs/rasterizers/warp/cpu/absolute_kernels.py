@@ -2,10 +2,11 @@
 # (Warp's arrays annotate as values)
 """The native CPU backward with absolute gradients, compiled only where they are requested."""
 
-from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
-from hoigs.rasterizers.warp.common.records import F32, I32
+from hoigs.core.fast.launch import CPU_FLAGS
+from hoigs.core.system.quiet_warp import wp
 from hoigs.rasterizers.warp.cpu import tile_source
 from hoigs.rasterizers.warp.cpu.native_kernels import TILE_WORK
+from hoigs.rasterizers.warp.frame import F32, I32
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS, "max_unroll": 1})
 

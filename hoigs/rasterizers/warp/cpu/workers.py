@@ -11,16 +11,16 @@ use more cores, with the same results bit for bit:
 from __future__ import annotations
 
 import ctypes
+import warnings
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
 
-from hoigs.core.cpu_kernels.launch import prepared
-from hoigs.core.cpu_kernels.runtime import wp
-from hoigs.core.cpu_kernels.workers import SerialWorkers, ThreadWorkers, Workers
 from hoigs.core.errors import RenderError
-from hoigs.core.machine.gomp import loaded_gomp
+from hoigs.core.fast.launch import SerialWorkers, ThreadWorkers, Workers, prepared
+from hoigs.core.system.quiet_warp import wp
+from hoigs.core.system.threads import loaded_gomp
 
 Scheduler = Literal["auto", "openmp", "threads", "serial"]
 
@@ -101,3 +101,83 @@ def make_workers(scheduler: Scheduler) -> tuple[Workers, str]:
             raise RenderError(f'WarpRasterizer: {reason}; use scheduler="threads"') from error
         return ThreadWorkers(), reason
     return workers, "torch's OpenMP pool passed its trial"
+
+
+# Running kernels on the cores of this machine.
+
+
+class Cores:
+    """CPU cores.
+
+    Args:
+        workers: how launches are spread over cores.
+        threads: how many cores; with None torch.get_num_threads() at each call.
+    """
+
+    def __init__(self, workers: Workers, threads: int | None) -> None:
+        self.workers, self.threads = workers, threads
+
+    def number(self, items: int) -> int:
+        """How many cores to use for so many work items."""
+        return max(1, min(self.threads or torch.get_num_threads(), items))
+
+    def chunks(self, count: int) -> int:
+        """In how many parts to process `count` Gaussians."""
+        return self.number(count // self.workers.worthwhile)
+
+    def once(self, kernel: Any, arguments: list[Any]) -> None:
+        """Run a kernel on the calling thread."""
+        prepared(kernel, 1, arguments).launch()
+
+    def together(self, kernel: Any, cores: int, arguments: list[Any]) -> None:
+        """Run the same launch on several cores, which share the work through `counters`."""
+        self._run([prepared(kernel, 1, arguments)] * cores)
+
+    def each(self, kernel: Any, count: int, arguments: list[Any]) -> None:
+        """Run a kernel for items 0 to count; its last two parameters, base and count, are added."""
+        if count == 0:
+            return
+        chunks = self.chunks(count)
+        size = -(-count // chunks)
+        self._run([prepared(kernel, size, [*arguments, j * size, count]) for j in range(chunks)])
+
+    def _run(self, launches: list[Any]) -> None:
+        (SerialWorkers() if len(launches) == 1 else self.workers).run(launches)
+
+
+# Which CPU kernels this machine can run, found by compiling them.
+
+Kernels = Literal["auto", "native", "portable"]
+
+
+def choose_kernels(requested: Kernels) -> tuple[Literal["native", "portable"], str]:
+    """The kernels to use and a line with the reason.
+
+    "auto" takes the native ones where they compile, else the portable ones with a warning.
+
+    Raises:
+        RenderError: "native" is requested and does not compile here.
+    """
+    if requested == "portable":
+        return "portable", "requested"
+    try:
+        lanes = vector_lanes()
+    except Exception as error:  # Warp raises nothing narrower when a build fails
+        reason = f"the native kernels do not compile here: {error}"
+        if requested == "native":
+            raise RenderError(
+                f'WarpRasterizer: {reason}; use cpu_kernels="portable" (about ten times slower)'
+            ) from error
+        warnings.warn(f"WarpRasterizer: {reason}; the portable ones are slower", stacklevel=2)
+        return "portable", reason
+    return "native", f"they compile, with vectors of {lanes} floats"
+
+
+def vector_lanes() -> int:
+    """Floats in a vector of the native kernels: 16 with AVX-512, else 8. Compiles them."""
+    from hoigs.core.fast.launch import prepared
+    from hoigs.rasterizers.warp.cpu import native_kernels
+
+    lanes = torch.zeros(1, dtype=torch.int32)
+    prepared(native_kernels.count_lanes, 1, [lanes]).launch()
+    return int(lanes)

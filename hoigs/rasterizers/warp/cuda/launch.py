@@ -12,8 +12,8 @@ from typing import Any
 
 import torch
 
-from hoigs.core.cpu_kernels.launch import flat, vector_sizes
-from hoigs.core.cpu_kernels.runtime import wp
+from hoigs.core.fast.launch import flat, vector_sizes
+from hoigs.core.system.quiet_warp import wp
 
 
 class CudaStream:

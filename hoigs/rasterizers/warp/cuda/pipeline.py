@@ -7,29 +7,30 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from hoigs.rasterizers.warp.arguments import (
+    Gradients,
+    Projected,
+    adjoint_arguments,
+    project_arguments,
+    tile_arguments,
+    upstream_arguments,
+)
 from hoigs.rasterizers.warp.blend import (
     absolute_kernels,
     gather_kernels,
     pixel_kernels,
     pixel_source,
 )
-from hoigs.rasterizers.warp.blend.arguments import tile_arguments, upstream_arguments
-from hoigs.rasterizers.warp.common.frame import (
+from hoigs.rasterizers.warp.cuda.intersections import IntersectionCapacity, Intersector
+from hoigs.rasterizers.warp.cuda.launch import CudaStreams
+from hoigs.rasterizers.warp.frame import (
+    ABSOLUTES,
+    MOMENTS,
     Images,
     Inputs,
     Settings,
     TileIntersections,
     check_addressable,
-)
-from hoigs.rasterizers.warp.common.records import ABSOLUTES, MOMENTS
-from hoigs.rasterizers.warp.cuda.capacity import IntersectionCapacity
-from hoigs.rasterizers.warp.cuda.intersections import Intersector
-from hoigs.rasterizers.warp.cuda.launch import CudaStreams
-from hoigs.rasterizers.warp.project.arguments import (
-    Gradients,
-    Projected,
-    adjoint_arguments,
-    project_arguments,
 )
 from hoigs.rasterizers.warp.project.kernels import project, project_adjoint
 from hoigs.rasterizers.warp.project.spherical_harmonics_adjoint import BLOCK as SH_BLOCK

@@ -3,8 +3,9 @@
 # Warp's arrays annotate as values, and int(0) declares a variable that a loop may change.
 """Tile intersections by sorting 64-bit keys, for the portable CPU kernels."""
 
-from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
-from hoigs.rasterizers.warp.common.records import F32, I32, I64, RECORD
+from hoigs.core.fast.launch import CPU_FLAGS
+from hoigs.core.system.quiet_warp import wp
+from hoigs.rasterizers.warp.frame import F32, I32, I64, RECORD
 from hoigs.rasterizers.warp.intersect.tile_spans import span, tile_row_range
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})

@@ -5,9 +5,9 @@
 The rules, names and limits are those at the head of `hoigs.core.maths.projection`.
 """
 
-from hoigs.core.cpu_kernels.runtime import wp
 from hoigs.core.maths import projection as rules
-from hoigs.rasterizers.warp.common.records import F32
+from hoigs.core.system.quiet_warp import wp
+from hoigs.rasterizers.warp.frame import F32
 
 LIMIT = wp.constant(rules.LIMIT)
 MAX_VARIANCE = wp.constant(rules.MAX_VARIANCE)

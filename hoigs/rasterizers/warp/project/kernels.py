@@ -4,8 +4,9 @@
 """Projection kernels for CPU and CUDA, one thread per Gaussian: raw fields to records, and the
 adjoint from partial gradients to the raw fields."""
 
-from hoigs.core.cpu_kernels.runtime import CPU_FLAGS, wp
-from hoigs.rasterizers.warp.common.records import (
+from hoigs.core.fast.launch import CPU_FLAGS
+from hoigs.core.system.quiet_warp import wp
+from hoigs.rasterizers.warp.frame import (
     DEPTH,
     F32,
     HALF_HEIGHT,

@@ -5,9 +5,9 @@
 Order and signs are those of `hoigs.core.maths.spherical_harmonics`, whose constants are used.
 """
 
-from hoigs.core.cpu_kernels.runtime import wp
 from hoigs.core.maths import spherical_harmonics as sh
-from hoigs.rasterizers.warp.common.records import VEC3
+from hoigs.core.system.quiet_warp import wp
+from hoigs.rasterizers.warp.frame import VEC3
 
 Vec16 = wp.types.vector(16, wp.float32)
 

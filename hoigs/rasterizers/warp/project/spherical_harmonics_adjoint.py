@@ -8,8 +8,8 @@ With 111,785 Gaussians of degree 3 on an H200 this shortens the adjoint of proje
 from 150 to 58 microseconds.
 """
 
-from hoigs.core.cpu_kernels.runtime import wp
-from hoigs.rasterizers.warp.common.records import F32, I32, M_RED, POSE, RECORD, RED, VEC3
+from hoigs.core.system.quiet_warp import wp
+from hoigs.rasterizers.warp.frame import F32, I32, M_RED, POSE, RECORD, RED, VEC3
 from hoigs.rasterizers.warp.project.kernels import camera_center
 from hoigs.rasterizers.warp.project.spherical_harmonics import (
     Vec16,

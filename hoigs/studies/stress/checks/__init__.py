@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from hoigs.core.errors import HoigsError, did_you_mean
-from hoigs.studies.stress.check_result import CheckResult
+from hoigs.studies.stress.case import CheckResult
 
 if TYPE_CHECKING:
     from hoigs.studies.stress.bench import Bench

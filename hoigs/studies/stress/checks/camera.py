@@ -15,9 +15,9 @@ from hoigs.core.model.object_placement import fit_scale, locate
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.lens import Lens
-from hoigs.studies.stress.check_result import CheckResult
+from hoigs.studies.stress.case import CheckResult
 from hoigs.studies.stress.checks.toy import SIZE, cameras, component, toy_clip, wall
-from hoigs.training.losses.terms import depth_loss
+from hoigs.training.losses import depth_loss
 
 RASTERIZERS = ("rasterizer:oracle", "rasterizer:torch", "rasterizer:warp")
 

@@ -10,9 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.studies.stress.bench import Bench, tiny_clip
-from hoigs.studies.stress.capability import rate_of
-from hoigs.studies.stress.check_result import CheckResult
+from hoigs.studies.stress.bench import Bench, rate_of, tiny_clip
+from hoigs.studies.stress.case import CheckResult
 from hoigs.training.objective import JointObjective
 from hoigs.training.trainer import Trainer
 

@@ -18,9 +18,9 @@ from hoigs.core.spec.train_schema import LossSpec, TrainSpec
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
-from hoigs.studies.stress.check_result import CheckResult
+from hoigs.studies.stress.case import CheckResult
 from hoigs.studies.stress.checks.toy import cameras, component, toy_clip, wall
-from hoigs.training.losses.terms import depth_loss
+from hoigs.training.losses import depth_loss
 from hoigs.training.trainer import Trainer
 
 

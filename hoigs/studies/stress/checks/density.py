@@ -8,7 +8,7 @@ from torch import Tensor
 
 from hoigs.core.interfaces.density import DensityControl, DensityStatistics, Refinement
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.studies.stress.check_result import CheckResult
+from hoigs.studies.stress.case import CheckResult
 from hoigs.studies.stress.checks.toy import component
 
 CAP = 300

@@ -15,9 +15,9 @@ from hoigs.core.model.smpl_params import hand_convention
 from hoigs.core.values.clip import BodyTrack
 from hoigs.core.values.moment import BodyPose
 from hoigs.evaluation.protocol import Protocol
+from hoigs.plugins.bodies.corrected import require_gender
 from hoigs.plugins.bodies.linear import LinearBody
-from hoigs.plugins.bodies.model_files import require_gender
-from hoigs.studies.stress.check_result import CheckResult
+from hoigs.studies.stress.case import CheckResult
 
 
 def twisted_covariances() -> CheckResult:

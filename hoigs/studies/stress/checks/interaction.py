@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.values.tokens import Residual, Role, Tokens
-from hoigs.studies.stress.check_result import CheckResult
+from hoigs.studies.stress.case import CheckResult
 from hoigs.studies.stress.checks.toy import component
 
 ARM = 0.7  # metres

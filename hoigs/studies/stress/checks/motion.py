@@ -9,7 +9,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.maths import splines
-from hoigs.core.maths.knots import Knots, uniform_times
 from hoigs.core.maths.rotations import (
     axis_angle_to_matrices,
     axis_angle_to_quats,
@@ -17,10 +16,11 @@ from hoigs.core.maths.rotations import (
     quats_to_matrices,
     slerp,
 )
+from hoigs.core.maths.splines import Knots, uniform_times
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
-from hoigs.studies.stress.check_result import CheckResult
+from hoigs.studies.stress.case import CheckResult
 from hoigs.studies.stress.checks.toy import component
 
 PERIOD = 6  # frames of the fast motion of F02

@@ -7,8 +7,8 @@ import torch
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
-from hoigs.plugins.deformation.splines.temporal_opacity import log_presence
-from hoigs.studies.stress.check_result import CheckResult
+from hoigs.plugins.deformation.zoo.ex4dgs import log_presence
+from hoigs.studies.stress.case import CheckResult
 from hoigs.studies.stress.checks.toy import component
 
 

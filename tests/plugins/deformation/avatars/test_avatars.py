@@ -14,9 +14,14 @@ from hoigs.core.model.entity import Entity
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.avatars.decoders import Trunk, matrices_to_6d, quats_of_6d
-from hoigs.plugins.deformation.avatars.lbs import Lbs, LbsConfig
-from hoigs.plugins.deformation.avatars.triplane_avatar import TriplaneAvatar, TriplaneAvatarConfig
+from hoigs.plugins.deformation.lbs import Lbs, LbsConfig
+from hoigs.plugins.deformation.zoo.triplane_avatar import (
+    TriplaneAvatar,
+    TriplaneAvatarConfig,
+    Trunk,
+    matrices_to_6d,
+    quats_of_6d,
+)
 
 COUNT = 200
 SMALL = {"resolution": 12, "channels": 4, "width": 16}

@@ -17,18 +17,15 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import POSES_EXACT, BodyTrack, Clip, FrameStore
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import Residual
-from hoigs.plugins.deformation.avatars.body.surface_laplacian import (
+from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning, HexPlaneSkinningConfig
+from hoigs.plugins.deformation.human_planes import body_planes
+from hoigs.plugins.deformation.nonrigid import NonRigidMotion, Shading
+from hoigs.plugins.deformation.surface_body import (
     mesh_edges,
     mesh_roughness,
     neighbours_of,
     point_roughness,
 )
-from hoigs.plugins.deformation.avatars.body_planes import body_planes
-from hoigs.plugins.deformation.avatars.hexplane_skinning import (
-    HexPlaneSkinning,
-    HexPlaneSkinningConfig,
-)
-from hoigs.plugins.deformation.avatars.nonrigid import NonRigidMotion, Shading
 
 
 def human(body, **settings) -> Entity:

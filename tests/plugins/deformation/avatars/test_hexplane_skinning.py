@@ -19,7 +19,7 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.avatars.hexplane_skinning import (
+from hoigs.plugins.deformation.hexplane_skinning import (
     HexPlaneSkinning,
     HexPlaneSkinningConfig,
     field_subset,

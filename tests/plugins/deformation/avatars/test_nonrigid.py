@@ -10,16 +10,8 @@ import torch
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.gaussians import SH_C0
 from hoigs.core.values.moment import Moment
-from hoigs.plugins.deformation.avatars.hexplane_skinning import (
-    HexPlaneSkinning,
-    HexPlaneSkinningConfig,
-)
-from hoigs.plugins.deformation.avatars.nonrigid import (
-    LEAST,
-    NonRigidConfig,
-    NonRigidMotion,
-    Shading,
-)
+from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning, HexPlaneSkinningConfig
+from hoigs.plugins.deformation.nonrigid import LEAST, NonRigidConfig, NonRigidMotion, Shading
 
 COUNT, NUM_FRAMES = 200, 32
 

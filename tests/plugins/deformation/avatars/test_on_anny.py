@@ -8,7 +8,7 @@ import torch
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.plugins.deformation.avatars.hexplane_skinning import HexPlaneSkinning
+from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
 from hoigs.plugins.features.body_parts import BodyPartFeatures
 
 

@@ -8,8 +8,8 @@ from field_cloud import cloud, perturbed
 
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.moment import Moment
-from hoigs.plugins.deformation.fields.hexplane_field import HexPlaneField, HexPlaneFieldConfig
-from hoigs.plugins.deformation.fields.mlp import MlpConfig, MlpDeformation
+from hoigs.plugins.deformation.mlp import MlpConfig, MlpDeformation
+from hoigs.plugins.deformation.zoo.hexplane_field import HexPlaneField, HexPlaneFieldConfig
 
 
 def planes(**settings) -> HexPlaneField:

@@ -8,8 +8,7 @@ from field_cloud import ALL_HEADS, COUNT, cloud
 
 from hoigs.core.maths.rotations import normalize_quats
 from hoigs.core.values.gaussians import GaussianDelta
-from hoigs.plugins.deformation.fields.deltas import DeltaHeads, apply_delta
-from hoigs.plugins.deformation.fields.encoding import TimeTable, positional_encoding
+from hoigs.plugins.deformation.fields import DeltaHeads, TimeTable, apply_delta, positional_encoding
 
 
 def test_deltas_are_added_as_their_authors_do():

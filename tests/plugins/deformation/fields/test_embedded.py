@@ -11,7 +11,7 @@ from field_cloud import cloud
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
-from hoigs.plugins.deformation.fields.embedded import Embedded, EmbeddedConfig
+from hoigs.plugins.deformation.zoo.embedded import Embedded, EmbeddedConfig
 
 
 def embedded(embedding: int, table: int, rows: int, coarse: int, **settings) -> Embedded:

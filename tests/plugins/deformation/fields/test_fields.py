@@ -13,10 +13,10 @@ from hoigs.core.values.clip import Clip
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.fields.embedded import Embedded, EmbeddedConfig
-from hoigs.plugins.deformation.fields.hexplane_field import HexPlaneField, HexPlaneFieldConfig
-from hoigs.plugins.deformation.fields.mlp import MlpConfig, MlpDeformation
-from hoigs.plugins.deformation.fields.se3_field import Se3Field, Se3FieldConfig
+from hoigs.plugins.deformation.mlp import MlpConfig, MlpDeformation
+from hoigs.plugins.deformation.zoo.embedded import Embedded, EmbeddedConfig
+from hoigs.plugins.deformation.zoo.hexplane_field import HexPlaneField, HexPlaneFieldConfig
+from hoigs.plugins.deformation.zoo.se3_field import Se3Field, Se3FieldConfig
 
 TIMES = [0.0, 0.3, 1.0]
 PLANES = {"channels": 4, "resolution": 6, "multires": (1, 2), "width": 12}

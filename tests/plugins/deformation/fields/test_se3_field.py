@@ -10,7 +10,7 @@ from field_cloud import cloud, perturbed
 
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.moment import Moment
-from hoigs.plugins.deformation.fields.se3_field import Se3Field, Se3FieldConfig
+from hoigs.plugins.deformation.zoo.se3_field import Se3Field, Se3FieldConfig
 
 
 def field(**settings) -> Se3Field:

@@ -14,8 +14,8 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.fields.se3_field import Se3Field
-from hoigs.plugins.deformation.fields.static_dynamic import StaticDynamic, StaticDynamicConfig
+from hoigs.plugins.deformation.zoo.se3_field import Se3Field
+from hoigs.plugins.deformation.zoo.static_dynamic import StaticDynamic, StaticDynamicConfig
 
 COUNT = 14
 

@@ -14,8 +14,8 @@ from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
-from hoigs.plugins.deformation.fields.mlp import MlpConfig, MlpDeformation, positional_encoding
-from hoigs.plugins.deformation.splines.rigid_track import RigidTrack
+from hoigs.plugins.deformation.mlp import MlpConfig, MlpDeformation, positional_encoding
+from hoigs.plugins.deformation.rigid_track import RigidTrack
 from hoigs.plugins.deformation.static import Static, StaticConfig
 
 

@@ -16,10 +16,16 @@ from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import Residual
-from hoigs.plugins.deformation.avatars.body.trained_frames import FrameCorrections
-from hoigs.plugins.deformation.rigid.object_bone import ObjectBone, ObjectBoneConfig, attachments_of
-from hoigs.plugins.deformation.rigid.object_states import Attachment, rest_transitions, state_of
-from hoigs.plugins.deformation.rigid.rigid_frames import RigidFrames, RigidFramesConfig
+from hoigs.plugins.deformation.skinned_body import FrameCorrections
+from hoigs.plugins.deformation.zoo.object_bone import (
+    Attachment,
+    ObjectBone,
+    ObjectBoneConfig,
+    attachments_of,
+    rest_transitions,
+    state_of,
+)
+from hoigs.plugins.deformation.zoo.rigid_frames import RigidFrames, RigidFramesConfig
 
 FRAMES = 12
 

@@ -14,9 +14,9 @@ from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.rigid.articulated import Articulated, ArticulatedConfig
-from hoigs.plugins.deformation.rigid.rigid_residual import RigidResidual, RigidResidualConfig
-from hoigs.plugins.deformation.rigid.rigid_spline import RigidSpline
+from hoigs.plugins.deformation.articulated import Articulated, ArticulatedConfig
+from hoigs.plugins.deformation.rigid_residual import RigidResidual, RigidResidualConfig
+from hoigs.plugins.deformation.rigid_spline import RigidSpline
 
 
 def articulated(

@@ -24,8 +24,7 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.rigid.rigid_spline import RigidSpline, RigidSplineConfig
-from hoigs.plugins.deformation.rigid.track_guide import TrackGuide
+from hoigs.plugins.deformation.rigid_spline import RigidSpline, RigidSplineConfig, TrackGuide
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures
 
 KINDS = [

@@ -10,16 +10,16 @@ import torch
 
 from hoigs.core.interfaces.deformation import StepStatistics
 from hoigs.core.maths import splines
-from hoigs.core.maths.knots import Knots
 from hoigs.core.maths.rotations import quats_to_matrices
+from hoigs.core.maths.splines import Knots
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
-from hoigs.plugins.deformation.rigid.articulated import Articulated
-from hoigs.plugins.deformation.rigid.rigid_spline import RigidSpline
-from hoigs.plugins.deformation.splines.chs import CubicHermite
-from hoigs.plugins.deformation.splines.knot_schedule import AdaptiveKnotsConfig, KnotSchedule
+from hoigs.plugins.deformation.articulated import Articulated
+from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.plugins.deformation.keyframes import AdaptiveKnotsConfig, KnotSchedule
+from hoigs.plugins.deformation.rigid_spline import RigidSpline
 
 FRAMES = 33
 CAMERA = Camera.look_at(torch.tensor([0.0, 0, -4]), torch.zeros(3), width=64, height=64, fov_y=0.8)

@@ -15,7 +15,7 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.splines.chs import CubicHermite, CubicHermiteConfig
+from hoigs.plugins.deformation.chs import CubicHermite, CubicHermiteConfig
 
 
 def cloud(count: int = 10, dtype: torch.dtype = torch.float32) -> Gaussians:

@@ -15,9 +15,13 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.splines.ex4dgs import Ex4dgs, slerp_without_check
-from hoigs.plugins.deformation.splines.linear_displacement import LinearDisplacement
-from hoigs.plugins.deformation.splines.temporal_opacity import log_presence, scaled_logits
+from hoigs.plugins.deformation.zoo.ex4dgs import (
+    Ex4dgs,
+    LinearDisplacement,
+    log_presence,
+    scaled_logits,
+    slerp_without_check,
+)
 
 CAMERA = Camera.look_at(torch.tensor([0.0, 0, -4]), torch.zeros(3), width=64, height=64, fov_y=0.8)
 

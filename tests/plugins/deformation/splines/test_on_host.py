@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from hoigs.core.model.on_host import on_host
+from hoigs.core.parameters import on_host
 
 
 class Part(nn.Module):

@@ -15,8 +15,8 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.splines.chs import CubicHermite
-from hoigs.plugins.deformation.splines.tracked_chs import (
+from hoigs.plugins.deformation.chs import CubicHermite
+from hoigs.plugins.deformation.tracked_chs import (
     TrackedHermite,
     TrackedHermiteConfig,
     nonrigid_part,

@@ -6,11 +6,10 @@ import numpy as np
 from scipy import ndimage
 from test_behind import footage_of, seated
 
-from hoigs.plugins.estimators.object_tracker.anchors import anchors
-from hoigs.plugins.estimators.object_tracker.pixels.scene import static_scene
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overlap
 from hoigs.plugins.estimators.object_tracker.propagation import Track
-from hoigs.plugins.estimators.object_tracker.tracker import _joined, tracked
+from hoigs.plugins.estimators.object_tracker.scene import static_scene
+from hoigs.plugins.estimators.object_tracker.tracker import _joined, anchors, tracked
 
 CLICKED, SPOILT = 0, range(10, 15)
 

@@ -7,13 +7,16 @@ from disc_world import COUNT, H, W, texture, world
 from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.alike import told_apart
-from hoigs.plugins.estimators.object_tracker.behind import Behind
-from hoigs.plugins.estimators.object_tracker.pixels.colors import bins_of, histogram
-from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage, lab_of
-from hoigs.plugins.estimators.object_tracker.pixels.scene import static_scene
-from hoigs.plugins.estimators.object_tracker.pixels.windows import Window
-from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overlap
+from hoigs.plugins.estimators.object_tracker.footage import (
+    Footage,
+    Window,
+    bins_of,
+    histogram,
+    lab_of,
+)
+from hoigs.plugins.estimators.object_tracker.prompts import Behind, PromptedMask, overlap
 from hoigs.plugins.estimators.object_tracker.propagation import Track
+from hoigs.plugins.estimators.object_tracker.scene import static_scene
 
 
 def once(i: int) -> list[tuple[float, float]]:

@@ -31,10 +31,10 @@ from hoigs.core.interfaces.estimator import (
     PromptPoint,
     VideoRequest,
 )
+from hoigs.plugins.estimators.object_tracker.footage import Footage, lab_of
 from hoigs.plugins.estimators.object_tracker.path import _cheapest
-from hoigs.plugins.estimators.object_tracker.pixels.footage import Footage, lab_of
-from hoigs.plugins.estimators.object_tracker.pixels.scene import MovingScene
 from hoigs.plugins.estimators.object_tracker.proposal import Candidate, ranked, without_scenery
+from hoigs.plugins.estimators.object_tracker.scene import MovingScene
 
 
 @pytest.mark.parametrize("pan", [0.0, 1.5])

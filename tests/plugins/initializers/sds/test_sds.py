@@ -10,11 +10,13 @@ import torch
 from hoigs.core.errors import NotFiniteError
 from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.plugins.initializers.sds.diffusion import Denoiser, annealed_step, distillation_loss
-from hoigs.plugins.initializers.sds.distillation import (
+from hoigs.plugins.initializers.sds_distillation import (
+    Denoiser,
     DistillationConfig,
     Reference,
+    annealed_step,
     distil,
+    distillation_loss,
     orbit_camera,
     reference_view,
 )

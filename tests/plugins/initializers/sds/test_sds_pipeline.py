@@ -13,9 +13,9 @@ from pydantic import ValidationError
 
 from hoigs.core.errors import HoigsError, PluginError
 from hoigs.core.interfaces.context import BuildContext
-from hoigs.plugins.initializers.sds.diffusion import distillation_loss
-from hoigs.plugins.initializers.sds.initializer import SdsInitializer, SdsInitializerConfig
-from hoigs.plugins.initializers.sds.pipelines import TextDenoiser, ViewDenoiser
+from hoigs.plugins.initializers.sds import SdsInitializer, SdsInitializerConfig
+from hoigs.plugins.initializers.sds_distillation import distillation_loss
+from hoigs.plugins.initializers.sds_pipelines import TextDenoiser, ViewDenoiser
 from hoigs.rasterizers.warp import WarpRasterizer
 
 LETTERS = "abcdefghijklmnopqrstuvwxyz,"

@@ -1,0 +1,532 @@
+"""The verbs of many trainings: `hoigs chart`, `stress`, `tables`, `batch` and `work`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hoigs.cli.common import (
+    AddressOption,
+    DeviceOption,
+    ExecutorOption,
+    JobsOption,
+    MinutesOption,
+    PluginOption,
+    SeedsOption,
+    SetOption,
+    ThreadsOption,
+    print_table,
+    study_device,
+)
+from hoigs.cli.train import LpipsOption
+from hoigs.core.system.files import printable
+from hoigs.core.system.threads import available_cpus
+
+if TYPE_CHECKING:
+    from hoigs.studies.batch.batch import Batch, Work
+    from hoigs.studies.execution.local import Executor
+
+
+def chart(
+    clips: Annotated[list[str] | None, typer.Argument(help="Clip folders or builtin:NAME.")] = None,
+    specs: Annotated[
+        str,
+        typer.Option(
+            "--specs",
+            help="Specs with commas between, each [LABEL=]SPEC[+KEY=VALUE…]: hoigs,mine.yaml,"
+            "hoigs+interaction.use=interaction:none.",
+        ),
+    ] = "hoigs,static",
+    rasterizers: Annotated[
+        str,
+        typer.Option("--rasterizers", help="Rasterizers: warp,torch …; default each spec's own."),
+    ] = "",
+    budgets: Annotated[
+        str, typer.Option("--budgets", help="Steps: 200,1000; default each spec's own.")
+    ] = "",
+    seeds: SeedsOption = 3,
+    out: Annotated[Path, typer.Option("--out", help="Folder of runs and charts.")] = Path(
+        "runs/chart"
+    ),
+    jobs: JobsOption = 1,
+    threads: ThreadsOption = None,
+    executor: ExecutorOption = "local",
+    address: AddressOption = None,
+    minutes: MinutesOption = None,
+    add: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--add",
+            help="Also draw the results of this chart.json; without CLIPS, only those. Repeatable.",
+        ),
+    ] = None,
+    mix_machines: Annotated[
+        bool,
+        typer.Option("--mix-machines", help="Draw times that were measured on different machines."),
+    ] = False,
+    rerun: Annotated[
+        str | None,
+        typer.Option("--rerun", help="Train CLIP/RUN again and print the differences."),
+    ] = None,
+    settings: SetOption = None,
+    device: DeviceOption = "auto",
+    lpips_weights: LpipsOption = None,
+    plugin: PluginOption = None,
+) -> None:
+    """Chart accuracy against cost. The same command continues an interrupted study.
+
+    Writes chart.html (interactive, needs plotly: pip install 'hoigs[charts]'), chart.md,
+    chart.csv, chart.json, and chart-CLIP.png and .svg with training curves beside them. With
+    --rerun, the exit code is 1 if a PSNR differs by more than 0.05 dB on the same machine.
+    """
+    from hoigs.studies.execution.local import make_executor
+
+    each = threads or max(1, available_cpus() // jobs)
+    where = make_executor(executor, jobs, each, address)
+    if rerun is not None:
+        _rerun(out, rerun, where)
+        return
+    from hoigs.core.errors import HoigsError
+    from hoigs.studies.chart.data import load_chart, merged_about
+    from hoigs.studies.chart.interactive import require_plotly
+    from hoigs.studies.chart.run import ChartStudy, run_chart
+    from hoigs.studies.chart.write import write_chart
+    from hoigs.studies.jobs.job import Job
+    from hoigs.studies.jobs.results import parse_variants
+
+    if not clips and not add:
+        raise HoigsError("name a clip: `hoigs chart builtin:carry --specs hoigs,static`")
+    require_plotly()
+    loaded = {path: load_chart(path) for path in add or ()}
+    others = [cell for added, _ in loaded.values() for cell in added]
+    study = ChartStudy(
+        clips=clips or [],
+        variants=parse_variants(specs),
+        out=out.resolve(),
+        rasterizers=[r.strip() for r in rasterizers.split(",") if r.strip()],
+        budgets=_steps(budgets),
+        seeds=seeds,
+        settings=tuple(settings or ()),
+        device=study_device(device, executor),
+        lpips_weights=lpips_weights.resolve() if lpips_weights else None,
+        plugins=tuple(p.resolve() for p in plugin or ()),
+    )
+
+    def report(job: Job, word: str) -> None:
+        typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
+
+    limit = None if minutes is None else 60 * minutes
+    cells = run_chart(study, executor=where, limit_s=limit, report=report)
+    about = _about_chart(study.settings, study.device, jobs, each)
+    if not clips:  # nothing was run
+        about = merged_about({path: made for path, (_, made) in loaded.items()})
+    for path in write_chart([*cells, *others], study.out, about, mix_machines=mix_machines):
+        typer.echo(f"wrote {path}")
+    if any(cell.missing for cell in cells):
+        typer.echo("some trainings are not done; chart.md gives the reason")
+
+
+def _steps(text: str) -> list[int]:
+    from hoigs.core.errors import HoigsError
+
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    for word in words:
+        if not word.isdecimal() or int(word) < 1:
+            raise HoigsError(
+                f'--budgets: "{word}" is not a number of steps; expected for example 200,1000'
+            )
+    return list(dict.fromkeys(map(int, words)))
+
+
+def _about_chart(
+    settings: tuple[str, ...], device: str, jobs: int, threads: int
+) -> dict[str, object]:
+    from datetime import UTC, datetime
+
+    from hoigs.runs.run_folder import versions
+
+    return {
+        "date": datetime.now(UTC).date().isoformat(),
+        "settings": " ".join(settings) or "none",
+        "runs at a time": f"{jobs}, {threads} threads each, on {device}",
+        "versions": ", ".join(f"{name} {value}" for name, value in versions().items()),
+    }
+
+
+def _rerun(out: Path, cell: str, executor: Executor) -> None:
+    from hoigs.evaluation.protocol import NotComputed
+    from hoigs.studies.chart.data import AXES
+    from hoigs.studies.chart.run import TOLERANCE_DB
+    from hoigs.studies.chart.run import rerun as run_again
+
+    found = run_again(out.resolve(), cell, executor)
+    rows = []
+    for name, axis in AXES.items():
+        pair = (found.first[name], found.again[name])
+        shown = [str(v) if isinstance(v, NotComputed) else f"{v:.4f}" for v in pair]
+        difference = found.difference(name)
+        rows.append((axis.title, *shown, "" if difference is None else f"{difference:+.4f}"))
+    print_table(cell, ("measure", "first", "again", "difference"), rows, [f"run: {found.run}"])
+    if not found.same_machine:
+        typer.echo(f"two machines, so not compared: {found.machines[0]} | {found.machines[1]}")
+        return
+    word = "reproduced" if found.reproduced else "NOT reproduced"
+    typer.echo(f"{word}: PSNR to {TOLERANCE_DB} dB on the same machine")
+    if not found.reproduced:
+        raise typer.Exit(1)
+
+
+# `hoigs stress`: 56 named failure cases, for every spec that they concern.
+
+
+def stress(
+    cases: Annotated[
+        str,
+        typer.Option(
+            "--cases", help="Ids and families with commas between: F01,F10,motion,camera; or all."
+        ),
+    ] = "all",
+    specs: Annotated[
+        str,
+        typer.Option("--specs", help="Specs with commas between: hoigs,4dgs@matched,mine.yaml."),
+    ] = "hoigs,static",
+    seeds: SeedsOption = 3,
+    steps: Annotated[int, typer.Option("--steps", min=1, help="Steps of every training.")] = 300,
+    points: Annotated[
+        int, typer.Option("--points", min=50, help="Initial Gaussians of every model.")
+    ] = 4000,
+    width: Annotated[int, typer.Option("--width", min=32, help="Width of the clips, pixels.")] = 96,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="Run harder values even after a seed has failed one.")
+    ] = False,
+    out: Annotated[Path, typer.Option("--out", help="Folder of runs and results.")] = Path(
+        "runs/stress"
+    ),
+    jobs: JobsOption = 1,
+    threads: ThreadsOption = None,
+    executor: ExecutorOption = "local",
+    address: AddressOption = None,
+    minutes: MinutesOption = None,
+    settings: SetOption = None,
+    device: DeviceOption = "cpu",
+    plugin: PluginOption = None,
+) -> None:
+    """Find out where methods break. The same command continues an interrupted study.
+
+    Direct checks of hoigs' own code take seconds. Cases with a sweep train on clips that get
+    harder until a spec breaks. Writes stress.md, .csv and .json, stress-matrix.png and .svg, and
+    stress-curves.png and .svg. The exit code is 1 if a check of hoigs' own code fails.
+    """
+    from hoigs.studies.execution.local import make_executor
+    from hoigs.studies.jobs.job import Job
+    from hoigs.studies.jobs.results import definition, parse_variants
+    from hoigs.studies.stress.case import choose_cases
+    from hoigs.studies.stress.report import write_stress
+    from hoigs.studies.stress.run import BASE, StressStudy, run_stress
+    from hoigs.studies.stress.verdict import make_table
+
+    study = StressStudy(
+        cases=choose_cases(cases),
+        specs=parse_variants(specs),
+        out=out.resolve(),
+        seeds=seeds,
+        steps=steps,
+        points=points,
+        base=BASE.replace("width=96", f"width={width}"),
+        whole=whole,
+        settings=tuple(settings or ()),
+        device=study_device(device, executor),
+        plugins=tuple(p.resolve() for p in plugin or ()),
+    )
+    each = threads or max(1, available_cpus() // jobs)
+    where = make_executor(executor, jobs, each, address)
+
+    def report(job: Job, word: str) -> None:
+        typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
+
+    limit = None if minutes is None else 60 * minutes
+    verdicts = run_stress(study, executor=where, limit_s=limit, report=report, log=typer.echo)
+    definitions = {row.label: definition(row) for row in study.specs}
+    table = make_table(study.cases, definitions, verdicts, _about_cases(study, jobs, each))
+    for path in write_stress(table, study.out):
+        typer.echo(f"wrote {path}")
+    broken = sorted({v.case for v in verdicts if v.ours and v.status == "fail"})
+    if any(v.status == "not run" for v in verdicts):
+        typer.echo("some trainings are not done; the same command continues them")
+    if broken:
+        typer.echo(f"checks of hoigs' own code fail: {', '.join(broken)}")
+        raise typer.Exit(1)
+
+
+def _about_cases(study: object, jobs: int, threads: int) -> dict[str, object]:
+    from datetime import UTC, datetime
+
+    from hoigs.runs.run_folder import versions
+    from hoigs.studies.jobs.cost import cpu_model
+    from hoigs.studies.stress.run import StressStudy
+
+    assert isinstance(study, StressStudy)
+    return {
+        "date": datetime.now(UTC).date().isoformat(),
+        "direct checks": f"on {cpu_model()}",
+        "trainings": f"{study.steps} steps from {study.points} Gaussians, seeds 0 to "
+        f"{study.seeds - 1}, on built-in clips with {study.base.replace('&', ', ')}",
+        "settings": " ".join(study.settings) or "none",
+        "runs at a time": f"{jobs}, {threads} threads each, on {study.device}",
+        "versions": ", ".join(f"{name} {value}" for name, value in versions().items()),
+    }
+
+
+# `hoigs tables`: the paper's ablations and comparisons on given clips.
+
+
+def tables(
+    clips: Annotated[
+        str, typer.Option("--clips", help="Clip folders or builtin:NAME, with commas between.")
+    ],
+    table: Annotated[
+        list[str] | None,
+        typer.Option("--table", help="Name of a table; default all. Repeatable."),
+    ] = None,
+    specs: Annotated[
+        str,
+        typer.Option(
+            "--specs", help="Also, or instead, a table of these specs: hoigs,4dgs@matched."
+        ),
+    ] = "",
+    seeds: SeedsOption = 3,
+    steps: Annotated[
+        int | None,
+        typer.Option("--steps", min=1, help="Steps of every training; default each spec's own."),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder of runs and tables.")] = Path(
+        "runs/tables"
+    ),
+    jobs: JobsOption = 1,
+    threads: ThreadsOption = None,
+    executor: ExecutorOption = "local",
+    address: AddressOption = None,
+    minutes: MinutesOption = None,
+    settings: SetOption = None,
+    device: DeviceOption = "auto",
+    lpips_weights: LpipsOption = None,
+    plugin: PluginOption = None,
+) -> None:
+    """Compare methods on clips in tables. The same command continues an interrupted study.
+
+    Tables: comparison, ablation-object-motion, ablation-interaction, ablation-human-feature,
+    object-prior, mask-depth-source. Writes tables.md, tables.csv and tables.json.
+    """
+    from hoigs.runs.run_folder import versions
+    from hoigs.studies.execution.local import make_executor
+    from hoigs.studies.jobs.job import Job
+    from hoigs.studies.tables.run import Study, choose_sets, circumstances, protocols, run_study
+    from hoigs.studies.tables.write import write_tables
+
+    study = Study(
+        clips=_split(clips),
+        sets=choose_sets(table or (), _split(specs)),
+        out=out.resolve(),
+        seeds=seeds,
+        steps=steps,
+        settings=tuple(settings or ()),
+        device=study_device(device, executor),
+        lpips_weights=lpips_weights.resolve() if lpips_weights else None,
+        plugins=tuple(p.resolve() for p in plugin or ()),
+    )
+    where = make_executor(executor, jobs, threads, address)
+    ended = 0
+
+    def report(job: Job, word: str) -> None:
+        nonlocal ended
+        ended += word not in ("started", "stopped")
+        typer.echo(printable(f"[{ended:>3}] {job.clip_label}/{job.folder.name}: {word}"))
+
+    limit = None if minutes is None else 60 * minutes
+    results = run_study(study, executor=where, limit_s=limit, report=report)
+    about: dict[str, object] = {
+        "clips": ", ".join(study.clips),
+        "seeds": seeds,
+        "steps": "each spec's own" if steps is None else steps,
+        "settings": " ".join(study.settings) or "none",
+        "spread": "sample standard deviation over seeds (± in the tables)",
+        "times": circumstances(study, results),
+        "versions": ", ".join(f"{name} {value}" for name, value in versions().items()),
+    }
+    for clip, sentences in protocols(study, results).items():
+        about[f"protocol of {clip}"] = " ".join(sentences)
+    for path in write_tables(results, study.out, about):
+        typer.echo(f"wrote {path}")
+    if any(r.missing and r.row.spec for t in results for rows in t.rows.values() for r in rows):
+        typer.echo("some rows are not computed; the tables give the reason")
+
+
+def _split(names: str) -> list[str]:
+    return [name.strip() for name in names.split(",") if name.strip()]
+
+
+# `hoigs batch` and `hoigs work`: many videos or clips, on any number of machines.
+
+RetriesOption = Annotated[
+    int, typer.Option("--retries", min=0, help="Further attempts at stages of a row that fail.")
+]
+LAST = 8  # ended rows that the live table shows
+
+
+def batch(
+    manifest: Annotated[
+        Path, typer.Argument(help="YAML or CSV: one row a video or clip, with its settings.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the rows and the summary.")],
+    spec: Annotated[
+        str | None, typer.Option("--spec", help="Spec of rows that name none; default hoigs.")
+    ] = None,
+    auto: Annotated[
+        bool, typer.Option("--auto", help="As for `hoigs train`, for rows that do not set it.")
+    ] = False,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Keys of the spec for rows without `set`. Repeatable."),
+    ] = None,
+    export: Annotated[
+        list[str] | None,
+        typer.Option("--export", help="Format for rows without `export`; default ply. Repeatable."),
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option("--device", help="cpu, cuda or auto, for rows that name none.")
+    ] = None,
+    jobs: JobsOption = 1,
+    threads: ThreadsOption = None,
+    executor: ExecutorOption = "local",
+    address: AddressOption = None,
+    retries: RetriesOption = 1,
+    limit: Annotated[
+        int | None, typer.Option("--limit", min=1, help="Only this many rows, the first.")
+    ] = None,
+    only: Annotated[
+        str | None, typer.Option("--only", help="failed: only rows whose last attempt failed.")
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check the manifest and print what would run.")
+    ] = False,
+) -> None:
+    """Prepare, train, evaluate and export every row of a manifest.
+
+    The same command continues where it was stopped, stage by stage. A row that fails does not stop
+    the others, and keeps its logs. Exit code 1: some rows failed.
+    """
+    from hoigs.core.errors import HoigsError
+    from hoigs.studies.batch.batch import batch as run
+
+    if only not in (None, "failed"):
+        raise HoigsError(f'--only {only}: expected "failed"')
+    given = {
+        "spec": spec,
+        "auto": auto or None,
+        "set": settings,
+        "export": export,
+        "device": device,
+    }
+    defaults = {key: value for key, value in given.items() if value is not None}
+    with _shown() as show:
+        done = run(
+            manifest, out, defaults=defaults, jobs=jobs, threads=threads, executor=executor,
+            address=address, retries=retries, limit=limit, only_failed=only == "failed",
+            dry_run=dry_run, **show,
+        )  # fmt: skip
+    if dry_run:
+        for name, commands in done.plan.items():
+            typer.echo(f"{name}:" + ("".join(f"\n  {c}" for c in commands) or " done"))
+        return
+    _finish(done)
+
+
+def work(
+    out: Annotated[Path, typer.Argument(help="Folder that `hoigs batch` was given as --out.")],
+    jobs: JobsOption = 1,
+    threads: ThreadsOption = None,
+    executor: ExecutorOption = "local",
+    address: AddressOption = None,
+    retries: RetriesOption = 1,
+) -> None:
+    """Help with a batch: work on its rows that nobody works on, until none is left."""
+    from hoigs.studies.batch.batch import work as run
+
+    with _shown() as show:
+        done = run(
+            out, jobs=jobs, threads=threads, executor=executor, address=address, retries=retries,
+            **show,
+        )  # fmt: skip
+    _finish(done)
+
+
+def _finish(done: Batch) -> None:
+    for path in done.summary:
+        typer.echo(f"wrote {path}")
+    if done.failed:
+        typer.echo(f"{len(done.failed)} of {done.rows} rows failed", err=True)
+        raise typer.Exit(1)
+
+
+@contextmanager
+def _shown() -> Iterator[dict[str, Any]]:
+    """`report` and `tick`: a live table on a terminal, else a line for each event."""
+    from rich.console import Console
+    from rich.live import Live
+
+    console, table = Console(), _LiveTable()
+    if not console.is_terminal:
+        yield {"report": lambda work, word: typer.echo(printable(f"{work.row.name}: {word}"))}
+        return
+    with Live(console=console, get_renderable=table.draw, refresh_per_second=4):
+        yield {"report": table.report, "tick": table.tick}
+
+
+class _LiveTable:
+    """Rows that run, and the last that ended."""
+
+    def __init__(self) -> None:
+        self.running: Sequence[Work] = ()
+        self.ended: dict[str, str] = {}
+        self.times: list[float] = []  # seconds of each row that this driver has finished
+
+    def report(self, work: Work, word: str) -> None:
+        ended = word in ("done", "done before") or word.startswith("failed")
+        if ended:
+            self.ended[work.row.name] = word
+        if word == "done":
+            self.times.append(time.monotonic() - work.taken_at)
+
+    def tick(self, running: Sequence[Work]) -> None:
+        self.running = list(running)
+
+    def draw(self) -> Any:
+        from rich.markup import escape
+        from rich.table import Table
+
+        failed = sum(word.startswith("failed") for word in self.ended.values())
+        table = Table(title=f"{len(self.ended)} rows ended, {failed} failed", title_justify="left")
+        for column in ("row", "stage", "seconds", "ETA", "device", "retries"):
+            table.add_column(column)
+        for name, word in list(self.ended.items())[-LAST:]:
+            table.add_row(escape(printable(name)), escape(printable(word)), "", "", "", "")
+        now = time.monotonic()
+        for work in self.running:
+            seconds = f"{now - work.since:.0f}" if work.process else ""
+            table.add_row(
+                escape(printable(work.row.name)), escape(work.stage), seconds, self._eta(work, now),
+                work.device, str(work.retries),
+            )  # fmt: skip
+        return table
+
+    def _eta(self, work: Work, now: float) -> str:
+        """Of a row, by the mean time of the rows that this driver has finished."""
+        if not self.times:
+            return ""
+        mean = sum(self.times) / len(self.times)
+        return f"{max(0.0, mean - (now - work.taken_at)):.0f} s"

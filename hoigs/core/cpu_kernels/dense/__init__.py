@@ -1,1 +1,0 @@
-"""A layer of a network, relu(x W^T + b), and its gradients: `function`."""

@@ -1,1 +1,0 @@
-"""Bilinear samples of feature planes, and their gradients: `function`."""

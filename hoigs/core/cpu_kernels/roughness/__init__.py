@@ -1,1 +1,0 @@
-"""How far values are from the mean of their neighbours', and its gradient: `function`."""

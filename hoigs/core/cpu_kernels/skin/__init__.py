@@ -1,1 +1,0 @@
-"""Skinning of points and rotations, products of quaternions, and their gradients: `function`."""

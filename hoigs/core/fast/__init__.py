@@ -1,0 +1,1 @@
+"""Kernels that replace functions of `core.maths` on a device, and CUDA graphs."""

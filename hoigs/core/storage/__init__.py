@@ -1,1 +1,0 @@
-"""Files and folders that are named by URL, such as s3://bucket/clips/a, through fsspec."""

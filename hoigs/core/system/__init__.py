@@ -1,0 +1,1 @@
+"""Files, locks, downloads, foreign files, threads and memory: what the machine offers."""

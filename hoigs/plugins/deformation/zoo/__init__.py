@@ -1,0 +1,1 @@
+"""Deformations of other methods, which hoigs is compared with."""

@@ -1,0 +1,397 @@
+"""exporter:gltf-splat and exporter:gltf-body: binary glTF 2.0 of Gaussians, people and objects."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.core.config import ComponentConfig
+from hoigs.core.maths.nearest import nearest
+from hoigs.core.maths.rotations import axis_angle_to_quats, matrices_to_quats
+from hoigs.core.maths.skinning import skin
+from hoigs.core.model.exporter import Exporter, ExportRequest
+from hoigs.core.reporting import Progress
+from hoigs.core.values.between import camera_between, frame_of
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.plugins.exporters.posed import (
+    AXES,
+    SEEN,
+    BodyMotion,
+    ObjectMotion,
+    body_motion,
+    object_motions,
+    world_move,
+)
+
+COMPONENTS = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}
+SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+VERTICES, INDICES = 34962, 34963  # what a buffer view is for
+
+
+class Glb:
+    """A glTF document that grows: `add` appends to a list and gives the index, `accessor` stores
+    an array.
+    """
+
+    def __init__(self, generator: str = "hoigs") -> None:
+        self.document: dict[str, Any] = {"asset": {"version": "2.0", "generator": generator}}
+        self._data = bytearray()
+
+    def add(self, kind: str, **entry: Any) -> int:
+        """Append to the list `kind` ("nodes", "meshes" …) and give the index of the entry."""
+        entries: list[dict[str, Any]] = self.document.setdefault(kind, [])
+        entries.append(entry)
+        return len(entries) - 1
+
+    def accessor(
+        self, array: np.ndarray, target: int | None = None, *, normalized: bool = False
+    ) -> int:
+        """Store an array [N] or [N, k]; gives the index of its accessor.
+
+        Args:
+            target: VERTICES or INDICES for what a mesh reads.
+            normalized: integers stand for [0, 1].
+        """
+        array = np.ascontiguousarray(array)
+        width = 1 if array.ndim == 1 else int(np.prod(array.shape[1:]))
+        view: dict[str, Any] = {
+            "buffer": 0, "byteOffset": len(self._data), "byteLength": array.nbytes,
+        }  # fmt: skip
+        if target is not None:
+            view["target"] = target
+        self._data += array.tobytes()
+        self._data += b"\0" * (-len(self._data) % 4)
+        entry: dict[str, Any] = {
+            "bufferView": self.add("bufferViews", **view),
+            "componentType": COMPONENTS[array.dtype.name],
+            "count": len(array),
+            "type": SHAPES[width],
+        }
+        if normalized:
+            entry["normalized"] = True
+        if (array.dtype == np.float32 and width <= 4) or width == 1:
+            flat = array.reshape(len(array), width)
+            entry["min"], entry["max"] = flat.min(0).tolist(), flat.max(0).tolist()
+        return self.add("accessors", **entry)
+
+    def bytes(self) -> bytes:
+        """The file."""
+        if self._data:
+            self.document["buffers"] = [{"byteLength": len(self._data)}]
+        text = json.dumps(self.document, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
+        chunks += struct.pack("<II", len(self._data), 0x004E4942) + bytes(self._data)
+        return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
+
+
+# exporter:gltf-splat: the Gaussians of one moment as glTF's KHR_gaussian_splatting.
+
+NAME = "KHR_gaussian_splatting"
+
+
+class GltfSplatConfig(ComponentConfig):
+    """`exporter:gltf-splat` has no settings."""
+
+
+class GltfSplatExporter(Exporter):
+    """`splats.glb`: one point primitive for each entity.
+
+    It is written as the release candidate and the ratified text of the extension have it, with
+    scales in metres; drafts before had their logarithms. Few programs read it yet.
+    """
+
+    Config: ClassVar[type[ComponentConfig]] = GltfSplatConfig
+    suffixes = (".glb",)
+    moving: ClassVar = False
+    up = "y"
+    axes = AXES["y"]
+    keeps: ClassVar = {
+        "means": "POSITION", "rotations": "unit quaternions xyzw", "opacities": "in [0, 1]",
+        "scales": "standard deviations", "colours": "all SH bands, srgb_rec709_display",
+    }  # fmt: skip
+
+    def __init__(self, config: GltfSplatConfig | None = None) -> None:
+        self.config = config or GltfSplatConfig()
+
+    def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
+        """See `Exporter.write`."""
+        progress(0.0, "gaussians")
+        move = world_move(request.clip, "y")
+        state = request.scene(request.moments[0], request.entities)
+        glb = Glb()
+        glb.document["extensionsUsed"] = [NAME]
+        nodes = []
+        for name, gaussians in state.gaussians.items():
+            if len(gaussians):
+                mesh = add_splats(glb, name, move.gaussians(gaussians))
+                nodes.append(glb.add("nodes", name=name, mesh=mesh))
+        glb.add("scenes", nodes=nodes)
+        glb.document["scene"] = 0
+        progress(0.5, "writing")
+        (folder / "splats.glb").write_bytes(glb.bytes())
+        lost = {"support": f"{NAME} is new: programs without it show coloured points"}
+        if len(request.moments) > 1:
+            lost["motion"] = "the extension holds one moment, the first; usd holds all"
+        return lost
+
+
+def add_splats(glb: Glb, name: str, gaussians: Gaussians) -> int:
+    """The mesh of one entity."""
+    g = gaussians.detach().to("cpu", torch.float32)
+    quats = torch.nn.functional.normalize(g.quats, dim=-1)[:, [1, 2, 3, 0]]
+    fallback = torch.cat((g.colors.clamp(0, 1), g.opacities[:, None]), 1)
+    values = {
+        "POSITION": g.means,
+        "COLOR_0": fallback,
+        f"{NAME}:ROTATION": quats,
+        f"{NAME}:SCALE": g.scales,
+        f"{NAME}:OPACITY": g.opacities,
+    }
+    for degree in range(g.sh_degree + 1):
+        for k in range(2 * degree + 1):
+            values[f"{NAME}:SH_DEGREE_{degree}_COEF_{k}"] = g.sh[:, degree * degree + k]
+    attributes = {
+        key: glb.accessor(value.float().numpy(), VERTICES) for key, value in values.items()
+    }
+    extension = {
+        "kernel": "ellipse", "colorSpace": "srgb_rec709_display",
+        "sortingMethod": "cameraDistance", "projection": "perspective",
+    }  # fmt: skip
+    shape = {"attributes": attributes, "mode": 0, "extensions": {NAME: extension}}
+    return glb.add("meshes", name=name, primitives=[shape])
+
+
+# exporter:gltf-body: skinned people, moving objects and the camera, animated, as binary glTF.
+
+INFLUENCES = 8  # joints that may move a vertex: two sets of four, which glTF players read
+
+
+class GltfBodyConfig(ComponentConfig):
+    """Settings of `exporter:gltf-body`."""
+
+    camera: bool = True
+    """the camera of the video, animated"""
+
+
+class GltfBodyExporter(Exporter):
+    """`body.glb`: each person as a skinned mesh with one animation, each object as coloured points
+    on an animated node.
+    """
+
+    Config: ClassVar[type[ComponentConfig]] = GltfBodyConfig
+    suffixes = (".glb",)
+    kinds: ClassVar = frozenset({"human", "object"})
+    up = "y"
+    axes = AXES["y"]
+    keeps: ClassVar = {
+        "people": "skinned meshes in their shape, coloured by the nearest Gaussians",
+        "objects": "the centres of their visible Gaussians as coloured points, moved rigidly",
+        "camera": "of the video, with its vertical field of view at the first moment",
+    }
+
+    def __init__(self, config: GltfBodyConfig | None = None) -> None:
+        self.config = config or GltfBodyConfig()
+
+    def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
+        """See `Exporter.write`."""
+        glb = Glb()
+        seconds = np.arange(len(request.moments), dtype=np.float32) / np.float32(request.fps)
+        clock = _Clock(glb, glb.accessor(seconds))
+        lost = {"looks": "Gaussians are left out; ply-sequence and usd hold them"}
+        children, skins = [], []  # what carries a skin stands at the root: its bones place it
+        people = request.of_kind("human")
+        for i, name in enumerate(people):
+            progress(0.8 * i / len(people), name)
+            if name not in request.bodies:
+                lost[name] = "it has no body model"
+                continue
+            motion = body_motion(request, name)
+            bones, skin = add_person(clock, motion, _looks(request, motion))
+            children.append(bones)
+            skins.append(skin)
+            worst = skinning_error(motion)
+            if worst > 1e-4:
+                lost[f"surface of {name}"] = (
+                    f"glTF's skinning is up to {1000 * worst:.1f} mm from the body model, which "
+                    "also corrects its vertices by pose or weighs more joints"
+                )
+        progress(0.8, "objects")
+        children += [add_object(clock, motion) for motion in object_motions(request)]
+        if self.config.camera:
+            frames = [frame_of(request.clip, moment) for moment in request.moments]
+            cameras = [camera_between(request.clip, frame).to("cpu") for frame in frames]
+            children.append(add_camera(clock, cameras))
+        move = world_move(request.clip, "y")
+        root = glb.add(
+            "nodes", name="world", rotation=_xyzw(matrices_to_quats(move.turn)).tolist(),
+            translation=move.shift.tolist(), children=children,
+        )  # fmt: skip
+        glb.add("scenes", nodes=[root, *skins])
+        glb.document["scene"] = 0
+        progress(0.9, "writing")
+        (folder / "body.glb").write_bytes(glb.bytes())
+        return lost
+
+
+class _Clock:
+    """The one animation of the file, and the accessor of its times."""
+
+    def __init__(self, glb: Glb, times: int) -> None:
+        self.glb, self.times = glb, times
+        self.animation = glb.add("animations", name="clip", channels=[], samplers=[])
+
+    def move(self, node: int, path: str, values: np.ndarray) -> None:
+        """Animate "rotation" or "translation" of a node: one value a moment."""
+        entry = self.glb.document["animations"][self.animation]
+        output = self.glb.accessor(values.astype(np.float32))
+        entry["samplers"].append({"input": self.times, "output": output, "interpolation": "LINEAR"})
+        target = {"node": node, "path": path}
+        entry["channels"].append({"sampler": len(entry["samplers"]) - 1, "target": target})
+
+
+def add_person(clock: _Clock, motion: BodyMotion, colors: Float[Tensor, "V 3"]) -> tuple[int, int]:
+    """Joints, skin and mesh of a person; gives the nodes of the pelvis and of the mesh."""
+    glb, parents = clock.glb, motion.body.parents
+    rest = motion.rest_joints.numpy()
+    quats = _continuous(_xyzw(axis_angle_to_quats(motion.rotations)))
+    joints: list[int] = []
+    for joint, parent in enumerate(parents):
+        place = rest[joint] - rest[parent] if parent >= 0 else motion.pelvis[0].numpy()
+        entry: dict[str, Any] = {"name": f"{motion.name}.{motion.body.joint_names[joint]}"}
+        entry |= {"translation": place.tolist(), "rotation": quats[0, joint].tolist()}
+        if parent < 0 and motion.scale != 1.0:
+            entry["scale"] = [motion.scale] * 3
+        joints.append(glb.add("nodes", **entry))
+        if parent >= 0:
+            glb.document["nodes"][joints[parent]].setdefault("children", []).append(joints[joint])
+        clock.move(joints[joint], "rotation", quats[:, joint])
+    clock.move(joints[0], "translation", motion.pelvis.numpy())
+    inverse = np.tile(np.eye(4, dtype=np.float32), (len(rest), 1, 1))
+    inverse[:, 3, :3] = -rest  # column by column, as glTF stores matrices
+    bound = glb.accessor(inverse.reshape(-1, 16))
+    skeleton = glb.add("skins", joints=joints, inverseBindMatrices=bound, skeleton=joints[0])
+    vertices = motion.body.shaped(motion.betas)[0].numpy()
+    chosen, weights = influences(motion.body.skinning_weights)
+    attributes = {
+        "POSITION": glb.accessor(vertices, VERTICES),
+        "COLOR_0": _color(glb, colors),
+    }
+    for k in range(0, chosen.shape[1], 4):
+        attributes[f"JOINTS_{k // 4}"] = glb.accessor(chosen[:, k : k + 4], VERTICES)
+        attributes[f"WEIGHTS_{k // 4}"] = glb.accessor(weights[:, k : k + 4], VERTICES)
+    faces = glb.accessor(motion.body.faces.numpy().astype(np.uint32).reshape(-1), INDICES)
+    material = glb.add("materials", pbrMetallicRoughness={"metallicFactor": 0.0}, doubleSided=True)
+    shape = {"attributes": attributes, "indices": faces, "material": material}
+    mesh = glb.add("meshes", name=motion.name, primitives=[shape])
+    return joints[0], glb.add("nodes", name=motion.name, mesh=mesh, skin=skeleton)
+
+
+def influences(weights: Float[Tensor, "V J"]) -> tuple[np.ndarray, np.ndarray]:
+    """The joints that move each vertex most, and their weights, which sum to one.
+
+    Four or eight of each, as glTF takes them by four.
+    """
+    count = 4 if bool(((weights > 1e-6).sum(1) <= 4).all()) else INFLUENCES
+    found = weights.float().topk(min(count, weights.shape[1]), dim=1)
+    kept = (found.values / found.values.sum(1, keepdim=True)).numpy().astype(np.float32)
+    joints = np.where(kept > 0, found.indices.numpy(), 0).astype(np.uint8)
+    return joints, kept
+
+
+@torch.no_grad()
+def skinning_error(motion: BodyMotion) -> float:
+    """How far linear blending of the kept weights is from the body model, metres, at worst."""
+    chosen, kept = influences(motion.body.skinning_weights)
+    weights = torch.zeros_like(motion.body.skinning_weights)
+    weights.scatter_add_(1, torch.from_numpy(chosen.astype(np.int64)), torch.from_numpy(kept))
+    vertices = motion.body.shaped(motion.betas)[0]
+    worst = 0.0
+    for i in range(0, len(motion), max(1, len(motion) // 8)):
+        pose = motion.pose(i)
+        ours = skin(vertices, motion.body.skinning_transforms(pose), weights)
+        theirs = motion.body(pose).vertices
+        worst = max(worst, motion.scale * float((ours - theirs).norm(dim=-1).max()))
+    return worst
+
+
+def add_object(clock: _Clock, motion: ObjectMotion) -> int:
+    """An object's points on an animated node."""
+    glb = clock.glb
+    quats = _continuous(_xyzw(matrices_to_quats(motion.rotations))[:, None])[:, 0]
+    attributes = {
+        "POSITION": glb.accessor(motion.points.numpy(), VERTICES),
+        "COLOR_0": _color(glb, motion.colors),
+    }
+    mesh = glb.add("meshes", name=motion.name, primitives=[{"attributes": attributes, "mode": 0}])
+    place = motion.translations[0].tolist()
+    node = glb.add(
+        "nodes", name=motion.name, mesh=mesh, rotation=quats[0].tolist(), translation=place
+    )
+    clock.move(node, "rotation", quats)
+    clock.move(node, "translation", motion.translations.numpy())
+    return node
+
+
+def add_camera(clock: _Clock, cameras: Sequence[Camera]) -> int:
+    """The camera of the video on an animated node; glTF's looks along -z with y up."""
+    glb, first = clock.glb, cameras[0]
+    lens = {
+        "yfov": 2 * math.atan(first.height / (2 * float(first.K[1, 1]))),
+        "aspectRatio": first.width / first.height,
+        "znear": 0.05,
+    }
+    index = glb.add("cameras", type="perspective", perspective=lens, name="video")
+    flip = torch.diag(torch.tensor((1.0, -1.0, -1.0)))
+    turns = torch.stack([c.world_to_camera[:3, :3].mT @ flip for c in cameras])
+    quats = _continuous(_xyzw(matrices_to_quats(turns))[:, None])[:, 0]
+    places = torch.stack([c.center for c in cameras])
+    node = glb.add(
+        "nodes", name="camera", camera=index, rotation=quats[0].tolist(),
+        translation=places[0].tolist(),
+    )  # fmt: skip
+    clock.move(node, "rotation", quats)
+    clock.move(node, "translation", places.numpy())
+    return node
+
+
+def _looks(request: ExportRequest, motion: BodyMotion) -> Float[Tensor, "V 3"]:
+    """Colours of a body's vertices: those of the nearest visible Gaussians at the first moment."""
+    with torch.no_grad():
+        gaussians = request.scene(request.moments[0], [motion.name]).gaussians[motion.name]
+        seen = gaussians.opacities > SEEN
+        gaussians = gaussians[seen] if bool(seen.any()) else gaussians
+        found = nearest(motion.vertices(0), 3, gaussians.means.cpu())[0]
+        return gaussians.colors.cpu().clamp(0, 1)[found].mean(1)
+
+
+def _color(glb: Glb, colors: Float[Tensor, "N 3"]) -> int:
+    """COLOR_0 of display colours: glTF's are linear (inverse of the sRGB transfer function)."""
+    value = colors.double().numpy()
+    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return glb.accessor(linear.astype(np.float32), VERTICES)
+
+
+def _xyzw(quats: Float[Tensor, "*batch 4"]) -> np.ndarray:
+    """glTF's order, unit, from wxyz."""
+    unit = torch.nn.functional.normalize(quats.double(), dim=-1)
+    return unit[..., [1, 2, 3, 0]].numpy().astype(np.float32)
+
+
+def _continuous(quats: np.ndarray) -> np.ndarray:
+    """[F, J, 4] with signs such that neighbours in time are near."""
+    turned = quats.copy()
+    for i in range(1, len(turned)):
+        away = (turned[i] * turned[i - 1]).sum(-1) < 0
+        turned[i, away] *= -1
+    return turned

@@ -1,5 +1,0 @@
-"""ExAvatar folders.
-
-- `reader.ExavatarReader`: reader:exavatar.
-- `files`: the files of such a folder, by frame number.
-"""

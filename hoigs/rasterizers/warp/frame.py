@@ -1,0 +1,290 @@
+# mypy: ignore-errors
+# (Warp's arrays annotate as values)
+"""The settings and tensors of one render, as all devices share them."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hoigs.core.errors import RenderError
+from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.system.quiet_warp import wp
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import Gaussians
+
+INT32 = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is no tensor in one render; see `RenderRequest` for most of it.
+
+    Attributes:
+        active_bases: how many SH basis functions are used: 1, 4, 9 or 16.
+    """
+
+    width: int
+    height: int
+    active_bases: int
+    near: float
+    low_pass: float
+    antialiased: bool
+    max_alpha: float
+    min_alpha: float
+    min_transmittance: float
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Contiguous float32 tensors of one render on one device; absent ones are empty.
+
+    Attributes:
+        means [N, 3], quats [N, 4], log_scales [N, 3], opacity_logits [N], sh [N, K, 3]: raw space.
+        features [N, F]; screen_offsets [N, 2] pixels; subset [N] uint8.
+        absolute_gradients [N, 2]: receives them; its values are not read.
+        background: [3] or [H, W, 3].
+        world_to_camera [4, 4], K [3, 3]: of the camera.
+    """
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    sh: Tensor
+    features: Tensor
+    screen_offsets: Tensor
+    background: Tensor
+    world_to_camera: Tensor
+    K: Tensor
+    subset: Tensor
+    absolute_gradients: Tensor
+
+    @property
+    def count(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def channels(self) -> int:
+        return self.features.shape[1]
+
+
+@dataclass(frozen=True)
+class TileIntersections:
+    """The Gaussians of each tile, nearest first.
+
+    Attributes:
+        tile_height: pixels; tiles_x, tiles_y: number of tiles.
+        offsets: [tiles + 1] int32, the first intersection of each tile. On CUDA more follows, see
+            `intersect.cuda_kernels`.
+        indices: [M, 2] int32, of each intersection the Gaussian and the partial (`common.records`).
+        first_partial: [N] int32, the first partial of each Gaussian.
+        tiles_per_gaussian: [N] int32, how many tiles, and so partials, each Gaussian has.
+    """
+
+    tile_height: int
+    tiles_x: int
+    tiles_y: int
+    offsets: Tensor
+    indices: Tensor
+    first_partial: Tensor
+    tiles_per_gaussian: Tensor
+
+    @property
+    def tiles(self) -> int:
+        return self.tiles_x * self.tiles_y
+
+    @property
+    def count(self) -> int:
+        """Intersections for which there is memory; on a CPU, how many there are."""
+        return self.indices.shape[0]
+
+
+@dataclass(frozen=True)
+class Images:
+    """color [H, W, 3] over the background, alpha [H, W], depth [H, W], features [H, W, F]."""
+
+    color: Tensor
+    alpha: Tensor
+    depth: Tensor
+    features: Tensor
+
+    @staticmethod
+    def empty(inputs: Inputs, settings: Settings) -> Images:
+        size, new = (settings.height, settings.width), inputs.means.new_empty
+        return Images(new(*size, 3), new(size), new(size), new(*size, inputs.channels))
+
+
+def check_addressable(numbers: int, what: str) -> None:
+    """Raise where kernels cannot address so many numbers with their 32-bit indices.
+
+    Raises:
+        RenderError: too many.
+    """
+    if numbers > INT32:
+        raise RenderError(
+            f"WarpRasterizer: {what} make {numbers} numbers, more than {INT32}, the most in one "
+            "render; render parts of the image (Camera.cropped), or fewer channels at a time"
+        )
+
+
+# Layout of the arrays between kernels, and the types of their parameters.
+#
+# One *record* of RECORD floats (64 bytes, one cache line) describes a drawn Gaussian on screen.
+# With d = (dx, dy) from its centre, u = dx - shear dy, and the screen covariance xx, xy, yy:
+#
+# log2 alpha = log2_opacity - a u^2 - c dy^2       two squares: nothing cancels in thin splats
+# a = log2(e) / 2 * yy / det,  c = log2(e) / 2 / yy,  shear = xy / yy
+#
+# A *partial* is the gradient of one Gaussian from one tile, MOMENTS + F floats, and ABSOLUTES more
+# where absolute gradients are requested. There is one for each tile intersection, and those of a
+# Gaussian are neighbours in memory. Each is written by one tile and they are summed in a fixed
+# order, so that no atomics are needed and results do not depend on the schedule. (On CUDA there is
+# one exception, where intersections exceed the allocated memory: see `warp.cuda.intersections`.)
+
+F32 = wp.array(dtype=wp.float32)
+I32 = wp.array(dtype=wp.int32)
+I64 = wp.array(dtype=wp.int64)
+U8 = wp.array(dtype=wp.uint8)
+U64 = wp.array(dtype=wp.uint64)
+VEC3 = wp.array(dtype=wp.vec3)
+VEC4 = wp.array(dtype=wp.vec4)
+RECORD = 16
+X = wp.constant(0)  # centre, pixels
+Y = wp.constant(1)
+A = wp.constant(2)
+SHEAR = wp.constant(3)
+C = wp.constant(4)
+LOG2_OPACITY = wp.constant(5)
+RED = wp.constant(6)  # then green, blue; -0 where clamped so that no gradient passes
+DEPTH = wp.constant(9)  # follows blue: four channels composited alike
+HALF_WIDTH = wp.constant(10)  # of the box where alpha >= min_alpha; negative when culled
+HALF_HEIGHT = wp.constant(11)
+SLOPE = wp.constant(12)  # xy / xx: dy of the ellipse's middle per dx
+WAIST_Y = wp.constant(13)  # half height of the ellipse at dx = 0
+WAIST_X = wp.constant(14)  # half width at dy = 0
+INVERSE_HALF_WIDTH = wp.constant(15)
+
+# partials: sums over the pixels of one tile of g = dloss / d(ln alpha), then of colour and depth
+MOMENTS = 10
+M_G = wp.constant(0)
+M_U = wp.constant(1)  # g u
+M_Y = wp.constant(2)  # g dy
+M_UU = wp.constant(3)
+M_UY = wp.constant(4)
+M_YY = wp.constant(5)
+M_RED = wp.constant(6)  # then green, blue, depth
+
+# last in a partial: sums of |dloss / du|, |dloss / dv| of the projected mean, where requested
+ABSOLUTES = 2
+POSE = 15  # gradient of the pose from one Gaussian: R (9), t (3), camera centre (3)
+HALF_LOG2E = wp.constant(0.5 / math.log(2.0))
+# Ellipses are widened by this when their pixels are sought. Each pixel's alpha is then tested
+# exactly, so this only guards against rounding.
+REACH_SLACK = wp.constant(1.001)
+# min_alpha = 0 means no cut-off; in float32 nothing below this is visible.
+SMALLEST_ALPHA = 1e-12
+
+
+# From the values that users hold to the tensors that kernels take.
+
+CACHE_SIZE = 256
+
+
+class InputValidation:
+    """Checks the inputs of a rasterizer and prepares them for its kernels.
+
+    The checks look at shapes, types and numbers only, and training repeats these. So what passed
+    once is cached by them, which takes a tenth of the time of the checks.
+
+    Args:
+        check: raises RenderError where the inputs cannot be drawn.
+    """
+
+    def __init__(self, check: Callable[[Gaussians, Camera, RenderRequest], None]) -> None:
+        self._check = check
+        self._passed: dict[Any, Settings] = {}
+
+    def prepare(
+        self, gaussians: Gaussians, camera: Camera, request: RenderRequest
+    ) -> tuple[Settings, list[Tensor]]:
+        """Settings, and tensors in the order of `frame.Inputs`: contiguous, absent ones empty.
+
+        Raises:
+            RenderError: input that cannot be drawn.
+        """
+        key = tuple(
+            (x.shape, x.dtype, x.device) if isinstance(x, Tensor) else x
+            for value in (gaussians, camera, request)
+            for x in vars(value).values()
+        )
+        settings = self._passed.get(key)
+        if settings is None:
+            self._check(gaussians, camera, request)
+            settings = _settings(gaussians, camera, request)
+            if len(self._passed) >= CACHE_SIZE:
+                self._passed.clear()
+            self._passed[key] = settings
+        return settings, _tensors(gaussians, camera, request)
+
+
+def _settings(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> Settings:
+    stored, degree = gaussians.sh.shape[1], request.sh_degree
+    channels = 0 if request.features is None else request.features.shape[1]
+    check_addressable(
+        camera.width * camera.height * max(3, channels),
+        f"{camera.width}x{camera.height} pixels with {channels} feature channels",
+    )
+    return Settings(
+        width=camera.width, height=camera.height,
+        active_bases=stored if degree is None else min(stored, (degree + 1) ** 2),
+        near=request.near, low_pass=request.low_pass, antialiased=request.antialiased,
+        max_alpha=request.max_alpha, min_alpha=request.min_alpha,
+        min_transmittance=request.min_transmittance,
+    )  # fmt: skip
+
+
+def _tensors(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> list[Tensor]:
+    like = gaussians.means
+    background, subset = request.background, request.subset
+    features, offsets = request.features, request.screen_offsets
+    tensors = [
+        like,
+        gaussians.quats,
+        gaussians.log_scales,
+        gaussians.opacity_logits,
+        gaussians.sh,
+        like.new_empty(like.shape[0], 0) if features is None else features,
+        _constant(like.device, 0, 2) if offsets is None else offsets,
+        _black(like) if background is None else background,
+        camera.world_to_camera,
+        camera.K,
+    ]
+    tensors = [
+        x if x.dtype == torch.float32 and x.is_contiguous() else x.float().contiguous()
+        for x in tensors
+    ]
+    drawn = _constant(like.device, 0, dtype=torch.uint8)
+    if subset is not None:
+        drawn = subset.contiguous().view(torch.uint8)
+    absolutes = request.absolute_gradients
+    return [*tensors, drawn, _constant(like.device, 0, 2) if absolutes is None else absolutes]
+
+
+def _black(like: Tensor) -> Tensor:
+    if like.is_cuda and torch.cuda.is_current_stream_capturing():
+        return like.new_zeros(3)  # memory of the graph, which others must not use
+    return _constant(like.device, 3)
+
+
+@functools.cache
+def _constant(device: torch.device, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Zeros, or nothing, that every render on a device shares."""
+    with torch.inference_mode(False):
+        return torch.zeros(shape, device=device, dtype=dtype)

@@ -1,1 +1,0 @@
-"""Errors in written clips: `noise` (values) and `damage` (whole files and frames)."""

@@ -1,1 +1,0 @@
-"""The person: `choreography.Choreographer` poses it, `clothes.dress` dresses it."""

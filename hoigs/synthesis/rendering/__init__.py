@@ -1,1 +1,0 @@
-"""Rendering: `raycast.RayCaster` renders a view, `paths` places cameras, `shutter` adds blur."""

@@ -1,1 +1,0 @@
-"""The room: `room.build_room` furnishes it; `textures`, `designs` and `meshes` make its parts."""

@@ -1,0 +1,272 @@
+"""Conformance of feature extractors: `CHECKS`, on a motion that provides everything."""
+
+from __future__ import annotations
+
+import random
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from hoigs.core.interfaces.body import PART_NAMES
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.interfaces.deformation import ProvidesField
+from hoigs.core.interfaces.features import FeatureExtractor
+from hoigs.core.model.entity import Entity
+from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.tokens import Tokens
+from hoigs.testing.checks import CheckList, require, require_close, require_finite
+from hoigs.testing.deformation import apply, changed_by, follow
+from hoigs.testing.material import OBJECT, TinyMotion, moment_at, object_track, tiny_clip
+from hoigs.testing.modules import (
+    DeviceSubject,
+    Moments,
+    copied,
+    perturb,
+    plain_state,
+    require_finite_gradients,
+    require_gradients,
+    require_same_state,
+    require_true_gradients,
+    seeded,
+    trained,
+    weighted_sum,
+)
+
+if TYPE_CHECKING:
+    from hoigs.testing.runner import Options
+
+
+COUNT = 7
+INSIDE = (0.0, 0.13, 0.5, 1.0)
+OUTSIDE = (-0.2, 1.2)
+
+
+class FeaturesSubject(DeviceSubject[FeatureExtractor]):
+    """The component under check; it describes an entity that moves."""
+
+    def entity(
+        self,
+        count: int = COUNT,
+        *,
+        seed: int = 0,
+        perturbed: bool = True,
+        dtype: torch.dtype = torch.float32,
+    ) -> Entity:
+        """An entity of `count` Gaussians with these features, in eval mode."""
+        context = BuildContext(OBJECT, tiny_clip(), object_track=object_track())
+        points = object_track().points[:count]
+
+        def make() -> Entity:
+            features = self.cls.from_config(self.config, context)
+            canonical = Gaussians.from_points(points, scales=0.02)
+            return Entity(canonical, TinyMotion(), features, kind="object")
+
+        entity = seeded(make, seed)
+        if perturbed:
+            assert entity.features is not None
+            perturb(entity.features)
+        return entity.to(device=self.device, dtype=dtype).eval()
+
+    def tokens(self, entity: Entity, time: float) -> Tokens:
+        tokens = entity.tokens(moment_at(time, entity.means.dtype, entity.means.device))
+        assert tokens is not None
+        return tokens
+
+
+CHECKS: CheckList[FeaturesSubject] = CheckList("F")
+
+
+def subject(cls: type[FeatureExtractor], config: Any, options: Options) -> FeaturesSubject:
+    made = FeaturesSubject(cls, config, torch.device(options.device))
+    made.entity()
+    return made
+
+
+def by_name(tokens: Tokens) -> dict[str, Tensor]:
+    return {"features": tokens.features, "positions": tokens.positions}
+
+
+def require_same(what: str, got: Tokens, expected: Tokens, atol: float = 1e-5) -> None:
+    for name, x in by_name(expected).items():
+        require_close(f"{what}: {name}", by_name(got)[name], x, atol=atol)
+
+
+def learns(subject: FeaturesSubject) -> str | None:
+    features = subject.entity().features
+    assert features is not None
+    trained = any(p.requires_grad for p in features.parameters())
+    return None if trained else "it has no parameters"
+
+
+# F01 to F07 and F13: shapes, values, gradients, positions and number of tokens.
+
+
+@CHECKS.check("F01")
+def as_many_positions_as_features(subject: FeaturesSubject) -> None:
+    """M tokens are features [M, width] and positions [M, 3], for 1 and for 7 Gaussians."""
+    for count in (1, 7):
+        entity = subject.entity(count)
+        tokens, features = subject.tokens(entity, 0.4), entity.features
+        assert features is not None
+        number, width = len(tokens.features), features.width
+        got = list(tokens.features.shape)
+        require(got == [number, width], f"features are {got}, width is {width}")
+        require(
+            tokens.positions.shape == (number, 3),
+            f"{number} tokens have positions {list(tokens.positions.shape)}",
+        )
+
+
+@CHECKS.check("F02")
+def dtype_and_device_are_kept(subject: FeaturesSubject) -> None:
+    """Tokens have dtype and device of the Gaussians, in float32 and in float64."""
+    for dtype in (torch.float32, torch.float64):
+        entity = subject.entity(dtype=dtype)
+        for name, x in by_name(subject.tokens(entity, 0.4)).items():
+            same = x.dtype == dtype and x.device == entity.means.device
+            require(same, f"{name} are {x.dtype} on {x.device}, the Gaussians {dtype}")
+
+
+@CHECKS.check("F03")
+def values_are_finite(subject: FeaturesSubject) -> None:
+    """Tokens and their gradients are finite inside the clip, at its ends and outside."""
+    for perturbed in (False, True):
+        entity = subject.entity(perturbed=perturbed)
+        for time in (*INSIDE, *OUTSIDE):
+            tokens = by_name(subject.tokens(entity, time))
+            for name, x in tokens.items():
+                require_finite(f"{name} at {time}", x)
+            require_finite_gradients(entity, weighted_sum(tokens))
+
+
+@CHECKS.check("F04")
+def order_of_gaussians_does_not_matter(subject: FeaturesSubject) -> None:
+    """Permuted Gaussians have permuted tokens, or the same where tokens are not one each."""
+    order = [3, 0, 6, 2, 5, 1, 4]
+    plain, permuted = subject.entity(), subject.entity()
+    apply(permuted, changed_by(order))
+    expected, got = subject.tokens(plain, 0.4), subject.tokens(permuted, 0.4)
+    if len(expected.features) == len(order):
+        expected = type(expected)(expected.features[order], expected.positions[order])
+    require_same("permuted", got, expected)
+
+
+@CHECKS.check("F05", learns)
+def every_parameter_gets_a_gradient(subject: FeaturesSubject) -> None:
+    """Every trained parameter gets a gradient from some moment."""
+    entity = subject.entity()
+    assert entity.features is not None
+    times = [i / 16 for i in range(17)]
+    losses = (weighted_sum({"features": subject.tokens(entity, t).features}) for t in times)
+    require_gradients(entity.features, losses)
+
+
+@CHECKS.check("F06", learns)
+def gradients_are_derivatives(subject: FeaturesSubject) -> None:
+    """In float64, the gradient of every parameter is the slope of the tokens."""
+    entity = subject.entity(dtype=torch.float64)
+    assert entity.features is not None
+    for time in (0.37, 0.81):
+        require_true_gradients(
+            trained(entity.features),
+            lambda time=time: weighted_sum(by_name(subject.tokens(entity, time))),  # type: ignore[misc]
+        )
+
+
+@CHECKS.check("F07")
+def tokens_are_where_the_entity_is(subject: FeaturesSubject) -> None:
+    """Positions of tokens are among the Gaussians, or on the body, at that moment."""
+    entity = subject.entity()
+    for time in (0.0, 0.6):
+        moment = moment_at(time, entity.means.dtype, entity.means.device)
+        drawn = entity(moment).means
+        assert isinstance(entity.deformation, ProvidesField)
+        field = entity.deformation.posed_field(entity.canonical, moment)[1]
+        positions = subject.tokens(entity, time).positions
+        far = []
+        for around in (drawn, field):
+            low, high = around.amin(0), around.amax(0)
+            far.append(float((positions - positions.clamp(low, high)).norm(dim=-1).max()))
+        require_close(f"distance of tokens to the entity at {time}", min(far), 0.0, atol=0.05)
+
+
+@CHECKS.check("F13")
+def as_many_tokens_as_declared(subject: FeaturesSubject) -> None:
+    """As many tokens as `tokens` declares: one for each Gaussian or body part, or "any" number."""
+    for count in (1, 7, 16, 20):
+        entity = subject.entity(count)
+        assert entity.features is not None
+        declared, number = entity.features.tokens, len(subject.tokens(entity, 0.4).positions)
+        expected = {"gaussian": count, "part": len(PART_NAMES), "any": number}[declared]
+        require(
+            number == expected,
+            f"{number} tokens for {count} Gaussians, but `tokens` is {declared!r}",
+        )
+
+
+# F08 to F12: rows, optimizer moments, checkpoints, seeds and independence of moments.
+
+
+@CHECKS.check("F08")
+def rows_and_moments_follow(subject: FeaturesSubject) -> None:
+    """After density control, tokens and optimizer moments follow the rows."""
+    before, after = subject.entity(), subject.entity()
+    assert after.features is not None
+    source = [0, 2, 3, 5, 2, 6, 1, 4]
+    change = changed_by(source, fresh=[4])
+    names = {f"features.{n}": p for n, p in trained(after.features).items()}
+    moments = Moments(names)
+    follow(after, change, moments)
+    apply(after, change)
+    moments.require_in_step({name: after.get_parameter(name) for name in names})
+    expected, got = subject.tokens(before, 0.4), subject.tokens(after, 0.4)
+    if len(expected.features) == len(before):
+        expected = type(expected)(expected.features[source], expected.positions[source])
+        require_same("after density control", got, expected)
+    require(len(got.features) == len(expected.features), "the number of tokens is not as expected")
+
+
+@CHECKS.check("F09")
+def a_checkpoint_restores_it(subject: FeaturesSubject) -> None:
+    """The state, saved without pickle, restores everything in a new instance with as many rows."""
+    entity = subject.entity()
+    apply(entity, changed_by([0, 1, 2, 3, 4, 5, 6, 2, 5], fresh=[7, 8]))
+    perturb(entity)
+    fresh = subject.entity(seed=5, perturbed=False)
+    fresh.resize(len(entity))
+    fresh.load_state_dict(plain_state(entity))
+    for time in INSIDE:
+        expected = subject.tokens(entity, time)
+        require_same(f"loaded, at {time}", subject.tokens(fresh, time), expected, atol=1e-6)
+
+
+@CHECKS.check("F10")
+def same_seed_same_features(subject: FeaturesSubject) -> None:
+    """Two instances from one random state of torch are equal, bit for bit."""
+    first = subject.entity()
+    random.random()
+    require_same_state("built twice from one seed", first, subject.entity())
+
+
+@CHECKS.check("F11")
+def a_deep_copy_is_independent(subject: FeaturesSubject) -> None:
+    """A deep copy, made after a training pass, is equal and independent."""
+    entity = subject.entity()
+    before = subject.tokens(entity, 0.4)
+    before = type(before)(before.features.detach().clone(), before.positions.detach().clone())
+    twin = copied(entity, lambda entity: subject.tokens(entity, 0.4))
+    require_same("a deep copy", subject.tokens(twin, 0.4), before, atol=0.0)
+    perturb(twin, seed=8)
+    require_same("after its copy changed", subject.tokens(entity, 0.4), before, atol=0.0)
+
+
+@CHECKS.check("F12")
+@torch.no_grad()
+def moments_are_independent(subject: FeaturesSubject) -> None:
+    """Several moments in any order give the same as each alone."""
+    together = subject.entity()
+    drawn = [(time, subject.tokens(together, time)) for time in (0.0, 0.77, 0.13, 1.2, 0.77, 0.0)]
+    for time, got in drawn:
+        alone = subject.tokens(subject.entity(), time)
+        require_same(f"at {time}, among other moments", got, alone, atol=1e-6)

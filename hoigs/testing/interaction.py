@@ -1,0 +1,358 @@
+"""Conformance of interactions: `CHECKS`, on synthetic humans and objects."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from hoigs.core.interfaces.body import PART_NAMES
+from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.interfaces.interaction import InteractionModule
+from hoigs.core.values.tokens import EntityKind, Residual, Role, Tokens
+from hoigs.testing.checks import (
+    CheckError,
+    CheckList,
+    require,
+    require_close,
+    require_finite,
+    require_zero,
+)
+from hoigs.testing.material import tiny_clip
+from hoigs.testing.modules import (
+    DeviceSubject,
+    copied,
+    perturb,
+    plain_state,
+    require_gradients,
+    require_same_state,
+    require_true_gradients,
+    seeded,
+    trained,
+    unchanged,
+    weighted_sum,
+)
+
+if TYPE_CHECKING:
+    from hoigs.testing.runner import Options
+
+
+KINDS: dict[str, EntityKind] = {
+    "ann": "human", "bob": "human", "cup": "object", "box": "object", "scene": "scene",
+}  # fmt: skip
+WIDTHS = {"ann": 6, "bob": 6, "cup": 4, "box": 4}
+COUNTS = {"ann": len(PART_NAMES), "bob": len(PART_NAMES), "cup": 5, "box": 3}
+PLACES = {"ann": -0.3, "bob": 0.3, "cup": 0.0, "box": 0.1}  # along x, metres: all within reach
+FAR = 1e3
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The inputs of an interaction: tokens and roles by entity."""
+
+    tokens: dict[str, Tokens]
+    roles: dict[str, Role]
+
+    def only(self, *names: str) -> Inputs:
+        """These entities, and the scene, in this order."""
+        tokens = {n: self.tokens[n] for n in names}
+        return Inputs(tokens, {n: self.roles[n] for n in (*names, "scene")})
+
+    def with_tokens(self, name: str, tokens: Tokens) -> Inputs:
+        return replace(self, tokens={**self.tokens, name: tokens})
+
+    def shifted(self, *names: str, by: tuple[float, float, float]) -> Inputs:
+        """These entities translated, with their anchors."""
+        tokens, roles = dict(self.tokens), dict(self.roles)
+        for name in names:
+            step = self.tokens[name].positions.new_tensor(by)
+            tokens[name] = replace(tokens[name], positions=tokens[name].positions + step)
+            anchors = roles[name].anchors
+            if anchors is not None:
+                roles[name] = replace(roles[name], anchors=anchors + step)
+        return Inputs(tokens, roles)
+
+
+class InteractionSubject(DeviceSubject[InteractionModule]):
+    """The component under check."""
+
+    def module(
+        self, *, seed: int = 0, perturbed: bool = True, dtype: torch.dtype = torch.float32
+    ) -> InteractionModule:
+        """A module bound to all five entities; by default with perturbed parameters."""
+
+        def make() -> InteractionModule:
+            module = self.cls.from_config(self.config, BuildContext(clip=tiny_clip()))
+            module.bind(WIDTHS, KINDS)
+            return module
+
+        module = seeded(make, seed)
+        if perturbed:
+            perturb(module, size=0.2)
+        return module.to(device=self.device, dtype=dtype).eval()
+
+    def inputs(self, dtype: torch.dtype = torch.float32) -> Inputs:
+        """Two humans and two objects, all in reach of each other."""
+        generator = torch.Generator().manual_seed(31)
+
+        def draw(*shape: int) -> Tensor:
+            return torch.randn(*shape, generator=generator).to(self.device, dtype)
+
+        tokens, roles = {}, {"scene": Role("scene")}
+        for name, count in COUNTS.items():
+            place = draw(count, 3) * 0.1
+            place[:, 0] += PLACES[name]
+            tokens[name] = Tokens(draw(count, WIDTHS[name]), place)
+            anchors = reach = None
+            if KINDS[name] == "human":
+                anchors, reach = place[[0, 8, 9, 14, 15]], torch.tensor(0.7).to(place)
+            roles[name] = Role(KINDS[name], anchors, reach)
+        return Inputs(tokens, roles)
+
+    def run(self, module: InteractionModule, inputs: Inputs) -> Mapping[str, Residual]:
+        return module(inputs.tokens, inputs.roles)
+
+
+CHECKS: CheckList[InteractionSubject] = CheckList("I")
+
+
+def subject(cls: type[InteractionModule], config: Any, options: Options) -> InteractionSubject:
+    made = InteractionSubject(cls, config, torch.device(options.device))
+    made.module()
+    return made
+
+
+def corrections(residuals: Mapping[str, Residual]) -> dict[str, Tensor]:
+    """Every tensor of the residuals, as "entity.part"."""
+    return {
+        f"{name}.{part}": value
+        for name, residual in residuals.items()
+        for part in ("pose", "means")
+        if (value := getattr(residual, part)) is not None
+    }
+
+
+def require_same(
+    what: str, got: Mapping[str, Residual], expected: Mapping[str, Residual], atol: float = 1e-6
+) -> None:
+    one, two = corrections(got), corrections(expected)
+    require(set(one) == set(two), f"{what}: {sorted(set(one) ^ set(two))} is present only once")
+    for name, x in two.items():
+        require_close(f"{what}: {name}", one[name], x, atol=atol)
+
+
+def learns(subject: InteractionSubject) -> str | None:
+    trained = any(p.requires_grad for p in subject.module().parameters())
+    return None if trained else "it has no parameters"
+
+
+# I01 to I05: shapes, values, and zero residuals out of reach.
+
+
+@CHECKS.check("I01")
+def residuals_fit_their_entities(subject: InteractionSubject) -> None:
+    """Residuals are of entities with tokens: poses [51, 3] of humans, a mean for each token."""
+    residuals = subject.run(subject.module(), subject.inputs())
+    for name, residual in residuals.items():
+        require(name in COUNTS, f'"{name}" has no tokens but gets a residual')
+        if residual.pose is not None:
+            require(KINDS[name] == "human", f'"{name}" is not a human but gets a pose correction')
+            require(residual.pose.shape == (51, 3), f"{name}.pose is {list(residual.pose.shape)}")
+        if residual.means is not None:
+            shape = list(residual.means.shape)
+            require(
+                shape == [COUNTS[name], 3],
+                f"{name}.means is {shape}: expected one for each token, [M, 3]",
+            )
+
+
+@CHECKS.check("I02")
+def dtype_and_device_are_kept(subject: InteractionSubject) -> None:
+    """Residuals have dtype and device of the tokens, in float32 and in float64."""
+    for dtype in (torch.float32, torch.float64):
+        residuals = subject.run(subject.module(dtype=dtype), subject.inputs(dtype))
+        for name, x in corrections(residuals).items():
+            same = x.dtype == dtype and x.device == subject.device
+            require(same, f"{name} is {x.dtype} on {x.device}, the tokens {dtype}")
+
+
+@CHECKS.check("I03")
+def residuals_are_zero_out_of_reach(subject: InteractionSubject) -> None:
+    """With every object far from every human, residuals are zero or absent."""
+    apart = subject.inputs().shifted("cup", "box", by=(FAR, 0.0, 0.0))
+    for name, x in corrections(subject.run(subject.module(), apart)).items():
+        require_finite(name, x.detach())
+        require_zero(f"{name}, out of reach", x.detach())
+
+
+@CHECKS.check("I04")
+def gradients_are_finite_out_of_reach(subject: InteractionSubject) -> None:
+    """Near and far, values and gradients to parameters and tokens are finite."""
+    whole = subject.inputs()
+    for by in (0.0, 0.5, 0.7, 1.0, FAR):
+        inputs, leaves = with_leaves(whole.shifted("cup", "box", by=(by, 0.0, 0.0)))
+        module = subject.module()
+        found = corrections(subject.run(module, inputs))
+        for name, x in found.items():
+            require_finite(f"{name} at {by} m", x.detach())
+        loss = weighted_sum(found)
+        if loss.requires_grad:
+            loss.backward()
+        for what, leaf in [*module.named_parameters(), *leaves.items()]:
+            if leaf.grad is not None:
+                require_finite(f"gradient of {what} at {by} m", leaf.grad)
+
+
+@CHECKS.check("I05")
+def distant_objects_do_not_matter(subject: InteractionSubject) -> None:
+    """Of two objects, the one out of reach gets nothing, and the other gets the same as alone."""
+    module = subject.module()
+    whole = subject.inputs()
+    apart = subject.run(module, whole.shifted("box", by=(FAR, 0.0, 0.0)))
+    alone = subject.run(module, whole.only("ann", "bob", "cup"))
+    for name, x in corrections(apart).items():
+        if name.startswith("box."):
+            require_zero(f"{name}, out of reach", x.detach())
+            continue
+        expected = corrections(alone).get(name)
+        if expected is None:
+            raise CheckError(f"{name} is present only beside an object that is far")
+        off = float((x - expected).detach().abs().max())
+        require(off < 1e-5, f"{name} changes by {off:.2g} because of an object that is far")
+
+
+def with_leaves(inputs: Inputs) -> tuple[Inputs, dict[str, Tensor]]:
+    """The same inputs, with features as leaves that require gradients."""
+    leaves = {n: t.features.detach().clone().requires_grad_() for n, t in inputs.tokens.items()}
+    tokens = {n: Tokens(leaves[n], t.positions) for n, t in inputs.tokens.items()}
+    return Inputs(tokens, inputs.roles), {f"{n}.features": x for n, x in leaves.items()}
+
+
+# I06 to I09: order, combinations and position of the entities.
+
+ALL = ("ann", "bob", "cup", "box")
+
+
+@CHECKS.check("I06")
+def order_of_entities_does_not_matter(subject: InteractionSubject) -> None:
+    """Entities in another order get the same residuals."""
+    module, whole = subject.module(), subject.inputs()
+    expected = subject.run(module, whole)
+    got = subject.run(module, whole.only("box", "bob", "cup", "ann"))
+    require_same("in another order", got, expected, atol=1e-5)
+
+
+@CHECKS.check("I07")
+def order_of_an_objects_tokens_does_not_matter(subject: InteractionSubject) -> None:
+    """Permuted tokens of an object have permuted residuals, and all others the same."""
+    module, whole = subject.module(), subject.inputs()
+    order, cup = [3, 0, 4, 2, 1], whole.tokens["cup"]
+    turned = Tokens(cup.features[order], cup.positions[order])
+    expected = corrections(subject.run(module, whole))
+    if "cup.means" in expected:
+        expected["cup.means"] = expected["cup.means"][order]
+    got = corrections(subject.run(module, whole.with_tokens("cup", turned)))
+    for name, x in expected.items():
+        require_close(f"{name}, with permuted tokens", got[name], x, atol=1e-5)
+
+
+@CHECKS.check("I08")
+def every_combination_works(subject: InteractionSubject) -> None:
+    """No entity, humans only, objects only, one of each, and objects of one or no token work."""
+    module, whole = subject.module(), subject.inputs()
+    cup = whole.tokens["cup"]
+    one = whole.with_tokens("cup", Tokens(cup.features[:1], cup.positions[:1]))
+    none = whole.with_tokens("cup", Tokens(cup.features[:0], cup.positions[:0]))
+    combinations = {
+        "no entity": whole.only(),
+        "humans only": whole.only("ann", "bob"),
+        "objects only": whole.only("cup", "box"),
+        "one of each": whole.only("ann", "cup"),
+        "an object of one token": one,
+        "an object of no tokens": none,
+    }
+    for what, inputs in combinations.items():
+        for name, x in corrections(subject.run(module, inputs)).items():
+            entity = name.partition(".")[0]
+            require(entity in inputs.tokens, f"with {what}, {entity} gets a residual")
+            require_finite(f"{name} with {what}", x.detach())
+
+
+@CHECKS.check("I09")
+def position_in_the_world_does_not_matter(subject: InteractionSubject) -> None:
+    """All entities moved together get the same residuals."""
+    module, whole = subject.module(), subject.inputs()
+    expected = subject.run(module, whole)
+    moved = whole.shifted(*ALL, by=(3.0, -1.0, 2.0))
+    require_same(
+        "after a common translation", subject.run(module, replace(moved)), expected, atol=1e-4
+    )
+
+
+# I10 to I15: gradients, checkpoints, seeds, copies and inputs.
+
+
+@CHECKS.check("I10", learns)
+def every_parameter_gets_a_gradient(subject: InteractionSubject) -> None:
+    """Every trained parameter gets a gradient, once heads are not zero."""
+    module = subject.module()
+    require_gradients(module, [weighted_sum(corrections(subject.run(module, subject.inputs())))])
+
+
+@CHECKS.check("I11")
+def gradients_are_derivatives(subject: InteractionSubject) -> None:
+    """In float64, gradients of parameters and of the tokens' features agree with differences."""
+    module = subject.module(dtype=torch.float64)
+    inputs, leaves = with_leaves(subject.inputs(torch.float64))
+    require_true_gradients(
+        {**trained(module), **leaves},
+        lambda: weighted_sum(corrections(subject.run(module, inputs))),
+    )
+
+
+@CHECKS.check("I12")
+def a_checkpoint_restores_it(subject: InteractionSubject) -> None:
+    """The state, saved without pickle, restores everything in a new instance."""
+    module, fresh = subject.module(), subject.module(seed=5, perturbed=False)
+    fresh.load_state_dict(plain_state(module))
+    whole = subject.inputs()
+    require_same("loaded", subject.run(fresh, whole), subject.run(module, whole))
+
+
+@CHECKS.check("I13")
+def same_seed_same_module(subject: InteractionSubject) -> None:
+    """Two instances from one random state of torch are equal, bit for bit."""
+    first = subject.module()
+    random.random()
+    require_same_state("built twice from one seed", first, subject.module())
+
+
+@CHECKS.check("I14")
+def a_deep_copy_is_independent(subject: InteractionSubject) -> None:
+    """A call keeps no state for the next one; a deep copy, made after a
+    training pass, is equal and independent."""
+    module, whole = subject.module(), subject.inputs()
+    first = subject.run(module, whole)
+    subject.run(module, whole.only("ann", "box"))
+    require_same("called again", subject.run(module, whole), first)
+    twin = copied(module, lambda module: subject.run(module, whole))
+    require_same("a deep copy", subject.run(twin, whole), first)
+    perturb(twin, seed=8)
+    require_same("after its copy changed", subject.run(module, whole), first)
+
+
+@CHECKS.check("I15")
+def inputs_are_not_modified(subject: InteractionSubject) -> None:
+    """Tokens, anchors and reach are not written to."""
+    module, whole = subject.module(), subject.inputs()
+    inputs: dict[str, Tensor] = {}
+    for part in (whole.tokens, whole.roles):
+        for name, value in part.items():
+            tensors = {k: x for k, x in vars(value).items() if isinstance(x, Tensor)}
+            inputs |= {f"{name}.{k}": x for k, x in tensors.items()}
+    with unchanged("", inputs), torch.no_grad():
+        subject.run(module, whole)

@@ -1,0 +1,218 @@
+"""refine_poses: the body poses of a clip, corrected by drawing all its frames."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.core.clip_folder.check import require_clip
+from hoigs.core.clip_folder.format import HEADER, is_clip_folder
+from hoigs.core.clip_folder.write import refuse_to_overwrite, replace_folder, save_body
+from hoigs.core.errors import ClipError, SpecError
+from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.registry.registry import Registry, default_registry
+from hoigs.core.reporting import Progress, no_progress
+from hoigs.core.spec.schema import Spec
+from hoigs.core.system.files import write_whole
+from hoigs.core.system.random_state import callers_random_state
+from hoigs.core.system.threads import short_waits_when_busy
+from hoigs.core.values.clip import POSES_EXACT, BodyTrack, Clip
+from hoigs.plugins.deformation.skinned_body import SkinnedBody
+from hoigs.runs.choices import pick_device
+from hoigs.runs.clip_source import clip_folder, read_clip, require_folder
+from hoigs.training.trainer import Trainer
+
+WIDTH = 256  # pixels: landmarks are off by one or two of a larger picture
+VISITS = 12.5  # of each frame
+LEAST, MOST = 800, 2000  # steps
+# people alone: objects and the scene change their poses by nothing that was measured, and cost half
+# of the time; clothes that move would explain what poses should; and three times the rate of a
+# training's refinement
+SETTINGS = (
+    "entities=[human]",
+    "interaction.use=interaction:none",
+    "train.loss.human_image=alone",
+    "model.human.deformation.nonrigid=false",
+    "model.human.deformation.refine_poses=true",
+    "train.rates.pose=1e-3",
+    "train.rates.pose_final=1e-4",
+    "train.fill_unseen=[]",
+    "train.preview_every=0",
+)
+
+
+@dataclass(frozen=True)
+class RefinedPoses:
+    """What was done.
+
+    Attributes:
+        path: the clip folder with the refined poses. steps: of the training.
+        moved: by person, the mean distance by which joints moved, metres.
+    """
+
+    path: Path
+    steps: int
+    moved: Mapping[str, float]
+
+    def __str__(self) -> str:
+        by = ", ".join(f"{name} {1000 * far:.1f} mm" for name, far in self.moved.items())
+        return f"joints moved by {by} (mean) in {self.steps} steps over all frames"
+
+
+@short_waits_when_busy()
+@callers_random_state()
+def refine_poses(
+    clip: Path | str,
+    out: Path | str,
+    *,
+    steps: int | None = None,
+    width: int = WIDTH,
+    overrides: Sequence[str] = (),
+    device: str = "auto",
+    overwrite: bool = False,
+    progress: Progress = no_progress,
+) -> RefinedPoses:
+    """Correct the estimated body poses of a clip by a short training on all its frames.
+
+    Landmarks and masks leave errors of about a pixel in every frame, which differ from frame to
+    frame. One model of the person, whose looks all frames share, is drawn in each, and pose and
+    translation of every frame and one shape follow the gradients of the image terms (as ExAvatar,
+    Moon et al. 2024, refines those of training frames). Training does that too, but only on
+    training frames, and there clothes that move take up a part of what poses should explain.
+
+    The poses of test frames then owe something to the images of test frames, as landmarks do;
+    the clip's provenance says so.
+
+    Args:
+        clip: a clip folder, whose poses were estimated.
+        out: folder of the refined clip: a copy, whose images are hard links where the file system
+            has them; or the clip's own folder, with `overwrite`.
+        steps: of the training; by default 12.5 a frame, from 800 to 2000.
+        width: of the images that are compared, pixels. overrides: settings laid over the spec's,
+            "train.seed=1".
+
+    Raises:
+        ClipError: nobody in the clip has poses with errors, or `out` is there already.
+        SpecError: `overrides` are wrong, or name a deformation that refines no poses.
+    """
+    registry = default_registry()
+    folder, out = clip_folder(clip), Path(out)
+    require_folder(folder)
+    if not is_clip_folder(folder):
+        raise ClipError(
+            f"{folder} has no {HEADER}: refined poses are written as a copy of a clip folder, "
+            "which `hoigs prepare` makes"
+        )
+    if out.exists() and not overwrite:
+        raise ClipError(f"{out} is there already; --overwrite (overwrite=True) replaces it")
+    refuse_to_overwrite(out)
+    require_clip(folder)
+    source = read_clip(folder, registry, width)
+    if not source.bodies or source.provenance.get(POSES_EXACT) is True:
+        why = "nobody is in it" if not source.bodies else "it declares its poses to be exact"
+        raise ClipError(f"{folder} has no body poses to refine: {why}")
+    steps = steps or round(min(max(VISITS * len(source), LEAST), MOST))
+    people = _trained(source, steps, overrides, pick_device(device), registry, progress)
+    tracks = {name: _refined(person, source, name, steps) for name, person in people.items()}
+    moved = {
+        name: _moved(source.bodies[name], track, people[name].body)
+        for name, track in tracks.items()
+    }
+    _write(folder, out, tracks)
+    return RefinedPoses(out, steps, moved)
+
+
+def _trained(
+    clip: Clip,
+    steps: int,
+    overrides: Sequence[str],
+    device: str,
+    registry: Registry,
+    progress: Progress,
+) -> dict[str, SkinnedBody]:
+    """The deformation of every person of the clip, on the CPU, trained on all its frames."""
+    settings = [*SETTINGS, f"train.steps={steps}", *overrides]
+    spec = Spec.load("hoigs", overrides=settings, registry=registry)
+    every = replace(clip, split={"train": list(range(len(clip))), "test": []}, held_out=None)
+    torch.manual_seed(spec.train.seed)
+    model = compose(spec, every, registry).to(device)
+    people = {name: model.entity(name).deformation for name in clip.bodies}
+    for name, person in people.items():
+        if not isinstance(person, SkinnedBody) or person.refinement is None:
+            raise SpecError(
+                f"the deformation of {name} refines no poses; take one that has refine_poses, as "
+                "deformation:hexplane-skinning, and set that to true"
+            )
+    density = compose_density(spec, every, registry)
+    trainer = Trainer(model, every, spec.train, density=density)
+    trainer.train(lambda report: progress(report.step / steps, "refining poses"))
+    model.eval().to("cpu")
+    return {name: person for name, person in people.items() if isinstance(person, SkinnedBody)}
+
+
+@torch.no_grad()
+def _refined(person: SkinnedBody, clip: Clip, name: str, steps: int) -> BodyTrack:
+    """A person's track with the poses, and the betas of all frames, that were learned."""
+    track = clip.bodies[name]
+    poses = {moment.index: person.pose(moment) for moment in clip.moments}
+    count = len(track.poses.transl)
+    every = [poses.get(i, track.poses.frame(i)) for i in range(count)]  # not all are in the clip
+    first = next(iter(poses.values()))
+    changes: dict[str, Any] = {
+        field: torch.stack([getattr(pose, field) for pose in every])
+        for field in ("global_orient", "body", "left_hand", "right_hand", "transl")
+    }
+    text = f"{track.provenance}; refined on the images of all frames, test frames among them"
+    refined = track.poses.replace(**changes, betas=first.betas)
+    return replace(track, poses=refined, provenance=f"{text} ({steps} steps)")
+
+
+@torch.no_grad()
+def _moved(before: BodyTrack, after: BodyTrack, body: BodyModel) -> float:
+    """Mean distance between the joints of two tracks, metres."""
+
+    def joints(track: BodyTrack, frame: int) -> Float[Tensor, "J 3"]:
+        return body(track.poses.frame(frame)).joints
+
+    frames = range(len(before.poses.transl))
+    apart = [(joints(after, i) - joints(before, i)).norm(dim=-1).mean() for i in frames]
+    return float(torch.stack(apart).mean())
+
+
+def _write(folder: Path, out: Path, tracks: Mapping[str, BodyTrack]) -> None:
+    """`folder` with other body tracks, as `out`, which appears when it is whole."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.absolute().parent) as parent:
+        made = Path(parent) / out.name
+        shutil.copytree(folder, made, copy_function=_linked)
+        for name, track in tracks.items():
+            path = made / "bodies" / f"{name}.npz"
+            path.unlink()  # a link to the other clip's file
+            save_body(path, track)
+        header = json.loads((made / HEADER).read_text())
+        provenance = header.setdefault("provenance", {})
+        for k, (name, track) in enumerate(tracks.items()):
+            provenance[f"body {name}" if k else "body"] = track.provenance
+        (made / HEADER).unlink()
+        write_whole(made / HEADER, json.dumps(header, indent=2) + "\n")
+        require_clip(made)
+        replace_folder(made, out)
+
+
+def _linked(source: str, target: str) -> None:
+    """A hard link, or a copy where there are none."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
