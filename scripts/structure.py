@@ -9,9 +9,10 @@ are left out (transitive reduction), and each package stands above all that it i
 
 from __future__ import annotations
 
+import ast
 import re
 import sys
-from collections.abc import Iterable
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import grimp
@@ -104,27 +105,69 @@ def _panel(axis, name: str, graph: nx.DiGraph, row: dict[str, int], height: int)
     axis.axis("off")
 
 
-def sizes() -> list[tuple[str, int, int, int]]:
-    """Package, modules, lines, and the modules of its fullest folder."""
-    found = []
-    for package in sorted(path for path in (ROOT / "hoigs").iterdir() if path.is_dir()):
-        files = list(package.rglob("*.py"))
-        if not files:
-            continue
-        lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in files)
-        folders: dict[Path, int] = {}
-        for path in files:
-            folders[path.parent] = folders.get(path.parent, 0) + (path.name != "__init__.py")
-        found.append((package.name, len(files), lines, max(folders.values())))
-    return found
+# lines that packages should need, in thousands
+BUDGET = {
+    "cli": 2, "core": 12, "evaluation": 2.5, "plugins": 19, "preparation": 10, "studies": 6,
+    "synthesis": 3, "testing": 3.5, "viewing": 4, "training + runs": 4.5,
+    "rasterizers + metrics": 6.5,
+}  # fmt: skip
+MANY = 8  # parameters
 
 
-def table(rows: Iterable[tuple[str, int, int, int]]) -> str:
-    rows = list(rows)
-    lines = ["| package | modules | lines | modules of its fullest folder |", "|---|---|---|---|"]
-    lines += [f"| `{name}` | {count} | {size:,} | {most} |" for name, count, size, most in rows]
-    total = [sum(row[i] for row in rows) for i in (1, 2)]
-    return "\n".join([*lines, f"| all | {total[0]} | {total[1]:,} | {max(r[3] for r in rows)} |"])
+@dataclass(frozen=True)
+class Size:
+    """What the files of a package come to; counts add up."""
+
+    modules: int = 0
+    folders: int = 0
+    lines: int = 0
+    imports: int = 0
+    comments: int = 0
+    many: int = 0
+
+    def __add__(self, other: Size) -> Size:
+        return Size(*map(sum, zip(astuple(self), astuple(other), strict=True)))
+
+
+def size_of(path: Path) -> Size:
+    """Of one module. Functions of Warp are left out: a kernel is passed its arrays one by one."""
+    text = path.read_text(encoding="utf-8")
+    imports, many = 0, 0
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            imports += (node.end_lineno or node.lineno) - node.lineno + 1
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            if any(ast.unparse(mark).startswith("wp.") for mark in node.decorator_list):
+                continue
+            given = node.args
+            names = [a.arg for a in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+            many += len([name for name in names if name not in {"self", "cls"}]) >= MANY
+    lines = text.splitlines()
+    comments = sum(line.lstrip().startswith("#") for line in lines)
+    return Size(1, path.name == "__init__.py", len(lines), imports, comments, many)
+
+
+def sizes() -> dict[str, Size]:
+    """By package; some are counted together, as their budgets are."""
+    found: dict[str, Size] = {}
+    for path in sorted((ROOT / "hoigs").rglob("*.py")):
+        package = path.relative_to(ROOT / "hoigs").parts[0]
+        name = next((key for key in BUDGET if package in key.split(" + ")), None)
+        if name:
+            found[name] = found.get(name, Size()) + size_of(path)
+    return dict(sorted(found.items()))
+
+
+def table(found: dict[str, Size]) -> str:
+    many = f"functions of {MANY}+ parameters"
+    head = ("package", "modules", "folders", "lines", "budget", "imports", "comments", many)
+    rows = [head, ("---",) * len(head)]
+    for name, size in {**found, "all": sum(found.values(), Size())}.items():
+        budget = f"{1000 * BUDGET.get(name, sum(BUDGET.values())):,.0f}"
+        shares = (f"{count / size.lines:.1%}" for count in (size.imports, size.comments))
+        counts = (str(size.modules), str(size.folders), f"{size.lines:,}", budget)
+        rows.append((name, *counts, *shares, str(size.many)))
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 def page(text: str) -> str:
