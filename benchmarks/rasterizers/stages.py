@@ -15,7 +15,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.warp import WarpRasterizer
 from hoigs.rasterizers.warp.cpu.workers import Cores
-from hoigs.rasterizers.warp.frame import MOMENTS, RECORD
+from hoigs.rasterizers.warp.records import MOMENTS, RECORD
 
 # stages by kernel, in the order in which they run
 STAGES = {

@@ -6,12 +6,12 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Generic, TypeVar
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from hoigs.core.errors import did_you_mean
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Subject = TypeVar("Subject")
 Component = TypeVar("Component")
@@ -212,6 +212,8 @@ def require_close(
     what: str, actual: Tensor | float, expected: Tensor | float, *, atol: float, rtol: float = 0.0
 ) -> None:
     """|actual - expected| <= atol + rtol |expected| everywhere, in float64; NaN never is."""
+    import torch
+
     a, b = (torch.as_tensor(x).detach().double().cpu() for x in (actual, expected))
     if a.shape != b.shape:
         raise CheckError(f"{what} has shape {list(a.shape)}, expected {list(b.shape)}")
@@ -236,6 +238,8 @@ def require_zero(what: str, value: Tensor | None) -> None:
 
 
 def require_finite(what: str, value: Tensor) -> None:
+    import torch
+
     if not bool(torch.isfinite(value).all()):
         place = (~torch.isfinite(value)).nonzero()[0].tolist()
         raise CheckError(f"{what} is {float(value[tuple(place)])} at {place}, expected numbers")

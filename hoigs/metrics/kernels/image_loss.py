@@ -15,7 +15,7 @@ from hoigs.core.first_order import first_order
 from hoigs.core.system.quiet_warp import wp
 from hoigs.metrics.kernels.tiles import SIDE, THREADS, backward, forward
 from hoigs.rasterizers.warp.cuda.launch import CudaStreams
-from hoigs.rasterizers.warp.frame import F32, U8
+from hoigs.rasterizers.warp.records import F32, U8
 
 # C++ of the image loss's kernels; the stages are those of SSIM (`warp.ssim.tile_source`).
 #

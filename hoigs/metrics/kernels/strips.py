@@ -8,7 +8,7 @@ from torch import Tensor
 from hoigs.core.fast.launch import CPU_FLAGS, SerialWorkers, ThreadWorkers, prepared
 from hoigs.core.system.quiet_warp import wp
 from hoigs.metrics.kernels.definition import FORMULA, WEIGHTS
-from hoigs.rasterizers.warp.frame import F32, I32
+from hoigs.rasterizers.warp.records import F32, I32
 
 # C++ of the CPU kernel: SSIM and its gradient in one pass down a strip of the image.
 #

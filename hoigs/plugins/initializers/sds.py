@@ -44,7 +44,7 @@ from hoigs.plugins.initializers.sds_pipelines import (
 )
 
 GUIDANCE = {"text": 100.0, "zero123": 5.0, "stable-zero123": 5.0}  # DreamFusion; DreamGaussian
-SOURCES = ("diffusion.py", "distillation.py", "initializer.py", "pipelines.py")
+SOURCES = ("sds.py", "sds_distillation.py", "sds_pipelines.py")
 
 
 class SdsInitializerConfig(PlacingConfig):

@@ -8,16 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.rasterizers.warp.frame import (
-    ABSOLUTES,
-    POSE,
-    RECORD,
-    SMALLEST_ALPHA,
-    Images,
-    Inputs,
-    Settings,
-    TileIntersections,
-)
+from hoigs.rasterizers.warp.frame import Images, Inputs, Settings, TileIntersections
+from hoigs.rasterizers.warp.records import ABSOLUTES, POSE, RECORD, SMALLEST_ALPHA
 
 # What the projection kernels are given and write, on every device.
 

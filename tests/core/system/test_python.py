@@ -43,7 +43,7 @@ def test_every_python_that_is_started_is_safe():
         if names & {"multiprocessing", "ProcessPoolExecutor", "runpy.run_path"}:
             assert "safe_children" in names, path
             used.add(path.name)
-    assert seen >= 8 and used == {"direct.py"}
+    assert seen >= 8 and used == {"run.py"}
     assert set(PYTHON) & SAFE
 
 
@@ -68,10 +68,10 @@ def test_a_job_imports_nothing_from_its_folder(trap):
 
 def test_a_pool_imports_nothing_from_its_folder(trap):
     code = (
-        "from hoigs.studies.stress import run as direct\n"
-        "direct._one_thread = int\n"
+        "from hoigs.studies.stress import run\n"
+        "run._one_thread = int\n"
         "if __name__ == '__main__':\n"
-        "    with direct.processes(1, 1) as pool: print(pool.submit(abs, -3).result())\n"
+        "    with run.processes(1, 1) as pool: print(pool.submit(abs, -3).result())\n"
     )
     script = trap.with_name("elsewhere") / "main.py"
     script.parent.mkdir()

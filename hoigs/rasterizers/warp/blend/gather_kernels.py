@@ -3,7 +3,7 @@
 """CUDA kernels that clear and sum the partial gradients; see `common.records`."""
 
 from hoigs.core.system.quiet_warp import wp
-from hoigs.rasterizers.warp.frame import F32, I32
+from hoigs.rasterizers.warp.records import F32, I32
 
 wp.set_module_options({"enable_backward": False})
 

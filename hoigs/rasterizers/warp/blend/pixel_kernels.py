@@ -8,7 +8,7 @@ Their C++ stands in `pixel_source`; threads are numbered 32 tile + lane.
 from hoigs.core.fast.launch import CPU_FLAGS
 from hoigs.core.system.quiet_warp import wp
 from hoigs.rasterizers.warp.blend import pixel_source
-from hoigs.rasterizers.warp.frame import F32, I32
+from hoigs.rasterizers.warp.records import F32, I32
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})
 

@@ -10,8 +10,8 @@ shared `counters`. What an item writes does not depend on the worker.
 from hoigs.core.fast.launch import CPU_FLAGS
 from hoigs.core.system.quiet_warp import wp
 from hoigs.rasterizers.warp.cpu import tile_source
-from hoigs.rasterizers.warp.frame import F32, I32, RECORD, U64
 from hoigs.rasterizers.warp.intersect.tile_spans import span, tile_row_range
+from hoigs.rasterizers.warp.records import F32, I32, RECORD, U64
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS, "max_unroll": 1})
 

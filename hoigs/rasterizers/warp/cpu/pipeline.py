@@ -23,8 +23,6 @@ from hoigs.rasterizers.warp.cpu import native_kernels as kernels
 from hoigs.rasterizers.warp.cpu.tile_source import MAX_ROWS
 from hoigs.rasterizers.warp.cpu.workers import Cores
 from hoigs.rasterizers.warp.frame import (
-    ABSOLUTES,
-    MOMENTS,
     Images,
     Inputs,
     Settings,
@@ -34,6 +32,7 @@ from hoigs.rasterizers.warp.frame import (
 from hoigs.rasterizers.warp.intersect import portable_kernels
 from hoigs.rasterizers.warp.intersect.tile_spans import TILE_WIDTH
 from hoigs.rasterizers.warp.project.kernels import project, project_adjoint
+from hoigs.rasterizers.warp.records import ABSOLUTES, MOMENTS
 
 
 class CpuPipeline(ABC):

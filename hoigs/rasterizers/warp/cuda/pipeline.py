@@ -24,8 +24,6 @@ from hoigs.rasterizers.warp.blend import (
 from hoigs.rasterizers.warp.cuda.intersections import IntersectionCapacity, Intersector
 from hoigs.rasterizers.warp.cuda.launch import CudaStreams
 from hoigs.rasterizers.warp.frame import (
-    ABSOLUTES,
-    MOMENTS,
     Images,
     Inputs,
     Settings,
@@ -35,6 +33,7 @@ from hoigs.rasterizers.warp.frame import (
 from hoigs.rasterizers.warp.project.kernels import project, project_adjoint
 from hoigs.rasterizers.warp.project.spherical_harmonics_adjoint import BLOCK as SH_BLOCK
 from hoigs.rasterizers.warp.project.spherical_harmonics_adjoint import harmonics_adjoint
+from hoigs.rasterizers.warp.records import ABSOLUTES, MOMENTS
 
 TILE_BLOCK = 32 * pixel_source.WARPS
 

@@ -6,10 +6,10 @@ Their C++ stands in `count_place_source` and `plan_sort_source`.
 """
 
 from hoigs.core.system.quiet_warp import wp
-from hoigs.rasterizers.warp.frame import F32, I32, I64
 from hoigs.rasterizers.warp.intersect import cuda_source as count_place_source
 from hoigs.rasterizers.warp.intersect import cuda_source as plan_sort_source
 from hoigs.rasterizers.warp.intersect.tile_spans import TILE_WIDTH
+from hoigs.rasterizers.warp.records import F32, I32, I64
 
 wp.set_module_options({"enable_backward": False})
 

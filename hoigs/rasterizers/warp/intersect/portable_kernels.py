@@ -5,8 +5,8 @@
 
 from hoigs.core.fast.launch import CPU_FLAGS
 from hoigs.core.system.quiet_warp import wp
-from hoigs.rasterizers.warp.frame import F32, I32, I64, RECORD
 from hoigs.rasterizers.warp.intersect.tile_spans import span, tile_row_range
+from hoigs.rasterizers.warp.records import F32, I32, I64, RECORD
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})
 

@@ -3,7 +3,7 @@
 """Which tiles a splat touches, as Warp functions. All tiles are TILE_WIDTH pixels wide."""
 
 from hoigs.core.system.quiet_warp import wp
-from hoigs.rasterizers.warp.frame import F32, HALF_HEIGHT, HALF_WIDTH, SHEAR, SLOPE, WAIST_X, X, Y
+from hoigs.rasterizers.warp.records import F32, HALF_HEIGHT, HALF_WIDTH, SHEAR, SLOPE, WAIST_X, X, Y
 
 TILE_WIDTH = 16
 TILE_WIDTH_C = wp.constant(TILE_WIDTH)

@@ -7,7 +7,7 @@ The rules, names and limits are those at the head of `hoigs.core.maths.projectio
 
 from hoigs.core.maths import projection as rules
 from hoigs.core.system.quiet_warp import wp
-from hoigs.rasterizers.warp.frame import F32
+from hoigs.rasterizers.warp.records import F32
 
 LIMIT = wp.constant(rules.LIMIT)
 MAX_VARIANCE = wp.constant(rules.MAX_VARIANCE)

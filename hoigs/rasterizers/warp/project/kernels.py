@@ -6,7 +6,20 @@ adjoint from partial gradients to the raw fields."""
 
 from hoigs.core.fast.launch import CPU_FLAGS
 from hoigs.core.system.quiet_warp import wp
-from hoigs.rasterizers.warp.frame import (
+from hoigs.rasterizers.warp.project.geometry import (
+    is_regular,
+    onto_screen,
+    onto_screen_adjoint,
+    pose_rotation,
+    pose_translation,
+)
+from hoigs.rasterizers.warp.project.spherical_harmonics import (
+    learns,
+    not_negative,
+    sh_color,
+    sh_color_adjoint,
+)
+from hoigs.rasterizers.warp.records import (
     DEPTH,
     F32,
     HALF_HEIGHT,
@@ -38,19 +51,6 @@ from hoigs.rasterizers.warp.frame import (
     C,
     X,
     Y,
-)
-from hoigs.rasterizers.warp.project.geometry import (
-    is_regular,
-    onto_screen,
-    onto_screen_adjoint,
-    pose_rotation,
-    pose_translation,
-)
-from hoigs.rasterizers.warp.project.spherical_harmonics import (
-    learns,
-    not_negative,
-    sh_color,
-    sh_color_adjoint,
 )
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS, "max_unroll": 4})

@@ -7,7 +7,7 @@ Order and signs are those of `hoigs.core.maths.spherical_harmonics`, whose const
 
 from hoigs.core.maths import spherical_harmonics as sh
 from hoigs.core.system.quiet_warp import wp
-from hoigs.rasterizers.warp.frame import VEC3
+from hoigs.rasterizers.warp.records import VEC3
 
 Vec16 = wp.types.vector(16, wp.float32)
 

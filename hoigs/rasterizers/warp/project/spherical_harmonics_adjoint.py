@@ -9,7 +9,6 @@ from 150 to 58 microseconds.
 """
 
 from hoigs.core.system.quiet_warp import wp
-from hoigs.rasterizers.warp.frame import F32, I32, M_RED, POSE, RECORD, RED, VEC3
 from hoigs.rasterizers.warp.project.kernels import camera_center
 from hoigs.rasterizers.warp.project.spherical_harmonics import (
     Vec16,
@@ -17,6 +16,7 @@ from hoigs.rasterizers.warp.project.spherical_harmonics import (
     sh_basis,
     sh_direction_gradient,
 )
+from hoigs.rasterizers.warp.records import F32, I32, M_RED, POSE, RECORD, RED, VEC3
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 16})
 
