@@ -100,7 +100,7 @@ _PUBLIC = {
 }
 
 # public modules, that load with their first use as `hoigs.metrics`
-_MODULES = ("metrics",)
+_MODULES = ("gsplat", "metrics")
 
 __all__ = ["__version__", *_MODULES, *_PUBLIC]  # noqa: PLE0604  (the names are strings)
 

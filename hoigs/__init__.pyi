@@ -1,5 +1,6 @@
 # written by scripts/public_stub.py
 
+from hoigs import gsplat as gsplat
 from hoigs import metrics as metrics
 from hoigs.core.config import ComponentConfig as ComponentConfig
 from hoigs.core.errors import HoigsError as HoigsError

@@ -31,6 +31,7 @@ MODULES = (
     "hoigs.core.reporting",
     "hoigs.core.registry.registry",
     "hoigs.core.values.topology",
+    "hoigs.gsplat",
     "hoigs.metrics",
     "hoigs.testing",
 )

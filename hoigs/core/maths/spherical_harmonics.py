@@ -1,4 +1,4 @@
-"""Real spherical harmonics of degree 0 to 3 for view-dependent colour."""
+"""Real spherical harmonics of degree 0 to 4 for view-dependent colour."""
 
 from __future__ import annotations
 
@@ -18,6 +18,15 @@ C3 = (
     0.3731763325901154,
     1.445305721320277,
 )
+C4 = (
+    2.5033429417967046,
+    1.7701307697799304,
+    0.9461746957575601,
+    0.6690465435572892,
+    0.10578554691520431,
+    0.47308734787878004,
+    0.6258357354491761,
+)
 BLACK = 1e-6  # a colour as little below zero is zero but for rounding
 
 
@@ -29,13 +38,13 @@ def sh_basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor
 
     Args:
         directions: unit vectors (x, y, z).
-        degree: 0 to 3.
+        degree: 0 to 4; rasterizers draw up to 3.
 
     Raises:
         ValueError: another degree.
     """
-    if not 0 <= degree <= 3:
-        raise ValueError(f"spherical harmonics of degree {degree}: expected 0, 1, 2 or 3")
+    if not 0 <= degree <= 4:
+        raise ValueError(f"spherical harmonics of degree {degree}: expected 0 to 4")
     x, y, z = directions.unbind(-1)
     bands = [torch.full_like(x, C0)]
     if degree >= 1:
@@ -58,6 +67,18 @@ def sh_basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor
             -C3[2] * x * (4 * zz - xx - yy),
             C3[4] * z * (xx - yy),
             -C3[0] * x * (xx - 3 * yy),
+        ]
+    if degree >= 4:
+        bands += [
+            C4[0] * x * y * (xx - yy),
+            -C4[1] * y * z * (3 * xx - yy),
+            C4[2] * x * y * (7 * zz - 1),
+            -C4[3] * y * z * (7 * zz - 3),
+            C4[4] * (zz * (35 * zz - 30) + 3),
+            -C4[3] * x * z * (7 * zz - 3),
+            C4[5] * (xx - yy) * (7 * zz - 1),
+            -C4[1] * x * z * (xx - 3 * yy),
+            C4[6] * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
         ]
     return torch.stack(bands, dim=-1)
 
