@@ -80,6 +80,23 @@ class TimeRows:
         return (time * (self.count - 1) - self.first) / max(1, present - 1)
 
 
+class OverTime(nn.Module):
+    """A module that reads rows for times: of its own parameters, or of values that it is given.
+
+    Attributes:
+        rows: which of them are there.
+        time_rows: `rows` by the name of each own parameter that has them along axis 1.
+    """
+
+    rows: TimeRows
+    time_rows: Mapping[str, TimeRows]
+
+    def keep_rows(self, count: int, *names: str) -> None:
+        """`count` rows for times, of the parameters `names`."""
+        self.rows = TimeRows(count)
+        self.time_rows = dict.fromkeys(names, self.rows)
+
+
 def timed_parameters(model: nn.Module) -> Iterator[tuple[str, TimeRows]]:
     """The dotted name of every parameter that has rows for times."""
     for path, module in model.named_modules():

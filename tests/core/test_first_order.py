@@ -8,10 +8,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from hoigs.core.device import replacement
 from hoigs.core.errors import DerivativeError
-from hoigs.core.fast.choose import native
+from hoigs.core.fast import dense
 from hoigs.core.maths import networks
 from hoigs.core.maths.feature_planes import sample_planes
+from hoigs.core.maths.nearest import point_roughness
 from hoigs.core.maths.skinning import skin_gaussians
 from hoigs.metrics.kernels.image_loss import Target, image_losses
 
@@ -22,7 +24,7 @@ def planes(x: Tensor) -> Tensor:
 
 def layers(x: Tensor) -> Tensor:
     layer = nn.Sequential(nn.Linear(3, 5), nn.ReLU(), nn.Linear(5, 2))
-    return networks.dense(layer, x.repeat(networks.WORTHWHILE, 1))
+    return networks.dense(layer, x.repeat(dense.WORTHWHILE, 1))
 
 
 def skin(x: Tensor) -> Tensor:
@@ -33,9 +35,9 @@ def skin(x: Tensor) -> Tensor:
 
 
 def roughness(x: Tensor) -> Tensor:
-    kernels = native("roughness", x)
-    assert kernels is not None
-    return kernels.Roughness.apply(x, torch.tensor([[1], [0], [0], [1]], dtype=torch.int64))
+    neighbours = torch.tensor([[1], [0], [0], [1]])
+    assert replacement(point_roughness, x, neighbours) is not None
+    return point_roughness(x, neighbours)
 
 
 def photometric(x: Tensor) -> Tensor:
@@ -45,7 +47,7 @@ def photometric(x: Tensor) -> Tensor:
 @pytest.mark.parametrize("function", [planes, layers, skin, roughness, photometric])
 def test_a_penalty_of_gradients_is_refused(function: Callable[[Tensor], Tensor]) -> None:
     torch.manual_seed(0)
-    if function is layers and not networks._wide_vectors():
+    if function is layers and not dense.wide_vectors():
         pytest.skip("no AVX-512")
     x = torch.rand(4, 3, requires_grad=True)
     # the upstream gradient needs no gradient here, where once_differentiable is silent

@@ -2,10 +2,11 @@
 # (Warp's arrays annotate as values)
 """A layer of a network, relu(x W^T + b): one kernel forward and one backward."""
 
+import functools
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from hoigs.core.fast.launch import CPU_FLAGS, shared
@@ -246,9 +247,29 @@ def layer_adjoint(
     )  # fmt: skip
 
 
-def fits(*widths: int) -> bool:
-    """Whether the kernels take layers of these widths."""
-    return max(widths) <= MAX_WIDTH
+WORTHWHILE = 256  # rows: fewer take as long either way
+
+
+def dense(layers: nn.Sequential, rows: Tensor) -> Any:
+    """As `networks.dense`, on CPUs with AVX-512: fused, where torch takes MKL for float32, which on
+    processors of AMD has AVX2 only."""
+    linears = [layer for layer in layers if isinstance(layer, nn.Linear)]
+    widths = [size for layer in linears for size in (layer.in_features, layer.out_features)]
+    if len(rows) < WORTHWHILE or not wide_vectors() or max(widths) > MAX_WIDTH:
+        return NotImplemented
+    chain = list(layers)
+    for layer, after in zip(chain, [*chain[1:], None], strict=True):
+        if isinstance(layer, nn.Linear):
+            relu = isinstance(after, nn.ReLU)
+            rows = DenseLayer.apply(rows, layer.weight, layer.bias, relu)
+        elif not isinstance(layer, nn.ReLU):
+            raise TypeError(f"dense: expected Linear and ReLU, got {type(layer).__name__}")
+    return rows
+
+
+@functools.cache
+def wide_vectors() -> bool:
+    return torch.backends.cpu.get_cpu_capability() == "AVX512"
 
 
 def whole_vectors(width: int) -> tuple[int, int]:

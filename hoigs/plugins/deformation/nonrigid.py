@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.fast.graphs import Time
+from hoigs.core.device import Time
 from hoigs.core.maths.feature_planes import PairedPlanes
 from hoigs.core.maths.networks import dense, zeroed
 from hoigs.core.values.gaussians import SH_C0, GaussianDelta, Gaussians

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.fast.graphs import constant
+from hoigs.core.device import constant
 from hoigs.core.interfaces.body import (
     BODY_JOINT_PARTS,
     LEFT_HAND_PART,
