@@ -1,4 +1,4 @@
-"""Parameters whose number or place changes in training: resized, by rows of time, or on the CPU."""
+"""Parameters: how they start, and where their number or place changes in training."""
 
 from __future__ import annotations
 
@@ -15,6 +15,13 @@ import torch
 from torch import Tensor, nn
 
 from hoigs.core.system.threads import c_library
+
+
+def zeroed(layer: nn.Linear) -> nn.Linear:
+    """`layer` with weights and bias of zero, for a network that starts by changing nothing."""
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
 
 
 class Resizing(nn.Module):

@@ -19,7 +19,6 @@ from hoigs.core.fast import batched
 KERNELS = {
     "hoigs.core.maths.feature_planes.sample_planes": "planes",
     "hoigs.core.maths.nearest.point_roughness": "roughness",
-    "hoigs.core.maths.networks.dense": "dense",
     "hoigs.core.maths.rotations.turned_quats": "skin",
     "hoigs.core.maths.skinning.skin_gaussians": "skin",
 }

@@ -14,7 +14,6 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.device import Time, filled
 from hoigs.core.interfaces.deformation import DeformationModel, ProvidesVelocity
 from hoigs.core.interfaces.features import FeatureExtractor
-from hoigs.core.maths.networks import dense
 from hoigs.core.maths.splines import (
     Interval,
     Knots,
@@ -147,7 +146,7 @@ class SplineMotionFeatures(FeatureExtractor):
         inputs = [velocity, filled(velocity, (len(canonical), 1), moment.time)]
         if self.config.embedding != "none":
             inputs.insert(1, self.embedded(len(canonical), moment.time))
-        features = dense(self.mlp, torch.cat(inputs, dim=-1))
+        features = self.mlp(torch.cat(inputs, dim=-1))
         with torch.no_grad():
             positions = deformation.means_at(canonical, moment)
         return Tokens(features, positions)

@@ -20,8 +20,8 @@ from hoigs.core.interfaces.body import (
     RIGHT_HAND_PART,
 )
 from hoigs.core.interfaces.interaction import InteractionModule
-from hoigs.core.maths.networks import zeroed
 from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.parameters import zeroed
 from hoigs.core.values.tokens import POSE_JOINTS, EntityKind, Residual, Role, Tokens
 
 # The distance mask B (HOIGS, Eq. 12), and its smooth form.

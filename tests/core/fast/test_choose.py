@@ -54,7 +54,7 @@ def test_where_kernels_do_not_compile_torch_does_the_same(monkeypatch: pytest.Mo
 def test_importing_the_mathematics_does_not_start_warp() -> None:
     code = """
 import sys
-import hoigs.core.maths.feature_planes, hoigs.core.maths.networks, hoigs.core.maths.skinning
+import hoigs.core.maths.feature_planes, hoigs.core.maths.skinning
 assert "warp" not in sys.modules and "hoigs.core.fast" not in sys.modules
 """
     root = Path(__file__).parents[3]

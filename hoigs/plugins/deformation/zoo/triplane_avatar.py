@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from hoigs.core.interfaces.body import LEFT_HAND_PART, PELVIS, RIGHT_HAND_PART
 from hoigs.core.maths.feature_planes import axis_pairs, sample_planes
 from hoigs.core.maths.nearest import nearest, neighbours_of, point_roughness
-from hoigs.core.maths.networks import zeroed
 from hoigs.core.maths.rotations import (
     axis_angle_to_matrices,
     matrices_to_quats,
@@ -25,6 +24,7 @@ from hoigs.core.maths.rotations import (
     quats_to_matrices,
 )
 from hoigs.core.maths.skinning import skin_quats
+from hoigs.core.parameters import zeroed
 from hoigs.core.values.gaussians import SH_C0, Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import Residual
