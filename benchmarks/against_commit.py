@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 import copy
+import importlib
 import json
 import os
 import signal
@@ -46,10 +47,9 @@ def serve(options: argparse.Namespace) -> None:
     import torch
 
     torch.set_num_threads(options.threads)
-    with suppress(ImportError):  # as the command line does, which older trees may not
-        from hoigs.core.system.memory import keep_freed_memory
-
-        keep_freed_memory()
+    for module in ("threads", "memory"):  # as the command line does; where older trees have it
+        with suppress(ImportError, AttributeError):
+            importlib.import_module(f"hoigs.core.system.{module}").keep_freed_memory()
     from hoigs.training.session import Session
     from hoigs.viewing.playback import Playback
 

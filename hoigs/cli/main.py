@@ -26,8 +26,11 @@ from hoigs.cli import train as compress
 from hoigs.cli import train as evaluate
 from hoigs.cli import train as needs
 from hoigs.cli.failures import GuardedGroup, failures_as_messages
-from hoigs.core.system.memory import keep_freed_memory
-from hoigs.core.system.threads import share_processors, short_waits_when_busy
+from hoigs.core.system.threads import (
+    keep_freed_memory,
+    share_processors,
+    short_waits_when_busy,
+)
 
 app = typer.Typer(
     name="hoigs",

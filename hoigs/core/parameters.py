@@ -1,4 +1,4 @@
-"""Parameters whose number or place changes in training: resized, by rows of time, or on the CPU."""
+"""Parameters: how they start, and where their number or place changes in training."""
 
 from __future__ import annotations
 
@@ -15,6 +15,13 @@ import torch
 from torch import Tensor, nn
 
 from hoigs.core.system.threads import c_library
+
+
+def zeroed(layer: nn.Linear) -> nn.Linear:
+    """`layer` with weights and bias of zero, for a network that starts by changing nothing."""
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
 
 
 class Resizing(nn.Module):
@@ -78,6 +85,23 @@ class TimeRows:
         if present == self.count:
             return time
         return (time * (self.count - 1) - self.first) / max(1, present - 1)
+
+
+class OverTime(nn.Module):
+    """A module that reads rows for times: of its own parameters, or of values that it is given.
+
+    Attributes:
+        rows: which of them are there.
+        time_rows: `rows` by the name of each own parameter that has them along axis 1.
+    """
+
+    rows: TimeRows
+    time_rows: Mapping[str, TimeRows]
+
+    def keep_rows(self, count: int, *names: str) -> None:
+        """`count` rows for times, of the parameters `names`."""
+        self.rows = TimeRows(count)
+        self.time_rows = dict.fromkeys(names, self.rows)
 
 
 def timed_parameters(model: nn.Module) -> Iterator[tuple[str, TimeRows]]:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from hoigs.core.fast.graphs import constant
+from hoigs.core.device import constant
 from hoigs.core.interfaces.body import BODY_JOINT_PARTS, BodyModel, BodyOutput, BodySurface
 from hoigs.core.interfaces.deformation import DeformationModel
 from hoigs.core.maths.rotations import axis_angle_to_matrices

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from hoigs.core.fast.graphs import constant
+from hoigs.core.device import constant
 from hoigs.core.interfaces.density import DensityControl
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.model.camera_refinement import CameraRefinement

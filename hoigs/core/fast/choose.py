@@ -1,24 +1,41 @@
-"""Whether a computation can run by the kernels of this folder."""
+"""Which functions of `core.maths` have faster versions in this folder, and where these apply."""
 
 from __future__ import annotations
 
 import functools
 import importlib
 import warnings
+from collections.abc import Callable
 from types import ModuleType
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from hoigs.core.device import replace
+from hoigs.core.fast import batched
 
-def native(name: str, *tensors: Tensor) -> ModuleType | None:
-    """The functions of `name`, a module beside this, for float32 tensors on a CPU; else None.
+# By kernels of the module named here, for float32 tensors on CPUs. Both are loaded at first use.
+KERNELS = {
+    "hoigs.core.maths.feature_planes.sample_planes": "planes",
+    "hoigs.core.maths.nearest.point_roughness": "roughness",
+    "hoigs.core.maths.rotations.turned_quats": "skin",
+    "hoigs.core.maths.skinning.skin_gaussians": "skin",
+}
+# By fewer operations of torch, for tensors of any kind anywhere.
+BATCHED = {
+    "hoigs.core.maths.skinning.joint_transforms": batched.joint_transforms,
+    "hoigs.core.maths.spherical_harmonics.irradiance_basis": batched.irradiance_basis,
+    "hoigs.core.maths.splines.hermite_weights": batched.hermite_weights,
+}
 
-    None, too, with a warning, where its kernels do not compile: torch operations then do the same
-    more slowly.
-    """
-    if all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors):
-        return _compiled(name)
+
+def _by_kernel(function: str, module: str, args: tuple[Any, ...]) -> Callable[..., Any] | None:
+    """The function of `module`; None, too, with a warning, where its kernels do not compile."""
+    tensors = [x for x in args if isinstance(x, Tensor)]
+    on_cpu = all(x.device.type == "cpu" for x in tensors)
+    if on_cpu and all(x.dtype == torch.float32 or not x.is_floating_point() for x in tensors):
+        return getattr(_compiled(module), function, None)
     return None
 
 
@@ -30,6 +47,12 @@ def _compiled(name: str) -> ModuleType | None:
         module = importlib.import_module(f"hoigs.core.fast.{name}")
         wp.load_module(module, device="cpu")
     except Exception as error:  # Warp raises nothing narrower when a build fails
-        warnings.warn(f"the CPU kernels of {name} do not compile here: {error}", stacklevel=3)
+        warnings.warn(f"the CPU kernels of {name} do not compile here: {error}", stacklevel=5)
         return None
     return module
+
+
+for _name, _module in KERNELS.items():
+    replace(_name, functools.partial(_by_kernel, _name.rpartition(".")[2], _module))
+for _name, _function in BATCHED.items():
+    replace(_name, functools.partial(lambda function, args: function, _function))

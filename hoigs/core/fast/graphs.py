@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import gc
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 
 @contextmanager
@@ -44,48 +41,14 @@ def no_garbage_collection() -> Iterator[None]:
             gc.enable()
 
 
-# Times that may be 0-d tensors, and constants that stay on the device.
-#
-# A moment's time is usually a Python number. A captured CUDA graph would repeat that number at
-# every replay, so graphs get the time as a 0-d tensor on the device, which is overwritten before
-# each replay. Functions that take a `Time` accept both and never copy a tensor back to the host.
-
-Time = float | Float[Tensor, ""]
-
-
-def filled(like: Float[Tensor, "..."], shape: tuple[int, ...], time: Time) -> Float[Tensor, "..."]:
-    """A tensor of `shape`, with the dtype and device of `like`, filled with `time`."""
-    if isinstance(time, Tensor):
-        return time.to(like.dtype).expand(shape)
-    return like.new_full(shape, time)
-
-
-def constant(values: Any, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    """A cached tensor of (nested) tuples of numbers on the device of `like`; never write to it.
-
-    A fresh tensor would be copied from the host, which waits for all work queued on the device.
-
-    Args:
-        dtype: that of `like` by default.
-    """
-    return _constant(values, like.dtype if dtype is None else dtype, like.device)
-
-
-@functools.cache  # never freed: captured graphs go on reading these tensors
-def _constant(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    with torch.inference_mode(False):
-        return torch.tensor(values, dtype=dtype, device=device)
-
-
 # Which components may be captured in a CUDA graph.
 #
 # A replay repeats the operations of one call on the same memory. A component may be captured, and
 # declares so by `cuda_graph_safe = True` in its own class, if in training mode
 #
-# - it reads the time, a 0-d tensor (`hoigs.core.fast.graphs`), and the values of
-#   parameters, buffers and poses on the device only: no `float(x)`, `x.item()`, `if x > 0` or
-#     boolean
-#   indexing, and no tensor made from Python numbers (`device_constants.constant` keeps those);
+# - it reads the time, a 0-d tensor (`hoigs.core.device.Time`), and the values of parameters,
+#   buffers and poses on the device only: no `float(x)`, `x.item()`, `if x > 0` or boolean indexing,
+#   and no tensor made from Python numbers (`hoigs.core.device.constant` keeps those);
 # - its sequence of operations depends on nothing that changes from step to step, except shapes and
 #   which tensors are parameters or buffers: not on `progress`, nor on a count of calls;
 # - nothing is random, and no call keeps anything for the next one.

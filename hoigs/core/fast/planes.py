@@ -207,6 +207,11 @@ def sample_adjoint(
     )  # fmt: skip
 
 
+def sample_planes(planes: Tensor, points: Tensor) -> Any:
+    """As `feature_planes.sample_planes`, of planes whose indices are 32-bit numbers."""
+    return SampledPlanes.apply(planes, points) if planes.numel() < 2**31 else NotImplemented
+
+
 class SampledPlanes(torch.autograd.Function):
     """`feature_planes.sample_planes`, of float32 tensors on a CPU."""
 

@@ -88,6 +88,11 @@ def apart_adjoint(
     backward_native(counter, count, channels, many, apart, neighbours, scale, gradient)
 
 
+def point_roughness(values: Tensor, neighbours: Tensor) -> Tensor:
+    """As `nearest.point_roughness`."""
+    return Roughness.apply(values, neighbours)
+
+
 class Roughness(torch.autograd.Function):
     """Mean over rows of |x_i - mean of its neighbours' x|^2, of float32 rows on a CPU."""
 

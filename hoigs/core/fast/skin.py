@@ -232,9 +232,19 @@ def skin_adjoint(
     )  # fmt: skip
 
 
-def fits(joints: int) -> bool:
-    """Whether the kernels take so many joints."""
-    return joints <= MAX_JOINTS
+def turned_quats(change: Tensor, quats: Tensor) -> Tensor:
+    """As `rotations.turned_quats`."""
+    return ComposedQuats.apply(change, quats, 1.0)
+
+
+def skin_gaussians(
+    points: Tensor, quats: Tensor, weights: Tensor, transforms: Tensor, turns: Tensor
+) -> Any:
+    """As `skinning.skin_gaussians`, of no more joints than the kernel takes."""
+    if len(turns) > MAX_JOINTS:
+        return NotImplemented
+    table = torch.cat((transforms[:, :3].flatten(1), turns), 1)
+    return SkinnedGaussians.apply(points, quats, weights, table)
 
 
 class ComposedQuats(torch.autograd.Function):

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.device import constant
 from hoigs.core.errors import RenderError
-from hoigs.core.fast.graphs import constant
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.rasterizer import Rasterizer

@@ -16,9 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hoigs.core.fast.choose import native
-from hoigs.core.fast.graphs import Time, constant, filled
-from hoigs.core.parameters import TimeRows
+from hoigs.core.device import Time, filled, replaceable
+from hoigs.core.parameters import OverTime
 
 # Axes (0 x, 1 y, 2 z) of the space planes xy, xz, yz, and the axis that each time plane pairs
 # with time so that the product of the two sees all four coordinates: xy*zt, xz*yt, yz*xt
@@ -26,6 +25,7 @@ SPACE_AXES = ((0, 1), (0, 2), (1, 2))
 TIME_AXES = (2, 1, 0)
 
 
+@replaceable
 def sample_planes(
     planes: Float[Tensor, "P H W C"], points: Float[Tensor, "P N 2"]
 ) -> Float[Tensor, "N F"]:
@@ -34,33 +34,21 @@ def sample_planes(
     Args:
         points: in [-1, 1]; first coordinate along W, second along H.
     """
-    kernels = native("planes", planes, points)
-    if kernels is not None and planes.numel() < 2**31:
-        fast: Tensor = kernels.SampledPlanes.apply(planes, points)
-        return fast
-    return _sampled(planes, points)
-
-
-def _sampled(
-    planes: Float[Tensor, "P H W C"], points: Float[Tensor, "P N 2"]
-) -> Float[Tensor, "N F"]:
-    """The same by torch operations, on any device and in any precision."""
     count, height, width, channels = planes.shape
-    size = constant((width - 1, height - 1), points)
-    cell = ((points + 1) / 2).clamp(0, 1) * size
-    corner = torch.minimum(cell.detach().floor(), size - 1).clamp_min(0)
-    fx, fy = (cell - corner).unbind(-1)
-    x, y = corner.long().unbind(-1)
-    offset = constant(tuple((i * height * width,) for i in range(count)), points, torch.long)
+    u, v = ((points + 1) / 2).clamp(0, 1).unbind(-1)
+    x, y = u * (width - 1), v * (height - 1)  # in cells
+    left = x.detach().floor().clamp(max=width - 2).clamp_min(0)
+    top = y.detach().floor().clamp(max=height - 2).clamp_min(0)
+    fx, fy = x - left, y - top
     # on a plane that is one cell wide or high, the neighbour is the cell itself
     right, below = min(1, width - 1), min(1, height - 1) * width
-    first = offset + y * width + x
-    rows = first[..., None] + constant((0, right, below, below + right), first)
-    along_x, along_y = torch.stack((1 - fx, fx), -1), torch.stack((1 - fy, fy), -1)
-    weights = (along_y[..., :, None] * along_x[..., None, :]).flatten(-2)
+    plane = torch.arange(count, device=points.device)[:, None] * (height * width)
+    cell = plane + top.long() * width + left.long()
+    cells = torch.stack((cell, cell + right, cell + below, cell + below + right), -1)
+    weights = torch.stack(((1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx), -1)
     # gathering four contiguous rows per point: less to read than grid_sample's channels apart
     sampled = nn.functional.embedding_bag(
-        rows.flatten(0, 1),
+        cells.flatten(0, 1),
         planes.reshape(-1, channels),
         per_sample_weights=weights.flatten(0, 1),
         mode="sum",
@@ -72,16 +60,17 @@ def axis_pairs(
     points: Float[Tensor, "N 3"], axes: tuple[tuple[int, int], ...] = SPACE_AXES
 ) -> Float[Tensor, "P N 2"]:
     """Two coordinates of each point for each plane."""
-    flat = constant(tuple(axis for pair in axes for axis in pair), points, torch.long)
-    return points.index_select(1, flat).unflatten(1, (len(axes), 2)).transpose(0, 1)
+    xyz = points.unbind(1)
+    return torch.stack([torch.stack((xyz[first], xyz[second]), 1) for first, second in axes])
 
 
 def timed_pairs(
     points: Float[Tensor, "N 3"], time: Time, axes: tuple[int, ...]
 ) -> Float[Tensor, "P N 2"]:
     """One coordinate of each point for each plane, paired with a time in [0, 1] as 2 t - 1."""
-    chosen = points.index_select(1, constant(axes, points, torch.long)).T
-    return torch.stack((chosen, filled(points, tuple(chosen.shape), 2 * time - 1)), -1)
+    xyz = points.unbind(1)
+    moment = filled(points, (len(points),), 2 * time - 1)
+    return torch.stack([torch.stack((xyz[axis], moment), 1) for axis in axes])
 
 
 def roughness(values: Float[Tensor, "*shape"], dim: int = 1) -> Float[Tensor, ""]:
@@ -94,7 +83,7 @@ def roughness(values: Float[Tensor, "*shape"], dim: int = 1) -> Float[Tensor, ""
     return values.diff(dim=dim).diff(dim=dim).square().mean()
 
 
-class PairedPlanes(nn.Module):
+class PairedPlanes(OverTime):
     """Three space planes, each multiplied with the time plane of the third axis (HexPlane).
 
     f(x, y, z) concatenates the space planes; phi(x, y, z, t) multiplies each with its time plane
@@ -121,8 +110,7 @@ class PairedPlanes(nn.Module):
         self.space = nn.Parameter(torch.randn(3, resolution, resolution, channels) * spread)
         timed = torch.ones(3, time_resolution, resolution, channels)
         self.register_parameter("time", nn.Parameter(timed) if time_resolution else None)
-        self.rows = TimeRows(time_resolution)
-        self.time_rows = {"time": self.rows} if time_resolution else {}
+        self.keep_rows(time_resolution, *(["time"] if time_resolution else []))
 
     def forward(
         self, points: Float[Tensor, "N 3"], time: Time | None = None
@@ -143,7 +131,7 @@ class PairedPlanes(nn.Module):
         return self.space.new_zeros(()) if self.time is None else (self.time - 1).abs().mean()
 
 
-class ProductPlanes(nn.Module):
+class ProductPlanes(OverTime):
     """Six planes xy, xz, yz, xt, yt, zt multiplied, several resolutions concatenated (K-Planes).
 
     f(x, y, z) is the product of the space planes alone; phi(x, y, z, t) multiplies in the time
@@ -173,8 +161,7 @@ class ProductPlanes(nn.Module):
             for size in resolutions
             if time_resolution
         )
-        self.rows = TimeRows(time_resolution)
-        self.time_rows = {f"time.{i}": self.rows for i in range(len(self.time))}
+        self.keep_rows(time_resolution, *(f"time.{i}" for i in range(len(self.time))))
 
     def forward(
         self, points: Float[Tensor, "N 3"], time: Time | None = None

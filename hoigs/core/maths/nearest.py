@@ -1,4 +1,4 @@
-"""The nearest neighbours of points, and the surface that they lie on."""
+"""The nearest neighbours of points, their surface, and how rough values are over it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from hoigs.core.device import replaceable
 
 
 def nearest(
@@ -78,3 +80,40 @@ def denser(
             torch.cat((old, new)) for old, new in zip((points, colors), between, strict=True)
         )
     return points, colors
+
+
+# How rough values are over a surface: the Laplacian of L_reg (HOIGS, Eq. 16), as ExAvatar has it.
+
+
+def neighbours_of(points: Float[Tensor, "N 3"], count: int = 4) -> Int[Tensor, "N k"] | None:
+    """Indices of each point's nearest neighbours, or None if there are too few points."""
+    return nearest(points, count)[0] if len(points) > count else None
+
+
+@replaceable
+def point_roughness(
+    values: Float[Tensor, "N D"], neighbours: Int[Tensor, "N k"]
+) -> Float[Tensor, ""]:
+    """Mean over points of |x_i - mean of its neighbours' x|^2."""
+    return (values - values[neighbours].mean(1)).square().sum(-1).mean()
+
+
+def mesh_edges(faces: Int[Tensor, "F 3"]) -> Int[Tensor, "E 2"]:
+    """Every edge of a mesh once in each direction."""
+    pairs = torch.cat((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+    return torch.unique(torch.cat((pairs, pairs.flip(1))), dim=0)
+
+
+def mesh_roughness(values: Float[Tensor, "V D"], edges: Int[Tensor, "E 2"]) -> Float[Tensor, ""]:
+    """Mean over vertices of |x_v - mean of the vertices that share an edge with v|^2.
+
+    This is the uniform Laplacian. Vertices without an edge count as smooth.
+
+    Args:
+        edges: `mesh_edges` of the mesh.
+    """
+    # not bincount, which waits for the device to report how many bins there are
+    degree = values.new_zeros(len(values)).index_add(0, edges[:, 0], values.new_ones(len(edges)))
+    sums = torch.zeros_like(values).index_add(0, edges[:, 0], values[edges[:, 1]])
+    means = torch.where(degree[:, None] > 0, sums / degree.clamp_min(1)[:, None], values)
+    return (values - means).square().sum(-1).mean()

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.fast.graphs import constant
+from hoigs.core.device import constant
 from hoigs.core.maths.rotations import (
     axis_angle_to_quats,
     conjugate_quats,

@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.fast.choose import native
-from hoigs.core.fast.graphs import constant
+from hoigs.core.device import constant, replaceable
 
 # Products of quaternions, and the matrices of their rotations, are sums of a few products a_i b_j.
 # A table of coefficients makes each of them two operations on all rows instead of thirty.
@@ -84,12 +83,9 @@ def multiply_quats(
     return _pairs(a, b) @ constant(HAMILTON, a)
 
 
+@replaceable
 def turned_quats(change: Float[Tensor, "N 4"], quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
     """Unit quaternions of rotations by `quats` and then by normalise((1, 0, 0, 0) + change)."""
-    kernels = native("skin", change, quats)
-    if kernels is not None:
-        composed: Tensor = kernels.ComposedQuats.apply(change, quats, 1.0)
-        return composed
     turn = normalize_quats(change + constant((1.0, 0.0, 0.0, 0.0), change))
     return multiply_quats(turn, normalize_quats(quats))
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.fast.choose import native
-from hoigs.core.fast.graphs import constant
+from hoigs.core.device import replaceable
 from hoigs.core.maths.rotations import (
     axis_angle_to_matrices,
     matrices_to_quats,
@@ -18,32 +16,23 @@ from hoigs.core.maths.rotations import (
     normalize_quats,
 )
 
-IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
+def checked_tree(parents: Sequence[int]) -> tuple[int, ...]:
+    """The parents of joints.
 
-@lru_cache(maxsize=32)
-def _doubling_rounds(parents: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
-    """For each round 0, 1, … the index of each joint's ancestor 2^round levels up.
-
-    Index 0 stands for no ancestor, j + 1 for joint j. The last round reaches the root from every
-    joint.
+    Raises:
+        ValueError: joint 0 is not the only root, or a parent does not stand before its children.
     """
-    depth: list[int] = []
     for joint, parent in enumerate(parents):
         if parent >= joint or (parent < 0) != (joint == 0):
             raise ValueError(
                 f"joint {joint} has parent {parent}: expected joint 0 as the only root (parent -1) "
                 "and every parent before its children"
             )
-        depth.append(0 if parent < 0 else depth[parent] + 1)
-    above = (0, *(parent + 1 for parent in parents))
-    rounds = []
-    for _ in range(max(depth).bit_length()):
-        rounds.append(above)
-        above = tuple(above[index] for index in above)
-    return tuple(rounds)
+    return tuple(parents)
 
 
+@replaceable
 def joint_transforms(
     rotations: Float[Tensor, "*batch J 3"],
     joints: Float[Tensor, "*shape J 3"],
@@ -51,6 +40,8 @@ def joint_transforms(
     transl: Float[Tensor, "*batch 3"],
 ) -> Float[Tensor, "*batch J 4 4"]:
     """World transform of each joint times its inverse rest transform (SMPL-X, `lbs.py` order).
+
+    G_j = G_parent [R_j | J_j - J_parent], and T_j = G_j [1 | -J_j].
 
     Args:
         rotations: local rotations, axis-angle, radians; zero is the rest pose.
@@ -61,26 +52,26 @@ def joint_transforms(
     Raises:
         ValueError: the parents are not such a tree.
     """
-    parents = tuple(parents)
-    rounds = _doubling_rounds(parents)
-    joints = joints.expand(rotations.shape)
-    # an extra joint with the identity transform stands before the root and is its parent
-    bases = torch.cat((-transl[..., None, :], joints), -2)
-    above = constant(tuple(parent + 1 for parent in parents), joints, torch.long)
-    bones = joints - bases.index_select(-2, above)
-    local = torch.cat((axis_angle_to_matrices(rotations), bones[..., None]), -1)
-    last = constant((0.0, 0.0, 0.0, 1.0), local).expand(*local.shape[:-2], 1, 4)
-    local = torch.cat((local, last), -2)
-    none = constant(IDENTITY, local).expand(*local.shape[:-3], 1, 4, 4)
-    world = torch.cat((none, local), -3)
-    # the chain of each joint doubles in every round: 4 products for a body with hands, where one
-    # product for each level of the tree would be 12
-    for indices in rounds:
-        world = world.index_select(-3, constant(indices, world, torch.long)) @ world
-    top = world[..., 1:, :3, :]
-    rotation, position = top[..., :3], top[..., 3]
-    shift = position - (rotation @ joints[..., None])[..., 0]
-    return torch.cat((torch.cat((rotation, shift[..., None]), -1), last), -2)
+    local = axis_angle_to_matrices(rotations).unbind(-3)
+    rest = joints.expand(rotations.shape).unbind(-2)
+    turns: list[Tensor] = []
+    places: list[Tensor] = []
+    for joint, parent in enumerate(checked_tree(parents)):
+        if parent < 0:
+            turns.append(local[joint])
+            places.append(rest[joint] + transl)
+            continue
+        bone = rest[joint] - rest[parent]
+        turns.append(turns[parent] @ local[joint])
+        places.append(places[parent] + _turned(turns[parent], bone))
+    shifts = [p - _turned(r, j) for r, p, j in zip(turns, places, rest, strict=True)]
+    top = torch.cat((torch.stack(turns, -3), torch.stack(shifts, -2)[..., None]), -1)
+    last = torch.eye(4, dtype=top.dtype, device=top.device)[3:]
+    return torch.cat((top, last.expand(*top.shape[:-2], 1, 4)), -2)
+
+
+def _turned(rotation: Float[Tensor, "*batch 3 3"], vector: Float[Tensor, "*batch 3"]) -> Tensor:
+    return (rotation @ vector[..., None])[..., 0]
 
 
 def transform_points(
@@ -125,8 +116,8 @@ def joint_turns(
     """
     quats = matrices_to_quats(transforms[:, :3, :3])
     with torch.no_grad():
-        above = constant(tuple(max(p, 0) for p in parents), quats, torch.long)
-        above = quats.index_select(0, above)
+        each = quats.unbind()
+        above = torch.stack([each[max(parent, 0)] for parent in parents])
         flipped = ((quats * above).sum(-1) < 0).to(quats)
         signs = 1 - 2 * torch.remainder(ancestors @ flipped, 2)
     return quats * signs[:, None]
@@ -149,6 +140,7 @@ def skin_quats(
     return normalize_quats(weights @ joint_turns(transforms, parents, ancestors))
 
 
+@replaceable
 def skin_gaussians(
     points: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],
@@ -161,10 +153,5 @@ def skin_gaussians(
     Args:
         turns: `joint_turns` of the transforms, or of ones that differ in scale and translation.
     """
-    kernels = native("skin", points, quats, weights, transforms, turns)
-    if kernels is not None and kernels.fits(len(turns)):
-        table = torch.cat((transforms[:, :3].flatten(1), turns), 1)
-        means, turned = kernels.SkinnedGaussians.apply(points, quats, weights, table)
-        return means, turned
     turned = multiply_quats(normalize_quats(weights @ turns), quats)
     return skin(points, transforms, weights), turned

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.core.device import replaceable
+
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
@@ -81,6 +83,14 @@ def sh_basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor
             C4[6] * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
         ]
     return torch.stack(bands, dim=-1)
+
+
+@replaceable
+def irradiance_basis(normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 8"]:
+    """Real spherical harmonics of degrees 1 and 2 at unit vectors, without their constants."""
+    x, y, z = normals.unbind(-1)
+    second = (x * y, y * z, z * x, x**2 - y**2, 2 * z**2 - x**2 - y**2)
+    return torch.cat((normals, torch.stack(second, -1)), -1)
 
 
 def mean_colors(

@@ -1,4 +1,4 @@
-"""Cubic Hermite splines over time (HOIGS, Sec. "Spline-based Motion Modeling").
+"""Cubic Hermite splines over time (HOIGS, Sec. "Spline-based Motion Modeling", Eq. 3 and 4).
 
 Values and tangents are kept at K knots over the clip's time [0, 1], at uniform times or at others
 (`hoigs.core.maths.splines.Knots`). An `Interval` is the position of a time among the knots; every
@@ -17,9 +17,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hoigs.core.fast.graphs import Time, constant
+from hoigs.core.device import Time, replaceable
 from hoigs.core.maths.rotations import slerp
-from hoigs.core.parameters import Resizing, TimeRows
+from hoigs.core.parameters import OverTime, Resizing
 
 
 class Interval(NamedTuple):
@@ -95,26 +95,21 @@ def knot_pair(values: Float[Tensor, "N K ..."], k: Any) -> tuple[Tensor, Tensor]
     return first, second
 
 
-# Coefficients of 1, r, r^2, r^3 (rows) in the weights of m_k, tau_k, m_{k+1}, tau_{k+1} (columns),
-# and in the derivatives of these weights.
-HERMITE = (
-    (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (-3.0, -2.0, 3.0, -1.0), (2.0, 1.0, -2.0, 1.0)
-)  # fmt: skip
-HERMITE_DERIVATIVE = (
-    (0.0, 1.0, 0.0, 0.0), (-6.0, -4.0, 6.0, -2.0), (6.0, 3.0, -6.0, 3.0), (0.0, 0.0, 0.0, 0.0)
-)  # fmt: skip
+@replaceable
+def hermite_weights(r: Any, *, derivative: bool = False) -> tuple[Any, Any, Any, Any]:
+    """The basis functions h00, h10, h01, h11 at r: weights of m_k, tau_k, m_{k+1}, tau_{k+1} in
+    CHS (HOIGS, Eq. 4), or their derivatives.
 
-
-def hermite_weights(r: Any, *, derivative: bool = False) -> Any:
-    """Weights of m_k, tau_k, m_{k+1}, tau_{k+1} at r (HOIGS, equation of CHS), or their derivative.
-
-    Returns:
-        four numbers for a number, a tensor [4] for a 0-d tensor, [T, 4] for [T, 1].
+    Args:
+        r: a number or a tensor, t_r of the paper; each weight has its shape.
     """
-    table = HERMITE_DERIVATIVE if derivative else HERMITE
-    if isinstance(r, Tensor):
-        return r ** constant((0, 1, 2, 3), r) @ constant(table, r)
-    return tuple(sum(c * r**power for power, c in enumerate(c4)) for c4 in zip(*table, strict=True))
+    if derivative:
+        return (6 * r**2 - 6 * r, 1 - 4 * r + 3 * r**2, 6 * r - 6 * r**2, 3 * r**2 - 2 * r)
+    h00 = 1 - 3 * r**2 + 2 * r**3
+    h10 = r - 2 * r**2 + r**3
+    h01 = 3 * r**2 - 2 * r**3
+    h11 = r**3 - r**2
+    return h00, h10, h01, h11
 
 
 def cubic_hermite(
@@ -124,7 +119,8 @@ def cubic_hermite(
     *,
     derivative: bool = False,
 ) -> Float[Tensor, "... D"]:
-    """CHS(t, m) with explicit tangents, or its derivative per reference interval.
+    """CHS(t, m) = h00 m_k + h10 tau_k + h01 m_{k+1} + h11 tau_{k+1} (HOIGS, Eq. 4) with explicit
+    tangents, or its derivative per reference interval.
 
     Args:
         values, tangents: [N, K, D] of N curves, read at one time: the result is [N, D]; or [K, D]
@@ -138,7 +134,7 @@ def cubic_hermite(
     # one product for all times: sums of four terms would be seven operations instead of two
     after = k + 1
     ends = (values[k], length * tangents[k], values[after], length * tangents[after])
-    weights = hermite_weights(r, derivative=derivative)
+    weights = torch.cat(hermite_weights(r, derivative=derivative), -1)
     found = (weights[:, None] @ torch.stack(ends, 1)).squeeze(1)
     return found / length if derivative else found
 
@@ -151,14 +147,14 @@ def _between(
     derivative: bool,
 ) -> Tensor:
     """`cubic_hermite` of the interval whose two values and tangents these are."""
-    first, second, third, fourth = hermite_weights(r, derivative=derivative)
+    h00, h10, h01, h11 = hermite_weights(r, derivative=derivative)
     if isinstance(length, Tensor) or length != 1.0:  # of tensors each of these is an operation
         if derivative:
-            first, third = first / length, third / length
+            h00, h01 = h00 / length, h01 / length
         else:
-            second, fourth = second * length, fourth * length
-    total: Tensor = first * values[0] + second * tangents[0] + third * values[1]
-    return total + fourth * tangents[1]
+            h10, h11 = h10 * length, h11 * length
+    total: Tensor = h00 * values[0] + h10 * tangents[0] + h01 * values[1] + h11 * tangents[1]
+    return total
 
 
 def finite_differences(
@@ -205,7 +201,7 @@ def catmull_rom(
         return _between(*pairs, r, length, derivative)
     if times is not None:
         return cubic_hermite(values, finite_differences(values, times), at, derivative=derivative)
-    near = (k + constant((-1, 0, 1, 2), k)).clamp(0, last)
+    near = (k + torch.arange(-1, 3, device=k.device)).clamp(0, last)
     window = values.index_select(1, near)
     spans = (near[2:] - near[:2])[:, None].to(values)  # 2 intervals, or 1 at an end of the spline
     tangents = (window[:, 2:] - window[:, :2]) / spans
@@ -253,7 +249,8 @@ def fit(
     """
     k, r, length = at
     count, target = len(differences), samples.to(torch.float64)
-    basis = hermite_weights(r) * torch.cat((torch.ones_like(length), length), 1).repeat(1, 2)
+    h00, h10, h01, h11 = hermite_weights(r)
+    basis = torch.cat((h00, h10 * length, h01, h11 * length), 1)
     columns = torch.stack((k, count + k, k + 1, count + k + 1), 1)
     rows = target.new_zeros(len(target), 2 * count).scatter(1, columns, basis)
     if weights is not None:
@@ -290,7 +287,7 @@ def one_time(time: Time) -> Times:
     return time[None] if isinstance(time, Tensor) else [time]
 
 
-class Knots(Resizing):
+class Knots(OverTime, Resizing):
     """Times of the knots of one entity, and interpolation of the values kept at them.
 
     Tangents are displacements per reference interval, 1 / (count - 1) of the clip, whatever the
@@ -315,7 +312,7 @@ class Knots(Resizing):
         times = uniform_times(count)
         self.register_buffer("times", torch.tensor(times, dtype=torch.float64), persistent=movable)
         self._times = times
-        self.rows = TimeRows(count)  # of values kept at uniform knots
+        self.keep_rows(count)  # of values kept at uniform knots
 
     def __len__(self) -> int:
         return len(self._times)
@@ -345,7 +342,8 @@ class Knots(Resizing):
     def at(self, time: Time) -> Interval:
         """The interval of one time."""
         if not self.movable:
-            return self.rows_about(time, self.rows)
+            at = keyframe_position(time, self.rows.count)
+            return at._replace(k=at.k - self.rows.first)
         if isinstance(time, Tensor):
             time = time.clamp(0.0, 1.0)
             first = torch.searchsorted(self.times, time, right=True) - 1
@@ -356,12 +354,6 @@ class Knots(Resizing):
         k = min(max(bisect_right(self._times, time) - 1, 0), len(self) - 2)
         length = self._times[k + 1] - self._times[k]
         return Interval(k, (time - self._times[k]) / length, length / self.reference)
-
-    @staticmethod
-    def rows_about(time: Time, rows: TimeRows) -> Interval:
-        """The interval of one time among uniform knots, whose number counts from `rows.first`."""
-        at = keyframe_position(time, rows.count)
-        return at._replace(k=at.k - rows.first)
 
     def at_times(self, times: Times, like: Tensor) -> Interval:
         """The intervals of T times; positions and lengths in the data type of `like`."""

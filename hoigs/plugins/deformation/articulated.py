@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from hoigs.core.fast.graphs import Time
+from hoigs.core.device import Time
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.maths.rotations import (
     axis_angle_to_quats,

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hoigs.core.fast.graphs import Time
+from hoigs.core.device import Time
 from hoigs.core.maths.rotations import (
     conjugate_quats,
     multiply_quats,

@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from hoigs.core.interfaces.body import PELVIS, BodyModel, BodySurface
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.deformation import Template
+from hoigs.core.maths.frame_times import at_frame
+from hoigs.core.maths.nearest import mesh_edges, neighbours_of
 from hoigs.core.maths.skinning import skin
 from hoigs.core.model.object_placement import masked_depths, seen_middle
 from hoigs.core.values.clip import BodyTrack, Clip
@@ -31,15 +33,13 @@ from hoigs.plugins.deformation.human_planes import (
     field_subset,
 )
 from hoigs.plugins.deformation.nonrigid import NonRigid, NonRigidConfig, NonRigidMotion, Shading
-from hoigs.plugins.deformation.skinned_body import SkinnedBodyConfig, at_frame, exact_poses
+from hoigs.plugins.deformation.skinned_body import SkinnedBodyConfig, exact_poses
 from hoigs.plugins.deformation.surface_body import (
     OPAQUE,
     LaplacianOn,
     Smoothed,
     SurfaceBody,
     laplacians,
-    mesh_edges,
-    neighbours_of,
 )
 
 # Where the learnable scale alpha of HOIGS, Eq. 6, starts: at one, or at a ratio of depths.

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from hoigs.core.interfaces.body import PART_NAMES
 from hoigs.core.maths.feature_planes import PairedPlanes, ProductPlanes
-from hoigs.core.maths.networks import dense, zeroed
+from hoigs.core.parameters import zeroed
 
 Fusion = Literal["paired", "product"]
 FRACTIONS = (4, 2, 1)  # of the finest resolution: three scales of 32 channels are 96 again
@@ -92,7 +92,7 @@ class CanonicalHead(nn.Module):
         )
 
     def forward(self, features: Float[Tensor, "N F"]) -> CanonicalAttributes:
-        colors, offsets, scales, *others = dense(self.layers, features).split(self.sizes, dim=-1)
+        colors, offsets, scales, *others = self.layers(features).split(self.sizes, dim=-1)
         # offsets are in units of 10 cm: at the learning rate of colours, metres would diverge
         made = CanonicalAttributes(0.1 * offsets, scales.expand(-1, 3), colors)
         if not others:

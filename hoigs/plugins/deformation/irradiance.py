@@ -6,18 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hoigs.core.fast.graphs import constant
 from hoigs.core.maths.nearest import surface_normals
 from hoigs.core.maths.rotations import quats_to_matrices, relative_quats
+from hoigs.core.maths.spherical_harmonics import irradiance_basis
 from hoigs.core.values.gaussians import SH_C0, Gaussians
 
 TERMS = 8  # spherical harmonics of degrees 1 and 2
-# xy, yz, zx, x^2 - y^2 and 3 z^2 - 1 (of unit vectors) from the products xx, xy, xz, yx, ... zz
-SECOND_DEGREE = (
-    (0.0, 0.0, 0.0, 1.0, -1.0), (1.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0, 0.0),
-    (0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, -1.0, -1.0), (0.0, 1.0, 0.0, 0.0, 0.0),
-    (0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 2.0),
-)  # fmt: skip
 
 
 class Irradiance(nn.Module):
@@ -44,15 +38,11 @@ class Irradiance(nn.Module):
         return moved.replace(sh=torch.addcmul(moved.sh, gain[:, None], colors))
 
 
-def irradiance_basis(normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 8"]:
-    """Real spherical harmonics of degrees 1 and 2 at unit vectors, without their constants."""
-    products = (normals[:, :, None] * normals[:, None]).flatten(1)
-    return torch.cat((normals, products @ constant(SECOND_DEGREE, normals)), -1)
-
-
 def mid_grey(sh: Float[Tensor, "N B 3"]) -> Float[Tensor, "B 1"]:
     """SH coefficients of the colour 0.5, to which those of Gaussians are relative."""
-    return constant(((0.5 / SH_C0,), *((0.0,),) * (sh.shape[1] - 1)), sh)
+    grey = sh.new_zeros(sh.shape[1], 1)
+    grey[0] = 0.5 / SH_C0
+    return grey
 
 
 def turned_normals(

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.deformation import DeformationModel
-from hoigs.core.maths.networks import zeroed
+from hoigs.core.parameters import zeroed
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import GaussianDelta, Gaussians
 from hoigs.core.values.moment import Moment

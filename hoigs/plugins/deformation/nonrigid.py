@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.fast.graphs import Time
+from hoigs.core.device import Time
 from hoigs.core.maths.feature_planes import PairedPlanes
-from hoigs.core.maths.networks import dense, zeroed
+from hoigs.core.parameters import zeroed
 from hoigs.core.values.gaussians import SH_C0, GaussianDelta, Gaussians
 from hoigs.plugins.deformation.irradiance import mid_grey
 
@@ -58,7 +58,8 @@ class NonRigid(nn.Module, ABC):
         Args:
             points: of the zero pose, in [-1, 1] within the planes. time: in [0, 1].
         """
-        return dense(self.layers, self.planes(points, time))
+        residual: Tensor = self.layers(self.planes(points, time))
+        return residual
 
     @abstractmethod
     def change(

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
-from hoigs.core.fast.graphs import Time
+from hoigs.core.device import Time
 from hoigs.core.maths.splines import Knots, keyframe_count
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.deformation.rigid_spline import RigidSpline, RigidSplineConfig

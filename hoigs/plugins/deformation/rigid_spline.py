@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hoigs.core.fast.graphs import Time
+from hoigs.core.device import Time
 from hoigs.core.maths.rotation_splines import angular_differences, hermite_factors, hermite_quats
 from hoigs.core.maths.rotations import (
     matrices_to_quats,

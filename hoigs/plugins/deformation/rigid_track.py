@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hoigs.core.fast.graphs import Time, constant
+from hoigs.core.device import Time
 from hoigs.core.maths.frame_times import frame_at
 from hoigs.core.maths.rotations import (
     matrices_to_quats,
@@ -39,6 +39,7 @@ class RigidTrack(nn.Module):
     translations: Tensor
     observed: Tensor
     turns: Tensor
+    rates: Tensor
 
     def __init__(self, track: ObjectTrack) -> None:
         super().__init__()
@@ -52,6 +53,9 @@ class RigidTrack(nn.Module):
             self.register_buffer(name, frames.detach().clone())
         turns = turn_between(self.quats[:-1], self.quats[1:])
         self.register_buffer("turns", turns, persistent=False)  # computed from the quaternions
+        self._rates = [1 / (b - a) for a, b in pairwise(self.times or ())]
+        rates = self.translations.new_tensor(self._rates)
+        self.register_buffer("rates", rates, persistent=False)
 
     def at(self, time: Time) -> tuple[Float[Tensor, " 4"], Float[Tensor, " 3"]]:
         """Rotation (wxyz) and translation, object to world, at `time` in [0, 1]."""
@@ -69,10 +73,7 @@ class RigidTrack(nn.Module):
         """Frames a unit of time from frame k to the next; k is a number or a 0-d tensor."""
         if self.times is None:
             return len(self.turns)
-        rates = tuple(1 / (b - a) for a, b in pairwise(self.times))
-        if isinstance(k, Tensor):
-            return constant(rates, self.translations).index_select(0, k).squeeze(0)
-        return rates[k]
+        return self.rates.index_select(0, k).squeeze(0) if isinstance(k, Tensor) else self._rates[k]
 
     def _rotation(self, time: Time) -> Float[Tensor, " 4"]:
         k, r, _ = self._position(time)

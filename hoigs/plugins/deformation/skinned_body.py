@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.fast.graphs import Time, constant
+from hoigs.core.device import Time
 from hoigs.core.interfaces.body import (
     LEFT_FOOT,
     LEFT_WRIST,
@@ -23,71 +23,13 @@ from hoigs.core.interfaces.body import (
 )
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.deformation import DeformationModel
-from hoigs.core.maths.frame_times import FrameTimes, frame_at
+from hoigs.core.maths.frame_times import FrameTimes, TrainedFrames
 from hoigs.core.maths.rotations import axis_angle_to_quats
 from hoigs.core.maths.skinning import ancestor_table, transform_points
-from hoigs.core.maths.splines import neighbours
 from hoigs.core.values.clip import POSES_EXACT, Clip
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.plugins.deformation.irradiance import Irradiance
-
-# Values that are learned for each trained frame and interpolated on the frames between.
-
-
-class TrainedFrames:
-    """Which of F frames are trained on.
-
-    Args:
-        count: F. trained: frames that are trained on; all by default.
-        times: of the F frames, in [0, 1]; None: uniform.
-
-    Raises:
-        ValueError: no frame is trained on, or one that the clip does not have.
-    """
-
-    def __init__(
-        self, count: int, trained: Sequence[int] | None = None, times: FrameTimes = None
-    ) -> None:
-        frames = sorted(set(range(count) if trained is None else trained))
-        if not frames or frames[0] < 0 or frames[-1] >= count:
-            raise ValueError(
-                f"trained frames must be some of 0..{count - 1}, got "
-                f"{f'{frames[0]}..{frames[-1]}' if frames else 'none'}"
-            )
-        self.count, self.trained, self.times = count, frames, times
-
-    def neighbours(self, time: Time) -> tuple[Any, Any, Any]:
-        """The trained frames before and after `time` and the position between them in [0, 1].
-
-        Numbers, or 0-d tensors for a time that is one. Before the first trained frame and after
-        the last both are that frame.
-        """
-        if isinstance(time, Tensor):
-            return self._neighbours_on_device(time)
-        frame = frame_at(time, self.count, self.times)
-        if abs(frame - round(frame)) < 1e-4:  # times in float32 must still match their own frame
-            frame = round(frame)
-        low, high, r = neighbours(frame, self.trained)
-        return self.trained[low], self.trained[high], r
-
-    def _neighbours_on_device(self, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        trained = constant(tuple(self.trained), time, torch.long)
-        frame = frame_at(time, self.count, self.times)
-        frame = torch.where((frame - frame.round()).abs() < 1e-4, frame.round(), frame)
-        after = torch.searchsorted(trained, frame.ceil().long())  # the first that is not earlier
-        high = trained.index_select(0, after.clamp_max(len(trained) - 1)).squeeze(0)
-        before = trained.index_select(0, (after - 1).clamp_min(0)).squeeze(0)
-        low = torch.where(high <= frame, high, before)
-        return low, high, (frame - low) / (high - low).clamp_min(1)
-
-    def between(self, values: Float[Tensor, "F ..."], time: Time) -> Float[Tensor, "..."]:
-        """`values`, one for each frame, at any time."""
-        low, high, r = self.neighbours(time)
-        if isinstance(low, Tensor):
-            pair = values.index_select(0, torch.stack((low, high)))
-            return torch.lerp(pair[0], pair[1], r.to(pair.dtype))
-        return values[low] if low == high else torch.lerp(values[low], values[high], r)
 
 
 class FrameCorrections(nn.Module):
@@ -372,8 +314,8 @@ class SkinnedBody(DeformationModel):
         joints: tuple[int, ...],
     ) -> Float[Tensor, "A 3"]:
         """World positions of some joints, before alpha; `places`: of all, in the zero pose."""
-        chosen = constant(joints, places, torch.long)
-        return transform_points(transforms.index_select(0, chosen), places.index_select(0, chosen))
+        chosen = [torch.stack([x[joint] for joint in joints]) for x in (transforms, places)]
+        return transform_points(*chosen)
 
     def scaled(
         self, points: Float[Tensor, "N 3"], pelvis: Float[Tensor, " 3"], moment: Moment
@@ -462,20 +404,6 @@ def checked_surface(surface: BodySurface, canonical: Gaussians) -> BodySurface:
             "and seed, or give their `surface`"
         )
     return surface
-
-
-def at_frame(
-    values: Float[Tensor, "F ..."], time: Time, times: FrameTimes = None
-) -> Float[Tensor, "..."]:
-    """The value of the frame that is nearest to a time in [0, 1].
-
-    Args:
-        times: of the frames; None: uniform.
-    """
-    frame = frame_at(time, len(values), times)
-    if isinstance(frame, Tensor):
-        return values.index_select(0, frame.round().long()).squeeze(0)
-    return values[round(frame)]
 
 
 def clip_settings(clip: Clip) -> dict[str, Any]:

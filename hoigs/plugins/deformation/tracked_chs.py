@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hoigs.core.fast.graphs import Time
+from hoigs.core.device import Time
 from hoigs.core.maths.rotations import multiply_quats
 from hoigs.core.model.knot_refit import probe_rows
 from hoigs.core.values.gaussians import Gaussians

@@ -11,19 +11,19 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.fast.graphs import Time, filled
+from hoigs.core.device import Time, filled
 from hoigs.core.interfaces.deformation import DeformationModel, ProvidesVelocity
 from hoigs.core.interfaces.features import FeatureExtractor
-from hoigs.core.maths.networks import dense
 from hoigs.core.maths.splines import (
+    Interval,
     Knots,
     catmull_rom,
     hermite_weights,
+    keyframe_position,
     knot_pair,
     lerp,
     linear,
 )
-from hoigs.core.parameters import TimeRows
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Tokens
@@ -105,23 +105,21 @@ class SplineMotionFeatures(FeatureExtractor):
         counts = {"per-gaussian": len(canonical), "shared": 1, "low-rank": config.rank}
         shape = (counts[config.embedding], keyframes, config.embedding_width)
         self.embedding = nn.Parameter(0.1 * torch.randn(shape).to(canonical.means))
-        self.time_rows = {"embedding": TimeRows(keyframes)}
+        self.knots = Knots(keyframes).to(canonical.means.device)
+        self.time_rows = {"embedding": self.knots.rows}
         if config.embedding == "low-rank":
             mixture = torch.randn(len(canonical), config.rank).to(canonical.means)
             self.mixture = nn.Parameter(mixture)
 
     def embedded(self, count: int, time: Time) -> Float[Tensor, "N E"]:
         """e(t) of each of `count` Gaussians."""
-        codes = self._between(self.embedding, time, self.time_rows["embedding"])
+        codes = self._between(self.embedding, self.knots.at(time))
         if self.config.embedding == "low-rank":
             return self.mixture @ codes / self.config.rank**0.5
         return codes.expand(count, -1)
 
-    def _between(
-        self, values: Float[Tensor, "N K D"], time: Time, rows: TimeRows
-    ) -> Float[Tensor, "N D"]:
-        """Values of the keyframes at `time`."""
-        at = Knots.rows_about(time, rows)
+    def _between(self, values: Float[Tensor, "N K D"], at: Interval) -> Float[Tensor, "N D"]:
+        """Values of the keyframes, interpolated."""
         if self.config.interpolation == "linear":
             return linear(values, at)
         if self.config.interpolation == "zero-tangent":
@@ -133,10 +131,11 @@ class SplineMotionFeatures(FeatureExtractor):
     ) -> Float[Tensor, "N 3"]:
         """tau(t)."""
         if self.config.velocity == "keyframes":
-            tangents, rows = deformation.tangents, getattr(deformation, "time_rows", {})
+            tangents, knots = deformation.tangents, getattr(deformation, "knots", None)
             assert isinstance(tangents, Tensor)
-            every = TimeRows(tangents.shape[1])
-            return self._between(tangents, moment.time, rows.get("tangents", every))
+            if isinstance(knots, Knots):
+                return self._between(tangents, knots.at(moment.time))
+            return self._between(tangents, keyframe_position(moment.time, tangents.shape[1]))
         assert isinstance(deformation, ProvidesVelocity)
         return deformation.velocity(canonical, moment)
 
@@ -147,7 +146,7 @@ class SplineMotionFeatures(FeatureExtractor):
         inputs = [velocity, filled(velocity, (len(canonical), 1), moment.time)]
         if self.config.embedding != "none":
             inputs.insert(1, self.embedded(len(canonical), moment.time))
-        features = dense(self.mlp, torch.cat(inputs, dim=-1))
+        features = self.mlp(torch.cat(inputs, dim=-1))
         with torch.no_grad():
             positions = deformation.means_at(canonical, moment)
         return Tokens(features, positions)

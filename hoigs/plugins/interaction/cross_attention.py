@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.fast.graphs import constant
+from hoigs.core.device import constant
 from hoigs.core.interfaces.body import (
     BODY_JOINT_PARTS,
     LEFT_HAND_PART,
@@ -20,8 +20,8 @@ from hoigs.core.interfaces.body import (
     RIGHT_HAND_PART,
 )
 from hoigs.core.interfaces.interaction import InteractionModule
-from hoigs.core.maths.networks import zeroed
 from hoigs.core.maths.rotations import axis_angle_to_matrices
+from hoigs.core.parameters import zeroed
 from hoigs.core.values.tokens import POSE_JOINTS, EntityKind, Residual, Role, Tokens
 
 # The distance mask B (HOIGS, Eq. 12), and its smooth form.

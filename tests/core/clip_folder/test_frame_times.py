@@ -14,10 +14,9 @@ from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.clip_folder.health import examine
 from hoigs.core.clip_folder.write import ClipWriter, write_clip
 from hoigs.core.errors import ClipError
-from hoigs.core.maths.frame_times import frame_at, time_of
+from hoigs.core.maths.frame_times import TrainedFrames, frame_at, time_of
 from hoigs.core.values.between import frame_numbers, frame_of, moment_between
 from hoigs.plugins.deformation.rigid_track import RigidTrack
-from hoigs.plugins.deformation.skinned_body import TrainedFrames
 from hoigs.plugins.readers.clip import ClipFolderReader
 
 SECONDS = np.cumsum([0.1 if i % 2 else 0.3 for i in range(FRAMES)]).tolist()  # from 0.3 on

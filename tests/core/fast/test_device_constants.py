@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from hoigs.core.fast.graphs import constant, filled
+from hoigs.core.device import constant, filled
 from hoigs.core.maths import splines
 from hoigs.core.maths.feature_planes import PairedPlanes, ProductPlanes
+from hoigs.core.maths.frame_times import TrainedFrames, at_frame
 from hoigs.core.maths.splines import Knots, keyframe_position
-from hoigs.plugins.deformation.skinned_body import TrainedFrames, at_frame
 
 TIMES = (-0.2, 0.0, 0.1, 1 / 7, 0.3, 0.5, 0.77, 6 / 7, 0.999, 1.0, 1.3)
 

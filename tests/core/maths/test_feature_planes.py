@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from hoigs.core.fast.choose import native
+from hoigs.core.device import replacement
 from hoigs.core.maths.feature_planes import PairedPlanes, ProductPlanes, roughness, sample_planes
 
 
@@ -42,7 +42,7 @@ def test_the_cpu_kernel_equals_its_float64_twin(shape: tuple[int, ...], count: i
     torch.manual_seed(0)
     planes, points = torch.randn(shape), torch.rand(shape[0], count, 2) * 2.6 - 1.3
     upstream = torch.randn(count, shape[0] * shape[3])
-    assert native("planes", planes) is not None and native("planes", planes.double()) is None
+    assert replacement(sample_planes, planes) and not replacement(sample_planes, planes.double())
     found = everything(planes, points, upstream)
     exact = everything(planes.double(), points.double(), upstream.double())
     for ours, theirs in zip(found, exact, strict=True):

@@ -11,7 +11,7 @@ import pytest
 CODE = """
 import resource, sys
 import numpy as np
-from hoigs.core.system.memory import keep_freed_memory
+from hoigs.core.system.threads import keep_freed_memory
 
 def pages() -> int:
     for _ in range(20):

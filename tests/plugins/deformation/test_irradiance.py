@@ -7,6 +7,7 @@ import torch
 from torch.nn.functional import normalize
 
 from hoigs.core.maths.rotations import axis_angle_to_matrices, quats_to_matrices
+from hoigs.core.maths.spherical_harmonics import irradiance_basis
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
@@ -18,7 +19,6 @@ from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning, HexPla
 from hoigs.plugins.deformation.irradiance import (
     TERMS,
     Irradiance,
-    irradiance_basis,
     outward_normals,
     turned_normals,
 )

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.deformation import DeformationModel
-from hoigs.core.maths.networks import zeroed
 from hoigs.core.maths.rotations import exp_se3, multiply_quats, normalize_quats, quats_to_matrices
+from hoigs.core.parameters import zeroed
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual

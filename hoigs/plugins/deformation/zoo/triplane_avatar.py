@@ -15,8 +15,7 @@ from torch import Tensor, nn
 
 from hoigs.core.interfaces.body import LEFT_HAND_PART, PELVIS, RIGHT_HAND_PART
 from hoigs.core.maths.feature_planes import axis_pairs, sample_planes
-from hoigs.core.maths.nearest import nearest
-from hoigs.core.maths.networks import zeroed
+from hoigs.core.maths.nearest import nearest, neighbours_of, point_roughness
 from hoigs.core.maths.rotations import (
     axis_angle_to_matrices,
     matrices_to_quats,
@@ -25,6 +24,7 @@ from hoigs.core.maths.rotations import (
     quats_to_matrices,
 )
 from hoigs.core.maths.skinning import skin_quats
+from hoigs.core.parameters import zeroed
 from hoigs.core.values.gaussians import SH_C0, Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import Residual
@@ -34,8 +34,6 @@ from hoigs.plugins.deformation.skinned_body import SkinnedBodyConfig
 from hoigs.plugins.deformation.surface_body import (
     OPAQUE,
     SurfaceBody,
-    neighbours_of,
-    point_roughness,
 )
 
 # Decoders from a canonical point's features to its Gaussian (ExAvatar, Moon et al. 2024,

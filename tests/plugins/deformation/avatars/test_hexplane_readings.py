@@ -11,6 +11,7 @@ from torch.nn.functional import grid_sample
 from hoigs.core.interfaces.body import PELVIS
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.maths.feature_planes import PairedPlanes, ProductPlanes
+from hoigs.core.maths.nearest import mesh_edges, mesh_roughness, neighbours_of, point_roughness
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.camera import Camera
@@ -20,12 +21,6 @@ from hoigs.core.values.tokens import Residual
 from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning, HexPlaneSkinningConfig
 from hoigs.plugins.deformation.human_planes import body_planes
 from hoigs.plugins.deformation.nonrigid import NonRigidMotion, Shading
-from hoigs.plugins.deformation.surface_body import (
-    mesh_edges,
-    mesh_roughness,
-    neighbours_of,
-    point_roughness,
-)
 
 
 def human(body, **settings) -> Entity:
