@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test lint lint-types lint-rest docs charts stress bench changelog format wheel sbom clean
+.PHONY: demo check check-code test lint lint-types lint-rest docs charts stress bench changelog format wheel sbom clean
 
 demo: $(INSTALLED)
 	$(BIN)/hoigs demo --out runs/demo --overwrite
@@ -13,6 +13,18 @@ demo: $(INSTALLED)
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder \
 		--max-worker-restart 3
+
+# the fast lane, under 90 s on 2 cores: types in one process; style, import rules and quick tests in
+# another. FAST takes about a minute of one core; `make test` runs every test
+FAST ?= tests/core/values tests/core/model tests/core/registry tests/core/spec tests/metrics
+check: $(INSTALLED)
+	@$(MAKE) --no-print-directory --jobs 2 --output-sync lint-types check-code
+
+check-code: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -p no:xdist -m "not slow" $(FAST)
 
 # types in one process, all else in another
 lint: $(INSTALLED)

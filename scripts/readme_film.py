@@ -1,10 +1,13 @@
-"""The moving picture at the top of the README: the video, its reconstruction, and bullet time.
+"""Moving pictures of a run: the video, its reconstruction, and bullet time.
 
     hoigs demo --out runs/demo --no-baseline
-    python scripts/readme_film.py runs/demo
+    python scripts/readme_film.py runs/demo --out docs/assets/demo.webp
+    hoigs prepare juggle.mp4 --out clips/juggle --width 640
+    hoigs train clips/juggle --out runs/juggle --set train.steps=1200 --set train.width=480
+    python scripts/readme_film.py runs/juggle --crop 0.28,0,0.78,1 --out docs/assets/juggle.webp
 
-All three show the same moment; while time stands still, only the camera of the third one moves.
-Renders have twice the pixels of the picture, and are averaged. Writes docs/assets/demo.webp.
+All three panels show the same moment; while time stands still, only the camera of the third one
+moves. Renders have twice the pixels of the picture, and are averaged.
 """
 
 from __future__ import annotations
@@ -23,28 +26,42 @@ from hoigs.runs.loaded_run import open_run
 from hoigs.viewing.films import playback_of, source_frame
 from hoigs.viewing.paths import film_path, frames_shown
 
-OUT = Path(__file__).resolve().parents[1] / "docs" / "assets" / "demo.webp"
 TITLES = ("the video", "reconstruction", "bullet time")
 GAP, HEAD = 8, 28  # pixels
 GROUND, INK = (14, 16, 20), (214, 210, 202)
 LARGEST = 3_000_000  # bytes
 
 
-def frames(run: Path, clip: Path | None, side: int) -> Iterator[tuple[Image.Image, float]]:
-    """The pictures of the film, and the seconds that each is shown."""
+def frames(
+    run: Path, clip: Path | None, height: int, crop: tuple[float, ...], part: tuple[int, ...]
+) -> Iterator[tuple[Image.Image, float]]:
+    """The pictures of the film, and the seconds that each is shown.
+
+    Args:
+        height: pixels of each panel. crop: left, top, right, bottom of what is shown, as fractions
+            of the picture. part: first frame, last frame and step; empty for the whole clip.
+    """
     loaded = open_run(run, clip=clip)
     numbers, fps = frame_numbers(loaded.clip)
+    if part:
+        numbers, fps = numbers[part[0] : part[1] + 1 : part[2]], fps / part[2]
+    _, top, _, bottom = crop
+    own = loaded.clip.cameras[0]
+    full = 2 * height / (bottom - top)
+    size = round(full * own.width / own.height), round(full)
+    box = tuple(round(c * s) for c, s in zip(crop, (*size, *size), strict=True))
+    width = round((box[2] - box[0]) / 2)
     around = film_path(loaded.model, loaded.clip, "bullet-time", numbers, fps)
     shown = frames_shown(loaded.clip, around)
-    views = [(moment, camera.resized(2 * side, 2 * side)) for moment, camera in around]
+    views = [(moment, camera.resized(*size)) for moment, camera in around]
     straight = [
-        (moment, camera_between(loaded.clip, frame).resized(2 * side, 2 * side))
+        (moment, camera_between(loaded.clip, frame).resized(*size))
         for (moment, _), frame in zip(around, shown, strict=True)
     ]
     play = playback_of(loaded.model, [*views[::8], *straight[::8]])
     font = ImageFont.load_default(15)
     for (moment, own), (_, beside), frame in zip(straight, views, shown, strict=True):
-        sheet = Image.new("RGB", (3 * side + 2 * GAP, side + HEAD), GROUND)
+        sheet = Image.new("RGB", (3 * width + 2 * GAP, height + HEAD), GROUND)
         draw = ImageDraw.Draw(sheet)
         panels = (
             _source(loaded.clip, frame),
@@ -52,9 +69,10 @@ def frames(run: Path, clip: Path | None, side: int) -> Iterator[tuple[Image.Imag
             Image.fromarray(picture(play(moment, beside).color)),
         )
         for i, (panel, title) in enumerate(zip(panels, TITLES, strict=True)):
-            left = i * (side + GAP)
-            sheet.paste(panel.resize((side, side), Image.Resampling.LANCZOS), (left, HEAD))
-            draw.text((left + side / 2, HEAD / 2), title, INK, font, anchor="mm")
+            at = i * (width + GAP)
+            shown_part = panel.resize(size, Image.Resampling.LANCZOS).crop(box)
+            sheet.paste(shown_part.resize((width, height), Image.Resampling.LANCZOS), (at, HEAD))
+            draw.text((at + width / 2, HEAD / 2), title, INK, font, anchor="mm")
         yield sheet, 1 / fps
 
 
@@ -67,11 +85,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--clip", type=Path)
-    parser.add_argument("--side", type=int, default=256, help="pixels of each of the three")
+    parser.add_argument("--height", type=int, default=256, help="pixels of each of the three")
+    parser.add_argument("--crop", default="0,0,1,1", help="left,top,right,bottom, fractions")
+    parser.add_argument("--part", default="", help="first,last,step of the clip's frames")
     parser.add_argument("--quality", type=int, default=66, help="lowered until it fits")
-    parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
-    made = list(frames(arguments.run, arguments.clip, arguments.side))
+    crop = tuple(float(edge) for edge in arguments.crop.split(","))
+    part = tuple(int(number) for number in arguments.part.split(",") if number)
+    made = list(frames(arguments.run, arguments.clip, arguments.height, crop, part))
     for quality in range(arguments.quality, 20, -8):
         made[0][0].save(
             arguments.out, save_all=True, append_images=[image for image, _ in made[1:]],
@@ -82,7 +104,7 @@ def main() -> None:
         print(f"{arguments.out}: {len(made)} pictures, quality {quality}, {size / 1e6:.2f} MB")
         if size <= LARGEST:
             return
-    raise SystemExit("too large for a README: lower --side")
+    raise SystemExit("too large for a README: lower --height")
 
 
 if __name__ == "__main__":

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
 import pytest
+import yaml
+
+import hoigs
 
 ROOT = Path(__file__).parents[2]
 
@@ -51,3 +55,9 @@ def test_the_fragments_here_are_fine(collect, project):
     for path in (ROOT / "changelog.d").glob("*.md"):
         (project / "changelog.d" / path.name).write_text(path.read_text())
     collect(project)
+
+
+def test_the_version_is_the_changelogs_and_the_citations():
+    newest = re.search(r"^## (\d+\.\d+\.\d+)", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"]
+    assert newest is not None and newest[1] == cited == hoigs.__version__

@@ -1,4 +1,4 @@
-"""No module imports itself in a circle, and the structure page is that of the code."""
+"""No module imports itself in a circle, and the pages on structure name files that exist."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "design" / "structure.md"
@@ -20,7 +22,8 @@ def test_no_module_imports_itself_in_a_circle() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_every_file_of_the_concept_table_is_there() -> None:
-    named = set(re.findall(r"`(hoigs/[\w/]+(?:\.py|/))`", PAGE.read_text(encoding="utf-8")))
+@pytest.mark.parametrize("page", [PAGE, ROOT / "ARCHITECTURE.md"], ids=lambda page: page.name)
+def test_every_file_that_the_tables_name_is_there(page: Path) -> None:
+    named = set(re.findall(r"`(hoigs/[\w/]+(?:\.py|/))`", page.read_text(encoding="utf-8")))
     assert len(named) > 12
     assert [name for name in sorted(named) if not (ROOT / name).exists()] == []

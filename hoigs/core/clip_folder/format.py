@@ -84,7 +84,7 @@ class ClipHeader(_Strict):
         gt=0, le=1e6, allow_inf_nan=False, strict=False, description="frames per second"
     )
     width: Count = Field(description="of every image, mask and depth map, pixels")
-    height: Count = Field(description="likewise")
+    height: Count = Field(description="the same, pixels")
     frames: Count = Field(description="F, the number of frames, held-out views not counted")
     entities: dict[str, EntityHeader] = Field(
         description='name to `{"kind": "human", "body": "body:anny"}` or `{"kind": "object"}`; '
@@ -145,7 +145,7 @@ class ViewsHeader(_Strict):
     format: Literal["hoigs-views"] = Field(default="hoigs-views", description='"hoigs-views"')
     version: Literal[1] = Field(default=1, description="1")
     width: Count = Field(description="of the held-out images, pixels")
-    height: Count = Field(description="likewise")
+    height: Count = Field(description="the same, pixels")
     frames: list[int] = Field(
         min_length=1, description="V frame numbers of the main clip: view v shows frame frames[v]"
     )

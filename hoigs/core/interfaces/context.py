@@ -20,7 +20,7 @@ class BuildContext:
         entity: name of the entity being built ("" for scene-wide parts).
         clip: the clip being reconstructed.
         body, body_track: for a human. object_track: for an object.
-        bodies: of every human that is modelled, by entity, for components attached to them.
+        bodies: body of every modelled human, by entity, for components attached to them.
         rasterizer: the spec's, for initializers that draw.
         seed: for anything random.
     """

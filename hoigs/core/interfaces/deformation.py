@@ -27,9 +27,9 @@ class StepStatistics:
     """What one training step showed of one entity, for deformations that change their own size.
 
     Attributes:
-        moment, camera: of the frame drawn, on the model's device.
+        moment, camera: those of the frame drawn, on the model's device.
         error: image loss of the frame: the entity's own term, or the scene's if it has none.
-        screen_gradient: of the loss with respect to the projected means, per pixel, or None.
+        screen_gradient: d loss / d projected means, per pixel, or None.
         radii: on the screen, pixels; 0 where a Gaussian was not drawn.
         step, total_steps: the number of this step, from 1, and of all steps.
     """
@@ -240,7 +240,7 @@ class Template:
 
     Attributes:
         gaussians: raw, as they are drawn but for the pose.
-        points: of the surface, one a Gaussian, metres. normals: there, outward, of unit length.
+        points: surface points, one a Gaussian, metres. normals: outward unit normals there.
         mirrored: `points` reflected in the body's plane of symmetry.
         parts: body part of each point (`hoigs.core.interfaces.body`).
     """

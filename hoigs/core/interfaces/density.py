@@ -68,8 +68,8 @@ class DensityStatistics:
 
         Args:
             screen_gradient: per pixel of displacement, as of `RenderRequest.screen_offsets`.
-            radii: pixels, 0 where a Gaussian is not drawn. width, height: of the image, pixels.
-            absolute_gradient: as of `RenderRequest.absolute_gradients`. loss: of the view.
+            radii: pixels, 0 where a Gaussian is not drawn. width, height: image size, pixels.
+            absolute_gradient: see `RenderRequest.absolute_gradients`. loss: that of the view.
         """
         visible = radii > 0
         half = constant((width / 2, height / 2), screen_gradient)

@@ -40,7 +40,7 @@ class FramePrompt:
     """Where an entity is in one frame.
 
     Attributes:
-        frame: of the video. points: on the entity, or beside it (`inside=False`).
+        frame: frame number in the video. points: on the entity, or off it (`inside=False`).
         box: x0, y0, x1, y1, pixels of the video.
     """
 
@@ -54,10 +54,10 @@ class EntityRequest:
     """One object or person to look for.
 
     Attributes:
-        name: of the entity. kind: what it is.
+        name: the entity's name. kind: its kind.
         text: what to look for, for estimators that read ("a man", "football"); None: the name.
         points, box: where it is in frame `frame`, pixels of the video; box is x0, y0, x1, y1.
-        frame: of the video, in which `points` and `box` are meant.
+        frame: frame number in the video to which `points` and `box` belong.
         further: where it is in other frames.
     """
 
@@ -192,8 +192,8 @@ class EntityMasks:
         entities: name to its masks, a list or LazyFrames. All False: not seen in that frame.
         together: masks of all entities at once, where they are not separated; None if they are.
         provenance: who made them, with what, in a line.
-        confidence: of each entity, how sure its mask is in each frame, 0..1; NaN: not computed.
-        chosen: of each entity that was requested without a prompt, where it was found.
+        confidence: mask confidence of each entity in each frame, 0..1; NaN: not computed.
+        chosen: prompts found for each entity that was requested without one.
         notes: sentences for the report, on what is doubtful.
     """
 

@@ -30,7 +30,7 @@ class InteractionModule(Configurable, nn.Module, ABC):
         """Allocate what depends on the entities.
 
         Args:
-            widths: token width D of each entity that has features. kinds: of every entity.
+            widths: token width D of each entity that has features. kinds: kind of every entity.
         """
         del widths, kinds
 
@@ -41,5 +41,5 @@ class InteractionModule(Configurable, nn.Module, ABC):
         """Residuals by entity name; an entity without one stays as it is.
 
         Args:
-            tokens: of each entity that has features, world. roles: of every entity.
+            tokens: world-space tokens of each entity with features. roles: role of every entity.
         """

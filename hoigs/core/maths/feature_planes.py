@@ -90,7 +90,7 @@ class PairedPlanes(OverTime):
     first. Both are 3 * channels wide. Time planes start at one, so that phi = f at the start.
 
     Args:
-        channels: of each plane; 32 gives the paper's 96.
+        channels: channels of each plane; 32 gives the paper's 96.
         resolution: cells along each space axis. time_resolution: along time; 0 leaves the time
             planes out: phi = f.
         spread: standard deviation of the space planes at the start.

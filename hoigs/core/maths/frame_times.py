@@ -26,7 +26,7 @@ def frame_at(time: Time, count: int, times: FrameTimes) -> Time:
     """The frame number of a time, between frames a fraction; held at the first and the last.
 
     Args:
-        count: F, the number of frames. times: of each.
+        count: number of frames F. times: time of each.
     """
     if times is None or count < 2:
         if isinstance(time, Tensor):

@@ -59,7 +59,7 @@ def hermite_quats(
 
     Args:
         velocity_a, velocity_b: in the frames of a and b, radians per unit.
-        length: of the interval, in the same unit.
+        length: interval length, in the same unit.
     """
     quat, turns, factors = hermite_factors(a, b, velocity_a, velocity_b, r, length)
     rates = turns * _polynomials(CUMULATIVE_DERIVATIVE, r, turns, 0)
@@ -73,7 +73,7 @@ def hermite_quats(
 def hermite_factors(
     a: Tensor, b: Tensor, velocity_a: Tensor, velocity_b: Tensor, r: Any, length: Any = 1.0
 ) -> tuple[Float[Tensor, "*batch 4"], Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3 4"]]:
-    """Of `hermite_quats`, whose arguments these are: q(r), then w1, w2, w3 in radians and their
+    """Terms of `hermite_quats`, with its arguments: q(r), then w1, w2, w3 in radians and their
     three factors. Equal steps are computed together, because on a GPU each small operation costs
     its launch."""
     ends = normalize_quats(torch.stack((a, b), -2))

@@ -150,7 +150,7 @@ def rotate_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Flo
     has functions; more are used, in float64 (the matrices of Ivanic & Ruedenberg 1996).
 
     Args:
-        sh: of degree 0 to 3. rotation: R, of the world.
+        sh: coefficients of degree 0 to 3. rotation: rotation R of the world.
     """
     bands = sh.shape[1]
     degree = int(bands**0.5 + 0.5) - 1

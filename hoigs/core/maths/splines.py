@@ -164,7 +164,7 @@ def finite_differences(
     paper compares with learned tangents.
 
     Args:
-        times: of knots that are not uniform, in reference intervals. Parabolas are then still
+        times: times of non-uniform knots, in reference intervals. Parabolas are then still
             exact at inner knots.
     """
     steps = values[:, 1:] - values[:, :-1]
@@ -243,7 +243,7 @@ def fit(
         at: the intervals of the samples' times, in float64.
         differences: `finite_differences` as a matrix, in float64.
         free_tangents: fit tangents too; else they are the finite differences of the values.
-        weights: of the samples; one each by default.
+        weights: sample weights; 1 by default.
         smoothness: weight of tangents against finite differences, and of accelerations, a
             hundredth of that; it decides what the samples leave open.
     """

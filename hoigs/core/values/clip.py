@@ -112,8 +112,8 @@ class BodyTrack:
 
     Attributes:
         model: registry key, for example "body:anny".
-        gender: of the model file that the poses were fitted with ("male", "female", "neutral"),
-            where that matters; body models refuse another.
+        gender: gender of the body model that the poses were fitted with ("male", "female",
+            "neutral"), where that matters; body models refuse another.
         template: the person's own zero-pose vertices, metres, in place of the model's mean
             (ARCTIC); the betas come on top of it.
     """
@@ -141,9 +141,9 @@ class ObjectTrack:
         rotations: object to world, per frame. translations: object centre in the world, metres.
         observed: frames in which the object was seen; the others are interpolated.
         provenance: who made the track, for reports.
-        moving: of an object in two parts, the points that belong to the moving one; None if
+        moving: mask of the points on the moving part of an object in two parts; None if
             that is not known, or there are no parts.
-        times: of the frames, in [0, 1]; None if they are evenly spaced.
+        times: frame times in [0, 1]; None if they are evenly spaced.
         rotation_known: whether `rotations` are measured; False if they are constant (a ball), or
             only the roll in the image.
     """

@@ -172,7 +172,7 @@ class Gaussians:
                 in float32, so that its logit is finite.
             sh_degree: bands to allocate; all but the first start at zero.
             thickness: standard deviation along the surface's normal, as a share of `scales`.
-            normals: of the surface, unit, of either sign; by default those of the plane through
+            normals: unit surface normals, either sign; by default those of the plane through
                 each point's nearest neighbours. Not used where `thickness` is 1.
 
         Raises:

@@ -128,7 +128,7 @@ class Lens:
         """A lens with OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6]], as many as there are.
 
         Args:
-            K: intrinsics, pixels. width, height: of the image.
+            K: intrinsics, pixels. width, height: image size.
             pixel_center: where its maker puts the centre of the top-left pixel: 0.5, or 0 for
                 calibrations by OpenCV itself.
         """

@@ -146,7 +146,7 @@ class MomentLayout:
 
     Attributes:
         people: by entity name, in the row's order.
-        fields: of BodyPose that are in the row, in this order.
+        fields: names of the fields of BodyPose in the row, in this order.
     """
 
     people: Mapping[str, Person]
@@ -194,7 +194,7 @@ class MomentLayout:
         """The moment of a row, with the time as a 0-d tensor.
 
         Args:
-            row: from `pack`, without `first`, on any device. dtype: of the poses.
+            row: from `pack`, without `first`, on any device. dtype: that of the poses.
             given: fields that are not in the row, by person.
         """
         single = row.to(dtype)

@@ -20,7 +20,7 @@ class Tokens:
     """M feature vectors of one entity, each at a point in the world.
 
     Attributes:
-        features: of the width D of the entity's FeatureExtractor. positions: metres.
+        features: rows of the width D of the entity's FeatureExtractor. positions: metres.
     """
 
     features: Float[Tensor, "M D"]
@@ -35,9 +35,9 @@ class Role:
 
     Attributes:
         kind: scene, human or object.
-        anchors: of a human, the points from which reach is measured: pelvis, left wrist, right
+        anchors: points of a human from which reach is measured: pelvis, left wrist, right
             wrist, left foot, right foot; world, metres.
-        reach: of a human, arm length, metres.
+        reach: arm length of a human, metres.
     """
 
     kind: EntityKind

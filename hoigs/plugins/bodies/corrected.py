@@ -34,7 +34,7 @@ def read_model(key: str, path: Path, layout: Layout, where: str) -> dict[str, np
     """The arrays of a model file, with their shapes checked; nothing is unpickled.
 
     Args:
-        key: of the component, for messages. where: a sentence on where such files come from.
+        key: the component's key, for messages. where: a sentence on where such files come from.
         layout: shape of each array by its key; a letter has one value within a file.
 
     Raises:
@@ -160,7 +160,8 @@ class CorrectedBody(LinearBody):
             that of the config, if there is one, is used in its place.
 
     Attributes:
-        key: of the component, for messages. layout: of its model files. source: where to get them.
+        key: the component's key, for messages. layout: that of its model files. source: where they
+            are published.
         hand_means: [2, 15, 3], the mean pose of left and right hand, axis-angle, or None. It is
             added to a BodyPose with hand_pose_convention="mean" (flat_hand_mean=False elsewhere).
 

@@ -176,7 +176,7 @@ class SkipTrunk(nn.Module):
     """ReLU layers, of which one takes the input again (NeRF's trunk).
 
     Args:
-        entry: width of the input. width, depth: of the layers.
+        entry: width of the input. width, depth: size of the layers.
         skip: index of the layer whose input is [input, hidden]; None for none.
     """
 
@@ -227,7 +227,7 @@ class TimeTable(nn.Module):
     """Learned codes at given times, linear between them and constant outside.
 
     Args:
-        size: of each code. times: of the codes, in [0, 1], ascending.
+        size: length of each code. times: times of the codes, in [0, 1], ascending.
         spread: standard deviation of the codes at the start.
 
     Raises:

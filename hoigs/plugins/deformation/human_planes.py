@@ -75,7 +75,7 @@ class CanonicalHead(nn.Module):
     """psi_h(f(T_c)) = (c, o, dP_c, R, S, W), one MLP; it starts by changing nothing.
 
     Args:
-        features: width of the input. joints: of the body. width: of the two hidden layers.
+        features: width of the input. joints: joint count. width: width of the two hidden layers.
         kind: "full" is HOIGS, Eq. 5; "exavatar" predicts only colour, offset and one isotropic
             scale, as ExAvatar does, on which HOIGS builds.
     """

@@ -190,14 +190,14 @@ class KeyframedConfig(ComponentConfig):
 class Keyframed(Resizing, DeformationModel):
     """Base of motions over K knots (`HasKnots`).
 
-    With `light`, `normals` [N, 3] are a parameter: of the canonical Gaussians' surface.
+    With `light`, `normals` [N, 3] are a parameter, those of the canonical Gaussians' surface.
 
     Args:
         config: with `keyframes` None or "adaptive", K follows from the number of frames.
         num_frames: frames of the clip; by default those of the track.
         track: the canonical Gaussians are then those of the object about its centre, and the
             motion starts from the track.
-        cameras: of every frame, if `keyframes` is "adaptive".
+        cameras: camera of every frame, if `keyframes` is "adaptive".
 
     Raises:
         ValueError: neither `keyframes` nor frames to derive them; adaptive without cameras.

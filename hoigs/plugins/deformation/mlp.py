@@ -72,8 +72,8 @@ class MlpDeformation(DeformationModel):
     there. Times outside [0, 1] are those of the ends.
 
     Args:
-        num_frames: of the clip, the unit of `time_noise`; needed unless that is 0.
-        track: of the object; the Gaussians are then canonical and deformed before the rigid motion.
+        num_frames: frames in the clip, the unit of `time_noise`; needed unless that is 0.
+        track: object track; Gaussians are then canonical, and deformed before the rigid motion.
 
     Raises:
         ValueError: `time_noise` without `num_frames`.

@@ -40,7 +40,7 @@ class NonRigid(nn.Module, ABC):
     that is not trained on takes what those around it have learned.
 
     Args:
-        num_frames: of the clip. outputs: of the network, for each point.
+        num_frames: frames in the clip. outputs: network outputs for each point.
     """
 
     def __init__(self, config: NonRigidConfig, num_frames: int, outputs: int) -> None:
@@ -56,7 +56,7 @@ class NonRigid(nn.Module, ABC):
     def read(self, points: Float[Tensor, "N 3"], time: Time) -> Float[Tensor, "N outputs"]:
         """
         Args:
-            points: of the zero pose, in [-1, 1] within the planes. time: in [0, 1].
+            points: points in the zero pose, in [-1, 1] within the planes. time: in [0, 1].
         """
         residual: Tensor = self.layers(self.planes(points, time))
         return residual
@@ -72,7 +72,7 @@ class NonRigid(nn.Module, ABC):
         """
 
     def penalties(self) -> dict[str, Tensor]:
-        """Of the planes, as those of the human's own (`HexPlaneSkinning.regularizers`)."""
+        """Penalties of the planes, as in `HexPlaneSkinning.regularizers`."""
         return {
             "nonrigid_smoothness": self.planes.time_smoothness(),
             "nonrigid_sparsity": self.planes.time_sparsity(),

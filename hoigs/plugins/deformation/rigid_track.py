@@ -97,7 +97,7 @@ class RigidTrack(nn.Module):
 
         Args:
             means, own: positions and velocities in the object's frame.
-            unit: of time, as a share of the clip.
+            unit: unit of time, as a fraction of the clip.
         """
         at = self._position(time)
         turn = self.turns.index_select(0, at.k)[0] if isinstance(at.k, Tensor) else self.turns[at.k]

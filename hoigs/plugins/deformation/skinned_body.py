@@ -67,7 +67,7 @@ class PoseRefinement(nn.Module):
     Args:
         num_frames: F. betas: number of shape coefficients of the body.
         trained: frames that are trained on; all by default.
-        times: of the F frames, in [0, 1]; None: uniform.
+        times: times of the F frames, in [0, 1]; None: uniform.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class PosedBody(NamedTuple):
     """A body at a moment, without the interaction's residual and without gradients.
 
     Attributes:
-        pose: refined. transforms: of its joints, [J, 4, 4].
+        pose: refined pose. transforms: its joint transforms, [J, 4, 4].
         vertices, joints: [V, 3] and [J, 3], of the zero pose in the shape of `pose`, metres.
     """
 
@@ -139,12 +139,12 @@ class SkinnedBody(DeformationModel):
         betas: shape of the canonical Gaussians; zeros by default.
         surface: points of the canonical Gaussians, where these are not
             `body.surface(count, betas, seed)`.
-        seed: of that surface.
-        num_frames: of the clip; needed to refine poses.
+        seed: seed of that surface.
+        num_frames: frames in the clip; needed to refine poses.
         trained_frames: frames whose poses are refined; all by default. The others follow
             (PoseRefinement).
         camera_centers: [F, 3], world, metres; needed to scale about the camera.
-        frame_times: of the frames, in [0, 1]; None: uniform.
+        frame_times: frame times in [0, 1]; None: uniform.
 
     Raises:
         ValueError: `refine_poses` without `num_frames`.

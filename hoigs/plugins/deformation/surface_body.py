@@ -43,7 +43,7 @@ def face_points(
     same part) to four fifths of it above (the hair).
 
     Args:
-        vertices: of the zero pose, metres. head: joint 15 there.
+        vertices: vertices in the zero pose, metres. head: joint 15 there.
         triangles: corners of the triangle on which each point lies.
         parts: body part of each point.
     """
@@ -125,7 +125,7 @@ class SurfaceBody(SkinnedBody):
         the betas of the canonical Gaussians.
 
         Args:
-            vertices: of the zero pose, in the shape of `pose`.
+            vertices: vertices in the zero pose, with the shape of `pose`.
         """
         if self.held:
             return self._change
@@ -148,8 +148,8 @@ class SurfaceBody(SkinnedBody):
         light there.
 
         Args:
-            canonical: Gaussians of the zero pose. joints: of the zero pose, in the shape of `pose`,
-                metres.
+            canonical: Gaussians of the zero pose. joints: zero-pose joints with the
+                shape of `pose`, metres.
         """
         transforms = self.body.skinning_transforms(pose)
         turns = joint_turns(transforms, self.body.parents, self.ancestors)
@@ -210,7 +210,7 @@ def laplacians(
     """The penalties "laplacian" (of offsets), "laplacian_scale", "laplacian_color", by `smoothed`.
 
     Args:
-        attributes: of the vertices if there are edges, else of the points that have neighbours.
+        attributes: one row a vertex if there are edges, else one a point with neighbours.
     """
     choices = {
         "offset": ("laplacian", attributes.offsets),

@@ -72,7 +72,7 @@ class AdaptiveDensity(DensityControl):
     rotates them as it rotates the Gaussian.
 
     Args:
-        seed: of the children's positions. clip: whose frames a cap of "auto" depends on.
+        seed: seed of the children's positions. clip: its frame size decides a cap of "auto".
     """
 
     Config: ClassVar = AdaptiveDensityConfig

@@ -65,7 +65,7 @@ class BudgetDensity(DensityControl):
     there are too many, those with the lowest score are pruned.
 
     Args:
-        seed: of draws and of the children's positions.
+        seed: seed of draws and of the children's positions.
 
     Raises:
         HoigsError: from `refine`, when no refinement falls into the window.

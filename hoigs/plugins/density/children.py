@@ -22,7 +22,8 @@ class Window:
     """The steps at which there are refinements.
 
     Attributes:
-        start, stop: of the window, fractions of all steps. interval: steps between refinements.
+        start, stop: bounds of the window, fractions of all steps. interval: steps between
+            refinements.
     """
 
     start: float

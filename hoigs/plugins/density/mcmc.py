@@ -138,7 +138,7 @@ class McmcDensity(DensityControl):
     Eq. 9, and the scale follows the largest. A relocated row takes the keyframes of its source.
 
     Args:
-        seed: of draws and noise. clip: whose frames a cap of "auto" depends on.
+        seed: seed of draws and noise. clip: its frame size decides a cap of "auto".
     """
 
     Config: ClassVar = McmcDensityConfig

@@ -20,7 +20,7 @@ class BvhConfig(ComponentConfig):
     up: Up = "y"
     """the axis that points upward; "clip" leaves the world as the cameras have it"""
     unit: Literal["m", "cm"] = "m"
-    """of lengths"""
+    """unit of lengths"""
 
 
 class BvhExporter(Exporter):
@@ -57,7 +57,7 @@ class BvhExporter(Exporter):
 
 
 def bvh_text(motion: BodyMotion, fps: float, unit: float) -> str:
-    """The file. unit: of the file, in a metre."""
+    """The file. unit: file units per metre."""
     parents, names = motion.body.parents, motion.body.joint_names
     rest = motion.rest_joints.double().numpy() * motion.scale * unit
     children: list[list[int]] = [[] for _ in parents]

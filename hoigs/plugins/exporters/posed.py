@@ -92,11 +92,11 @@ class BodyMotion:
     """One person over F moments, on the CPU.
 
     Attributes:
-        name: of the entity. model: registry key of the body, as the clip has it.
+        name: the entity's name. model: registry key of the body, as the clip has it.
         body: its model. betas: shape, one for all moments.
         rotations: axis-angle of each joint in its parent's frame; zero is the T-pose.
         transl: the pelvis is at rest_joints[0] + transl, metres.
-        scale: of the whole body about its pelvis.
+        scale: scale of the whole body about its pelvis.
         rest_joints: in the T-pose, metres, unscaled.
     """
 

@@ -57,7 +57,7 @@ class Denoiser(ABC):
         """The noise in noisy latents, guidance included.
 
         Args:
-            views: of the camera, from the reference view: elevation (downwards) and azimuth (to
+            views: camera offsets from the reference view: elevation (downwards) and azimuth (to
                 the right), radians, and what is added to its distance.
         """
 

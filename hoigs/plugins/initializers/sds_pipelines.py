@@ -187,7 +187,7 @@ class ViewDenoiser(PipelineDenoiser):
 
     Args:
         image: the reference on white, RGB in [0, 1].
-        elevation: of the reference camera above the object, radians; read by stable-zero123.
+        elevation: angle of the reference camera above the object, radians; read by stable-zero123.
     """
 
     def __init__(

@@ -81,7 +81,7 @@ def log_gate(
     return log.expand(count, len(item.positions))
 
 
-OFFSET_UNIT = 0.1  # metres: of the size of corrections
+OFFSET_UNIT = 0.1  # metres, the size of corrections
 # body part of each joint that has a correction; the root has none
 JOINT_PARTS = (*BODY_JOINT_PARTS[1:], *(LEFT_HAND_PART,) * 15, *(RIGHT_HAND_PART,) * 15)
 

@@ -48,7 +48,7 @@ def require_files(
     """Refuse an incomplete folder.
 
     Args:
-        folder: of the data. layout: its name, for the message: "HOSNeRF".
+        folder: data folder. layout: its name, for the message: "HOSNeRF".
         needs: every file that the layout has.
         problems: other messages for the same error ("cameras.pkl has no frame 00003").
 
@@ -155,7 +155,7 @@ def numbers(value: Any, where: str, *shape: int, flat: bool = False) -> np.ndarr
     """`value` as finite float64 numbers.
 
     Args:
-        where: file and key, for the message. shape: of the result; -1 leaves a size free, and
+        where: file and key, for the message. shape: expected shape; -1 leaves a size free, and
             without any, so is the whole shape. flat: as one row, whatever the shape in the file.
 
     Raises:

@@ -325,7 +325,7 @@ def timed_moments(times: Sequence[float], train: Sequence[int]) -> list[Moment]:
     """Moments at given times, numbered on the even grid that the training times span.
 
     Args:
-        times: of all frames, in any unit from 0; scaled to [0, 1] by the largest if it exceeds 1
+        times: frame times, in any unit from 0; scaled to [0, 1] by the largest if it exceeds 1
             (4DGaussians, scene/dataset_readers.py: read_timeline).
         train: positions of the training frames; their different times are the clip's frames.
     """

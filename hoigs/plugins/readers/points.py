@@ -1,4 +1,4 @@
-"""Points and poses that readers share: of scenes, of object templates, of cameras and bodies."""
+"""Points and poses that readers share: scenes, object templates, cameras, bodies."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ class Embedded(DeformationModel):
     Parameters: `embedding` [N, E], allocated in `bind`; `time_table` [rows, table].
 
     Args:
-        num_frames: of the clip; needed for `rows` of None.
+        num_frames: frames in the clip; needed for `rows` of None.
 
     Raises:
         ValueError: `coarse_rows` is more than `rows`.

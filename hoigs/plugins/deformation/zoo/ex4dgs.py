@@ -155,7 +155,7 @@ class Ex4dgs(Resizing, LinearDisplacement):
     of opacity in time, in keyframe intervals.
 
     Args:
-        num_frames: of the clip.
+        num_frames: frames in the clip.
     """
 
     Config: ClassVar = Ex4dgsConfig

@@ -67,7 +67,7 @@ class HexPlaneField(DeformationModel):
     ends.
 
     Args:
-        num_frames: of the clip; needed for a `time_resolution` of None.
+        num_frames: frames in the clip; needed for a `time_resolution` of None.
     """
 
     Config: ClassVar = HexPlaneFieldConfig

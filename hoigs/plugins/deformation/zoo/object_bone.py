@@ -157,11 +157,11 @@ class ObjectBone(DeformationModel):
 
     Args:
         config: `transitions` and `attach` are used by `from_config` alone.
-        bodies: of the humans, by entity.
+        bodies: body of each human, by entity.
         attachments: bone and first offset of each state; a bone is "HUMAN/left", "HUMAN/right" or
             "world".
         transitions: times between states, ascending, one fewer than attachments.
-        num_frames: of the clip, which corrections need (`refine`).
+        num_frames: frames in the clip; needed for corrections (`refine`).
         trained_frames: frames that are trained on; all when absent.
     """
 

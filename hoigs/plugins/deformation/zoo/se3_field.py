@@ -73,7 +73,7 @@ class Se3Field(DeformationModel):
     colour and opacity from (x, w): what appears and vanishes need not be moved out of sight.
 
     Args:
-        times: of the trained frames, in [0, 1], ascending.
+        times: times of the training frames, in [0, 1], ascending.
     """
 
     Config: ClassVar = Se3FieldConfig

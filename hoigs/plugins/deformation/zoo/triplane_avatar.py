@@ -100,10 +100,11 @@ class CanonicalDecoders(nn.Module):
     """Geometry, appearance and optionally skinning: a trunk and its heads for each.
 
     Args:
-        features: width of the input. width, depth, kind: of each trunk.
+        features: width of the input. width, depth, kind: those of each trunk.
         shape: "isotropic" is one scale and no rotation (ExAvatar), "full" three scales and a 6D
             rotation (HUGS).
-        opacity: learn opacities. joints: of learned skinning weights; None keeps the body's.
+        opacity: learn opacities. joints: number of learned skinning weights; None keeps the
+            body's.
     """
 
     def __init__(
@@ -362,7 +363,7 @@ class TriplaneAvatar(SurfaceBody):
         self.neighbours = self._predicted = None
 
     def regularizers(self) -> dict[str, Tensor]:
-        """Of the last training pass; means over points and coordinates.
+        """Penalties of the last training pass; means over points and coordinates.
 
         "offset": squared offsets, m^2, and "scale": squared scales, m^2, plus the squares of what
         the pose adds to their logarithms; hands count `hand_stiffness` times (ExAvatar).

@@ -37,7 +37,7 @@ def doubt(points, own, wide) -> int:
 
     Args:
         points: x, y in pixels, depth and visibility of the 33 landmarks.
-        own: the mask that came with them. wide: of all people. 0..1 a pixel; None: not known.
+        own: the mask that came with them. wide: mask of all people. 0..1 a pixel; None: not known.
     """
     seen = inside(points, own)
     if seen is None:
@@ -54,7 +54,7 @@ def doubt(points, own, wide) -> int:
 
 
 def share_on(points, mask) -> float:
-    """Of the landmarks that are seen, those on a mask; 1 without one, or if it is empty."""
+    """Share of the visible landmarks on a mask; 1 without one, or if it is empty."""
     seen = inside(points, mask)
     if seen is None or not len(seen) or not (mask > 0.5).any():
         return 1.0

@@ -48,7 +48,7 @@ class GuidedPose:
     Args:
         graph: of `landmark_graph`. rect: makes a square for it, NormalizedRect.
         doubt: what there is against landmarks, given them, their own mask and the frame's mask of
-            people; 0: nothing. share_on: of the seen landmarks, those on a mask.
+            people; 0: nothing. share_on: share of the visible landmarks on a mask.
     """
 
     def __init__(self, graph, rect, doubt, share_on) -> None:

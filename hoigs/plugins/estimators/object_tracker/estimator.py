@@ -135,7 +135,7 @@ class ObjectTrackerEstimator(Estimator):
         return Estimates(read_tracks(file, video, [e.name for e in wanted]))
 
     def _key(self, video: VideoRequest, wanted: Sequence[EntityRequest]) -> str:
-        """Of everything that masks depend on; the person's masks by a few frames of them."""
+        """Key of everything that masks depend on; a few frames stand for the person's masks."""
         person = _person(video)
         digest = hashlib.sha256()
         if video.known is not None:

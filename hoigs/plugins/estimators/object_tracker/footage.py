@@ -102,7 +102,7 @@ class Footage:
     """The frames to work on, reduced.
 
     Attributes:
-        numbers: of each frame, in the video. scale: pixels here per pixel of the video.
+        numbers: number of each frame in the video. scale: pixels here per pixel of the video.
         lab: CIE L*a*b*, as uint8: L* times 2.55, a* and b* plus 128.
         person: pixels that the person's mask covers; all False where there is none.
         blank: pixels that show nothing, such as the black corners of a stabilised video.
@@ -224,7 +224,7 @@ def _reduced(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def _is_border(blank: Bool[np.ndarray, "F h w"]) -> Bool[np.ndarray, "F h w"]:
-    """Of blank regions, those that touch the edge of the image: not what is merely black."""
+    """Blank regions that touch the edge of the image; black areas inside it are kept."""
     kept = np.zeros_like(blank)
     for i in np.flatnonzero(blank.any((1, 2))):
         labels, _ = ndimage.label(blank[i])
@@ -254,7 +254,7 @@ class Window:
         return cls(round(x - n * step / 2), round(y - n * step / 2), n, step)
 
     def at(self, x: float, y: float) -> Window:
-        """Of the same size around another point."""
+        """A window of the same size around another point."""
         side = self.n * self.step / 2
         return Window(round(x - side), round(y - side), self.n, self.step)
 

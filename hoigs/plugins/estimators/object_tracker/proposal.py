@@ -32,7 +32,7 @@ class Candidate:
 
     Attributes:
         point: its innermost pixel, x and y. score: what speaks for it in this frame, 0 to 1.
-        colors: their histogram. radius: of a disc of its area. near: how near a hand is, 0 to 1.
+        colors: their histogram. radius: that of a disc of its area. near: how near a hand is, 0..1.
     """
 
     frame: int

@@ -1,4 +1,4 @@
-"""Which pixels differ from the scene behind: of a static camera, and of a moving one."""
+"""Which pixels differ from the scene behind, for static and for moving cameras."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def scene_behind(footage: Footage, masks: Bool[np.ndarray, "F h w"], around: flo
     """What an object passes in front of: the scene, and of people what keeps still.
 
     Args:
-        masks: of the object. around: pixels beside them that may be its own, too.
+        masks: masks of the object. around: neighbouring pixels that may also belong to it.
     """
     picks = _samples(footage, 2 * SAMPLES)
     hidden = masks[picks] | footage.blank[picks]
@@ -197,7 +197,7 @@ def _samples(footage: Footage, count: int) -> np.ndarray:
 def _still_parts(
     footage: Footage, picks: np.ndarray, hidden: Bool[np.ndarray, "S h w"]
 ) -> StaticScene:
-    """Of samples of frames, where they are not hidden."""
+    """Median and spread of sampled frames where they are not hidden."""
     median, spread = np.empty((*footage.shape, 3), np.float32), np.empty(footage.shape, np.float32)
     for y in range(footage.shape[0]):  # a row of pixels at a time, which fits the cache
         median[y], spread[y] = _median_and_spread(footage.lab[picks, y], hidden[:, y])
@@ -298,7 +298,7 @@ def carried(scene: Scene, point: tuple[float, float], i: int, j: int) -> Float[n
 
 
 def median_of(differences: np.ndarray) -> float:
-    """Of those that are known; NaN where none is."""
+    """Median of the known values; NaN where none is known."""
     known = differences[np.isfinite(differences)]
     return float(np.median(known)) if known.size else float("nan")
 

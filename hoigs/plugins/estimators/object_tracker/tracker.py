@@ -48,7 +48,7 @@ def anchors(footage: Footage, track: Track, prompts: Sequence[PromptedMask]) -> 
 
 
 def _quality(footage: Footage, track: Track) -> Float[np.ndarray, " F"]:
-    """Of each frame's mask, 0 to 1: how sure it is, how well set off, how usual its size is, and
+    """Quality of each frame's mask, 0 to 1: its confidence, contrast, how usual its size is, and
     how little of it the body may be."""
     masks = track.soft > 127
     area = masks.sum((1, 2)).astype(float)

@@ -146,7 +146,7 @@ class Detector:
     """A detector of transformers.
 
     Args:
-        checkpoint: as in the estimators' settings. key: of the estimator that uses it, for errors.
+        checkpoint: as in the estimators' settings. key: the estimator's key, for errors.
         threshold: lowest score of a box.
     """
 

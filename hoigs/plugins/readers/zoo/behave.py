@@ -191,7 +191,7 @@ class SequenceInfo(BaseModel):
 
 
 class ColorCalibration(BaseModel):
-    """Of the colour camera. opencv: fx, fy, cx, cy in some order, then the distortion."""
+    """The colour camera. opencv: fx, fy, cx, cy in some order, then the distortion."""
 
     width: int
     height: int
