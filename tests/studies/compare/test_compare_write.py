@@ -10,15 +10,15 @@ from pathlib import Path
 
 import plotly.graph_objects as go
 import pytest
-from chart_tables import METHODS, A, B, cell, study
+from made_up_cells import METHODS, A, B, cell, study
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from hoigs.core.errors import HoigsError
-from hoigs.studies.chart.data import load_chart, machine_sentences, points_of, series_of
-from hoigs.studies.chart.interactive import details, page
-from hoigs.studies.chart.panels import accuracy_chart, curve_chart
-from hoigs.studies.chart.write import by_clip, write_chart
+from hoigs.studies.compare.data import load_chart, machine_sentences, points_of, series_of
+from hoigs.studies.compare.interactive import details, page
+from hoigs.studies.compare.panels import accuracy_chart, curve_chart
+from hoigs.studies.compare.write import by_clip, write_chart
 from hoigs.studies.plots import is_log, short_number
 
 FEW = {name: METHODS[name] for name in ("hoigs", "4dgs", "static-3dgs")}
@@ -190,7 +190,7 @@ def test_times_of_two_machines_are_in_no_menu() -> None:
 
 
 def test_without_plotly_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hoigs.studies.chart.interactive.find_spec", lambda name: None)
+    monkeypatch.setattr("hoigs.studies.compare.interactive.find_spec", lambda name: None)
     with pytest.raises(HoigsError, match=r"pip install 'hoigs\[charts\]'"):
         page([], {}, {}, False)
 

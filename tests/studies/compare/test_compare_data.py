@@ -6,11 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
-from chart_tables import NO_JOULES, A, B, cell, study
+from made_up_cells import NO_JOULES, A, B, cell, study
 
 from hoigs.core.errors import HoigsError
 from hoigs.evaluation.protocol import NotComputed
-from hoigs.studies.chart.data import (
+from hoigs.studies.compare.data import (
     AXES,
     all_clips,
     dominances,
