@@ -17,7 +17,6 @@ from hoigs.studies.execution.local import (
     Needs,
     Process,
     make_executor,
-    stop_all,
     visible_gpus,
     why_failed,
 )
@@ -88,7 +87,9 @@ def starts(tmp_path, two_gpus):
         return made[-1]
 
     yield make
-    stop_all(process for one in made for process in one.processes)
+    for process in (process for one in made for process in one.processes):
+        if process is not None:
+            process.stop()
 
 
 def test_processes_take_the_gpus_in_turn(starts):
