@@ -51,7 +51,7 @@ CHART_BUDGETS ?= 1200
 CHART_SEEDS ?= 3
 CHART_OUT ?= runs/results-chart
 charts: $(INSTALLED)
-	$(BIN)/hoigs chart $(CHART_CLIPS) --specs "$(CHART_SPECS)" --budgets $(CHART_BUDGETS) \
+	$(BIN)/hoigs study compare $(CHART_CLIPS) --specs "$(CHART_SPECS)" --budgets $(CHART_BUDGETS) \
 		--seeds $(CHART_SEEDS) --out $(CHART_OUT)
 	mkdir -p docs/results/chart
 	cp $(addprefix $(CHART_OUT)/,chart.md chart.json chart-*.png) docs/results/chart/
@@ -64,7 +64,7 @@ STRESS_STEPS ?= 300
 STRESS_JOBS ?= 1
 STRESS_OUT ?= runs/results-stress
 stress: $(INSTALLED)
-	$(BIN)/hoigs stress --cases "$(STRESS_CASES)" --specs "$(STRESS_SPECS)" \
+	$(BIN)/hoigs study stress --cases "$(STRESS_CASES)" --specs "$(STRESS_SPECS)" \
 		--seeds $(STRESS_SEEDS) --steps $(STRESS_STEPS) --jobs $(STRESS_JOBS) --threads 1 \
 		--out $(STRESS_OUT)
 	mkdir -p docs/results/stress

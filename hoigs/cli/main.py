@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from hoigs import __version__
-from hoigs.cli import doctor, train
+from hoigs.cli import doctor, study, train
 from hoigs.cli import doctor as bug_report
 from hoigs.cli import make as annotate
 from hoigs.cli import make as demo
@@ -19,9 +19,6 @@ from hoigs.cli import see as publish
 from hoigs.cli import see as render
 from hoigs.cli import see as view
 from hoigs.cli import study as batch
-from hoigs.cli import study as chart
-from hoigs.cli import study as stress
-from hoigs.cli import study as tables
 from hoigs.cli import train as compress
 from hoigs.cli import train as evaluate
 from hoigs.cli import train as needs
@@ -41,6 +38,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+study_app = typer.Typer(no_args_is_help=True, help="Compare methods, and find their limits.")
+study_app.command("compare")(study.compare)
+study_app.command("stress")(study.stress)
+study_app.command("needs")(needs.needs)
 app.command("demo")(demo.demo)
 app.command("annotate")(annotate.annotate)
 app.command("prepare")(prepare.prepare)
@@ -53,10 +54,7 @@ app.command("export")(export.export)
 app.command("publish")(publish.publish)
 app.command("batch")(batch.batch)
 app.command("work")(batch.work)
-app.command("tables")(tables.tables)
-app.command("chart")(chart.chart)
-app.command("stress")(stress.stress)
-app.command("needs")(needs.needs)
+app.add_typer(study_app, name="study")
 app.command("compress")(compress.compress)
 app.add_typer(plugins.plugins_app, name="plugins")
 app.add_typer(spec.spec_app, name="spec")

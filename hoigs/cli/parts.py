@@ -264,7 +264,8 @@ def new_plugin(
     typer.echo(f"  hoigs plugins show {kind}:{name}")
     if (folder / f"{name}.yaml").is_file():
         typer.echo(f"  hoigs train builtin:carry --spec {name}.yaml")
-        typer.echo(f"  hoigs chart builtin:carry --specs hoigs,{name}.yaml --budgets 300 --seeds 1")
+        command = f"hoigs study compare builtin:carry --specs hoigs,{name}.yaml"
+        typer.echo(f"  {command} --budgets 300 --seeds 1")
 
 
 def write_package(name: str, kind: NewKind, out: Path) -> Path:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from hoigs.studies.needs.result import Needs
 
 
-# `hoigs needs`: find how much of a spec a clip needs; the answer is a spec.
+# `hoigs study needs`: find how much of a spec a clip needs; the answer is a spec.
 
 CriterionOption = Annotated[
     str,
@@ -140,8 +140,8 @@ def train(
         bool,
         typer.Option(
             "--auto",
-            help="First reduce the spec to what this clip needs (`hoigs needs`); after training, "
-            "prune and compress the model.",
+            help="First reduce the spec to what this clip needs (`hoigs study needs`); after "
+            "training, prune and compress the model.",
         ),
     ] = False,
     budget: Annotated[

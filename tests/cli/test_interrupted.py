@@ -91,9 +91,11 @@ def test_a_second_signal_stops_within_the_step(hoigs, clip, tmp_path, monkeypatc
     ("command", "work"),
     [
         (["batch", "rows.csv", "--out", "out"], "batch.batch.batch"),
-        (["tables", "--clips", "x", "--specs", "static", "--out", "out"], "tables.run.run_study"),
-        (["chart", "x", "--specs", "static", "--out", "out"], "chart.run.run_chart"),
-        (["stress", "--specs", "static", "--out", "out"], "stress.run.run_stress"),
+        (
+            ["study", "compare", "x", "--specs", "static", "--out", "out"],
+            "compare.run.run_comparison",
+        ),
+        (["study", "stress", "--specs", "static", "--out", "out"], "stress.run.run_stress"),
     ],
     ids=lambda x: x[0] if isinstance(x, list) else "",
 )

@@ -73,7 +73,7 @@ def test_other_folders_with_a_spec_in_them(hoigs, train, clip_copy, tmp_path):
     for outcome in (
         train(out=project),
         hoigs("demo", "--out", project, "--overwrite"),
-        hoigs("needs", clip_copy, "--out", project, "--overwrite", "--device", "cpu"),
+        hoigs("study", "needs", clip_copy, "--out", project, "--overwrite", "--device", "cpu"),
     ):
         assert outcome.code == 2 and "not a complete" in outcome.err
     assert (project / "thesis.tex").read_text() == "mine"

@@ -7,10 +7,12 @@ import torch
 from raster_scenes import CUT, a_camera, images, random_scene
 
 from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers import compositing
 from hoigs.rasterizers.compositing import compositing_weights, prepare, splat_alphas
 from hoigs.rasterizers.oracle import OracleRasterizer
 from hoigs.rasterizers.torch_tiles import TorchRasterizer, tile_intersections
+from hoigs.rasterizers.warp import WarpRasterizer
 from hoigs.testing.rasterizer import CHECKS, RasterizerSubject
 
 
@@ -83,3 +85,17 @@ def test_the_oracle_ignores_cutoffs_by_default() -> None:
     cut = CUT.render(gaussians, camera)
     assert default.color.dtype == torch.float64
     assert 1e-4 < float((default.color - cut.color).abs().max()) < 0.1
+
+
+@pytest.mark.parametrize("backend", [TorchRasterizer, OracleRasterizer, WarpRasterizer])
+def test_gaussians_in_the_camera_and_on_its_plane(backend) -> None:  # F20
+    camera, scene = a_camera(), random_scene(40)
+    z = torch.tensor([0.0, 1e-6, -1e-6, 0.005, -0.5, -4.0])
+    means = torch.cat((scene.means, camera.center + z[:, None] * camera.world_to_camera[2, :3]))
+    both = Gaussians.from_points(means, scales=0.2, opacity=0.9)
+    leaf = both.map(lambda x: x.clone().requires_grad_())
+    output = backend().render(leaf, camera)
+    output.color.square().sum().backward()
+    assert output.color.isfinite().all() and not output.info["radii"][len(scene) :].any()
+    assert all(field.grad.isfinite().all() for field in (leaf.means, leaf.log_scales, leaf.quats))
+    assert leaf.means.grad[: len(scene)].any() and not leaf.means.grad[len(scene) :].any()

@@ -264,8 +264,8 @@ class ProvidesTemplate(Protocol):
 class HasKnots(Protocol):
     """Deformations whose motion is a spline over knots that other knots can replace.
 
-    Training (`KnotSchedule`) and pruning (`hoigs needs`) insert and remove knots of such a motion
-    (`hoigs.core.model.knot_refit`).
+    Training (`KnotSchedule`) and pruning (`hoigs study needs`) insert and remove knots of such a
+    motion (`hoigs.core.model.knot_refit`).
 
     Attributes:
         knots: the times of the knots; another Knots may be assigned.

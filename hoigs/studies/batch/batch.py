@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import shutil
 import socket
+import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
@@ -15,7 +15,7 @@ from typing import Any
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.system.folder_lock import FolderLock
-from hoigs.studies.batch.folder import BATCH, BatchFolder, Stage, State, TakenError, stages_of
+from hoigs.studies.batch.folder import BATCH, BatchFolder, Stage, State, stages_of
 from hoigs.studies.batch.manifest import Row, each_row
 from hoigs.studies.batch.summary import write_summary
 from hoigs.studies.execution.local import (
@@ -24,21 +24,11 @@ from hoigs.studies.execution.local import (
     Needs,
     Process,
     make_executor,
-    stop_all,
     why_failed,
 )
+from hoigs.studies.execution.queue import TAKEN_POLL_S, Queue, TakenError, hold
 
-# The driver of a batch: runs the stages of rows that no other driver works on.
-#
-# Any number of drivers may work on one folder, on one machine or on many: the lock of a row's
-# folder (`hoigs.core.system.folder_lock`) admits one of them, and what is done is what lies on
-# disk.
-
-POLL_S = 0.01
-TAKEN_POLL_S = 2.0  # how often a row that another driver has is looked at again
 RETRY_S = 1.0
-LEASE_POLL_S = 1.0
-NEW_ROWS = 100  # that are looked at between two looks at the running ones
 WRONG_INPUT = 2  # exit code that another attempt does not change
 Report = Callable[["Work", str], None]
 
@@ -49,9 +39,8 @@ class Work:
 
     Attributes:
         stage: that runs, or ran last. since: when it was started, on the monotonic clock.
-        taken_at: when this driver took the row.
-        retries: of the present stage, by this driver, and losses: those of them whose machine was
-            lost. device: where the stage runs.
+        taken_at: when this driver took the row. process: of the stage, while it runs.
+        retries: of the present stage, by this driver. device: where the stage runs.
     """
 
     row: Row
@@ -62,12 +51,9 @@ class Work:
     since: float = 0.0
     taken_at: float = 0.0
     retries: int = 0
-    losses: int = 0
     device: str = ""
-    lock: FolderLock | None = None
     process: Process | None = None
-    not_before: float = 0.0
-    look_at: float = 0.0  # when to look at the lock again
+    elsewhere: bool = False  # whether another driver has it
 
     @property
     def todo(self) -> Sequence[Stage]:
@@ -100,67 +86,40 @@ def drive(
             done", "waits: why", "retry: why", "done" or "failed: why".
         tick: called at every look at the running rows.
     """
-    began = time.time()
     new = (Work(row, out.of(row), stages_of(row, out.of(row))) for row in rows)
-    waiting: deque[Work] = deque()  # rows that other drivers have
-    more = True
-    running: list[Work] = []
-    failed: dict[str, str] = {}
-    driver = _Driver(executor, retries, report, began, failed)
-    try:
-        while more or waiting or running:
-            for i in range(len(waiting) + NEW_ROWS):
-                if len(running) >= executor.slots:
-                    break
-                known = i < len(waiting)
-                work = waiting.popleft() if known else next(new, None)
-                if work is None:
-                    more = False
-                    break
-                if time.monotonic() < work.not_before or (taken := driver.take(work)) is None:
-                    waiting.append(work)
-                elif taken:
-                    running.append(work)
-            running = [work for work in running if driver.go_on(work)]
-            waiting.extend(driver.lost)
-            driver.lost.clear()
-            tick(running)
-            time.sleep(POLL_S)
-    finally:
-        stop_all(work.process for work in running)
-        for work in running:
-            if work.lock is not None:
-                work.lock.release()
-    return failed
+    driver = _Driver(Queue(executor), retries, report)
+    driver.queue.drain(lambda: next(new, None), driver.work, tick=tick)
+    return driver.failed
 
 
-@dataclass
 class _Driver:
-    executor: Executor
-    retries: int
-    report: Report
-    began: float
-    failed: dict[str, str]
-    lost: list[Work] = field(default_factory=list)  # rows that another driver took over
+    def __init__(self, queue: Queue, retries: int, report: Report) -> None:
+        self.queue, self._retries = queue, retries
+        self._report, self._reporting = report, threading.Lock()
+        self._began = time.time()
+        self.failed: dict[str, str] = {}
 
-    def take(self, work: Work) -> bool | None:
-        """Whether this driver works on the row now; None if another one does."""
+    def report(self, work: Work, word: str) -> None:
+        with self._reporting:
+            self._report(work, word)
+
+    def work(self, work: Work) -> bool:
+        """Run the stages of a row that are not done; False if another driver has it."""
         if self._settled(work):
-            return False
-        lock = FolderLock(work.folder, "hoigs batch", error=TakenError)
+            return True
         try:
-            lock.acquire()
+            with hold(work.folder, "hoigs batch") as lock:
+                work.elsewhere, work.taken_at = False, time.monotonic()
+                if not self._settled(work):  # by another driver, before its lock was ours
+                    work.folder.mkdir(exist_ok=True)
+                    self._stages(work, lock)
         except TakenError:
-            if not work.not_before:
+            if not work.elsewhere:
                 self.report(work, "taken by another driver")
-            work.not_before = time.monotonic() + TAKEN_POLL_S
-            return None
-        if self._settled(work):  # by another driver, before its lock was ours
-            lock.release()
+            work.elsewhere = True
             return False
-        work.lock = lock
-        work.not_before, work.taken_at = 0.0, time.monotonic()
-        work.folder.mkdir(exist_ok=True)
+        finally:
+            work.process = None
         return True
 
     def _settled(self, work: Work) -> bool:
@@ -172,7 +131,7 @@ class _Driver:
         if not work.todo:
             self.report(work, "done before")
             return True
-        if work.state.failed.when > self.began:
+        if work.state.failed.when > self._began:
             return self._failed(work, work.state.failed.why)
         return False
 
@@ -181,94 +140,59 @@ class _Driver:
         self.report(work, f"failed: {why}")
         return True
 
-    def go_on(self, work: Work) -> bool:
-        """Look at a row; whether it is still worked on."""
+    def _stages(self, work: Work, lock: FolderLock) -> None:
+        why = ""
         try:
-            return self._go_on(work)
+            while work.todo and not why:
+                why = self._stage(work, lock)
+        except TakenError:
+            raise
         except (HoigsError, OSError) as error:  # costs this row only
-            if work.process is not None:
-                work.process.stop()
-                work.process = None
-            if isinstance(error, TakenError):
-                self.report(work, "taken over by another driver")
-                work.lock, work.not_before = None, time.monotonic() + TAKEN_POLL_S
-                self.lost.append(work)
-                return False
-            with contextlib.suppress(OSError):  # a full disk, say, which is the error itself
-                work.state.fail(work.todo[0], str(error))
-                work.state.write(work.folder)
-            self._failed(work, str(error))
-            return self._leave(work)
-
-    def _go_on(self, work: Work) -> bool:
-        if work.process is None:
-            self._start(work)
-            return True
-        assert work.lock is not None
-        code = work.process.poll()
-        if code is None:
-            if time.monotonic() >= work.look_at:
-                work.look_at = time.monotonic() + LEASE_POLL_S
-                if work.lock.is_lost():
-                    work.lock.require_held()
-            return True
-        work.lock.require_held()  # or another driver's record would be overwritten
-        lost = work.process.lost and work.losses < LOST_RETRIES
-        work.device = work.process.device  # some executors know it only now
-        stage, work.process = work.todo[0], None
-        if code == 0 and stage.result.exists():
-            seconds = time.monotonic() - work.since
-            work.state.end(stage, seconds, work.device, socket.gethostname())
-            work.state.write(work.folder)
-            work.retries = work.losses = 0
-            self.report(work, f"{stage.name} done")
-            if work.todo:
-                self._start(work)
-                return True
+            why = str(error)
+        if not why:
             self.report(work, "done")
-            return self._leave(work)
-        why = why_failed(work.log, code) if code else f"made no {stage.result.name}"
-        if lost or (code != WRONG_INPUT and work.retries - work.losses < self.retries):
-            work.retries, work.losses = work.retries + 1, work.losses + lost
-            work.not_before = time.monotonic() + RETRY_S
-            self.report(work, f"retry: {why}")
-            return True
-        work.state.fail(stage, why)
-        work.state.write(work.folder)
-        self._failed(work, why)
-        return self._leave(work)
-
-    def _start(self, work: Work) -> None:
-        """Start the next stage of a row, unless all is busy or a retry waits."""
-        if time.monotonic() < work.not_before:
             return
-        assert work.lock is not None
-        work.lock.require_held()
+        with contextlib.suppress(OSError):  # a full disk, say, which is the error itself
+            work.state.fail(work.todo[0], why)
+            work.state.write(work.folder)
+        self._failed(work, why)
+
+    def _stage(self, work: Work, lock: FolderLock) -> str:
+        """Run the next stage of a row; why it failed, or an empty text."""
         todo = work.todo
-        stage = todo[0]
-        command = work.state.command(stage)
+        stage, work.stage, work.retries, losses = todo[0], todo[0].name, 0, 0
         gpus = 0.0 if work.row.device == "cpu" else work.row.gpus
         needs = Needs(gpus=gpus, memory_gb=work.row.memory_gb)
-        work.stage = stage.name
-        if left := FolderLock(stage.locks, "").holder():  # by a driver that was lost
-            self.report(work, f"waits: {stage.locks.name} is being written by {left}")
-            work.not_before = time.monotonic() + TAKEN_POLL_S
-            return
-        if stage.clear and stage.result.exists():
-            shutil.rmtree(stage.result)
-        work.process = self.executor.start(("hoigs", *command), work.log, needs, work.lock.lease)
-        if work.process is not None:
-            work.since, work.device = time.monotonic(), work.process.device
+
+        def started(process: Process) -> None:
+            work.process, work.since, work.device = process, time.monotonic(), process.device
             work.state.begin(todo)
             work.state.write(work.folder)
             self.report(work, stage.name)
 
-    def _leave(self, work: Work) -> bool:
-        if work.lock is not None:
-            with contextlib.suppress(OSError):
-                work.lock.release()
-        work.process = None
-        return False
+        while True:
+            while left := FolderLock(stage.locks, "").holder():  # by a driver that was lost
+                self.report(work, f"waits: {stage.locks.name} is being written by {left}")
+                self.queue.pause(TAKEN_POLL_S)
+            lock.require_held()
+            command = ("hoigs", *work.state.command(stage))
+            if stage.clear and stage.result.exists():
+                shutil.rmtree(stage.result)
+            code, process = self.queue.run(command, work.log, needs, lock, started)
+            work.process, work.device = None, process.device  # some executors know it only now
+            if code == 0 and stage.result.exists():
+                seconds = time.monotonic() - work.since
+                work.state.end(stage, seconds, work.device, socket.gethostname())
+                work.state.write(work.folder)
+                self.report(work, f"{stage.name} done")
+                return ""
+            why = why_failed(work.log, code) if code else f"made no {stage.result.name}"
+            lost = process.lost and losses < LOST_RETRIES
+            if not lost and (code == WRONG_INPUT or work.retries - losses >= self._retries):
+                return why
+            work.retries, losses = work.retries + 1, losses + lost
+            self.report(work, f"retry: {why}")
+            self.queue.pause(RETRY_S)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -22,17 +22,13 @@ from hoigs.core.system.files import (
     write_whole,
     written_whole,
 )
-from hoigs.core.system.folder_lock import FolderLock
 from hoigs.studies.batch.manifest import Row
+from hoigs.studies.execution.queue import TakenError, hold
 
 BATCH = "batch.jsonl"
 MANY = 10_000  # rows, from which on they lie in 256 folders: network disks list large ones slowly
 HALVES = [f"{i:02x}" for i in range(256)]
 TURN_POLL_S = 0.2
-
-
-class TakenError(HoigsError):
-    """Another driver has this row or file."""
 
 
 @dataclass(frozen=True)
@@ -132,17 +128,14 @@ class BatchFolder:
 @contextmanager
 def in_turn(path: Path) -> Iterator[None]:
     """Wait until no other driver writes this file, and keep them from it."""
-    lock = FolderLock(path, "hoigs batch", TakenError)
-    while True:
-        try:
-            lock.acquire()
-            break
-        except TakenError:
-            time.sleep(TURN_POLL_S)
-    try:
+    with ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(hold(path, "hoigs batch"))
+                break
+            except TakenError:
+                time.sleep(TURN_POLL_S)
         yield
-    finally:
-        lock.release()
 
 
 def _head(fan_out: bool) -> str:

@@ -9,8 +9,7 @@ import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -111,13 +110,6 @@ def make_executor(
         raise HoigsError(f"--executor {name}: cannot be imported ({error})") from error
     made: Executor = kind(slots=slots, threads=threads, address=address)
     return made
-
-
-def stop_all(processes: Iterable[Process | None]) -> None:
-    """Stop processes, all at a time, as each may take seconds to end."""
-    running = [process for process in processes if process is not None]
-    with ThreadPoolExecutor(max(1, len(running))) as pool:
-        list(pool.map(lambda process: process.stop(), running))
 
 
 def why_failed(log: Path, code: int) -> str:

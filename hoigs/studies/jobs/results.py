@@ -1,10 +1,10 @@
-"""Mean and spread over seeds of every measure of the evaluations, by row and clip."""
+"""What studies train, and the numbers of it: rows, measures, their spread and protocol."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
@@ -13,7 +13,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.evaluation.protocol import NotComputed, Protocol, Value, from_json
 from hoigs.studies.jobs.cost import Cost
 
-# Rows of methods that a study trains, and tables of them.
+# Rows of methods that a study trains.
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,6 @@ class Row:
     why: str = ""
 
 
-@dataclass(frozen=True)
-class TableSet:
-    """A table: its rows, in order."""
-
-    name: str
-    title: str
-    rows: tuple[Row, ...]
-
-
 Measure = tuple[str, str, str]  # view or "geometry", "time", "size"; region or part; metric
 ALL_CLIPS = "mean of all clips"
 
@@ -62,43 +53,6 @@ class Spread:
         return Spread(mean(values), stdev(values) if len(values) > 1 else None, tuple(values))
 
 
-@dataclass(frozen=True)
-class RowResult:
-    """A row on one clip: its measures by seed, or why a seed has none.
-
-    Attributes:
-        runs: run folder by seed, relative to the tables' own folder.
-    """
-
-    row: Row
-    clip: str
-    by_seed: Mapping[int, Mapping[Measure, Value]]
-    missing: Mapping[int, str]
-    runs: Mapping[int, str] = field(default_factory=dict)
-
-    def over_seeds(self, measure: Measure) -> Spread | NotComputed:
-        """Mean and spread, or the reasons of the seeds that have no number."""
-        if self.missing:
-            reasons = sorted(set(self.missing.values()))
-            seeds = ", ".join(map(str, self.missing))
-            each = f"seed {seeds}: " if self.by_seed else ""
-            return NotComputed(each + "; ".join(reasons))
-        absent = NotComputed("this evaluation has no such score")
-        values = [measures.get(measure, absent) for measures in self.by_seed.values()]
-        reasons = sorted({v.reason for v in values if isinstance(v, NotComputed)})
-        if reasons:
-            return NotComputed("; ".join(reasons))
-        return Spread.of([v for v in values if not isinstance(v, NotComputed)])
-
-
-@dataclass(frozen=True)
-class TableResult:
-    """A table set, run. rows: by clip label, in the order of the set."""
-
-    table: TableSet
-    rows: Mapping[str, Sequence[RowResult]]
-
-
 def measures_of(scores: Mapping[str, Any]) -> dict[Measure, Value]:
     """Every number of an evaluation.json, or why there is none."""
     found: dict[Measure, Value] = {
@@ -113,28 +67,6 @@ def measures_of(scores: Mapping[str, Any]) -> dict[Measure, Value]:
     for name in ("gaussians", "parameters", "megabytes"):
         found["size", "", name] = float(sum(part[name] for part in scores["size"]))
     return found
-
-
-def mean_of_clips(rows: Sequence[RowResult]) -> RowResult:
-    """One row over several clips: each seed's mean over clips; absent where any clip lacks it."""
-    first = rows[0]
-    missing = {seed: f"{r.clip}: {why}" for r in rows for seed, why in r.missing.items()}
-    seeds = [s for s in first.by_seed if s not in missing]
-    by_seed: dict[int, dict[Measure, Value]] = {}
-    for seed in seeds:
-        keys = dict.fromkeys(key for row in rows for key in row.by_seed[seed])
-        by_seed[seed] = {key: _clip_mean(rows, seed, key) for key in keys}
-    return RowResult(first.row, ALL_CLIPS, by_seed, missing)
-
-
-def _clip_mean(rows: Sequence[RowResult], seed: int, key: Measure) -> Value:
-    numbers = []
-    for row in rows:
-        value = row.by_seed[seed].get(key, NotComputed("no such score"))
-        if isinstance(value, NotComputed):
-            return NotComputed(f"{row.clip}: {value.reason}")
-        numbers.append(value)
-    return mean(numbers)
 
 
 # The protocol of a run's numbers: evaluation, timing and energy meter, in sentences.
@@ -164,7 +96,7 @@ def protocol_of(scores: Mapping[str, Any], cost: Cost) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-# Variants of specs as `--specs` of `hoigs chart` and `hoigs stress` declares them.
+# Variants of specs as `--specs` of `hoigs study` declares them.
 
 KEY = re.compile(r"\+(?=[A-Za-z_][\w.-]*=)")
 

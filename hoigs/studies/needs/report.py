@@ -47,7 +47,7 @@ def spec_text(needs: Needs, given: Sequence[str], folder: Path) -> str:
     # a clip's name is free text, a spec's is not
     name = f"{needs.spec.name.partition('@')[0]}-needs-{name_from(needs.clip, 'clip')}"
     lines = [
-        f"# What the clip {needs.clip} needs of {needs.base}, chosen by `hoigs needs` on "
+        f"# What the clip {needs.clip} needs of {needs.base}, chosen by `hoigs study needs` on "
         f"{len(needs.frames)} training frames held back.",
         f"extends: {json.dumps(base)}",
         f"name: {json.dumps(name)}",
@@ -208,8 +208,8 @@ def _point(step: Step) -> tuple[int, float, float]:
 FILES = ("spec.yaml", "needs.md", "needs.json", "needs.png", "needs.svg")
 # its files are replaced one by one, and the table after the training goes through a `.part`
 ANSWER = Layout(
-    what="answer of `hoigs needs`",
-    maker="`hoigs needs`",
+    what="answer of `hoigs study needs`",
+    maker="`hoigs study needs`",
     required=FILES,
     files=one_of(*map(re.escape, FILES), r"\.needs\.(md|json)\.\d+\.part"),
     folders=one_of(),

@@ -1,9 +1,8 @@
-"""Cases F01 … F56, read from YAML: trigger, criterion, and the models that each concerns."""
+"""Cases, read from YAML: trigger, criterion, sweep, and the models that each concerns."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -13,13 +12,11 @@ from pydantic import Field, ValidationError, model_validator
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.spec.loader import load_yaml
-from hoigs.studies.stress.bench import Capability
+from hoigs.studies.stress.capabilities import Capability
 from hoigs.studies.stress.measures import MEASURES
 
 FOLDER = Path(__file__).with_name("cases")
 FAMILIES = ("motion", "camera", "human", "interaction", "optimisation")
-COUNT = 56
-Kind = Literal["unit", "per spec", "sweep", "not applicable"]
 
 
 class Criterion(ComponentConfig):
@@ -121,18 +118,15 @@ class Sweep(ComponentConfig):
 
 
 class Case(ComponentConfig):
-    """One failure case. At least one of `check`, `per_spec`, `sweep` and `why_not` is given.
+    """One failure case.
 
     Attributes:
         title: what fails. trigger: what causes it. criterion: what passes, in words.
         concerns: capabilities of the models that the case applies to; () is every model.
-        check: name of a direct check of hoigs' own code (`checks.CHECKS`).
-        per_spec: name of a check of a composed model (`checks.PER_SPEC`).
         sweep: the setting that is varied, with short trainings.
         nature: failing is inherent in the method of a model with one of these capabilities (or
             without: "no keyed opacity").
         advice: what to do about it.
-        why_not: why there is nothing to check here.
     """
 
     id: str = Field(pattern=r"^F\d\d$")
@@ -140,34 +134,14 @@ class Case(ComponentConfig):
     trigger: str
     criterion: str
     concerns: tuple[Capability, ...] = ()
-    check: str | None = None
-    per_spec: str | None = None
-    sweep: Sweep | None = None
+    sweep: Sweep
     nature: tuple[Capability | Literal["no keyed opacity"], ...] = ()
     advice: str = ""
-    why_not: str | None = None
-
-    @model_validator(mode="after")
-    def _does_something(self) -> Case:
-        done = [x for x in (self.check, self.per_spec, self.sweep) if x is not None]
-        if bool(done) == (self.why_not is not None):
-            raise ValueError("give what is checked (check, per_spec, sweep), or why_not")
-        if self.per_spec is not None and self.sweep is not None:
-            raise ValueError("per_spec and sweep exclude each other; give one")
-        return self
 
     def is_nature(self, has: frozenset[Capability]) -> bool:
         """Whether failing is inherent in a method with these capabilities."""
         flat = "keyed opacity" not in has
         return any(flat if word == "no keyed opacity" else word in has for word in self.nature)
-
-    @property
-    def kind(self) -> Kind:
-        if self.sweep is not None:
-            return "sweep"
-        if self.per_spec is not None:
-            return "per spec"
-        return "unit" if self.check is not None else "not applicable"
 
 
 class _File(ComponentConfig):
@@ -215,19 +189,7 @@ def choose_cases(text: str) -> tuple[Case, ...]:
         if key is None:
             near = did_you_mean(word.upper() if word[1:].isdigit() else word.lower(), by_word)
             raise HoigsError(
-                f"--cases: no case {word!r}{near}; there are F01 to F{COUNT}, "
-                f"{', '.join(FAMILIES)} and all"
+                f"--cases: no case {word!r}{near}; there are {', '.join(by_word)} and all"
             )
         wanted |= {case.id for case in by_word[key]}
     return tuple(case for case in known if case.id in wanted)
-
-
-# CheckResult: whether a check passed, and by which numbers.
-
-
-@dataclass(frozen=True)
-class CheckResult:
-    """Result of one check. measured: in words, with the deciding numbers."""
-
-    passed: bool
-    measured: str

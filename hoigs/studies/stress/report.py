@@ -20,7 +20,7 @@ from matplotlib.patches import Rectangle
 from hoigs.core.system.files import write_whole
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.studies.plots import INK, MARKERS, PALETTE, QUIET, STYLE, short_number
-from hoigs.studies.stress.bench import MEANING as HAS
+from hoigs.studies.stress.capabilities import MEANING as HAS
 from hoigs.studies.stress.case import Case
 from hoigs.studies.stress.verdict import (
     MEANING,
@@ -66,7 +66,7 @@ def as_json(table: Table) -> str:
         "machines": table.machines,
         "meaning": dict(MEANING),
         "specs": dict(table.definitions),
-        "cases": [case.model_dump(mode="json") | {"kind": case.kind} for case in table.cases],
+        "cases": [case.model_dump(mode="json") | {"kind": "sweep"} for case in table.cases],
         "verdicts": [v.to_dict() for v in table.verdicts.values()],
     }
     return json.dumps(data, indent=1, allow_nan=False)
@@ -84,11 +84,11 @@ def as_csv(table: Table) -> str:
         for spec in table.specs:
             verdict = table.at(case, spec)
             base = {
-                "case": case.id, "title": case.title, "kind": case.kind, "spec": spec,
+                "case": case.id, "title": case.title, "kind": "sweep", "spec": spec,
                 "definition": table.definitions[spec], "status": verdict.status,
                 "rate": "" if verdict.rate is None else f"{verdict.rate:.3f}",
                 "breaks_at": "" if verdict.breaks_at is None else f"{verdict.breaks_at:g}",
-                "unit": case.sweep.unit if case.sweep else "",
+                "unit": case.sweep.unit,
                 "machine": " and ".join(verdict.machines),
                 "protocol": " ".join(verdict.protocol), **table.about,
             }  # fmt: skip
@@ -135,7 +135,7 @@ def as_markdown(table: Table) -> str:
 def _cell(case: Case, verdict: Verdict) -> str:
     rate = rate_of(verdict)
     words = [MARKS[verdict.status]]
-    if case.sweep is not None and verdict.seeds:
+    if verdict.seeds:
         words.append(in_short(case, verdict))
     return " ".join([*words, *([f"({rate})"] if rate else [])])
 
@@ -145,9 +145,8 @@ def _section(table: Table, case: Case) -> list[str]:
              f"{case.criterion}."]  # fmt: skip
     if case.concerns:
         lines[-1] += f" Concerns models with {', '.join(HAS[c] for c in case.concerns)}."
-    if case.sweep is not None:
-        values = ", ".join(f"{value:g}" for value in case.sweep.values)
-        lines += ["", f"Values: {case.sweep.unit}: {values}; required: {requirement_of(case)}."]
+    values = ", ".join(f"{value:g}" for value in case.sweep.values)
+    lines += ["", f"Values: {case.sweep.unit}: {values}; required: {requirement_of(case)}."]
     results: dict[str, list[str]] = {}
     for spec in table.specs:
         verdict = table.at(case, spec)
@@ -170,7 +169,7 @@ CURVES_HEAD, CURVES_LINE = 1.05, 0.19
 
 def breakdown(table: Table, title: str) -> Figure | None:
     """A panel for each case with a sweep that has been run; None where none has."""
-    cases = [c for c in table.cases if c.sweep is not None and _drawn(table, c)]
+    cases = [c for c in table.cases if _drawn(table, c)]
     if not cases:
         return None
     columns = min(MOST_COLUMNS, len(cases))
@@ -228,7 +227,6 @@ def _legend(figure: Figure, specs: Sequence[str], width: float, height: float) -
 
 def _panel(axes: Any, table: Table, case: Case) -> None:
     sweep = case.sweep
-    assert sweep is not None
     places = {value: i for i, value in enumerate(sweep.values)}
     axes.axvline(places[sweep.required_value], color="#c3c8ce", linewidth=1.2, zorder=0)
     for i, spec in enumerate(table.specs):

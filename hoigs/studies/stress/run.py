@@ -1,12 +1,11 @@
-"""Run a stress study: direct checks, then chains of trainings, each until its seed fails."""
+"""Run a stress study: chains of trainings, each until its seed fails."""
 
 from __future__ import annotations
 
 import multiprocessing
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -20,9 +19,16 @@ from hoigs.studies.jobs.cost import read_cost
 from hoigs.studies.jobs.job import ClipFolders, Job, JobState, make_job
 from hoigs.studies.jobs.results import Row, protocol_of
 from hoigs.studies.jobs.run_jobs import Report, run_jobs
-from hoigs.studies.stress.bench import MEANING, TINY, Bench, Capability, modelled, small_settings
-from hoigs.studies.stress.case import Case, CheckResult, Sweep
-from hoigs.studies.stress.checks import check, per_spec
+from hoigs.studies.stress.capabilities import (
+    MEANING,
+    TINY,
+    Capability,
+    capabilities,
+    compose_small,
+    modelled,
+    small_settings,
+)
+from hoigs.studies.stress.case import Case, Sweep
 from hoigs.studies.stress.measures import scored_values
 from hoigs.studies.stress.verdict import Level, Seed, Verdict, level_of, verdict_of
 
@@ -92,11 +98,6 @@ class Chain:
     seed: int
     jobs: tuple[StressJob, ...]
 
-    @property
-    def sweep(self) -> Sweep:
-        assert self.case.sweep is not None
-        return self.case.sweep
-
 
 def clip_names(sweep: Sweep, base: str) -> list[str]:
     """The built-in clip of each value of a sweep; one clip if the sweep varies the spec."""
@@ -128,7 +129,6 @@ def plan_chains(
     return [
         _chain(study, case, row, own[row.label], seed, folders)
         for case in study.cases
-        if case.sweep is not None
         for row in study.specs
         if set(case.concerns) <= capabilities[row.label]
         for seed in range(study.seeds)
@@ -139,7 +139,7 @@ def _chain(
     study: StressStudy, case: Case, row: Row, spec: Spec, seed: int, folders: ClipFolders
 ) -> Chain:
     sweep = case.sweep
-    assert sweep is not None and row.spec is not None
+    assert row.spec is not None
     given = [*study.settings, *row.settings]
     small = small_settings(spec, study.points, study.steps)
     names = clip_names(sweep, study.base)
@@ -173,87 +173,19 @@ def block_settings(spec: Spec, sweep: Sweep, value: float) -> list[str]:
     return found
 
 
-# Direct checks of a study, several at a time, in worker processes.
-
-STATIC = f"{TINY}&camera.path=static"  # of composed:static_camera
-Composed = tuple[str, tuple[str, ...], tuple[str, ...]]  # spec, overrides, plugin files
-OnResult = Callable[[str, str, CheckResult], None]
-
-
-@contextmanager
-def processes(workers: int, tasks: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool whose processes compute with one thread each."""
-    spawn = multiprocessing.get_context("spawn")
-    count = max(1, min(workers, tasks))
-    with safe_children(), ProcessPoolExecutor(count, spawn, _one_thread) as pool:
-        yield pool
-
-
 def make_clips(
     names: Sequence[str], workers: int, log: Callable[[str], None] = lambda line: None
 ) -> None:
     """Generate the built-in clips that are not cached yet."""
     unique = list(dict.fromkeys(names))
-    with processes(workers, len(unique)) as pool:
+    spawn = multiprocessing.get_context("spawn")
+    count = max(1, min(workers, len(unique)))
+    with safe_children(), ProcessPoolExecutor(count, spawn, _one_thread) as pool:
         waiting = [pool.submit(_make_clip, name) for name in unique]
         for i, done in enumerate(as_completed(waiting)):
             done.result()
             if (i + 1) % 10 == 0 or i + 1 == len(unique):
                 log(f"{i + 1} of {len(unique)} clips")
-
-
-def run_direct(
-    cases: Sequence[Case],
-    specs: Mapping[str, Composed],
-    has: Mapping[str, frozenset[Capability]],
-    workers: int,
-    on_result: OnResult = lambda case, spec, result: None,
-) -> dict[tuple[str, str], CheckResult]:
-    """Results by case and label of the spec; those of hoigs' own code have the label "".
-
-    Args:
-        specs: what is composed, by label. has: capabilities of each, by label.
-        on_result: called with each result as it is known.
-    """
-    own = [(case.id, "", case.check) for case in cases if case.check is not None]
-    composed = [
-        (case.id, label, case.per_spec)
-        for label in specs
-        for case in cases
-        if case.per_spec is not None and set(case.concerns) <= has[label]
-    ]
-    found: dict[tuple[str, str], CheckResult] = {}
-    if not own and not composed:
-        return found
-    with processes(workers, len(own) + len(composed)) as pool:
-        waiting = {pool.submit(run_check, name): (case, label) for case, label, name in own}
-        waiting |= {
-            pool.submit(run_composed_check, name, specs[label]): (case, label)
-            for case, label, name in composed
-        }
-        for done in as_completed(waiting):
-            found[waiting[done]] = done.result()
-            on_result(*waiting[done], done.result())
-    return found
-
-
-def run_check(name: str) -> CheckResult:
-    """Run a check of hoigs' own code."""
-    return _result(check(name))
-
-
-def run_composed_check(name: str, composed: Composed) -> CheckResult:
-    """Run a check of a model that is composed for it."""
-    source, overrides, plugins = composed
-    return _result(lambda: per_spec(name)(Bench.compose(source, overrides, plugins)))
-
-
-def _result(run: Callable[[], CheckResult]) -> CheckResult:
-    """A check that raises has failed; its result has the error."""
-    try:
-        return run()
-    except Exception as error:
-        return CheckResult(False, f"{type(error).__name__}: {error}")
 
 
 def _one_thread() -> None:
@@ -289,13 +221,13 @@ class _Progress:
     def record(self, why: str | None) -> None:
         """Add the result of the next training, or the reason why it failed."""
         job = self.chain.jobs[len(self.levels)]
-        value, run = self.chain.sweep.values[len(self.levels)], job.run.removeprefix(self.out)
+        value, run = self.chain.case.sweep.values[len(self.levels)], job.run.removeprefix(self.out)
         if why is not None:
             self.levels.append(Level(value, False, f"the training failed: {why}", {}, run))
             return
         found = scored_values(job.scores())
         self.first = self.first or found
-        self.levels.append(level_of(self.chain.sweep, value, found, self.first, run))
+        self.levels.append(level_of(self.chain.case.sweep, value, found, self.first, run))
 
 
 def run_stress(
@@ -312,8 +244,8 @@ def run_stress(
     (`StressStudy.whole` runs them too).
 
     Args:
-        executor: where the trainings run; the direct checks run here, as many at a time.
-        report: called with jobs, as for `run_jobs`. log: called with lines of text on the rest.
+        executor: where the trainings run.
+        report: called with jobs, as for `run_jobs`. log: called with lines of text on the clips.
 
     Raises:
         HoigsError: a spec is invalid; this is checked before any training.
@@ -322,25 +254,21 @@ def run_stress(
     registry = default_registry(list(study.plugins))
     for row in study.specs:  # raises before clips are generated
         Spec.load(str(row.spec), overrides=[*study.settings, *row.settings], registry=registry)
-    names = [n for c in study.cases if c.sweep is not None for n in clip_names(c.sweep, study.base)]
-    workers = executor.slots if executor else 1
-    make_clips([TINY, STATIC, *names], workers, log)
-    specs: dict[str, Composed] = {
-        row.label: (str(row.spec), (*study.settings, *row.settings), tuple(map(str, study.plugins)))
+    names = [name for case in study.cases for name in clip_names(case.sweep, study.base)]
+    make_clips([TINY, *names], executor.slots if executor else 1, log)
+    has = {
+        row.label: capabilities(
+            *compose_small(
+                str(row.spec), (*study.settings, *row.settings), tuple(map(str, study.plugins))
+            )
+        )
         for row in study.specs
     }
-    has = {label: Bench.compose(*composed).capabilities for label, composed in specs.items()}
-
-    def on_result(case: str, spec: str, result: CheckResult) -> None:
-        word = "passed" if result.passed else "FAILED"
-        log(f"{case}{' ' + spec if spec else ''}: {word}: {result.measured}")
-
-    direct = run_direct(study.cases, specs, has, workers, on_result)
     chains = plan_chains(study, has)
     left = None if deadline is None else max(0.0, deadline - time.monotonic())
     progress = _train(study, chains, executor, left, report)
     return [
-        _verdict(case, row.label, has[row.label], direct, progress)
+        _verdict(case, row.label, has[row.label], progress)
         for case in study.cases
         for row in study.specs
     ]
@@ -380,22 +308,11 @@ def _verdict(
     case: Case,
     label: str,
     has: frozenset[Capability],
-    direct: Mapping[tuple[str, str], CheckResult],
     progress: Sequence[_Progress],
 ) -> Verdict:
-    if case.why_not is not None:
-        return Verdict(case.id, label, "not applicable", case.why_not)
     lacks = [MEANING[c] for c in case.concerns if c not in has]
     if lacks:
         return Verdict(case.id, label, "not applicable", f"lacks: {', '.join(lacks)}")
-    nature = case.is_nature(has)
-    own = direct.get((case.id, ""))
-    if own is not None and (not own.passed or case.kind == "unit"):
-        return Verdict(case.id, label, "pass" if own.passed else "fail", own.measured, ours=True)
-    if case.kind == "per spec":
-        found = direct[case.id, label]
-        status = "pass" if found.passed else "nature" if nature else "fail"
-        return Verdict(case.id, label, status, found.measured)  # type: ignore[arg-type]
     mine = [p for p in progress if p.chain.case is case and p.chain.spec.label == label]
     seeds = [Seed(p.chain.seed, tuple(p.levels)) for p in mine]
     jobs = [job for p in mine for job in p.chain.jobs[: len(p.levels)]]
@@ -403,4 +320,6 @@ def _verdict(
     costs = [read_cost(job.folder) for job in done]
     machines = tuple(dict.fromkeys(word for cost in costs for word in cost.machines))
     protocol = protocol_of(done[0].scores(), costs[0]) if done else ()
-    return verdict_of(case, label, nature, seeds, machines=machines, protocol=tuple(protocol))
+    return verdict_of(
+        case, label, case.is_nature(has), seeds, machines=machines, protocol=tuple(protocol)
+    )

@@ -70,13 +70,12 @@ class Verdict:
 
     Attributes:
         case, spec: id and label. status: see MEANING.
-        measured: of a direct check, or why there is no verdict.
+        measured: which criteria failed, or why there is no verdict.
         rate: share of the seeds that pass the required value, of those that are known.
         seeds: of a sweep.
         breaks_at: the first value that half of the seeds or more fail; None is beyond the last, or
             not known.
         machines, protocol: how the numbers were measured.
-        ours: whether a check of hoigs' own code decided, before any training.
     """
 
     case: str
@@ -88,7 +87,6 @@ class Verdict:
     breaks_at: float | None = None
     machines: tuple[str, ...] = ()
     protocol: tuple[str, ...] = ()
-    ours: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         data = asdict(self)
@@ -134,7 +132,6 @@ def verdict_of(case: Case, spec: str, nature: bool, seeds: Sequence[Seed], **mor
         nature: whether failing is inherent in the method.
     """
     sweep = case.sweep
-    assert sweep is not None
     known = [s for seed in seeds if (s := seed.stands(sweep.required_value)) is not None]
     rate = sum(known) / len(known) if known else None
     status: Status = "not run"
@@ -220,7 +217,6 @@ class Table:
     def curve(self, case: Case, spec: str) -> list[Spread]:
         """The drawn measure at every value that has been run."""
         sweep = case.sweep
-        assert sweep is not None
         points = []
         for value in sweep.values:
             numbers = middle_of(self.at(case, spec).seeds, value, sweep.drawn)
@@ -258,8 +254,6 @@ def in_short(case: Case, verdict: Verdict) -> str:
         return "–"
     if verdict.status == "not run":
         return "not run"
-    if case.sweep is None:
-        return "pass" if verdict.status == "pass" else "fails"
     if verdict.breaks_at is None:
         stands = f"stands {short_number(case.sweep.values[-1])}"
     else:
@@ -276,17 +270,13 @@ def rate_of(verdict: Verdict) -> str:
 
 def requirement_of(case: Case) -> str:
     """What a case requires, with the unit of its sweep."""
-    if case.sweep is None:
-        return case.criterion
     return f"{case.sweep.required_value:g} ({case.sweep.unit}): {measures_of(case)}"
 
 
 def measures_of(case: Case) -> str:
-    assert case.sweep is not None
     return "; ".join(criterion.words for criterion in case.sweep.criteria)
 
 
 def axis_title(case: Case) -> str:
-    assert case.sweep is not None
     measure = MEASURES[case.sweep.drawn]
     return f"{measure.title} ({measure.unit})" if measure.unit else measure.title

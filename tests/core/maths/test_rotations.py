@@ -137,6 +137,15 @@ class TestSlerp:
         torch.testing.assert_close(between, wanted, atol=5e-7, rtol=0)
         assert torch.autograd.gradcheck(lambda x, y: R.slerp(x, y, 0.3), leaves, atol=1e-4)
 
+    def test_products_that_round_to_more_than_one(self) -> None:  # F46
+        generator = torch.Generator().manual_seed(0)
+        keys = R.normalize_quats(torch.randn(4000, 4, generator=generator))
+        keys = (keys * (1 + 1e-7)).requires_grad_()
+        assert ((keys * keys).sum(-1) > 1).any()
+        between = R.slerp(keys, keys.detach().clone(), 0.3)
+        between.sum().backward()
+        assert torch.isfinite(between).all() and torch.isfinite(keys.grad).all()
+
     def test_position_takes_a_gradient(self) -> None:
         r = torch.tensor([[0.3]], dtype=torch.float64, requires_grad=True)
         a, b = random_quats(1), random_quats(1, seed=2)

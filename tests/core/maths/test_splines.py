@@ -204,3 +204,15 @@ def test_fit_weighs_samples():
     weights[7] = 0
     m, _ = fit(spoilt, 6, free_tangents=True, weights=weights)
     torch.testing.assert_close(m, torch.linspace(0, 1, 6)[:, None], atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("step", [4, 2, 1])
+def test_the_error_of_a_fit_falls_with_the_fourth_power_of_the_interval(step: int):  # F02
+    """A sine of 6 frames through ever denser knots, against the bound |f''''| h^4 / 384."""
+    phase = 2 * math.pi / 6 * torch.arange(49, dtype=torch.float64)
+    wave = phase.sin()[:, None]
+    keyframes = splines.keyframe_count(len(wave), step)
+    values, tangents = fit(wave, keyframes, free_tangents=True, smoothness=1e-9)
+    error = float((sampled(values, tangents, len(wave)) - wave).abs().max())
+    assert error <= (2 * math.pi / 6 * step) ** 4 / 384
+    assert step > 1 or error < 0.01

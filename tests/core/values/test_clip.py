@@ -90,3 +90,12 @@ def test_slices_that_hold_nothing_or_run_backwards_are_refused(clip) -> None:
         clip[FRAMES:]
     with pytest.raises(ValueError, match="-1"):
         clip[::-1]
+
+
+@pytest.mark.parametrize("points", [True, False])
+def test_a_static_camera_has_an_extent(clip, points) -> None:  # F13
+    """Learning rates of positions are in units of it."""
+    still = replace(clip, cameras=[clip.cameras[0]] * len(clip.cameras))
+    if not points:
+        still = replace(still, points=torch.zeros(0, 3), point_colors=torch.zeros(0, 3))
+    assert still.extent() > 0.5

@@ -36,6 +36,16 @@ def test_shapes_bounds_and_finiteness(count, values, granularity, object_residua
     assert torch.isfinite(out["ball"].means).all()
 
 
+def test_saturated_heads_stay_within_their_bounds():  # F30
+    made = module()
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.mul_(1e3)
+    out, limits = run(made, thing(500)), made.config
+    assert 0.97 * limits.pose_bound < out["human"].pose.abs().max() <= limits.pose_bound
+    assert 0.9 * limits.means_bound < out["ball"].means.abs().max() <= limits.means_bound
+
+
 def test_starts_without_effect():
     out = run(module(perturbed=False, object_residual="both"), thing())
     assert (out["human"].pose == 0).all() and (out["ball"].means == 0).all()

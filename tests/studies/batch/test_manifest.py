@@ -38,14 +38,17 @@ def test_yaml_and_csv_give_the_same_rows(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("rows:\n  - video: oen.mp4\n", r'm\.yaml:2:\S* video: .*did you mean "one.mp4"'),
-        ("rows:\n  - vidoe: one.mp4\n", r'm\.yaml:2:\S* vidoe: .*did you mean "video"'),
-        ("row:\n  - video: one.mp4\n", r'm\.yaml:1:\S* row: .*did you mean "rows"'),
-        ("rows:\n  - {video: one.mp4, clip: one.mp4}\n", "either a video or a clip"),
+        ("rows:\n  - video: oen.mp4\n", r'm\.yaml:2:\S* video: .*"one.mp4"'),
+        ("rows:\n  - vidoe: one.mp4\n", r'm\.yaml:2:\S* vidoe: .*"video"'),
+        ("row:\n  - video: one.mp4\n", r'm\.yaml:1:\S* row: .*"rows"'),
+        ("rows:\n  - {video: one.mp4, clip: one.mp4}\n", r"m\.yaml:2.*video.*clip"),
         ("rows:\n  - video: one.mp4\n    auto: maybe\n", r"m\.yaml:3:\S* auto: .*'maybe'"),
         ("rows:\n  - video: one.mp4\n    name: ../x\n", r"m\.yaml:3:\S* name: "),
-        ("rows:\n  - video: one.mp4\n  - video: one.mp4\n", r'name: "one" is also the row at'),
-        ("rows: []\n", "has no rows"),
+        (
+            "rows:\n  - video: one.mp4\n  - video: one.mp4\n",
+            r'm\.yaml:3\S* name: "one" .*m\.yaml:2',
+        ),
+        ("rows: []\n", r"m\.yaml"),
     ],
 )
 def test_mistakes_are_found_where_they_are(tmp_path, text, message):
@@ -57,11 +60,11 @@ def test_mistakes_are_found_where_they_are(tmp_path, text, message):
 
 def test_rows_are_checked_before_a_folder_is_made(tmp_path):
     (tmp_path / "m.csv").write_text("clip,name\nbuiltin:carry,a\nbuiltin:carry,A\n")
-    with pytest.raises(ManifestError, match=r'm.csv:3: name: "A" is also the row at .*m.csv:2'):
+    with pytest.raises(ManifestError, match=r'm.csv:3: name: "A" .*m.csv:2'):
         BatchFolder.begin(tmp_path / "out", each_row(tmp_path / "m.csv"))
     assert not list(tmp_path.glob("out/*"))
     (tmp_path / "m.csv").write_text("clip,name\ngone,a\n")
-    with pytest.raises(ManifestError, match="does not exist"):
+    with pytest.raises(ManifestError, match="gone"):
         BatchFolder.begin(tmp_path / "out2", each_row(tmp_path / "m.csv"))
     assert not (tmp_path / "out2").exists()
 
@@ -120,7 +123,7 @@ def test_names_that_leave_the_batch_are_refused_when_read_and_when_read_back(tmp
             read_manifest(tmp_path / "m.yaml")
         assert repr(value) in str(caught.value)
     (made.path / BATCH).write_text(f'{{"fan_out": false}}\n{json.dumps(row)}\n')
-    with pytest.raises(HoigsError, match=f"{BATCH}:2: damaged"):
+    with pytest.raises(HoigsError, match=f"{BATCH}:2"):
         list(made.rows())
 
 

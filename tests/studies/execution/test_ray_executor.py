@@ -26,7 +26,7 @@ sys.exit(int(sys.argv[5]))
 
 def test_a_missing_ray_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(HoigsError, match=r"pip install 'hoigs\[ray\]'"):
+    with pytest.raises(HoigsError, match=r"hoigs\[ray\]"):
         make_executor("ray")
 
 
@@ -88,9 +88,9 @@ def test_shares_of_gpus_and_exit_codes(start):
 def test_what_no_machine_has_room_for_is_refused(ray, tmp_path):
     where = RayExecutor(4, threads=1)
     for needs in (Needs(memory_gb=1e6), Needs(gpus=2.5)):
-        with pytest.raises(HoigsError, match=r"no machine of the Ray cluster|expected a share"):
+        with pytest.raises(HoigsError, match=r"GPUs|memory"):
             where.start(("module",), tmp_path / "log", needs)
-    with pytest.raises(HoigsError, match="has 99 CPUs, 0 GPUs and 0 GB"):
+    with pytest.raises(HoigsError, match="99 CPUs"):
         RayExecutor(1, threads=99).start(("module",), tmp_path / "log", Needs(gpus=0))
 
 

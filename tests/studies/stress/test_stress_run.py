@@ -1,4 +1,4 @@
-"""A study run twice, end to end; and the checks that composed models are expected to pass."""
+"""A study run twice, end to end."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from hoigs.core.spec.schema import Spec
 from hoigs.studies.execution.local import LocalExecutor
 from hoigs.studies.jobs.job import Job
 from hoigs.studies.jobs.results import parse_variants
-from hoigs.studies.stress.bench import Bench, small_settings
+from hoigs.studies.stress.capabilities import small_settings
 from hoigs.studies.stress.case import Case, choose_cases
-from hoigs.studies.stress.checks import PER_SPEC, per_spec
 from hoigs.studies.stress.run import StressStudy, block_settings, plan_chains, run_stress
 
 BASE = (
@@ -28,8 +27,6 @@ pytestmark = pytest.mark.usefixtures("own_caches")
 
 def short(case: Case) -> Case:
     """With the ends of its sweep alone."""
-    if case.sweep is None:
-        return case
     ends = {"values": (case.sweep.values[0], case.sweep.values[-1]), "required": None}
     return case.model_copy(update={"sweep": case.sweep.model_copy(update=ends)})
 
@@ -43,7 +40,7 @@ def study(out: Path, cases: str, specs: str = "static", **more: object) -> Stres
 @pytest.mark.slow
 def test_a_study_is_run_once_and_goes_on(tmp_path: Path) -> None:
     words: list[str] = []
-    wanted = study(tmp_path, "F04,F20,F49,F47,F56")
+    wanted = study(tmp_path, "F03,F49")
 
     def report(job: Job, word: str) -> None:
         words.append(word)
@@ -51,10 +48,8 @@ def test_a_study_is_run_once_and_goes_on(tmp_path: Path) -> None:
     stopped = run_stress(wanted, limit_s=0.0, report=report)
     by_case = {v.case: v for v in stopped}
     assert by_case["F49"].status == "not run" and not any(t == "done" for t in words)
-    assert by_case["F20"].status == "pass" and by_case["F20"].ours
-    assert by_case["F56"].status == "pass" and not by_case["F56"].ours
-    assert by_case["F04"].status == by_case["F47"].status == "not applicable"
-    assert "rotations at keyframes" in by_case["F04"].measured
+    assert by_case["F03"].status == "not applicable"
+    assert "positions at keyframes" in by_case["F03"].measured
 
     words.clear()
     (verdict,) = run_stress(
@@ -78,23 +73,6 @@ def test_a_study_is_run_once_and_goes_on(tmp_path: Path) -> None:
     assert again == verdict and set(words) == {"done before"}
 
 
-@pytest.mark.slow
-def test_composed_models_pass_the_expected_checks() -> None:
-    bench = Bench.compose("hoigs")
-    assert {"body", "object", "interaction", "free knots", "time planes"} <= bench.capabilities
-    of_keyframes = "composed:motion_rate"  # those of hoigs learn at the rate of poses
-    expected = [name for name in PER_SPEC if name != of_keyframes]
-    failed = {n: f.measured for n in expected if not (f := per_spec(n)(bench)).passed}
-    assert not failed and "keyframe rate" not in bench.capabilities
-    paper = Bench.compose("hoigs-paper")
-    assert "keyframe rate" in paper.capabilities and per_spec(of_keyframes)(paper).passed
-    half = Bench.compose("4dgs")
-    assert "whole picture" in half.capabilities and "body" not in half.capabilities
-    assert not per_spec("composed:unused_rows")(half).passed, "its code reads half of its planes"
-    constant = Bench.compose("ex4dgs")
-    assert not per_spec(of_keyframes)(constant).passed
-
-
 def test_a_spec_is_made_small_by_what_it_has() -> None:
     whole = Spec.load("ex4dgs")
     settings = dict(s.split("=") for s in small_settings(whole, 1000, 400))
@@ -109,7 +87,6 @@ def test_a_spec_is_made_small_by_what_it_has() -> None:
 
 def test_sweeps_of_a_spec_are_set_where_it_has_them() -> None:
     (case,) = choose_cases("F03")
-    assert case.sweep is not None
     assert block_settings(Spec.load("hoigs"), case.sweep, 2) == [
         "model.object.deformation.keyframe_step=2"
     ]
@@ -128,5 +105,5 @@ def test_chains_share_what_they_have_in_common(tmp_path: Path) -> None:
     }  # fmt: skip
     runs = {c.case.id: c.jobs[0].run for c in chains if c.spec.label == "hoigs" and c.seed == 0}
     assert runs["F01"] == runs["F49"], "one clean clip, one training"
-    with pytest.raises(HoigsError, match="did you mean"):
+    with pytest.raises(HoigsError, match=r"statik.*static"):
         plan_chains(study(tmp_path, "F49", "statik"), {"statik": frozenset()})

@@ -55,7 +55,7 @@ def test_numbers_are_held_against_the_first():
     first = {"psnr_object": 20.0}
     assert level_of(CASE.sweep, 2, {"psnr_object": 19.2}, first, "r").stands
     level = level_of(CASE.sweep, 2, {"psnr_object": 18.5}, first, "r")
-    assert not level.stands and level.why.endswith("at most 1 dB: 18.5 of 20")
+    assert not level.stands and "18.5 of 20" in level.why
     low = level_of(CASE.sweep, 1, {"psnr_object": 12.0}, {"psnr_object": 12.0}, "r")
     assert not low.stands, "what was never learned cannot be said to stand"
     absent = level_of(CASE.sweep, 2, {"psnr_object": NotComputed("no object")}, first, "r")

@@ -5,40 +5,41 @@ from __future__ import annotations
 import csv
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 from made_up import MACHINE, PROTOCOL, SPECS, table
 from PIL import Image
 
-from hoigs.studies.stress.case import COUNT, choose_cases
+from hoigs.studies.stress.case import all_cases, choose_cases
 from hoigs.studies.stress.report import as_csv, as_json, as_markdown, write_stress
-from hoigs.studies.stress.verdict import in_short, rate_of
+from hoigs.studies.stress.verdict import Verdict, in_short, rate_of
 
 
 def test_all_files_are_written_whole(tmp_path: Path) -> None:
-    paths = write_stress(table(), tmp_path)
+    paths = write_stress(table(cases=choose_cases("F01,F15,F27,F50,F51")), tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(p.name for p in paths)
     assert {p.suffix for p in paths} == {".json", ".csv", ".md", ".png", ".svg"}
     for path in tmp_path.glob("*.png"):
         with Image.open(path) as image:
-            assert min(image.size) > 1000
+            assert min(image.size) > 300
             assert len(image.convert("RGB").getcolors(1 << 20) or ()) > 50
     svg = (tmp_path / "stress-matrix.svg").read_text()
-    for words in ("F01", "F56", "fast motion is smoothed over", "static-3dgs", MACHINE, "2030-01"):
+    for words in ("F01", "F51", "fast motion is smoothed over", "static-3dgs", MACHINE, "2030-01"):
         assert words in svg
     curves = (tmp_path / "stress-curves.svg").read_text()
     assert "degrees, end to end" in curves and MACHINE.partition(";")[0] in curves
 
 
-def test_without_knobs_there_are_no_curves(tmp_path: Path) -> None:
-    paths = write_stress(table(cases=choose_cases("F04,F07")), tmp_path)
+def test_before_any_training_there_are_no_curves(tmp_path: Path) -> None:
+    paths = write_stress(table(seeds=0, cases=choose_cases("F01")), tmp_path)
     assert not any("curves" in p.name for p in paths)
 
 
 def test_every_number_has_its_machine_and_protocol() -> None:
     made = table()
     rows = list(csv.DictReader(io.StringIO(as_csv(made))))
-    assert {row["case"] for row in rows} == {f"F{i:02d}" for i in range(1, COUNT + 1)}
+    assert {row["case"] for row in rows} == {case.id for case in all_cases()}
     numbers = [row for row in rows if row["number"]]
     assert numbers and all(
         row["machine"] == MACHINE and row["protocol"] == " ".join(PROTOCOL) and row["date"]
@@ -47,7 +48,8 @@ def test_every_number_has_its_machine_and_protocol() -> None:
     absent = [row for row in rows if row["not_computed"]]
     assert absent and all(row["number"] == "" for row in absent)
     data = json.loads(as_json(made))
-    assert len(data["cases"]) == COUNT and len(data["verdicts"]) == COUNT * len(SPECS)
+    assert len(data["cases"]) == len(all_cases())
+    assert len(data["verdicts"]) == len(all_cases()) * len(SPECS)
     one = next(v for v in data["verdicts"] if v["case"] == "F01" and v["spec"] == "d3dgs@matched")
     levels = one["seeds"][0]["levels"]
     assert one["seeds"][0]["broke_at"] == levels[-1]["value"] and not levels[-1]["stands"]
@@ -62,5 +64,8 @@ def test_the_words_say_who_breaks_where_and_what_to_do() -> None:
     verdict = made.at(case, "ex4dgs@matched")
     assert in_short(case, verdict) == f"breaks at {verdict.breaks_at:g}"
     assert rate_of(verdict) == "0/3"
-    assert f"What to do: {case.advice}." in text
-    assert "What to do" not in as_markdown(table(cases=choose_cases("F45")))
+    assert case.advice in text
+    passed = Verdict(case.id, "hoigs", "pass")
+    assert case.advice not in as_markdown(
+        replace(made, verdicts=dict.fromkeys(made.verdicts, passed))
+    )

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from small_clip import small_clip, truth
 
 from hoigs.core.spec.train_schema import LossSpec
 from hoigs.metrics.image_loss import image_loss
 from hoigs.metrics.ssim import ssim
+from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.training.losses import align_depth, depth_loss, term_weights
 
 
@@ -35,6 +37,35 @@ def test_depth_loss_skips_what_is_unknown():
     assert depth_loss(depth, alpha, torch.zeros(8, 8), "metric") is None
     assert depth_loss(depth, alpha, prior, "none") is None
     assert depth_loss(depth, 0.4 * alpha, prior, "metric") is None
+
+
+def test_depth_that_is_no_depth_is_skipped():  # F44
+    depth = torch.rand(20, 8, generator=torch.Generator().manual_seed(0)) + 2
+    alpha, good = torch.ones(20, 8), torch.full((20, 8), 4.2)
+    bad, unknown = good.clone(), good.clone()
+    bad[:4], bad[4:8], bad[8:12], bad[12:16] = torch.nan, 0.0, torch.inf, -1.0
+    unknown[:16] = 0.0
+    leaf = depth.clone().requires_grad_()
+    found, expected = (depth_loss(leaf, alpha, prior, "metric") for prior in (bad, unknown))
+    assert found is not None and torch.equal(found, expected)
+    found.backward()
+    assert torch.isfinite(leaf.grad).all() and (leaf.grad[:16] == 0).all()
+    assert depth_loss(depth, alpha, torch.full_like(good, torch.nan), "metric") is None
+
+
+def test_depth_sees_a_scale_about_the_camera_that_the_image_does_not():  # F17
+    camera, scene = small_clip().cameras[0], truth()
+    alpha = torch.tensor(1.1, requires_grad=True)
+    scaled = scene.replace(
+        means=camera.center + alpha * (scene.means - camera.center),
+        log_scales=scene.log_scales + alpha.log(),
+    )
+    true, drawn = (TorchRasterizer().render(g, camera) for g in (scene, scaled))
+    image = (drawn.color - true.color).abs().mean()
+    depth = depth_loss(drawn.depth, drawn.alpha, true.expected_depth, "metric")
+    (by_image,) = torch.autograd.grad(image, alpha, retain_graph=True)
+    (by_depth,) = torch.autograd.grad(depth, alpha)
+    assert by_depth > 0.1 and by_image.abs() < 0.01 * by_depth
 
 
 def test_affine_disparity_is_recovered_through_outliers():

@@ -63,9 +63,11 @@ class Cell:
         spec: its label. definition: what it is: a name or file, and what is laid over it.
         rasterizer: name. steps: the budget. clip: label. seed: of the training.
         run: its folder, relative to the chart's. machine: fingerprint in words, "" if never run.
-        values: by axis name. protocol: how they came about, sentences.
+        values: by axis name; every further number of the evaluation as "VIEW/REGION/METRIC".
+        protocol: how they came about, sentences.
         curve: PSNR of a few test frames as training went.
         missing: why there are no values; "" when there are.
+        table: of the paper, that the spec is a row of; "" for specs that were chosen freely.
     """
 
     spec: str
@@ -80,6 +82,7 @@ class Cell:
     protocol: tuple[str, ...] = ()
     curve: tuple[CurvePoint, ...] = ()
     missing: str = ""
+    table: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         plain = {name: to_json(v) for name, v in self.values.items()}
@@ -114,6 +117,7 @@ class Point:
     protocol: tuple[str, ...]
     curve: tuple[CurvePoint, ...]
     missing: Mapping[int, str]
+    table: str = ""
 
     def number(self, axis: Axis) -> float | None:
         value = self.values.get(axis.name)
@@ -127,10 +131,10 @@ class Point:
 
 def points_of(cells: Sequence[Cell]) -> list[Point]:
     """Cells of one spec, rasterizer, budget, clip and machine become a point, in order."""
-    groups: dict[tuple[str, str, int, str, str], list[Cell]] = {}
+    groups: dict[tuple[str | int, ...], list[Cell]] = {}
     for cell in cells:
         if not cell.missing:
-            key = (cell.spec, cell.rasterizer, cell.steps, cell.clip, cell.machine)
+            key = (*_method(cell), cell.clip, cell.machine)
             groups.setdefault(key, []).append(cell)
     return [_point(own, cells) for own in groups.values()]
 
@@ -147,12 +151,12 @@ def _point(own: Sequence[Cell], cells: Sequence[Cell]) -> Point:
     return Point(
         first.spec, first.definition, first.rasterizer, first.steps, first.clip, first.machine,
         tuple(c.seed for c in own), values, first.protocol, mean_curve([c.curve for c in own]),
-        missing,
+        missing, first.table,
     )  # fmt: skip
 
 
-def _method(cell: Cell) -> tuple[str, str, int]:
-    return cell.spec, cell.rasterizer, cell.steps
+def _method(cell: Cell) -> tuple[str, str, str, int]:
+    return cell.table, cell.spec, cell.rasterizer, cell.steps
 
 
 def _over(values: Sequence[Value | None]) -> Spread | NotComputed:
@@ -224,7 +228,7 @@ def load_chart(path: Path) -> tuple[list[Cell], dict[str, Any]]:
     except (OSError, json.JSONDecodeError) as error:
         raise HoigsError(f"{path}: expected the chart.json of another chart: {error}") from error
     if not isinstance(data, dict) or data.get("format") != FORMAT:
-        raise HoigsError(f"{path}: not a chart.json; `hoigs chart` writes one")
+        raise HoigsError(f"{path}: not a chart.json; `hoigs study compare` writes one")
     if data["version"] != VERSION:
         raise HoigsError(f"{path}: version {data['version']} of a chart; this hoigs has {VERSION}")
     return [Cell.from_dict(cell) for cell in data["cells"]], data["about"]

@@ -1,4 +1,4 @@
-"""Run a chart's cells, and gather what they have into plain data."""
+"""Run the cells of a comparison, and gather what they have into plain data."""
 
 from __future__ import annotations
 
@@ -10,31 +10,35 @@ from typing import Any
 
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.evaluation.protocol import NotComputed, Value
-from hoigs.studies.chart.data import ACCURACY, AXES, Cell, CurvePoint
+from hoigs.studies.compare.data import ACCURACY, AXES, Cell, CurvePoint
 from hoigs.studies.execution.local import Executor
 from hoigs.studies.jobs.cost import read_cost, read_study
 from hoigs.studies.jobs.job import ClipFolders, Job, JobState, digest_folder, make_job
 from hoigs.studies.jobs.results import VIEW, Measure, Row, definition, measures_of, protocol_of
 from hoigs.studies.jobs.run_jobs import Report, run_jobs
 
-# What a chart runs: specs and their variants x rasterizers x budgets x clips x seeds.
+# What is run: rows x rasterizers x budgets x clips x seeds.
 
 PREVIEWS = 8  # points of a curve
+ONLY_BUILTIN = "its noise needs a built-in clip"
 
 
 @dataclass(frozen=True)
-class ChartStudy:
+class Comparison:
     """What to run.
 
     Attributes:
-        clips: folders or "builtin:NAME". variants: of `jobs.variants.parse_variants`.
+        clips: folders or "builtin:NAME".
+        rows: by table: of `jobs.results.parse_variants` under "", or of the paper's tables.
         rasterizers: names or keys; empty takes each spec's own.
         budgets: steps; empty takes each spec's own. seeds: how many, from 0.
-        out, settings, device, lpips_weights, plugins: as for `tables.Study`.
+        out: folder of the runs and of the results.
+        settings: "a.b=value", overrides of every spec.
+        device, lpips_weights, plugins: as for `hoigs train`.
     """
 
     clips: Sequence[str]
-    variants: Sequence[Row]
+    rows: Mapping[str, Sequence[Row]]
     out: Path
     rasterizers: Sequence[str] = ()
     budgets: Sequence[int] = ()
@@ -47,18 +51,14 @@ class ChartStudy:
 
 @dataclass(frozen=True)
 class Planned:
-    """One cell of the plan. steps, rasterizer: of its resolved spec."""
+    """A cell without values, with its job; None where there is nothing to run."""
 
-    variant: Row
-    rasterizer: str
-    steps: int
-    clip: str
-    seed: int
-    job: Job
+    cell: Cell
+    job: Job | None
 
 
-def plan(study: ChartStudy) -> list[Planned]:
-    """Every cell, variant by variant. Built-in clips are generated here, once.
+def plan(study: Comparison) -> list[Planned]:
+    """Every cell, row by row. Built-in clips are generated here, once.
 
     Raises:
         HoigsError: a clip, spec, rasterizer or setting that does not exist; nothing has been run.
@@ -69,9 +69,10 @@ def plan(study: ChartStudy) -> list[Planned]:
     rasterizers: Sequence[str | None] = study.rasterizers or [None]
     budgets: Sequence[int | None] = study.budgets or [None]
     return [
-        _planned(study, variant, rasterizer, budget, clip, seed, folders)
+        _planned(study, table, row, rasterizer, budget, clip, seed, folders)
+        for table, rows in study.rows.items()
         for clip in study.clips
-        for variant in study.variants
+        for row in rows
         for rasterizer in rasterizers
         for budget in budgets
         for seed in range(study.seeds)
@@ -79,8 +80,9 @@ def plan(study: ChartStudy) -> list[Planned]:
 
 
 def _planned(
-    study: ChartStudy,
-    variant: Row,
+    study: Comparison,
+    table: str,
+    row: Row,
     rasterizer: str | None,
     budget: int | None,
     clip: str,
@@ -89,27 +91,36 @@ def _planned(
 ) -> Planned:
     from hoigs.core.registry.registry import default_registry
     from hoigs.core.spec.schema import Spec
+    from hoigs.synthesis.named import is_named
 
     registry = default_registry(list(study.plugins))
-    settings = [*study.settings, *variant.settings]  # a variant overrides the study
+    what = definition(row) if row.spec else ""
+    cell = Cell(row.label, what, "", 0, folders.get(clip)[1], seed, table=table)
+    if row.spec is None:
+        return Planned(replace(cell, missing=row.why), None)
+    if row.clip_settings:
+        if not is_named(clip):
+            return Planned(replace(cell, missing=ONLY_BUILTIN), None)
+        clip = f"{clip}{'&' if '?' in clip else '?'}{row.clip_settings}"
+    settings = [*study.settings, *row.settings]  # a row overrides the study
     if rasterizer is not None:
         key = rasterizer if ":" in rasterizer else f"rasterizer:{rasterizer}"
         settings.append(f"rasterizer.use={key}")
     if budget is not None:
         settings.append(f"train.steps={budget}")
-    assert variant.spec is not None
-    own = Spec.load(variant.spec, overrides=settings, registry=registry)
+    own = Spec.load(row.spec, overrides=settings, registry=registry)
     # a few previews of any budget make its curve; --set train.preview_every takes precedence
     previews = f"train.preview_every={max(1, own.train.steps // PREVIEWS)}"
     settings = [previews, *settings, f"train.seed={seed}"]
     folder, label, digest = folders.get(clip)
     job = make_job(
-        study.out, folder, label, digest, variant.spec, settings, device=study.device,
+        study.out, folder, label, digest, row.spec, settings, device=study.device,
         lpips_weights=str(study.lpips_weights) if study.lpips_weights else None,
         plugins=tuple(map(str, study.plugins)),
     )  # fmt: skip
     name = own.rasterizer.use.removeprefix("rasterizer:")
-    return Planned(variant, name, own.train.steps, label, seed, job)
+    run = str(job.folder.relative_to(study.out))
+    return Planned(replace(cell, rasterizer=name, steps=own.train.steps, run=run), job)
 
 
 # axis name -> measure of an evaluation
@@ -121,8 +132,8 @@ MEASURES: dict[str, Measure] = {
 }
 
 
-def run_chart(
-    study: ChartStudy,
+def run_comparison(
+    study: Comparison,
     *,
     executor: Executor | None = None,
     limit_s: float | None = None,
@@ -130,21 +141,20 @@ def run_chart(
 ) -> list[Cell]:
     """Run what is not done yet, and gather all cells; see `run_jobs`."""
     planned = plan(study)
-    jobs = {p.job.run: p.job for p in planned}  # two labels of one training are one job
+    # two labels of one training are one job
+    jobs = {p.job.run: p.job for p in planned if p.job is not None}
     failed = run_jobs(list(jobs.values()), executor, limit_s=limit_s, report=report)
-    return [gather(p, study.out, failed) for p in planned]
+    return [gather(p, failed) for p in planned]
 
 
-def gather(planned: Planned, out: Path, failed: Mapping[str, str]) -> Cell:
+def gather(planned: Planned, failed: Mapping[str, str]) -> Cell:
     """One cell as plain data; `failed` has the errors, by run folder."""
-    job, row = planned.job, planned.variant
-    cell = Cell(
-        row.label, definition(row), planned.rasterizer, planned.steps, planned.clip, planned.seed,
-        run=str(job.folder.relative_to(out)),
-    )  # fmt: skip
+    cell, job = planned.cell, planned.job
+    if job is None:
+        return cell
     if job.state() is not JobState.done:
-        return Cell(**(vars(cell) | {"missing": failed.get(job.run, "not run yet")}))
-    return Cell(**(vars(cell) | measured(job)))
+        return replace(cell, missing=failed.get(job.run, "not run yet"))
+    return replace(cell, **measured(job))
 
 
 def measured(job: Job) -> dict[str, Any]:
@@ -153,6 +163,7 @@ def measured(job: Job) -> dict[str, Any]:
     absent = NotComputed("this evaluation has no such score")
     found = measures_of(scores)
     values: dict[str, Value] = {name: found.get(key, absent) for name, key in MEASURES.items()}
+    values |= {"/".join(key): value for key, value in found.items()}
     values |= {"train_s": cost.train_s, "joules": cost.joules, "memory_mb": cost.memory_mb}
     return {
         "machine": " and ".join(cost.machines) or "a machine that is not on record",

@@ -10,15 +10,17 @@ from pathlib import Path
 import pytest
 
 from hoigs.cli.main import main
-from hoigs.core.errors import HoigsError
+from hoigs.core.errors import ClipError
+from hoigs.studies.compare import run as studies
+from hoigs.studies.compare.data import points_of
+from hoigs.studies.compare.paper import TABLES
+from hoigs.studies.compare.run import ONLY_BUILTIN, Comparison, plan, run_comparison
+from hoigs.studies.compare.write import write_chart
 from hoigs.studies.execution.local import LocalExecutor
 from hoigs.studies.jobs.job import Job, JobState, digest_folder
-from hoigs.studies.jobs.results import Row, TableSet
+from hoigs.studies.jobs.results import Row
 from hoigs.studies.jobs.run_jobs import run_jobs
 from hoigs.studies.jobs.worker import run_job
-from hoigs.studies.tables import run as studies
-from hoigs.studies.tables.run import ONLY_BUILTIN, TABLE_SETS, Study, plan, run_study
-from hoigs.studies.tables.write import write_tables
 from hoigs.training.session import Session
 from hoigs.training.trainer import Trainer
 
@@ -27,79 +29,68 @@ QUICK = ("train.preview_every=0", "model.scene.points=200", "train.checkpoint_ev
 ROWS = (
     Row("still", "static", paper=("hosnerf/hoigs", "object-prior/depth")),
     Row("wrong", "static", ("entities=[nobody]",)),
-    Row("unknown", "statik"),
     Row("other", None, why="nobody has it"),
 )
-TABLE = TableSet("toy", "A toy table", ROWS)
 
 
 pytestmark = pytest.mark.usefixtures("own_caches")
 
 
-def _study(out: Path, rows: tuple[Row, ...] = ROWS, **more: object) -> Study:
-    sets = [TableSet("toy", "A toy table", rows)]
-    return Study([CLIP], sets, out, **{"seeds": 1, "steps": 4, "settings": QUICK, **more})
+def _study(out: Path, rows: tuple[Row, ...] = ROWS, **more: object) -> Comparison:
+    return Comparison(
+        [CLIP], {"toy": rows}, out, **{"seeds": 1, "budgets": [4], "settings": QUICK, **more}
+    )
 
 
-def _jobs(study: Study) -> list[Job]:
-    return [cell.job for cell in plan(study) if cell.job is not None]
+def _jobs(study: Comparison) -> list[Job]:
+    return [planned.job for planned in plan(study) if planned.job is not None]
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory):
-    """A study with a good row, one that fails, and two that cannot be run."""
+    """A study with a good row, one that fails, and one that cannot be run."""
     out = tmp_path_factory.mktemp("study")
     words: list[tuple[str, str]] = []
     study = _study(out)
-    results = run_study(
+    cells = run_comparison(
         study,
         executor=LocalExecutor(2, threads=1),
         report=lambda job, word: words.append((job.folder.name, word)),
     )
-    return study, results, words
+    return study, cells, words
 
 
 def test_a_failed_job_is_told_and_stops_no_other(done) -> None:
-    _, results, words = done
-    rows = {r.row.label: r for r in results[0].rows[CLIP]}
-    psnr = ("test frames", "full", "psnr")
-    assert rows["still"].over_seeds(psnr).mean > 5
-    assert "nobody" in str(rows["wrong"].over_seeds(psnr))
-    assert 'did you mean "static"' in str(rows["unknown"].over_seeds(psnr)) or (
-        'no spec "statik"' in str(rows["unknown"].over_seeds(psnr))
+    _, cells, words = done
+    still, wrong, other = cells
+    assert (
+        still.values["psnr_full"] > 5
+        and still.values["psnr_full"] == (still.values["test frames/full/psnr"])
     )
-    assert str(rows["other"].over_seeds(psnr)) == "not computed: nobody has it"
+    assert "nobody" in wrong.missing and other.missing == "nobody has it"
     assert sorted(word.partition(":")[0] for _, word in words) == sorted(
         ["started"] * 2 + ["done", "failed"]
     )
 
 
-def test_markdown_csv_and_json_say_the_same(done, tmp_path: Path) -> None:
-    study, results, _ = done
-    paths = write_tables(results, tmp_path, {"clips": CLIP, "seeds": 1})
-    assert sorted(p.name for p in paths) == ["tables.csv", "tables.json", "tables.md"]
-    assert not list(tmp_path.glob(".*"))
-    text = (tmp_path / "tables.md").read_text()
-    stored = json.loads((tmp_path / "tables.json").read_text())
-    rows = list(csv.DictReader(io.StringIO((tmp_path / "tables.csv").read_text())))
-    run = study.out / stored["tables"][0]["runs"][0]["runs"]["0"]
-    scores = json.loads((run / "evaluation.json").read_text())["scores"]
+def test_rows_of_a_table_stand_beside_the_papers(done, tmp_path, monkeypatch) -> None:
+    study, cells, _ = done
+    monkeypatch.setitem(TABLES, "toy", ROWS)
+    write_chart(cells, tmp_path, {"clips": CLIP})
+    text = (tmp_path / "chart.md").read_text()
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "chart.csv").read_text())))
+    scores = json.loads((study.out / cells[0].run / "evaluation.json").read_text())["scores"]
     for region in ("full", "human_object", "human", "object", "interaction"):
         (score,) = [s for s in scores if (s["region"], s["metric"]) == (region, "psnr")]
-        (row,) = [r for r in rows if (r["row"], r["region"], r["metric"]) ==
-                  ("still", region, "psnr") and r["source"] == "this study"]  # fmt: skip
-        assert float(row["mean"]) == pytest.approx(score["value"])
+        (row,) = [r for r in rows if (r["table"], r["spec"], r["measure"]) ==
+                  ("toy", "still", f"test frames/{region}/psnr")]  # fmt: skip
+        assert float(row["value"]) == pytest.approx(score["value"])
         assert f"{score['value']:.2f}" in text
-    assert "| wrong | not computed:" in text and text.count("nobody has it") == 1
-    assert "LPIPS ↓, test frames: not computed: HOIGS_LPIPS_WEIGHTS names" in text
-    assert "Geometry: not computed: the model has no separate object" in text
     # the paper's numbers stand apart, with table and data, and its own average where it differs
     mine, _, theirs = text.partition("**on other data**")
-    assert "Table 1, HOSNeRF | 25.89" in theirs and "Table 1" not in mine
+    assert "nobody has it" in theirs and "Table 1" not in mine
+    assert "Table 1, HOSNeRF | 25.89" in theirs
     assert "supplement, Table D, HOSNeRF | 24.61 (printed: 25.36)" in theirs
-    published = [r for r in rows if r["source"].startswith("paper")]
-    assert {r["data"] for r in published} == {"HOSNeRF"}
-    assert not any(r["data"] == "HOSNeRF" for r in rows if r["source"] == "this study")
 
 
 def test_what_is_done_is_not_run_again(done, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,7 +109,7 @@ def test_another_clip_or_spec_is_another_job(done) -> None:
     study, _, _ = done
     job = _jobs(study)[0]
     assert job.state() is JobState.done
-    longer = _jobs(_study(study.out, steps=5))[0]
+    longer = _jobs(_study(study.out, budgets=[5]))[0]
     seeded = [j.run for j in _jobs(_study(study.out, ROWS[:1], seeds=3))]
     assert longer.run != job.run and len(set(seeded)) == 3 and seeded[0] == job.run
     changed = Job(**{**vars(job), "clip_digest": "0" * 64})
@@ -154,12 +145,11 @@ def test_an_interrupted_job_goes_on_from_its_checkpoint(
 
 def test_a_time_limit_ends_the_runs_and_says_so(tmp_path: Path) -> None:
     rows = (Row("long", "static"), Row("waits", "static", ("model.scene.opacity=0.3",)))
-    study = _study(tmp_path, rows, steps=100_000)
+    study = _study(tmp_path, rows, budgets=[100_000])
     words: list[str] = []
-    (result,) = run_study(study, limit_s=0.3, report=lambda job, word: words.append(word))
+    cells = run_comparison(study, limit_s=0.3, report=lambda job, word: words.append(word))
     assert words == ["started", "stopped"]
-    for row in result.rows[CLIP]:
-        assert "the time limit came first" in str(row.over_seeds(("test frames", "full", "psnr")))
+    assert all("time limit" in cell.missing for cell in cells) and not points_of(cells)
 
 
 def test_a_run_that_stopped_before_its_first_checkpoint_starts_again(
@@ -178,14 +168,14 @@ def test_a_run_that_stopped_before_its_first_checkpoint_starts_again(
 
 
 def test_the_same_training_is_one_job_in_every_table(tmp_path: Path) -> None:
-    sets = [TABLE_SETS["ablation-interaction"], TABLE_SETS["ablation-human-feature"]]
-    cells = plan(Study([CLIP], sets, tmp_path, seeds=2, steps=4))
-    assert len(cells) == 8 and len({c.job.run for c in cells if c.job}) == 6
-    rows = [row for table in TABLE_SETS.values() for row in table.rows if row.spec]
+    tables = {name: TABLES[name] for name in ("ablation-interaction", "ablation-human-feature")}
+    planned = plan(Comparison([CLIP], tables, tmp_path, budgets=[4], seeds=2))
+    assert len(planned) == 8 and len({p.job.run for p in planned if p.job}) == 6
+    rows = [row for table in TABLES.values() for row in table if row.spec]
     assert all(row.spec.endswith("@matched") for row in rows)  # of which hoigs is the yardstick
 
 
-def test_knobs_are_for_built_in_clips_only(tmp_path: Path) -> None:
+def test_settings_of_a_clip_are_for_built_in_clips_only(tmp_path: Path) -> None:
     noisy = (Row("still", "static"), Row("noisy", "static", clip_settings="noise.depth_scale=2"))
     still, other = _jobs(_study(tmp_path / "out", noisy))
     assert still.clip_digest != other.clip_digest and still.folder.parent != other.folder.parent
@@ -193,11 +183,10 @@ def test_knobs_are_for_built_in_clips_only(tmp_path: Path) -> None:
     recorded.mkdir()
     (recorded / "clip.json").write_text("{}")
     rows = (Row("noisy", "static", clip_settings="noise.mask_boundary=0.3"),)
-    study = Study([str(recorded)], [TableSet("t", "T", rows)], tmp_path / "out", seeds=1)
-    (cell,) = plan(study)
-    assert cell.job is None and cell.why == ONLY_BUILTIN
-    with pytest.raises(HoigsError, match="no such clip folder"):
-        plan(Study([str(tmp_path / "gone")], [TABLE], tmp_path))
+    (planned,) = plan(Comparison([str(recorded)], {"t": rows}, tmp_path / "out"))
+    assert planned.job is None and planned.cell.missing == ONLY_BUILTIN
+    with pytest.raises(ClipError, match="gone"):
+        plan(Comparison([str(tmp_path / "gone")], {"t": ROWS}, tmp_path))
 
 
 def test_a_digest_is_of_names_and_content(tmp_path: Path) -> None:
@@ -213,29 +202,13 @@ def test_the_command_refuses_what_it_does_not_know(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.setattr(studies, "run_jobs", lambda *a, **k: pytest.fail("something was run"))
-    for words, message in (
-        (["--clips", "builtin:cary"], 'did you mean "builtin:carry"?'),
-        (["--clips", CLIP, "--table", "comparisn"], 'did you mean "comparison"?'),
+    for words, nearest in (
+        (["builtin:cary"], '"builtin:carry"'),
+        ([CLIP, "--table", "comparisn"], '"comparison"'),
     ):
-        monkeypatch.setattr("sys.argv", ["hoigs", "tables", *words, "--out", str(tmp_path / "o")])
+        command = ["hoigs", "study", "compare", *words, "--out", str(tmp_path / "o")]
+        monkeypatch.setattr("sys.argv", command)
         with pytest.raises(SystemExit) as stop:
             main()
-        assert stop.value.code == 2 and message in capsys.readouterr().err
+        assert stop.value.code == 2 and nearest in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
-
-
-def test_the_command_writes_what_there_is(
-    done, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    study, _, _ = done
-    settings = [part for one in QUICK for part in ("--set", one)]
-    monkeypatch.setattr("sys.argv", ["hoigs", "tables", "--clips", CLIP, "--specs", "static",
-                                     "--seeds", "1", "--steps", "4", "--out", str(study.out),
-                                     "--device", "cpu", *settings])  # fmt: skip
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert not stop.value.code
-    assert "done before" in capsys.readouterr().out
-    text = (study.out / "tables.md").read_text()
-    assert "## Chosen specs" in text and "| static |" in text
-    assert "2 frames of split 'test'" in text, "numbers come with their protocol"

@@ -10,7 +10,7 @@ from itertools import product
 from typing import Any
 
 from hoigs.core.errors import HoigsError
-from hoigs.studies.chart.data import (
+from hoigs.studies.compare.data import (
     ACCURACY,
     AXES,
     COST,
@@ -32,7 +32,7 @@ SYMBOLS = {"o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "v"
 CONFIG = {"showSendToCloud": False, "displaylogo": False, "responsive": True,
           "modeBarButtonsToRemove": ["select2d", "lasso2d"]}  # fmt: skip
 PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>hoigs chart: accuracy against cost</title>
+<html lang="en"><head><meta charset="utf-8"><title>hoigs: accuracy against cost</title>
 <style>body {{ font: 14px/1.5 sans-serif; color: {ink}; margin: 1.5rem; }}</style></head><body>
 <h1>Accuracy against cost</h1>
 <p>Filled markers are on the Pareto front (dashed). Bars: one standard deviation over seeds. Larger:

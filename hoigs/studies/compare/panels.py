@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from hoigs.studies.chart.data import (
+from hoigs.studies.compare.data import (
     ACCURACY,
     COST,
     Axis,

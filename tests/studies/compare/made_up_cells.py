@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 from hoigs.evaluation.protocol import NotComputed, Value
-from hoigs.studies.chart.data import Cell
+from hoigs.studies.compare.data import Cell
 
 A = "Xeon A, 2 cores; torch 2.13.0, warp 1.19.0"
 B = "Ryzen B, 8 cores; torch 2.13.0, warp 1.19.0"

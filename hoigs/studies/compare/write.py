@@ -11,7 +11,8 @@ from typing import Any
 
 from hoigs.core.system.files import write_whole
 from hoigs.evaluation.protocol import NotComputed
-from hoigs.studies.chart.data import (
+from hoigs.studies.compare import paper
+from hoigs.studies.compare.data import (
     ACCURACY,
     AXES,
     COST,
@@ -28,16 +29,19 @@ from hoigs.studies.chart.data import (
     points_of,
     usable_axes,
 )
-from hoigs.studies.jobs.results import Spread
+from hoigs.studies.jobs.results import ALL_CLIPS, Spread
 
 
 def by_clip(cells: Sequence[Cell]) -> dict[str, list[Point]]:
-    """Points of each clip that has any, then the mean of all where there are several."""
-    clips = list(dict.fromkeys(c.clip for c in cells))
-    sheets = {clip: points_of([c for c in cells if c.clip == clip]) for clip in clips}
-    if len(clips) > 1:
-        merged = all_clips(cells)
-        sheets |= {c.clip: points_of(merged) for c in merged[:1]}
+    """Points of each clip that has any, then the mean of all where there are several; with the name
+    of the paper's table where they are rows of one."""
+    sheets: dict[str, list[Point]] = {}
+    for table in dict.fromkeys(c.table for c in cells):
+        rows = [c for c in cells if c.table == table]
+        clips = list(dict.fromkeys(c.clip for c in rows))
+        for clip in [*clips, ALL_CLIPS] if len(clips) > 1 else clips:
+            own = all_clips(rows) if clip == ALL_CLIPS else [c for c in rows if c.clip == clip]
+            sheets[f"{table}, {clip}" if table else clip] = points_of(own)
     return {clip: points for clip, points in sheets.items() if points}
 
 
@@ -50,7 +54,7 @@ def write_chart(
         about: how the study was made, JSON values.
         mix_machines: draw times of several machines in one panel.
     """
-    from hoigs.studies.chart.interactive import page
+    from hoigs.studies.compare.interactive import page
 
     out.mkdir(parents=True, exist_ok=True)
     sheets = by_clip(cells)
@@ -68,7 +72,7 @@ def write_chart(
 
 
 def _figures(clip: str, points: Sequence[Point], mix_machines: bool) -> dict[str, bytes]:
-    from hoigs.studies.chart.panels import accuracy_chart, curve_chart
+    from hoigs.studies.compare.panels import accuracy_chart, curve_chart
     from hoigs.studies.plots import figure_files
 
     stem = f"chart-{slug(clip)}"
@@ -88,14 +92,14 @@ def slug(name: str) -> str:
 
 def as_csv(cells: Sequence[Cell]) -> str:
     """One number a line, every seed on its own, each with its protocol."""
-    columns = ("clip", "spec", "definition", "rasterizer", "steps", "seed", "measure", "value",
-               "not_computed", "machine", "run", "protocol")  # fmt: skip
+    columns = ("table", "clip", "spec", "definition", "rasterizer", "steps", "seed", "measure",
+               "value", "not_computed", "machine", "run", "protocol")  # fmt: skip
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for cell in cells:
         base = vars(cell) | {"protocol": " ".join(cell.protocol)}
-        for name in AXES:
+        for name in dict.fromkeys((*AXES, *cell.values)):
             value = cell.values.get(
                 name, NotComputed(cell.missing or "this run has no such number")
             )
@@ -115,7 +119,16 @@ def markdown(
     lines = ["# Accuracy against cost", "", *(f"- {k}: {v}" for k, v in about.items()), ""]
     for clip, points in sheets.items():
         lines += [f"## {clip}", "", *machine_lines(points), ""]
-        lines += [*_numbers(points), "", *dominance_table(points, mix_machines), ""]
+        lines += [
+            *_grid([*ACCURACY, *COST], points),
+            "",
+            *dominance_table(points, mix_machines),
+            "",
+        ]
+        if points[0].table:
+            for title, axes in paper.columns(points):
+                lines += [f"{title}:", "", *_grid(axes, points), ""]
+            lines += paper.published_table(points[0].table)
         lines += ["Protocol:", "", *(f"- {s}" for s in points[0].protocol), ""]
     lost = [c for c in cells if c.missing]
     if lost:
@@ -136,8 +149,7 @@ def machine_lines(points: Sequence[Point]) -> list[str]:
     return [f"**Points of {len(found)} machines**, {differ}:", "", *each]
 
 
-def _numbers(points: Sequence[Point]) -> list[str]:
-    axes = (*ACCURACY, *COST)
+def _grid(axes: Sequence[Axis], points: Sequence[Point]) -> list[str]:
     notes: dict[str, int] = {}
     lines = ["| | steps | seeds | " + " | ".join(a.title for a in axes) + " |",
              "|---" * (len(axes) + 3) + "|"]  # fmt: skip
