@@ -77,5 +77,5 @@ def _simple(annotation: Any, marks: list[Any]) -> tuple[Any, list[Any]]:
         return (kind | None if type(None) in arguments else kind), marks
     if origin is tuple:
         kind, marks = _simple(arguments[0], marks)
-        return list[kind] | None, marks  # type: ignore[valid-type]
+        return list[kind] | None, marks
     return (str if origin is Literal else annotation), marks

@@ -141,7 +141,9 @@ def verb(
                     raise HoigsError(f"{label}: there is no option {name!r}{hint}")
             passed = {name: settings.pop(name) for name in own if name in settings}
             whole = passed.pop("options", None)
-            return function(**passed, options=options.of(whole, settings, label))
+            if settings or not isinstance(whole, options):
+                whole = options.of(whole, settings, label)
+            return function(**passed, options=whole)
 
         called.__signature__ = _signature(own, options, places)  # type: ignore[attr-defined]
         called.__doc__ = _documented(function.__doc__ or "", options)
