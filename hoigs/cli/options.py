@@ -56,7 +56,7 @@ def _flag(name: str, annotation: Any, marks: list[Any], text: str) -> Any:
     """The type of an option on the command line, with its typer.Option."""
     kind, marks = _simple(annotation, marks)
     found = next((mark for mark in marks if isinstance(mark, Flag)), None)
-    names = found.names if found else (f"--{name.replace('_', '-')}",)
+    names = Flag.names_of(name, found)
     least = next((mark.ge for mark in marks if getattr(mark, "ge", None) is not None), None)
     shown = " ".join(text.split()) + (" Repeatable." if get_origin(annotation) is tuple else "")
     option = typer.Option(*names, help=shown, min=least, hidden=found is not None and found.hidden)

@@ -38,6 +38,11 @@ class Flag:
     def __init__(self, *names: str, hidden: bool = False) -> None:
         self.names, self.hidden = names, hidden
 
+    @staticmethod
+    def names_of(option: str, flag: Flag | None) -> tuple[str, ...]:
+        """How an option is written; empty where it has no flag."""
+        return flag.names if flag else (f"--{option.replace('_', '-')}",)
+
 
 class Options(ComponentConfig):
     """Base of the options of a verb: every field has a default, or is required, and a description.
@@ -89,6 +94,20 @@ class Options(ComponentConfig):
             for name, value in self.given().items()
             if name not in without and value != type(self).model_fields[name].default
         }
+
+    def words(self) -> list[str]:
+        """What differs from the defaults, as words of a command line."""
+        found: list[str] = []
+        for name, field, flag in fields_of(type(self)):
+            value = getattr(self, name)
+            for names in Flag.names_of(name, flag)[:1]:
+                yes, _, no = names.partition("/")
+                if value != field.default and isinstance(value, bool):
+                    found.append(yes if value else no)
+                elif value != field.default:
+                    parts = value if isinstance(value, tuple) else (value,)
+                    found += [word for part in parts for word in (yes, str(part))]
+        return found
 
 
 Other = TypeVar("Other", bound=Options)

@@ -99,6 +99,8 @@ def test_the_command_line_has_the_same_options():
     assert CliRunner().invoke(app, line).exit_code == 0
     assert CliRunner().invoke(app, ["rye"]).exit_code == 0
     few = BakeOptions(minutes=3, toppings=("nuts", "figs"), serve=False)
+    assert CliRunner().invoke(app, ["rye", *few.words()]).exit_code == 0
+    assert got.pop() == ("rye", few) and not BakeOptions().words()
     assert got == [("rye", few), ("rye", BakeOptions())]
     assert not got[1][1].model_fields_set
     assert CliRunner().invoke(app, ["rye", "--minutes", "0"]).exit_code == 2
