@@ -1,5 +1,6 @@
 # written by scripts/public_stub.py
 
+from collections.abc import Sequence
 from hoigs import gsplat as gsplat
 from hoigs import metrics as metrics
 from hoigs.core.config import ComponentConfig as ComponentConfig
@@ -19,11 +20,14 @@ from hoigs.core.interfaces.rasterizer import RenderRequest as RenderRequest
 from hoigs.core.interfaces.reader import ClipReader as ClipReader
 from hoigs.core.model.compose import compose as compose
 from hoigs.core.model.entity import Entity as Entity
+from hoigs.core.model.exporter import Exported as _Exported
 from hoigs.core.model.exporter import Exporter as Exporter
 from hoigs.core.model.scene import SceneModel as SceneModel
+from hoigs.core.model.scene import SceneModel as _SceneModel
 from hoigs.core.registry.component import Component as Component
 from hoigs.core.registry.component import hookimpl as hookimpl
 from hoigs.core.spec.schema import Spec as Spec
+from hoigs.core.spec.schema import Spec as _Spec
 from hoigs.core.spec.train_schema import TrainSpec as TrainSpec
 from hoigs.core.system.urls import publish as publish
 from hoigs.core.values.camera import Camera as Camera
@@ -40,8 +44,11 @@ from hoigs.core.values.tokens import Residual as Residual
 from hoigs.core.values.tokens import Tokens as Tokens
 from hoigs.core.values.topology import TopologyChange as TopologyChange
 from hoigs.core.values.world import World as World
-from hoigs.evaluation.evaluate import score as score
-from hoigs.evaluation.evaluate_run import evaluate as evaluate
+from hoigs.evaluation.evaluate_run import EvaluatedRun as _EvaluatedRun
+from hoigs.evaluation.options import EvaluateOptions as EvaluateOptions
+from hoigs.evaluation.options import EvaluateOptions as _EvaluateOptions
+from hoigs.evaluation.options import ScoreOptions as _ScoreOptions
+from hoigs.evaluation.scores import Evaluation as _Evaluation
 from hoigs.plugins.bodies.anny import AnnyBody as AnnyBody
 from hoigs.plugins.bodies.smpl import SmplxBody as _SmplxBody
 from hoigs.plugins.deformation.chs import CubicHermite as _CubicHermite
@@ -73,21 +80,29 @@ from hoigs.studies.batch.batch import batch as batch
 from hoigs.studies.batch.batch import work as work
 from hoigs.studies.doctor import bug_report as bug_report
 from hoigs.studies.doctor import doctor as doctor
-from hoigs.studies.needs.auto import auto as auto
+from hoigs.studies.needs.auto import AutoRun as _AutoRun
 from hoigs.studies.needs.compress import compress as compress
 from hoigs.studies.needs.needs import needs as needs
 from hoigs.synthesis import builtin_clip as builtin_clip
-from hoigs.training.demo import demo as demo
-from hoigs.training.refine_poses import refine_poses as refine_poses
+from hoigs.training.options import DemoOptions as _DemoOptions
+from hoigs.training.options import RefineOptions as _RefineOptions
+from hoigs.training.options import TrainOptions as TrainOptions
+from hoigs.training.options import TrainOptions as _TrainOptions
+from hoigs.training.refine_poses import RefinedPoses as _RefinedPoses
 from hoigs.training.session import Session as Session
-from hoigs.training.train import train as train
+from hoigs.training.train import TrainedRun as _TrainedRun
 from hoigs.training.trainer import StepReport as StepReport
 from hoigs.training.trainer import Trainer as Trainer
 from hoigs.viewing.annotate.server import annotate as annotate
-from hoigs.viewing.export import export as export
-from hoigs.viewing.films import render as render
+from hoigs.viewing.films import Film as _Film
+from hoigs.viewing.options import ExportOptions as ExportOptions
+from hoigs.viewing.options import ExportOptions as _ExportOptions
+from hoigs.viewing.options import RenderOptions as RenderOptions
+from hoigs.viewing.options import RenderOptions as _RenderOptions
+from hoigs.viewing.options import ViewOptions as ViewOptions
+from hoigs.viewing.options import ViewOptions as _ViewOptions
 from hoigs.viewing.playback import Playback as Playback
-from hoigs.viewing.view import view as view
+from hoigs.viewing.player.page import Page as _Page
 from pathlib import Path as _Path
 from torch import Tensor
 from typing import Any, Literal
@@ -163,7 +178,7 @@ class Embedded(_Embedded):
         fine_until: float = ...,
         width: int = ...,
         depth: int = ...,
-        heads: Any = ...,
+        heads: Sequence[Literal['means', 'scales', 'rotations', 'opacity', 'sh']] = ...,
         table_spread: float = ...,
         anneal: float = ...,
         turning: Literal['composed', 'added'] = ...,
@@ -190,10 +205,10 @@ class HexPlaneField(_HexPlaneField):
         channels: int = ...,
         resolution: int = ...,
         time_resolution: int | None = ...,
-        multires: Any = ...,
+        multires: Sequence[int] = ...,
         width: int = ...,
         depth: int = ...,
-        heads: Any = ...,
+        heads: Sequence[Literal['means', 'scales', 'rotations', 'opacity', 'sh']] = ...,
         time_span: Literal['whole', 'half'] = ...,
         turning: Literal['composed', 'added'] = ...,
         start: float = ...,
@@ -223,7 +238,7 @@ class HexPlaneSkinning(_HexPlaneSkinning):
         nonrigid: bool | Literal['auto', 'shading'] = ...,
         nonrigid_motion: _NonRigidConfig = ...,
         laplacian: Literal['points', 'mesh'] = ...,
-        laplacian_of: Any = ...,
+        laplacian_of: Sequence[Literal['offset', 'scale', 'color']] = ...,
         body: _BodyModel,
         entity: str = ...,
         betas: Tensor | None = ...,
@@ -232,7 +247,7 @@ class HexPlaneSkinning(_HexPlaneSkinning):
         num_frames: int | None = ...,
         trained_frames: Any | None = ...,
         camera_centers: Tensor | None = ...,
-        frame_times: Any | None = ...,
+        frame_times: Sequence[float] | None = ...,
     ) -> None: ...
 
 class MlpDeformation(_MlpDeformation):
@@ -338,3 +353,189 @@ class WarpRasterizer(_WarpRasterizer):
         scheduler: Literal['threads', 'openmp', 'auto', 'serial'] = ...,
         threads: int | None = ...,
     ) -> None: ...
+
+def auto(
+    clip: _Path | str | None,
+    spec: str | _Path | _Spec | None = ...,
+    *,
+    out: _Path | str | None = ...,
+    resume: bool = ...,
+    allow_faults: bool = ...,
+    reader: str | None = ...,
+    reader_settings: Sequence[str] = ...,
+    budget: str | float | None = ...,
+    chunk: int | None = ...,
+    evaluate: bool = ...,
+    view: bool = ...,
+    port: int = ...,
+    lpips_weights: _Path | str | None = ...,
+    rasterizer: str | None = ...,
+    device: str = ...,
+    plugins: Sequence[_Path | str] = ...,
+    overrides: Sequence[str] = ...,
+    overwrite: bool = ...,
+    on_found: Any | None = ...,
+    on_start: Any | None = ...,
+    on_step: Any | None = ...,
+    progress: Any | None = ...,
+    report: Any = ...,
+    options: _TrainOptions | None = ...,
+) -> _AutoRun: ...
+
+def demo(
+    *,
+    out: _Path | str = ...,
+    fast: bool = ...,
+    steps: int | None = ...,
+    baseline: bool | None = ...,
+    rasterizer: str | None = ...,
+    device: str = ...,
+    plugins: Sequence[_Path | str] = ...,
+    overrides: Sequence[str] = ...,
+    overwrite: bool = ...,
+    on_start: Any | None = ...,
+    on_step: Any | None = ...,
+    progress: Any | None = ...,
+    report: Any = ...,
+    options: _DemoOptions | None = ...,
+) -> dict[str, _TrainedRun]: ...
+
+def evaluate(
+    run: _Path | str,
+    *,
+    lpips_weights: _Path | str | None = ...,
+    test_pose: str | None = ...,
+    test_camera: str | None = ...,
+    fit_steps: int | None = ...,
+    report: bool = ...,
+    rasterizer: str | None = ...,
+    device: str = ...,
+    plugins: Sequence[_Path | str] = ...,
+    clip: str | _Path | None = ...,
+    progress: Any | None = ...,
+    options: _EvaluateOptions | None = ...,
+) -> _EvaluatedRun: ...
+
+def export(
+    run: _Path | str,
+    *,
+    format: str,
+    out: _Path | str | None = ...,
+    entities: Sequence[str] = ...,
+    overrides: Sequence[str] = ...,
+    rasterizer: str | None = ...,
+    device: str = ...,
+    plugins: Sequence[_Path | str] = ...,
+    clip: str | _Path | None = ...,
+    start: float | None = ...,
+    end: float | None = ...,
+    fps: float | None = ...,
+    slow: float = ...,
+    progress: Any | None = ...,
+    options: _ExportOptions | None = ...,
+) -> _Exported: ...
+
+def refine_poses(
+    clip: _Path | str,
+    out: _Path | str,
+    *,
+    steps: int | None = ...,
+    width: int = ...,
+    overrides: Sequence[str] = ...,
+    device: str = ...,
+    overwrite: bool = ...,
+    progress: Any = ...,
+    options: _RefineOptions | None = ...,
+) -> _RefinedPoses: ...
+
+def render(
+    run: _Path | str,
+    *,
+    out: _Path | str | None = ...,
+    path: str = ...,
+    entities: Sequence[str] = ...,
+    only: Sequence[str] = ...,
+    compare: bool = ...,
+    background: str | None = ...,
+    width: int | None = ...,
+    height: int | None = ...,
+    at: float | None = ...,
+    rasterizer: str | None = ...,
+    device: str = ...,
+    plugins: Sequence[_Path | str] = ...,
+    clip: str | _Path | None = ...,
+    start: float | None = ...,
+    end: float | None = ...,
+    fps: float | None = ...,
+    slow: float = ...,
+    progress: Any | None = ...,
+    options: _RenderOptions | None = ...,
+) -> _Film: ...
+
+def train(
+    clip: _Path | str | None = ...,
+    spec: str | _Path | _Spec | None = ...,
+    *,
+    out: _Path | str | None = ...,
+    resume: bool = ...,
+    allow_faults: bool = ...,
+    reader: str | None = ...,
+    reader_settings: Sequence[str] = ...,
+    budget: str | float | None = ...,
+    chunk: int | None = ...,
+    evaluate: bool = ...,
+    view: bool = ...,
+    port: int = ...,
+    lpips_weights: _Path | str | None = ...,
+    rasterizer: str | None = ...,
+    device: str = ...,
+    plugins: Sequence[_Path | str] = ...,
+    overrides: Sequence[str] = ...,
+    overwrite: bool = ...,
+    on_start: Any | None = ...,
+    on_step: Any | None = ...,
+    progress: Any | None = ...,
+    report: Any = ...,
+    options: _TrainOptions | None = ...,
+) -> _TrainedRun: ...
+
+def view(
+    what: _Path | str,
+    second: _Path | str | None = ...,
+    *,
+    host: str = ...,
+    port: int = ...,
+    html: _Path | str | None = ...,
+    max_mb: float | None = ...,
+    entities: Sequence[str] = ...,
+    width: int = ...,
+    client: bool = ...,
+    rasterizer: str | None = ...,
+    device: str = ...,
+    plugins: Sequence[_Path | str] = ...,
+    clip: str | _Path | None = ...,
+    report: Any = ...,
+    progress: Any | None = ...,
+    started: Any | None = ...,
+    options: _ViewOptions | None = ...,
+) -> _Page | None: ...
+
+def score(
+    model: _SceneModel,
+    clip: _Clip,
+    *,
+    split: str = ...,
+    lpips_weights: _Path | str | None = ...,
+    held_out: bool = ...,
+    test_pose: Literal['auto', 'given', 'interpolated', 'blended', 'fitted'] = ...,
+    test_camera: Literal['given', 'interpolated', 'fitted'] = ...,
+    fit_steps: int = ...,
+    pixels: Literal['float', '8-bit'] = ...,
+    band: int | None = ...,
+    timing_frames: int = ...,
+    timing_warmup: int = ...,
+    timing_budget_s: float = ...,
+    device: str | None = ...,
+    progress: Any | None = ...,
+    options: _ScoreOptions | None = ...,
+) -> _Evaluation: ...

@@ -3,7 +3,8 @@
     python scripts/public_stub.py
 
 `hoigs/__init__.py` resolves its names on first use, and constructors of components take their
-settings as keywords: neither can a type checker follow. A test compares the stub with the code.
+settings as keywords, as functions do with their options: no type checker can follow. A test
+compares the stub with the code.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ def text() -> str:
         if component and takes_settings(value):
             imports.add(f"from {module} import {name} as _{name}")
             classes += ["", *_component(name, value, imports)]
+        elif isinstance(value, types.FunctionType) and hasattr(value, "options"):
+            classes += ["", *_verb(name, value, imports)]
         else:
             imports.add(f"from {module} import {name} as {name}")
     ordered = sorted(imports, key=lambda line: line.split())
@@ -59,6 +62,24 @@ def _component(name: str, cls: Any, imports: set[str]) -> list[str]:
     return [*lines, "    ) -> None: ..."]
 
 
+def _verb(name: str, function: Any, imports: set[str]) -> list[str]:
+    """A function that takes the fields of an options class as keywords."""
+    hints = _hints(inspect.unwrap(function))
+    fields = function.options.model_fields
+    lines, star = [f"def {name}("], False
+    for parameter in inspect.signature(function).parameters.values():
+        if parameter.kind is parameter.KEYWORD_ONLY and not star:
+            lines.append("    *,")
+            star = True
+        field = fields.get(parameter.name)
+        typed = _typed(field.annotation if field else hints.get(parameter.name, Any), imports)
+        if parameter.name == "options":
+            typed += " | None"
+        needed = parameter.default is parameter.empty
+        lines.append(f"    {parameter.name}: {typed}{'' if needed else ' = ...'},")
+    return [*lines, f") -> {_typed(hints.get('return', Any), imports)}: ..."]
+
+
 def _hints(function: Any) -> dict[str, Any]:
     try:
         return typing.get_type_hints(function)
@@ -76,6 +97,11 @@ def _typed(hint: Any, imports: set[str]) -> str:
         return f"Literal[{', '.join(map(repr, arguments))}]"
     if origin in (Union, types.UnionType):
         return " | ".join(dict.fromkeys(_typed(each, imports) for each in arguments))
+    if origin is tuple and arguments[1:] == (...,):  # lists are taken too
+        imports.add("from collections.abc import Sequence")
+        return f"Sequence[{_typed(arguments[0], imports)}]"
+    if origin is dict:
+        return f"dict[{', '.join(_typed(each, imports) for each in arguments)}]"
     if not isinstance(hint, type) or origin is not None:
         return "Any"
     if hint.__module__.startswith("jaxtyping"):

@@ -59,6 +59,13 @@ ClipOption = Annotated[
     Path | None,
     typer.Option("--clip", help="The clip, if it was moved: a folder or builtin:NAME."),
 ]
+LpipsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--lpips-weights",
+        help="File of LPIPS weights; default $HOIGS_LPIPS_WEIGHTS, or else AlexNet's, shipped.",
+    ),
+]
 AllowFaultsOption = Annotated[
     bool,
     typer.Option(

@@ -9,68 +9,34 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hoigs.cli.common import (
-    DeviceOption,
-    Display,
-    OverwriteOption,
-    RasterizerOption,
-    SetOption,
-    print_scores,
-    print_table,
-)
+from hoigs.cli.common import Display, print_scores, print_table
+from hoigs.cli.options import flags
 from hoigs.core.system.files import printable
+from hoigs.training.options import DemoOptions, RefineOptions
 
 if TYPE_CHECKING:
     from hoigs.preparation.estimates.plan import Consent, EstimatorPlan
     from hoigs.training.train import TrainedRun
 
 
-def demo(
-    out: Annotated[Path, typer.Option("--out", help="Run folder.")] = Path("runs/demo"),
-    fast: Annotated[
-        bool,
-        typer.Option("--fast", help="A first look in half a minute: smaller, less sharp."),
-    ] = False,
-    steps: Annotated[
-        int | None,
-        typer.Option("--steps", help="Training steps of each model; 800, with --fast 200."),
-    ] = None,
-    settings: SetOption = None,
-    rasterizer: RasterizerOption = None,
-    device: DeviceOption = "auto",
-    baseline: Annotated[
-        bool | None,
-        typer.Option(
-            "--baseline/--no-baseline",
-            help="Also train a static model for comparison; by default not with --fast.",
-        ),
-    ] = None,
-    overwrite: OverwriteOption = False,
-) -> None:
+@flags(DemoOptions)
+def demo(*, options: DemoOptions) -> None:
     """Generate a clip with known truth, reconstruct it, and write report.html."""
     from hoigs.training.demo import demo as run_demo
 
     began = time.perf_counter()
     with Display() as show:
         runs = run_demo(
-            out=out,
-            fast=fast,
-            steps=steps,
-            overrides=settings or (),
-            rasterizer=rasterizer,
-            device=device,
-            baseline=baseline,
-            overwrite=overwrite,
-            on_start=show.started,
-            on_step=show.step,
-            progress=show.fraction,
+            options=options, on_start=show.started, on_step=show.step, progress=show.fraction,
             report=show.line,
-        )
+        )  # fmt: skip
     for run in runs.values():
         assert run.evaluated is not None
         print_scores(run.evaluated)
     _compare(runs)
-    typer.echo(f"demo took {time.perf_counter() - began:.0f} s; open {out / 'report.html'}")
+    typer.echo(
+        f"demo took {time.perf_counter() - began:.0f} s; open {Path(options.out) / 'report.html'}"
+    )
 
 
 def _compare(runs: dict[str, TrainedRun]) -> None:
@@ -284,21 +250,14 @@ def _consent() -> Consent | None:
 # `hoigs refine`: the body poses of a clip, corrected by drawing all its frames.
 
 
+@flags(RefineOptions)
 def refine(
     clip: Annotated[Path, typer.Argument(help="Clip folder, as `hoigs prepare` makes it.")],
     out: Annotated[
         Path, typer.Option("--out", help="Folder of the refined clip; with --overwrite also CLIP.")
     ],
-    steps: Annotated[
-        int | None,
-        typer.Option("--steps", min=1, help="Default: 12.5 a frame, from 800 to 2000."),
-    ] = None,
-    width: Annotated[
-        int, typer.Option("--width", min=16, help="Of the images that are compared, pixels.")
-    ] = 256,
-    settings: SetOption = None,
-    device: DeviceOption = "auto",
-    overwrite: OverwriteOption = False,
+    *,
+    options: RefineOptions,
 ) -> None:
     """Correct the estimated body poses of a clip by a short training of the people on all frames.
 
@@ -307,11 +266,7 @@ def refine(
     from hoigs.training.refine_poses import refine_poses
 
     with Display() as show:
-        done = refine_poses(
-            clip, out, steps=steps, width=width, overrides=settings or (),
-            device=device, overwrite=overwrite,
-            progress=show.fraction,
-        )  # fmt: skip
+        done = refine_poses(clip, out, options=options, progress=show.fraction)
         show.line(str(done))
         show.line(f"clip: {done.path}")
 

@@ -15,6 +15,7 @@ from hoigs.cli.common import (
     DeviceOption,
     ExecutorOption,
     JobsOption,
+    LpipsOption,
     MinutesOption,
     PluginOption,
     SeedsOption,
@@ -23,7 +24,6 @@ from hoigs.cli.common import (
     print_table,
     study_device,
 )
-from hoigs.cli.train import LpipsOption
 from hoigs.core.system.files import printable
 from hoigs.core.system.threads import available_cpus
 

@@ -19,6 +19,9 @@ from hoigs.cli.common import (
     print_scores,
     print_table,
 )
+from hoigs.cli.options import flags
+from hoigs.evaluation.options import EvaluateOptions
+from hoigs.training.options import TrainOptions
 
 if TYPE_CHECKING:
     from hoigs.studies.needs.after_training import After
@@ -97,6 +100,7 @@ def print_needs(found: Needs) -> None:
         typer.echo(sentence)
 
 
+@flags(TrainOptions)
 def train(
     clip: Annotated[
         str | None,
@@ -104,37 +108,6 @@ def train(
             help="Clip folder, as `hoigs prepare` makes it, or builtin:NAME. Default with "
             "--resume: the run's."
         ),
-    ] = None,
-    spec: Annotated[
-        str | None,
-        typer.Option(
-            "--spec",
-            help="A built-in spec's name or a file; @PROFILE may follow. Default hoigs; with "
-            "--resume the run's.",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Run folder; default runs/CLIP-SPEC.")
-    ] = None,
-    settings: SetOption = None,
-    rasterizer: RasterizerOption = None,
-    device: DeviceOption = "auto",
-    resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Continue the run in --out, with its own spec and clip."),
-    ] = False,
-    overwrite: OverwriteOption = False,
-    allow_faults: AllowFaultsOption = False,
-    reader: Annotated[
-        str | None,
-        typer.Option(
-            "--reader",
-            help="Reader of the dataset layout of CLIP; default: the one that recognises it.",
-        ),
-    ] = None,
-    reader_set: Annotated[
-        list[str] | None,
-        typer.Option("--reader-set", help="A setting of the reader: masks=false. Repeatable."),
     ] = None,
     auto: Annotated[
         bool,
@@ -144,75 +117,28 @@ def train(
             "training, prune and compress the model.",
         ),
     ] = False,
-    budget: Annotated[
-        str | None,
-        typer.Option(
-            "--budget",
-            help="A time, 90s, 20m or 2h: width and steps that fit it on this machine.",
-        ),
-    ] = None,
-    chunk: Annotated[
-        int | None,
-        typer.Option(
-            "--chunk",
-            help="For a long clip, to save memory: train in windows of this many frames, of which "
-            "one is in memory at a time. Short windows, of 16 frames, cost the least time.",
-        ),
-    ] = None,
-    evaluate: Annotated[
-        bool, typer.Option("--eval/--no-eval", help="Score the run and write its report.")
-    ] = True,
-    view: Annotated[
-        bool, typer.Option("--view", help="Show the training in the browser while it lasts.")
-    ] = False,
-    port: Annotated[
-        int, typer.Option("--port", help="Of --view, on this machine; 0 finds a free one.")
-    ] = 8090,
-    plugin: PluginOption = None,
+    *,
+    options: TrainOptions,
 ) -> None:
     """Fit a model to a clip; then score it and write report.html."""
-    from hoigs.studies.needs.auto import auto as train_auto
-    from hoigs.training.train import train as train_spec
-
     with Display() as show:
-        given: dict[str, Any] = {
-            "out": out, "overrides": settings or (), "rasterizer": rasterizer, "device": device,
-            "resume": resume, "overwrite": overwrite, "allow_faults": allow_faults,
-            "evaluate": evaluate, "chunk": chunk, "plugins": plugin or (), "view": view,
-            "port": port,
-            "on_start": show.started, "on_step": show.step,
-            "progress": show.fraction, "report": show.line,
+        callbacks: dict[str, Any] = {
+            "on_start": show.started, "on_step": show.step, "progress": show.fraction,
+            "report": show.line,
         }  # fmt: skip
         if auto:
-            named = _clip_for_auto(clip, reader, reader_set, budget)
-            made = train_auto(named, spec, on_found=print_needs, **given)
+            from hoigs.studies.needs.auto import auto as train_auto
+
+            made = train_auto(clip, options=options, on_found=print_needs, **callbacks)
             run = made.run
         else:
-            run = train_spec(
-                clip, spec, reader=reader, reader_settings=reader_set or (), budget=budget, **given
-            )
+            from hoigs.training.train import train as train_spec
+
+            run = train_spec(clip, options=options, **callbacks)
     if auto:
         _print_after(made.after)
     if run.evaluated is not None:
         print_scores(run.evaluated)
-
-
-def _clip_for_auto(
-    clip: str | None, reader: str | None, reader_set: list[str] | None, budget: str | None
-) -> str:
-    """The clip of `--auto`, which has to be there; --budget and --reader do not go with it."""
-    from hoigs.core.errors import HoigsError
-    from hoigs.runs.resuming import NO_CLIP
-
-    if clip is None:
-        raise HoigsError(f"{NO_CLIP}; without --auto, --resume takes the run's own")
-    if budget is not None:
-        raise HoigsError("--auto has a budget of its own: leave --budget out")
-    if reader or reader_set:
-        raise HoigsError(
-            "--auto takes no --reader and no --reader-set: it chooses the reader of CLIP"
-        )
-    return clip
 
 
 def _print_after(after: After) -> None:
@@ -227,42 +153,12 @@ def _print_after(after: After) -> None:
 
 # `hoigs eval`: score a run on its test frames and held-out cameras.
 
-LpipsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--lpips-weights",
-        help="File of LPIPS weights; default $HOIGS_LPIPS_WEIGHTS, or else AlexNet's, shipped.",
-    ),
-]
 
-
+@flags(EvaluateOptions)
 def evaluate(
     run: Annotated[Path, typer.Argument(help="Run folder, as `hoigs train` makes it.")],
-    clip: ClipOption = None,
-    rasterizer: RasterizerOption = None,
-    lpips_weights: LpipsOption = None,
-    device: DeviceOption = "auto",
-    test_pose: Annotated[
-        str | None,
-        typer.Option(
-            "--test-pose",
-            help="Body poses of test frames: auto (blended if the clip's are estimates), "
-            "given, interpolated (from training frames), blended (between both) or fitted (to the "
-            "test images). "
-            "Default: the spec's.",
-        ),
-    ] = None,
-    test_camera: Annotated[
-        str | None,
-        typer.Option(
-            "--test-camera", help="Cameras of test frames: given, interpolated or fitted."
-        ),
-    ] = None,
-    fit_steps: Annotated[
-        int | None, typer.Option("--fit-steps", min=1, help="Steps for each frame with fitted.")
-    ] = None,
-    report: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html.")] = True,
-    plugin: PluginOption = None,
+    *,
+    options: EvaluateOptions,
 ) -> None:
     """Score a run, print the table, and write evaluation.json and report.html.
 
@@ -272,11 +168,7 @@ def evaluate(
     from hoigs.evaluation.evaluate_run import evaluate as evaluate_run
 
     with Display() as show:
-        done = evaluate_run(
-            run, clip=clip, rasterizer=rasterizer, lpips_weights=lpips_weights, device=device,
-            test_pose=test_pose, test_camera=test_camera, fit_steps=fit_steps, report=report,
-            plugins=plugin or (), progress=show.fraction,
-        )  # fmt: skip
+        done = evaluate_run(run, options=options, progress=show.fraction)
     print_scores(done)
     typer.echo(f"report: {done.report}" if done.report else f"scores: {done.scores}")
 

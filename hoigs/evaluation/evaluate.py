@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -14,16 +13,17 @@ from torch import Tensor
 from hoigs.core.errors import did_you_mean
 from hoigs.core.interfaces.rasterizer import RenderOutput
 from hoigs.core.model.scene import SceneModel
+from hoigs.core.options import verb
 from hoigs.core.parameters import PIECE, release_time_rows
 from hoigs.core.reporting import Progress, no_progress
-from hoigs.core.spec.train_schema import TestCamera, TestPoseSetting
 from hoigs.core.system.threads import short_waits_when_busy
 from hoigs.core.values.clip import CAMERAS_REFINED, Clip, Frame
 from hoigs.core.values.tokens import EntityKind
 from hoigs.evaluation.geometry import measure_geometry
 from hoigs.evaluation.measure import device_name, model_size, render_time
-from hoigs.evaluation.posing import FIT_STEPS, own_share, posed_clip, source_of_poses
-from hoigs.evaluation.protocol import NotComputed, Pixels, Protocol, TestPose, Value
+from hoigs.evaluation.options import ScoreOptions
+from hoigs.evaluation.posing import own_share, posed_clip, source_of_poses
+from hoigs.evaluation.protocol import NotComputed, Protocol, Value
 from hoigs.evaluation.scores import METRICS, Evaluation, FrameScores, ViewScores
 from hoigs.metrics.lpips import Lpips, find_weights
 from hoigs.metrics.psnr import region_psnr
@@ -33,37 +33,14 @@ from hoigs.metrics.ssim import ssim_map
 TIMING_SHARE, FITTING_SHARE = 0.3, 0.5  # of the progress bar
 
 
+@verb(ScoreOptions)
 @short_waits_when_busy()
 def score(
-    model: SceneModel,
-    clip: Clip,
-    *,
-    split: str = "test",
-    lpips_weights: Path | str | None = None,
-    held_out: bool = True,
-    test_pose: TestPoseSetting = "auto",
-    test_camera: TestCamera = "given",
-    fit_steps: int = FIT_STEPS,
-    pixels: Pixels = "float",
-    band: int | None = None,
-    timing_frames: int = 100,
-    timing_warmup: int = 10,
-    timing_budget_s: float = 60.0,
-    device: str | torch.device | None = None,
-    progress: Progress | None = None,
+    model: SceneModel, clip: Clip, *, options: ScoreOptions, progress: Progress | None = None
 ) -> Evaluation:
     """Score a model on a split of a clip and on its held-out cameras, and measure it.
 
     Args:
-        lpips_weights: see `lpips.find_weights`; None: the package's own.
-        held_out: also score the clip's held-out cameras, where it has them.
-        test_pose, test_camera, fit_steps: source of body poses and cameras; see
-            `posing.posed_clip`, and for "auto" `posing.source_of_poses`. The clip with these is
-            `Evaluation.scored`.
-        pixels: score float renders, or round them to 8 bits first. Clamped to [0, 1] either way.
-        band: width of the interaction band, pixels; by default 2 % of the longer side.
-        timing_frames, timing_warmup, timing_budget_s: see `measure.render_time`; 0 frames skip it.
-        device: to move the model to; None leaves it in place.
         progress: called with the share that is done, in [0, 1], and the present work.
 
     Raises:
@@ -71,40 +48,46 @@ def score(
             score gives that as its reason.
         HoigsError: `lpips_weights` names no file, or a damaged one.
     """
+    split = options.split
     if split not in clip.split:
         known = list(clip.split)
         raise ValueError(f"clip has no split {split!r}: {known}{did_you_mean(split, known)}")
-    if device is not None:
-        model.to(device)
-    found = find_weights(lpips_weights)
+    if options.device is not None:
+        model.to(options.device)
+    found = find_weights(options.lpips_weights)
     lpips: Lpips | NotComputed = NotComputed(found.reason)
     if found.location is not None:
         lpips = Lpips.load(found).to(model.device)
     report = progress or no_progress
     was_training = model.training
     model.eval()
-    poses = source_of_poses(clip, test_pose)
-    begun = FITTING_SHARE if {"blended", "fitted"} & {poses, test_camera} else 0.0
+    trained = {clip.moments[p].index for p in clip.split.get("train", ())}
+
+    # body poses and cameras of the scored frames
+    poses, cameras = source_of_poses(clip, options.test_pose), options.test_camera
+    begun = FITTING_SHARE if {"blended", "fitted"} & {poses, cameras} else 0.0
 
     def posing(done: float, text: str) -> None:
         report(FITTING_SHARE * done, text)
 
     share = own_share(model, clip, split, posing) if poses == "blended" else None
     clip = posed_clip(
-        model, clip, split=split, test_pose=poses, test_camera=test_camera,
-        fit_steps=fit_steps, share=share, progress=posing,
+        model, clip, split=split, test_pose=poses, test_camera=cameras,
+        fit_steps=options.fit_steps, share=share, progress=posing,
     )  # fmt: skip
+
+    # every frame of the split, and of the held-out cameras
     chosen = [("test frames" if split == "test" else f"{split} frames", clip, split)]
-    if held_out and clip.held_out is not None and len(clip.held_out):
+    if options.held_out and clip.held_out is not None and len(clip.held_out):
         chosen.append(("held-out cameras", clip.held_out, "test"))
     work = max(1, sum(len(source.split[name]) for _, source, name in chosen))
-    trained = {clip.moments[p].index for p in clip.split.get("train", ())}
     views, done = [], 0
     for title, source, name in chosen:
         protocol = replace(
-            _protocol(model, source, title, name, trained, poses, pixels, band, lpips),
-            test_camera=test_camera if source is clip else "given",
-            fit_steps=fit_steps if "fitted" in (poses, test_camera) else 0,
+            _protocol(model, source, title, name, trained, options, lpips),
+            test_pose=poses,
+            test_camera=cameras if source is clip else "given",
+            fit_steps=options.fit_steps if "fitted" in (poses, cameras) else 0,
             own_share=share,
         )
         frames = []
@@ -115,12 +98,14 @@ def score(
                 release_time_rows(model)
             report(begun + (1 - TIMING_SHARE - begun) * done / work, title)
         views.append(ViewScores(title, protocol, frames))
+
     report(1 - TIMING_SHARE, "geometry")
     geometry = measure_geometry(model, clip, clip.split[split])
     report(1 - TIMING_SHARE, "render time")
     timed = list(clip.split[split]) or list(range(len(clip)))
-    timing = NotComputed("timing_frames is 0") if timing_frames == 0 else render_time(
-        model, clip, timed, frames=timing_frames, warmup=timing_warmup, budget_s=timing_budget_s,
+    timing = NotComputed("timing_frames is 0") if options.timing_frames == 0 else render_time(
+        model, clip, timed, frames=options.timing_frames, warmup=options.timing_warmup,
+        budget_s=options.timing_budget_s,
     )  # fmt: skip
     report(1.0, "")
     model.train(was_training)
@@ -134,11 +119,10 @@ def _protocol(
     title: str,
     split: str,
     trained: set[int],
-    test_pose: TestPose,
-    pixels: Pixels,
-    band: int | None,
+    options: ScoreOptions,
     lpips: Lpips | NotComputed,
 ) -> Protocol:
+    """The conditions of a view's scores, with given poses and cameras."""
     positions = clip.split[split]
     camera = clip.cameras[positions[0] if positions else 0]
     first = camera.world_to_camera
@@ -152,10 +136,10 @@ def _protocol(
         frames=len(positions),
         unseen_times=sum(clip.moments[p].index not in trained for p in positions),
         region="full",
-        band=default_band(camera.width, camera.height) if band is None else band,
-        test_pose=test_pose,
+        band=default_band(camera.width, camera.height) if options.band is None else options.band,
+        test_pose="given",
         object_poses="given" if set(clip.objects) & set(model.entities) else "",
-        pixels=pixels,
+        pixels=options.pixels,
         width=camera.width,
         height=camera.height,
         lpips_net=None if isinstance(lpips, NotComputed) else lpips.net,

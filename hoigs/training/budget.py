@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +16,10 @@ from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
 from hoigs.evaluation.report.sections import clock
-from hoigs.runs.choices import pick_device, with_rasterizer
+from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import choose_reader, clip_folder, read_clip, require_folder
 from hoigs.runs.resuming import DEFAULT_SPEC, NO_CLIP
+from hoigs.training.options import TrainOptions
 from hoigs.training.session import lpips_term
 from hoigs.training.trainer import Trainer
 
@@ -124,16 +125,7 @@ def choose(
 
 def plan_budget(
     clip: Path | str | None,
-    spec: str | Path | Spec | None,
-    budget: str | float,
-    *,
-    overrides: Sequence[str] = (),
-    rasterizer: str | None = None,
-    device: str = "auto",
-    allow_faults: bool = False,
-    reader: str | None = None,
-    reader_settings: Sequence[str] = (),
-    plugins: Sequence[Path | str] = (),
+    options: TrainOptions,
     now: Callable[[], float] = time.perf_counter,
 ) -> tuple[Spec, BudgetPlan]:
     """The spec with `train.width` and `train.steps` for a time, by steps timed on this machine.
@@ -141,20 +133,23 @@ def plan_budget(
     Raises:
         HoigsError: the input is wrong, sets width or steps itself, or the time is too short.
     """
-    limit, began = seconds_of(budget), now()
+    if options.resume:
+        raise HoigsError("--budget plans a new run; a resumed one keeps its width and steps")
+    limit, began = seconds_of(options.budget or ""), now()
     if clip is None:
         raise HoigsError(NO_CLIP)
-    for setting in overrides:
+    settings = options.spec_settings()
+    for setting in settings:
         if setting.split("=")[0].strip() in ("train.steps", "train.width"):
             raise SpecError(f"--budget chooses width and steps: leave out {setting!r}")
-    registry, device = default_registry(plugin_files=plugins), pick_device(device)
+    registry = default_registry(plugin_files=options.plugins)
+    device, spec = pick_device(options.device), options.spec
     if not isinstance(spec, Spec):
-        settings = with_rasterizer(overrides, rasterizer)
         spec = Spec.load(spec or DEFAULT_SPEC, overrides=settings, registry=registry)
     folder = clip_folder(clip, registry)
     require_folder(folder)
-    choice = choose_reader(folder, registry, reader, reader_settings)
-    source = read_clip(folder, registry, allow_faults=allow_faults, reader=choice)
+    choice = choose_reader(folder, registry, options.reader, options.reader_settings)
+    source = read_clip(folder, registry, allow_faults=options.allow_faults, reader=choice)
     native = source.cameras[0].width, source.cameras[0].height
     few, many = (
         _timed(_with(spec, min(width, native[0])), source, registry, device, now)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
 
+from hoigs.core.options import verb
 from hoigs.core.reporting import Progress
 from hoigs.core.system.files import named
 from hoigs.core.system.random_state import callers_random_state
@@ -18,6 +18,7 @@ from hoigs.rasterizers.warp.rasterizer import WarpRasterizer
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_folder
 from hoigs.runs.run_folder import RunFolder
+from hoigs.training.options import DemoOptions, TrainOptions
 from hoigs.training.train import OnStart, OnStep, Report, TrainedRun, silent, train
 
 STEPS = 800
@@ -35,17 +36,11 @@ FAST_POINTS = {
 }
 
 
+@verb(DemoOptions)
 @callers_random_state()
 def demo(
     *,
-    out: Path | str = "runs/demo",
-    fast: bool = False,
-    steps: int | None = None,
-    overrides: Sequence[str] = (),
-    rasterizer: str | None = None,
-    device: str = "auto",
-    baseline: bool | None = None,
-    overwrite: bool = False,
+    options: DemoOptions,
     on_start: OnStart | None = None,
     on_step: OnStep | None = None,
     progress: Progress | None = None,
@@ -53,14 +48,11 @@ def demo(
 ) -> dict[str, TrainedRun]:
     """Generate a clip with known truth, reconstruct it, and write report.html.
 
+    With `fast` half the frames, at half the width, and a third of the Gaussians; its scores are not
+    those of the whole demo.
+
     Args:
-        out: the run folder; that of the static model is OUT-static.
-        fast: half the frames, at half the width, and a third of the Gaussians: a first look in
-            a minute. Its scores are not those of the whole demo.
-        steps: of each training; by default 800, or 200 with `fast`.
-        baseline: also train a static model, to compare with; by default not with `fast`.
-        overwrite: replace earlier runs in these folders.
-        overrides, rasterizer, device, on_start, on_step, progress, report: as for `train`.
+        on_start, on_step, progress, report: as for `train`.
 
     Returns:
         The runs by the name of their spec, "hoigs" first.
@@ -68,31 +60,33 @@ def demo(
     Raises:
         HoigsError: a folder exists already, or an option is wrong.
     """
-    folders = {"hoigs": named(Path(out))}
-    if not fast if baseline is None else baseline:
+    folders = {"hoigs": named(Path(options.out))}
+    if not options.fast if options.baseline is None else options.baseline:
         folders["static"] = folders["hoigs"].with_name(f"{folders['hoigs'].name}-static")
     for folder in folders.values():  # check both before training for minutes
-        RunFolder(folder).refuse_existing(overwrite)
+        RunFolder(folder).refuse_existing(options.overwrite)
+    steps = options.steps
     if steps is None:
-        steps = FAST_STEPS if fast else STEPS
-    if fast:
+        steps = FAST_STEPS if options.fast else STEPS
+    if options.fast:
         report(
             f"fast: 32 frames of 128x128, {steps} steps, a small model; without --fast the demo is "
             "larger, better and compared with a static model"
         )
     with ThreadPoolExecutor(1) as other_core:
-        if pick_device(device) == "cpu" and rasterizer in (None, "warp"):
+        if pick_device(options.device) == "cpu" and options.rasterizer in (None, "warp"):
             other_core.submit(_compile_kernels)
-        clip = clip_folder(FAST_CLIP if fast else CLIP)
-    return {
-        spec: train(
-            clip, spec, out=folder,
-            overrides=[f"train.steps={steps}", *(FAST_POINTS[spec] if fast else ()), *overrides],
-            rasterizer=rasterizer, device=device, overwrite=overwrite, on_start=on_start,
-            on_step=on_step, progress=progress, report=report,
-        )
-        for spec, folder in folders.items()
-    }  # fmt: skip
+        clip = clip_folder(FAST_CLIP if options.fast else CLIP)
+    runs = {}
+    for spec, folder in folders.items():
+        points = FAST_POINTS[spec] if options.fast else ()
+        overrides = (f"train.steps={steps}", *points, *options.overrides)
+        chosen = options.part(TrainOptions).changed(spec=spec, out=folder, overrides=overrides)
+        runs[spec] = train(
+            clip, options=chosen, on_start=on_start, on_step=on_step, progress=progress,
+            report=report,
+        )  # fmt: skip
+    return runs
 
 
 def _compile_kernels() -> None:

@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from hoigs.core.clip_folder.write import refuse_to_overwrite, replace_folder, sa
 from hoigs.core.errors import ClipError, SpecError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.options import verb
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.spec.schema import Spec
@@ -31,9 +32,9 @@ from hoigs.core.values.clip import POSES_EXACT, BodyTrack, Clip
 from hoigs.plugins.deformation.skinned_body import SkinnedBody
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_folder, read_clip, require_folder
+from hoigs.training.options import RefineOptions
 from hoigs.training.trainer import Trainer
 
-WIDTH = 256  # pixels: landmarks are off by one or two of a larger picture
 VISITS = 12.5  # of each frame
 LEAST, MOST = 800, 2000  # steps
 # people alone: objects and the scene change their poses by nothing that was measured, and cost half
@@ -70,17 +71,14 @@ class RefinedPoses:
         return f"joints moved by {by} (mean) in {self.steps} steps over all frames"
 
 
+@verb(RefineOptions)
 @short_waits_when_busy()
 @callers_random_state()
 def refine_poses(
     clip: Path | str,
     out: Path | str,
     *,
-    steps: int | None = None,
-    width: int = WIDTH,
-    overrides: Sequence[str] = (),
-    device: str = "auto",
-    overwrite: bool = False,
+    options: RefineOptions,
     progress: Progress = no_progress,
 ) -> RefinedPoses:
     """Correct the estimated body poses of a clip by a short training on all its frames.
@@ -98,9 +96,7 @@ def refine_poses(
         clip: a clip folder, whose poses were estimated.
         out: folder of the refined clip: a copy, whose images are hard links where the file system
             has them; or the clip's own folder, with `overwrite`.
-        steps: of the training; by default 12.5 a frame, from 800 to 2000.
-        width: of the images that are compared, pixels. overrides: settings laid over the spec's,
-            "train.seed=1".
+        progress: called with the share done, in [0, 1], and the work.
 
     Raises:
         ClipError: nobody in the clip has poses with errors, or `out` is there already.
@@ -114,16 +110,16 @@ def refine_poses(
             f"{folder} has no {HEADER}: refined poses are written as a copy of a clip folder, "
             "which `hoigs prepare` makes"
         )
-    if out.exists() and not overwrite:
+    if out.exists() and not options.overwrite:
         raise ClipError(f"{out} is there already; --overwrite (overwrite=True) replaces it")
     refuse_to_overwrite(out)
     require_clip(folder)
-    source = read_clip(folder, registry, width)
+    source = read_clip(folder, registry, options.width)
     if not source.bodies or source.provenance.get(POSES_EXACT) is True:
         why = "nobody is in it" if not source.bodies else "it declares its poses to be exact"
         raise ClipError(f"{folder} has no body poses to refine: {why}")
-    steps = steps or round(min(max(VISITS * len(source), LEAST), MOST))
-    people = _trained(source, steps, overrides, pick_device(device), registry, progress)
+    steps = options.steps or round(min(max(VISITS * len(source), LEAST), MOST))
+    people = _trained(source, steps, options, registry, progress)
     tracks = {name: _refined(person, source, name, steps) for name, person in people.items()}
     moved = {
         name: _moved(source.bodies[name], track, people[name].body)
@@ -136,17 +132,16 @@ def refine_poses(
 def _trained(
     clip: Clip,
     steps: int,
-    overrides: Sequence[str],
-    device: str,
+    options: RefineOptions,
     registry: Registry,
     progress: Progress,
 ) -> dict[str, SkinnedBody]:
     """The deformation of every person of the clip, on the CPU, trained on all its frames."""
-    settings = [*SETTINGS, f"train.steps={steps}", *overrides]
+    settings = [*SETTINGS, f"train.steps={steps}", *options.overrides]
     spec = Spec.load("hoigs", overrides=settings, registry=registry)
     every = replace(clip, split={"train": list(range(len(clip))), "test": []}, held_out=None)
     torch.manual_seed(spec.train.seed)
-    model = compose(spec, every, registry).to(device)
+    model = compose(spec, every, registry).to(pick_device(options.device))
     people = {name: model.entity(name).deformation for name in clip.bodies}
     for name, person in people.items():
         if not isinstance(person, SkinnedBody) or person.refinement is None:

@@ -9,12 +9,12 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.model.compose import compose_bodies
 from hoigs.core.model.exporter import SHEET, Exported, Exporter, ExportRequest
 from hoigs.core.model.standing import in_known_world
+from hoigs.core.options import verb
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.system.files import named
@@ -23,43 +23,23 @@ from hoigs.core.values.between import frame_numbers, moment_between
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.moment import Moment
 from hoigs.runs.choices import parse_settings, validated
-from hoigs.runs.loaded_run import LoadedRun
+from hoigs.viewing.options import ExportOptions
 
 KIND = "exporter"
 ZIP = ".zip"
 
 
+@verb(ExportOptions)
 def export(
-    run: Path | str,
-    *,
-    format: str,
-    out: Path | str | None = None,
-    entities: Sequence[str] = (),
-    start: float | None = None,
-    end: float | None = None,
-    fps: float | None = None,
-    slow: float = 1.0,
-    overrides: Sequence[str] = (),
-    clip: Path | str | None = None,
-    device: str = "auto",
-    plugins: Sequence[Path | str] = (),
-    progress: Progress | None = None,
+    run: Path | str, *, options: ExportOptions, progress: Progress | None = None
 ) -> Exported:
     """Write a run to the files of another program.
 
+    A format of one moment takes `start`. Moments between frames are computed by the model, not
+    blended.
+
     Args:
-        format: name of an exporter, "ply" or "exporter:ply" (`hoigs plugins` lists them).
-        out: the new file or folder; by default RUN/exports/FORMAT. A name that ends as the
-            format's files do (x.ply) is a file, beside which x.ply.json is written; any other is
-            a folder with export.json in it. x.zip holds the folder.
-        entities: names of those to export; all by default.
-        start, end: first and last frame number, also fractions; the whole clip by default. A
-            format of one moment takes `start`.
-        fps: moments a second in the files; by default the clip's. Those between frames are
-            computed by the model, not blended.
-        slow: how many times slower than the clip the files play.
-        overrides: settings of the exporter, "KEY=VALUE".
-        clip, device, plugins: as for `open_run`.
+        run: a run folder, as `hoigs.train` makes it.
         progress: called with the share done, in [0, 1], and the work.
 
     Raises:
@@ -67,26 +47,27 @@ def export(
             the format cannot hold what was chosen; or the disk is full. Nothing is left behind.
     """
     run = Path(run)
-    registry = default_registry(plugin_files=plugins)
-    exporter, name = make_exporter(format, overrides, registry)
-    target = named(Path(out)) if out is not None else run / "exports" / name
+    registry = default_registry(plugin_files=options.plugins)
+    exporter, name = make_exporter(options.format, options.overrides, registry)
+    target = named(Path(options.out)) if options.out is not None else run / "exports" / name
     refuse_existing(target)
-    loaded = LoadedRun.open(run, clip=clip, device=device, plugins=plugins, pixels=False)
+    loaded = options.open(run, pixels=False)
     known = loaded.model.names()
-    for entity in entities:
+    for entity in options.entities:
         if entity not in known:
             hint = did_you_mean(entity, known)
             raise HoigsError(f'no entity "{entity}"{hint}; this run has {", ".join(known)}')
-    bodies = _bodies(loaded, registry)
-    loaded = replace(loaded, clip=in_known_world(loaded.clip, bodies))
-    moments, rate = export_moments(loaded.clip, start, end, fps, slow)
+    bodies = compose_bodies(loaded.spec, loaded.clip, registry)
+    clip = in_known_world(loaded.clip, bodies)
+    moments, rate = export_moments(clip, options.start, options.end, options.fps, options.slow)
     chosen = moments if exporter.moving else moments[:1]
+    device = loaded.model.device
     request = ExportRequest(
         loaded.model,
-        loaded.clip,
-        tuple(m.to(loaded.model.device) for m in chosen),
-        tuple(entities),
-        bodies={n: b.to(loaded.model.device) for n, b in bodies.items()},
+        clip,
+        tuple(m.to(device) for m in chosen),
+        options.entities,
+        bodies={n: b.to(device) for n, b in bodies.items()},
         fps=rate,
     )
     if not any(request.of_kind(kind) for kind in exporter.kinds):
@@ -198,7 +179,3 @@ def write_zip(folder: Path, path: Path) -> None:
 
 def _sheet_of(target: Path) -> Path:
     return target.with_name(f"{target.name}.json")
-
-
-def _bodies(loaded: LoadedRun, registry: Registry) -> dict[str, Any]:
-    return dict(compose_bodies(loaded.spec, loaded.clip, registry))

@@ -15,6 +15,7 @@ from torch import Tensor
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.model.scene import SceneModel
+from hoigs.core.options import verb
 from hoigs.core.parameters import PIECE, release_time_rows
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.system.threads import short_waits_when_busy
@@ -24,6 +25,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.moment import Moment
 from hoigs.runs.loaded_run import LoadedRun
+from hoigs.viewing.options import RenderOptions
 from hoigs.viewing.paths import OLDER, View, film_path, frames_shown, rate_of
 from hoigs.viewing.playback import Mode, Playback
 from hoigs.viewing.viewer.panes import placed
@@ -164,92 +166,54 @@ class Film:
         )
 
 
+@verb(RenderOptions)
 @short_waits_when_busy()
-def render(
-    run: Path | str,
-    *,
-    out: Path | str | None = None,
-    path: str = "video",
-    entities: Sequence[str] = (),
-    only: Sequence[str] = (),
-    compare: bool = False,
-    background: str | None = None,
-    width: int | None = None,
-    height: int | None = None,
-    start: float | None = None,
-    end: float | None = None,
-    fps: float | None = None,
-    slow: float = 1.0,
-    at: float | None = None,
-    clip: Path | str | None = None,
-    rasterizer: str | None = None,
-    device: str = "auto",
-    plugins: Sequence[Path | str] = (),
-    progress: Progress | None = None,
-) -> Film:
+def render(run: Path | str, *, options: RenderOptions, progress: Progress | None = None) -> Film:
     """Draw a run to a video.
 
     Args:
-        out: the video: .mp4, .webm, .mov (ProRes 4444) or .gif; by default RUN/renders/PATH.mp4,
-            with `compare` PATH-compare.mp4.
-        path: "video" follows the clip's cameras, "orbit" moves around while the clip plays,
-            "bullet-time" stands still at a moment while the camera moves, "spiral" circles before
-            the middle camera, "follow human" and "follow object" go along with it; or a JSON file
-            of keyed cameras, also nerfstudio's camera_path.json.
-        entities: names of those to draw; all by default. only: an older name of it.
-        compare: draw beside the frame of the video.
-        background: a colour ("white", "#20242a"), an image file, or "transparent"; black by
-            default.
-        width, height: pixels; by default those of training. One alone keeps the aspect, both
-            cut what does not fit.
-        start, end: first and last frame number. fps: pictures a second, by default those
-            of nerfstudio's file, or the clip's.
-        slow: how many times slower than the clip it plays; moments between frames are computed.
-        at: frame number at which bullet-time stands still; by default where the objects move
-            fastest.
-        clip, rasterizer, device, plugins: as for `open_run`.
+        run: a run folder, as `hoigs.train` makes it.
         progress: called with the share done, in [0, 1], and the work.
 
     Raises:
         HoigsError: this is no run, its clip is not there, or an entity, a path, a background, a
             size or a kind of file is unknown.
     """
-    run, chosen = Path(run), [*entities, *only]
-    name = OLDER.get(path, path)
-    stem = Path(name).stem if name.endswith(".json") else name.replace(" ", "-")
-    stem += "-compare" if compare else ""
-    suffix = ".webm" if background == TRANSPARENT else ".mp4"
-    target = Path(out) if out is not None else run / "renders" / f"{stem}{suffix}"
-    _check_target(target, background)
-    loaded = LoadedRun.open(
-        run, clip=clip, rasterizer=rasterizer, device=device, plugins=plugins, pixels=compare
-    )
+    name = OLDER.get(options.path, options.path)
+    target = _target(Path(run), name, options)
+    loaded = options.open(run, pixels=options.compare)
     names = list(loaded.model.entities)
-    for entity in chosen:
+    for entity in (*options.entities, *options.only):
         if entity not in names:
             raise HoigsError(
                 f"--entities {entity}: this run has {', '.join(names)}{did_you_mean(entity, names)}"
             )
-    numbers, rate = frame_numbers(loaded.clip, start, end, fps, slow)
-    if name.endswith(".json") and fps is None:
+    numbers, rate = frame_numbers(
+        loaded.clip, options.start, options.end, options.fps, options.slow
+    )
+    if name.endswith(".json") and options.fps is None:
         rate = rate_of(Path(name)) or rate
-    views = film_path(loaded.model, loaded.clip, name, numbers, rate, at)
-    film = [(moment, fitted(camera, width, height)) for moment, camera in views]
+    views = film_path(loaded.model, loaded.clip, name, numbers, rate, options.at)
+    film = [(moment, fitted(camera, options.width, options.height)) for moment, camera in views]
     several = len({(camera.width, camera.height) for camera in loaded.clip.cameras}) > 1
-    return _draw(
-        loaded, film, target, rate, only=chosen, compare=compare, background=background,
-        shape=(views[0][1].width, views[0][1].height) if several else None,
-        report=progress or no_progress,
-    )  # fmt: skip
+    shape = (views[0][1].width, views[0][1].height) if several else None
+    return _draw(loaded, film, target, rate, shape, options, progress or no_progress)
 
 
-def _check_target(target: Path, background: str | None) -> None:
-    """Refuse what would fail after the drawing."""
-    clear = background == TRANSPARENT
+def _target(run: Path, path: str, options: RenderOptions) -> Path:
+    """The video's file; one that cannot hold the video is refused before the drawing."""
+    clear = options.background == TRANSPARENT
+    if options.out is not None:
+        target = Path(options.out)
+    else:
+        stem = Path(path).stem if path.endswith(".json") else path.replace(" ", "-")
+        stem += "-compare" if options.compare else ""
+        target = run / "renders" / f"{stem}{'.webm' if clear else '.mp4'}"
     kinds = WITH_ALPHA if clear else SUFFIXES
     if target.suffix.lower() not in kinds:
         what = "transparent videos" if clear else "videos"
         raise HoigsError(f"{target}: {what} end with {', '.join(kinds)}")
+    return target
 
 
 def _draw(
@@ -257,17 +221,17 @@ def _draw(
     film: Sequence[View],
     target: Path,
     fps: float,
-    *,
-    only: Sequence[str],
-    compare: bool,
-    background: str | None,
     shape: tuple[int, int] | None,
+    options: RenderOptions,
     report: Progress,
 ) -> Film:
-    camera, clear = film[0][1], background == TRANSPARENT
-    behind = None if clear or background is None else read_background(background, camera)
+    camera, clear = film[0][1], options.background == TRANSPARENT
+    behind = (
+        None if clear or options.background is None else read_background(options.background, camera)
+    )
+    only = (*options.entities, *options.only)
     play = playback_of(loaded.model, film, only, behind, copied=False)
-    shown = frames_shown(loaded.clip, film) if compare else []
+    shown = frames_shown(loaded.clip, film) if options.compare else []
     drawn, draw_s = 0, 0.0
 
     def frames() -> Iterator[UInt8[np.ndarray, "H W C"]]:
@@ -279,7 +243,7 @@ def _draw(
                 torch.cuda.synchronize(output.color.device)
             draw_s += time.perf_counter() - began
             picture = dithered(_with_alpha(output) if clear else output.color, drawn)
-            if compare:
+            if options.compare:
                 source = source_frame(loaded.clip, shown[drawn], view, picture.shape[2], shape)
                 picture = np.concatenate((source, picture), 1)
             drawn += 1

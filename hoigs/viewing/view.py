@@ -12,11 +12,13 @@ from pathlib import Path
 from types import TracebackType
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.options import verb
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.reporting import Progress
 from hoigs.core.system.environments import PYTHON
 from hoigs.runs.clip_source import clip_folder, read_clip
-from hoigs.runs.loaded_run import LoadedRun
+from hoigs.runs.options import ModelOptions
+from hoigs.viewing.options import ViewOptions
 from hoigs.viewing.player.page import Page, write_page
 from hoigs.viewing.splats import ClientScene
 from hoigs.viewing.viewer.access import is_loopback
@@ -24,28 +26,19 @@ from hoigs.viewing.viewer.clip_drawing import ClipDrawing
 from hoigs.viewing.viewer.following import FollowedRun, wait_for_checkpoint
 from hoigs.viewing.viewer.overlays import bodies_of_clip, bodies_of_run, offered
 from hoigs.viewing.viewer.run_drawing import Drawing, RunDrawing
-from hoigs.viewing.viewer.server import LOCAL, free_port, open_server, require_viser, stop
+from hoigs.viewing.viewer.server import free_port, open_server, require_viser, stop
 from hoigs.viewing.viewer.viewer import Viewer
 
 Report = Callable[[str], None]
-PORT, WIDTH = 8090, 1280
+SERVED = ("host", "port", "width", "client")  # options of a page that is served
 
 
+@verb(ViewOptions)
 def view(
     what: Path | str,
     second: Path | str | None = None,
     *,
-    host: str = LOCAL,
-    port: int = PORT,
-    html: Path | str | None = None,
-    max_mb: float | None = None,
-    entities: Sequence[str] = (),
-    width: int = WIDTH,
-    client: bool = False,
-    clip: Path | str | None = None,
-    rasterizer: str | None = None,
-    device: str = "auto",
-    plugins: Sequence[Path | str] = (),
+    options: ViewOptions,
     report: Report = print,
     progress: Progress | None = None,
     started: Callable[[Viewer], None] | None = None,
@@ -56,13 +49,6 @@ def view(
 
     Args:
         what: a run folder, a clip folder, or "builtin:NAME". second: another run.
-        host: the address to listen on; other machines can reach any but a loopback address.
-        port: 0 finds a free one.
-        html: write the run to this file instead, to be opened without a server or a network.
-        max_mb, entities: of that file (`write_page`).
-        width: of a still picture at most, pixels.
-        client: send the Gaussians of `what` to the browser, which draws them itself.
-        clip, rasterizer, device, plugins: as for `open_run`.
         report: receives lines: the address, and warnings.
         progress: called with the share done of the file, in [0, 1], and the work.
         started: receives the viewer before it draws, for example to stop it from a thread.
@@ -77,31 +63,29 @@ def view(
     if second is not None and len(runs) < 2:
         odd = what if not is_run(what) else second
         raise HoigsError(f"{odd}: two can be shown together if both are run folders; this is none")
-    if html is not None:
+    if options.html is not None:
         if len(runs) != 1 or second is not None:
             raise HoigsError(f"--html writes one run, and {what} is none; `hoigs train` makes one")
-        if (host, port, width, client) != (LOCAL, PORT, WIDTH, False):
+        served = ViewOptions()
+        if any(getattr(options, n) != getattr(served, n) for n in SERVED):
             raise HoigsError(
-                "host, port, width and client are of a page that is served, and --html writes a "
-                "file: leave them out"
+                f"{', '.join(SERVED)} are of a page that is served, and --html writes a file: "
+                "leave them out"
             )
-        loaded = LoadedRun.open(
-            runs[0], clip=clip, rasterizer=rasterizer, device=device, plugins=plugins
-        )
-        return write_page(loaded, html, max_mb=max_mb, entities=entities, progress=progress)
-    if max_mb is not None or entities:
+        return write_page(
+            options.open(runs[0]), options.html, max_mb=options.max_mb, entities=options.entities,
+            progress=progress,
+        )  # fmt: skip
+    if options.max_mb is not None or options.entities:
         raise HoigsError("max_mb and entities are of the file that `html` names")
-    if client and not runs:
+    if options.client and not runs:
         raise HoigsError(f"--client shows the Gaussians of a run, and {what} is none")
     report(f"starting the viewer of {' and '.join([str(run) for run in runs] or [str(what)])}")
-    registry = default_registry(plugin_files=plugins)
+    registry = default_registry(plugin_files=options.plugins)
     followed = []
     for path in runs:
         wait_for_checkpoint(path, report)
-        opened = partial(
-            LoadedRun.open, path, clip=clip, rasterizer=rasterizer, device=device, plugins=plugins
-        )
-        followed.append(FollowedRun(path, opened))
+        followed.append(FollowedRun(path, partial(options.open, path)))
     drawings: list[Drawing]
     if followed:
         drawings = [RunDrawing(run.loaded) for run in followed]
@@ -119,12 +103,13 @@ def view(
             report(f"{name}: {why}")
         drawings = [ClipDrawing(source)]
     overlays = offered(drawings[0].clip, bodies, before_training=not followed)
-    server = open_server(host, port, "hoigs")
+    host = options.host
+    server = open_server(host, options.port, "hoigs")
     try:
         viewer = Viewer(
-            server, drawings, bodies, overlays, widest=width,
+            server, drawings, bodies, overlays, widest=options.width,
             refresh=partial(_newer, followed, drawings, report),
-            splats=ClientScene(server.scene) if client else None,
+            splats=ClientScene(server.scene) if options.client else None,
         )  # fmt: skip
         if not is_loopback(host):
             report(
@@ -173,7 +158,7 @@ class LiveView:
     training is killed. It is in a session of its own, since Ctrl-C is the training's to answer.
 
     Args:
-        port: 0 finds a free one. device, rasterizer, plugins: as for `hoigs.view`.
+        port: 0 finds a free one. options: how the run is opened.
 
     Attributes:
         port: of its address on this machine.
@@ -182,17 +167,10 @@ class LiveView:
         HoigsError: viser is not installed, or the port is in use.
     """
 
-    def __init__(
-        self,
-        port: int,
-        *,
-        device: str = "auto",
-        rasterizer: str | None = None,
-        plugins: Sequence[Path | str] = (),
-    ) -> None:
+    def __init__(self, port: int, options: ModelOptions) -> None:
         require_viser()
         self.port = free_port(port)
-        self._options = [device, rasterizer or "", *map(str, plugins)]
+        self._options = [options.device, options.rasterizer or "", *map(str, options.plugins)]
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self, run: Path) -> None:

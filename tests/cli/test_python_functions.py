@@ -43,8 +43,6 @@ RENAMED = {
 CHOOSING = {("train", "auto"), ("prepare", "stage"), ("doctor", "json")}
 # options of a command that the second of its functions is without, and why
 WITHOUT = {
-    # a clip is read by the reader that it looks like, and the search has a budget of its own
-    hoigs.auto: {"reader", "reader_settings", "budget"},
     # the options of prepare_until are ready-made
     hoigs.prepare_until: {"width", "camera", "max_frames", "every", "fps", "focal", "keep_black",
                           "overwrite", "overrides", "start", "end", "intrinsics", "calibration",
@@ -52,7 +50,7 @@ WITHOUT = {
 }  # fmt: skip
 # arguments that only a Python caller can give: objects and callbacks
 PYTHON = {"on_start", "on_step", "on_found", "progress", "report", "body", "estimators",
-          "positions", "consent", "announce", "tick"}  # fmt: skip
+          "positions", "consent", "announce", "tick", "options"}  # fmt: skip
 
 
 def options_of(command: str) -> dict[str, Any]:

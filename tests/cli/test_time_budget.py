@@ -6,6 +6,7 @@ import pytest
 
 from hoigs.core.errors import HoigsError, SpecError
 from hoigs.training.budget import ENOUGH, MOST, StepTime, choose, plan_budget, seconds_of
+from hoigs.training.options import TrainOptions
 from hoigs.training.train import train
 
 STEP = StepTime(0.02, 1e-6)  # 85 ms at 256x256
@@ -22,7 +23,7 @@ def test_times_are_read(text, seconds):
 
 @pytest.mark.parametrize("text", ["", "soon", "-5", "0s", "inf", "nan", "m", "1d", "5m2h"])
 def test_what_is_no_time_is_refused(text):
-    with pytest.raises(SpecError, match="give 90s, 20m"):
+    with pytest.raises(SpecError, match="90s, 20m"):
         seconds_of(text)
 
 
@@ -43,21 +44,21 @@ def test_more_time_is_more_steps_then_more_pixels():
 
 
 def test_too_short_a_time_names_one_that_is_enough():
-    with pytest.raises(SpecError, match=r"100 steps at 128 pixels .* take 18 s"):
+    with pytest.raises(SpecError, match=r"100 steps .*128 .*18 s"):
         choose(NATIVE, 24, 10, STEP)
     assert choose(NATIVE, 24, 19, STEP).width == 128
 
 
 def test_what_it_chooses_cannot_be_given_as_well():
-    with pytest.raises(SpecError, match=r"leave out .train\.steps=5"):
-        plan_budget("builtin:carry", "hoigs", "5m", overrides=["train.steps=5"])
-    with pytest.raises(HoigsError, match="resumed one keeps"):
+    with pytest.raises(SpecError, match=r"train\.steps=5"):
+        plan_budget("builtin:carry", TrainOptions(budget="5m", overrides=("train.steps=5",)))
+    with pytest.raises(HoigsError, match=r"--budget.*resumed"):
         train(resume=True, out="nowhere", budget="5m")
 
 
 def test_a_clip_is_measured(tiny_clip):
     """By a clock that a step takes a tenth of a second of."""
-    spec, plan = plan_budget(tiny_clip, "hoigs", "2h", overrides=SMALL, now=Ticks(0.5))
+    spec, plan = plan_budget(tiny_clip, TrainOptions(budget="2h", overrides=SMALL), Ticks(0.5))
     native = 64
     assert (spec.train.width, spec.train.steps) == (plan.width, plan.steps) == (native, MOST)
     assert plan.step_s == pytest.approx(1.25 * 0.1)

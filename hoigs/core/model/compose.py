@@ -204,17 +204,14 @@ class _Builder:
         if block.body is None:
             why = f"the clip's {name} is a {track.model}: "
             with _errors_at(self.spec, "model", place, why=why):
-                return self._built(self._default_body(track.model), context)
+                body: BodyModel = self.part((), self._default_body(track.model), context)
+                return body
         if block.body.use.partition("@")[0] != track.model.partition("@")[0]:
             raise SpecError(
                 f"{self.spec.at('model', place, 'body')}: the clip's {name} was fitted with "
                 f"{track.model}; its shape coefficients do not fit {block.body.use}"
             )
-        return self._built(block.body, context, "model", place, "body")
-
-    def _built(self, part: ComponentSpec, context: BuildContext, *place: str) -> BodyModel:
-        body = self.part(place, part, context)
-        assert isinstance(body, BodyModel)
+        body = self.part(("model", place, "body"), block.body, context)
         return body
 
     def _with_initializer(

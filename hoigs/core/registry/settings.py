@@ -39,13 +39,13 @@ def describe_settings(config: type[BaseModel], prefix: str = "") -> list[Setting
         default = None
         if not field.is_required():
             default = repr(field.get_default(call_default_factory=True))
-        kind, bar, none = _spelled(field.annotation).partition(" | None")
+        kind, bar, none = spelled(field.annotation).partition(" | None")
         kind += _bounds(field.metadata) + bar + none
         rows.append(Setting(prefix + name, kind, default, field.description or ""))
     return rows
 
 
-def _spelled(annotation: Any) -> str:
+def spelled(annotation: Any) -> str:
     """A type as a spec's author needs it."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if annotation in (None, type(None)):
@@ -53,14 +53,14 @@ def _spelled(annotation: Any) -> str:
     if origin is Literal:
         return " | ".join(map(repr, arguments))
     if origin in (Union, types.UnionType):
-        return " | ".join(map(_spelled, arguments))
+        return " | ".join(map(spelled, arguments))
     if origin is Annotated:
         marks = [
             m for a in arguments[1:] for m in (a.metadata if isinstance(a, FieldInfo) else [a])
         ]
-        return _spelled(arguments[0]) + _bounds(marks)
+        return spelled(arguments[0]) + _bounds(marks)
     if origin is not None:
-        inner = ", ".join("..." if a is Ellipsis else _spelled(a) for a in arguments)
+        inner = ", ".join("..." if a is Ellipsis else spelled(a) for a in arguments)
         return f"{origin.__name__}[{inner}]"
     if annotation is Path:
         return "path"

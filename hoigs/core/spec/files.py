@@ -55,7 +55,8 @@ def read_spec(source: str | Path) -> Document:
     Raises:
         SpecError: a file is absent or not a spec, or has no such profile.
     """
-    return _chosen(source, Path(), ())
+    _, profile = split_profile(source)
+    return _with_profile(_read_file(source, Path(), ()), profile, str(source))
 
 
 def extended(document: Document) -> Document:
@@ -76,14 +77,28 @@ def split_profile(source: str | Path) -> tuple[str, str | None]:
     return base, profile
 
 
-def _chosen(source: str | Path, folder: Path | None, chain: tuple[Path, ...]) -> Document:
-    _, profile = split_profile(source)
-    return _with_profile(_read_file(source, folder, chain), profile, str(source))
-
-
 def _read_file(source: str | Path, folder: Path | None, chain: tuple[Path, ...]) -> Document:
-    """The file that `source` means, over what it extends; its profiles still to choose from."""
-    path = _find(source, folder)
+    """The file that `source` means, over what it extends; its profiles still to choose from.
+
+    A relative path starts from `folder`; None allows names only.
+    """
+    text, _ = split_profile(source)
+    named = isinstance(source, str) and "/" not in text and not text.endswith(SUFFIXES)
+    if isinstance(source, str) and text in builtin_specs():
+        path = BUILTIN_SPECS / f"{text}.yaml"
+    elif folder is not None and not text.endswith(SUFFIXES) and (folder / text).is_dir():
+        raise SpecError(f"{text}: is a folder, expected a YAML or TOML file")
+    elif named:
+        raise SpecError(
+            f'no spec "{text}"{did_you_mean(text, builtin_specs())} (built in: '
+            f"{', '.join(builtin_specs())}; a file ends in {', '.join(SUFFIXES)})"
+        )
+    elif folder is None:
+        raise SpecError(f'"{text}": only the names of built-in specs can be extended here')
+    elif not text.endswith(SUFFIXES):
+        raise SpecError(f"{text}: a spec file ends in {', '.join(SUFFIXES)}")
+    else:
+        path = folder / text
     resolved = path.resolve()
     if resolved in chain:
         names = " -> ".join(p.name for p in (*chain, resolved))
@@ -91,25 +106,6 @@ def _read_file(source: str | Path, folder: Path | None, chain: tuple[Path, ...])
     document = read_document(path)
     document.data.setdefault("name", name_from(path.stem, "spec"))
     return _extended(document, path.parent, (*chain, resolved))
-
-
-def _find(source: str | Path, folder: Path | None) -> Path:
-    """The file that `source` means; relative ones start from `folder`, None allows names only."""
-    text, _ = split_profile(source)
-    if isinstance(source, str) and text in builtin_specs():
-        return BUILTIN_SPECS / f"{text}.yaml"
-    if folder is not None and not text.endswith(SUFFIXES) and (folder / text).is_dir():
-        raise SpecError(f"{text}: is a folder, expected a YAML or TOML file")
-    if isinstance(source, str) and "/" not in text and not text.endswith(SUFFIXES):
-        raise SpecError(
-            f'no spec "{text}"{did_you_mean(text, builtin_specs())} (built in: '
-            f"{', '.join(builtin_specs())}; a file ends in {', '.join(SUFFIXES)})"
-        )
-    if folder is None:
-        raise SpecError(f'"{text}": only the names of built-in specs can be extended here')
-    if not text.endswith(SUFFIXES):
-        raise SpecError(f"{text}: a spec file ends in {', '.join(SUFFIXES)}")
-    return folder / text
 
 
 def _extended(document: Document, folder: Path | None, chain: tuple[Path, ...]) -> Document:
@@ -141,12 +137,12 @@ def _names(document: Document) -> list[str]:
         raise SpecError(f"{at} profiles: expected a block of names and trees, got {profiles!r}")
     for name, tree in profiles.items():
         place: Place = ("profiles", name)
-        at = f"{document.where(place, key=True)} profiles.{name}"
-        if name == NATIVE:
-            raise SpecError(
-                f"{at}: the file itself is its {NATIVE} profile; give this one another name"
-            )
-        if not isinstance(tree, dict):
+        if name == NATIVE or not isinstance(tree, dict):
+            at = f"{document.where(place, key=True)} profiles.{name}"
+            if name == NATIVE:
+                raise SpecError(
+                    f"{at}: the file itself is its {NATIVE} profile; give this one another name"
+                )
             raise SpecError(f"{at}: expected a block of keys ({{}} for none), got {tree!r}")
         for key in OF_THE_FILE:
             if key in tree:
@@ -165,7 +161,7 @@ def _with_profile(document: Document, profile: str | None, source: str) -> Docum
             f'{at}: "{source}": no profile "{profile}"{did_you_mean(profile, names)} '
             f"(has: {', '.join(names)})"
         )
-    document.remove(("profiles",))
+    document.data.pop("profiles", None)
     if profile is not None:
         document.data["name"] = f"{document.data.get('name', '')}@{profile}"
     if over is None:

@@ -99,7 +99,7 @@ class Document:
 
 
 class Loader(yaml.SafeLoader):
-    """Composes nodes; `_Builder` constructs the values, so no tag can run code."""
+    """Composes nodes; `_built` constructs the values, so no tag can run code."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
@@ -148,10 +148,10 @@ def load_yaml(text: str, source: str) -> Document:
         if node is None:
             raise SpecError(f"{source}: the file is empty")
         document = Document(source)
-        data = _Builder(document).build(node, ())
+        data = _built(node, (), document)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        at = f"{source}:{mark.line + 1}:{mark.column + 1}" if mark else source
+        at = _at(source, mark) if mark else source
         raise SpecError(f"{at}: {error.problem or error.context}") from error
     except yaml.YAMLError as error:  # unreadable characters
         raise SpecError(f"{source}: {' '.join(str(error).split())}") from error
@@ -163,47 +163,38 @@ def load_yaml(text: str, source: str) -> Document:
     return document
 
 
-class _Builder:
-    """YAML nodes to plain values; positions go into the document."""
-
-    def __init__(self, document: Document) -> None:
-        self.document = document
-
-    def build(self, node: yaml.Node, place: Place) -> Any:
-        at = self._at(node)
-        self.document.values[place] = at
-        tag = node.tag.removeprefix("tag:yaml.org,2002:")
-        if isinstance(node, yaml.MappingNode) and tag == "map":
-            return self._mapping(node, place)
-        if isinstance(node, yaml.SequenceNode) and tag == "seq":
-            return [self.build(item, (*place, i)) for i, item in enumerate(node.value)]
-        if isinstance(node, yaml.ScalarNode) and tag in _SCALARS:
-            text = node.value
-            if (pattern := _PATTERNS.get(tag)) and not pattern.match(text):  # of `!!int a`
-                raise SpecError(f"{at}: {text[:40]!r} is no {tag}")
-            if tag == "int" and len(text) > LONGEST_INTEGER:
-                raise SpecError(f"{at}: a number of {len(text)} digits")
-            return _SCALARS[tag](text)
-        raise SpecError(f"{at}: the tag {node.tag} is not supported")
-
-    def _mapping(self, node: yaml.MappingNode, place: Place) -> dict[str, Any]:
+def _built(node: yaml.Node, place: Place, document: Document) -> Any:
+    """The plain value of a YAML node; positions go into the document."""
+    at = _at(document.source, node.start_mark)
+    document.values[place] = at
+    tag = node.tag.removeprefix("tag:yaml.org,2002:")
+    if isinstance(node, yaml.MappingNode) and tag == "map":
         result: dict[str, Any] = {}
         for key_node, value_node in node.value:
-            at = self._at(key_node)
+            at = _at(document.source, key_node.start_mark)
             if not isinstance(key_node, yaml.ScalarNode):
                 raise SpecError(f"{at}: a key must be text")
-            key = key_node.value
-            if key in result:
-                first = self.document.keys[(*place, key)]
-                name = ".".join(str(part) for part in (*place, key))
+            here = (*place, key_node.value)
+            if key_node.value in result:
+                name, first = ".".join(map(str, here)), document.keys[here]
                 raise SpecError(f"{at} {name}: this key is given twice; first at {first}")
-            self.document.keys[(*place, key)] = at
-            result[key] = self.build(value_node, (*place, key))
+            document.keys[here] = at
+            result[key_node.value] = _built(value_node, here, document)
         return result
+    if isinstance(node, yaml.SequenceNode) and tag == "seq":
+        return [_built(item, (*place, i), document) for i, item in enumerate(node.value)]
+    if isinstance(node, yaml.ScalarNode) and tag in _SCALARS:
+        text = node.value
+        if (pattern := _PATTERNS.get(tag)) and not pattern.match(text):  # of `!!int a`
+            raise SpecError(f"{at}: {text[:40]!r} is no {tag}")
+        if tag == "int" and len(text) > LONGEST_INTEGER:
+            raise SpecError(f"{at}: a number of {len(text)} digits")
+        return _SCALARS[tag](text)
+    raise SpecError(f"{at}: the tag {node.tag} is not supported")
 
-    def _at(self, node: yaml.Node) -> str:
-        mark = node.start_mark
-        return f"{self.document.source}:{mark.line + 1}:{mark.column + 1}"
+
+def _at(source: str, mark: Any) -> str:
+    return f"{source}:{mark.line + 1}:{mark.column + 1}"
 
 
 def _integer(text: str) -> int:

@@ -320,18 +320,19 @@ def _settings(
 ) -> tuple[dict[str, Any], list[str]]:
     """Complete settings of one component, and what is wrong with it."""
     path = ".".join(map(str, place))
-    at = document.where((*place, "use"))
-    kind = str(place[-1])
+    use, kind = (*place, "use"), str(place[-1])
     try:
         found = registry.component(part.use)
         if found.kind != kind:
             known = ", ".join(registry.keys(kind))
-            return {}, [f'{at} {path}.use: "{part.use}" is no {kind} (known: {known})']
+            return {}, [
+                f'{document.where(use)} {path}.use: "{part.use}" is no {kind} (known: {known})'
+            ]
         config_class = registry.config_class(part.use)
         registry.get(part.use)
     except PluginError as error:
         known = "" if ":" in part.use else f" (known: {', '.join(registry.keys(kind))})"
-        return {}, [f"{at} {path}.use: {error}{known}"]
+        return {}, [f"{document.where(use)} {path}.use: {error}{known}"]
     try:
         return config_class.model_validate(part.settings).model_dump(mode="json"), []
     except ValidationError as error:
@@ -352,24 +353,23 @@ def require_fitting(spec: Spec, registry: Registry) -> None:
     Raises:
         SpecError: a line for each, with its position.
     """
-    if found := [line for name in spec.model for line in _misfits(spec, name, registry)]:
-        raise SpecError("\n".join(found))
-
-
-def _misfits(spec: Spec, name: str, registry: Registry) -> Iterator[str]:
     from hoigs.core.interfaces.features import check_provided
 
-    block = spec.model[name]
-    deformation = registry.get(block.deformation.use)
-    places = [spec.at("model", name, part, "use") for part in ("deformation", "features")]
-    if name in KINDS and name not in deformation.kinds:
-        yield (
-            f"{places[0]}: {deformation.__name__} deforms entities of kind "
-            f"{' or '.join(sorted(deformation.kinds))}, not {name}"
-        )
-    elif block.features is not None:
-        try:
-            check_provided(registry.get(block.features.use), deformation)
-        except ValueError as error:
-            # of the two, the one that a user wrote
-            yield f"{min(places, key=lambda at: at.startswith(str(BUILTIN_SPECS)))}: {error}"
+    found = []
+    for name, block in spec.model.items():
+        deformation = registry.get(block.deformation.use)
+        if name in KINDS and name not in deformation.kinds:
+            found.append(
+                f"{spec.at('model', name, 'deformation', 'use')}: {deformation.__name__} deforms "
+                f"entities of kind {' or '.join(sorted(deformation.kinds))}, not {name}"
+            )
+        elif block.features is not None:
+            try:
+                check_provided(registry.get(block.features.use), deformation)
+            except ValueError as error:
+                parts = ("deformation", "features")  # of these, the one that a user wrote
+                places = [spec.at("model", name, part, "use") for part in parts]
+                place = min(places, key=lambda at: at.startswith(str(BUILTIN_SPECS)))
+                found.append(f"{place}: {error}")
+    if found:
+        raise SpecError("\n".join(found))

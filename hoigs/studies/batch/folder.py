@@ -22,8 +22,10 @@ from hoigs.core.system.files import (
     write_whole,
     written_whole,
 )
+from hoigs.evaluation.options import EvaluateOptions
 from hoigs.studies.batch.manifest import Row
 from hoigs.studies.execution.queue import TakenError, hold
+from hoigs.viewing.options import ExportOptions
 
 BATCH = "batch.jsonl"
 MANY = 10_000  # rows, from which on they lie in 256 folders: network disks list large ones slowly
@@ -182,16 +184,16 @@ def stages_of(row: Row, folder: Path) -> list[Stage]:
                    *_each("--set", row.prepare), *_each("--object", row.object))  # fmt: skip
         stages.append(Stage("prepare", prepare, clip, work, again=(*prepare, "--overwrite")))
     named = row.clip or str(clip)
-    train = ("train", named, "--spec", row.spec, "--out", str(run), "--device", row.device,
-             "--no-eval", *(["--auto"] if row.auto else []), *_each("--set", row.set))  # fmt: skip
+    train = ("train", named, *row.training(run).words(), *(["--auto"] if row.auto else []))
     stages.append(
         Stage("train", train, run, run, again=(*train, "--overwrite"), resume=(*train, "--resume"))
     )
-    device = ("--device", row.device)
-    stages.append(Stage("eval", ("eval", str(run), *device), run / "evaluation.json", run))
+    evaluate = ("eval", str(run), *EvaluateOptions(device=row.device).words())
+    stages.append(Stage("eval", evaluate, run / "evaluation.json", run))
     for format in row.export:
         target = folder / "exports" / format
-        export = ("export", str(run), "--format", format, "--out", str(target), *device)
+        options = ExportOptions(format=format, out=target, device=row.device)
+        export = ("export", str(run), *options.words())
         stages.append(Stage(f"export-{format}", export, target, target, clear=True))
     if row.publish:
         only = _each("--only", ("run", "exports") if row.export else ("run",))

@@ -22,11 +22,16 @@ from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.spec.loader import MAX_BYTES, load_yaml
 from hoigs.core.system.files import is_plain, regular_file, short
 from hoigs.core.system.urls import as_url
+from hoigs.runs.choices import parse_settings
+from hoigs.training.options import TrainOptions
 
 NAMES = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")  # of rows, as they name folders
 FORMATS = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:@-]{0,79}")  # likewise, with kind: and @distribution
 ONE_SOURCE = "a row has either a video or a clip"
-LISTS = ("set", "prepare", "object", "export")  # in CSV, texts with ";" between
+# options of a training that a row has under another name, or that the batch sets; plugin files run
+# code, and the batch's folder may be writable for others
+OF_THE_BATCH = ("spec", "out", "device", "overrides", "evaluate", "resume", "overwrite", "plugins")
+LISTS = ("set", "train", "prepare", "object", "export")  # in CSV, texts with ";" between
 
 
 class ManifestError(HoigsError):
@@ -51,6 +56,9 @@ class Row(BaseModel):
     spec: str = Field(default="hoigs", description="spec to train")
     auto: bool = Field(default=False, description="reduce the spec to what the clip needs")
     set: tuple[str, ...] = Field(default=(), description="keys of the spec: train.steps=500")
+    train: tuple[str, ...] = Field(
+        default=(), description="further options of the training, by their Python names: chunk=16"
+    )
     prepare: tuple[str, ...] = Field(
         default=(), description="options of the preparation: width=640"
     )
@@ -100,6 +108,25 @@ class Row(BaseModel):
                     f"{short(name)} is no name of a format, such as ply; `hoigs plugins` lists them"
                 )
         return value
+
+    @field_validator("train")
+    @classmethod
+    def _trains(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        try:
+            given = parse_settings(value, "train")
+            for name in given:
+                if name in OF_THE_BATCH:
+                    raise ValueError(f"{name} cannot be set here, as the batch or a key sets it")
+            TrainOptions.of(None, given, "train")
+        except HoigsError as error:
+            raise ValueError(str(error)) from error
+        return value
+
+    def training(self, run: Path) -> TrainOptions:
+        """The options of the training of this row into a run folder."""
+        given = parse_settings(self.train, "train")
+        own = {"spec": self.spec, "out": run, "device": self.device, "overrides": self.set}
+        return TrainOptions.of(None, {**given, **own, "evaluate": False})
 
     @model_validator(mode="after")
     def _has_one_source(self) -> Self:

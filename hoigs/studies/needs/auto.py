@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.options import verb
 from hoigs.core.reporting import Progress
+from hoigs.core.spec.schema import Spec
 from hoigs.core.system.files import named
 from hoigs.core.system.random_state import callers_random_state
 from hoigs.evaluation.evaluate_run import evaluate as evaluate_run
+from hoigs.evaluation.options import EvaluateOptions
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_name
-from hoigs.runs.resuming import DEFAULT_SPEC
+from hoigs.runs.resuming import DEFAULT_SPEC, NO_CLIP
 from hoigs.runs.run_folder import RunFolder
 from hoigs.studies.needs.after_training import After, add_to_answer, finish
 from hoigs.studies.needs.compress import compact_of
 from hoigs.studies.needs.needs import needs
 from hoigs.studies.needs.result import Needs
+from hoigs.training.options import TrainOptions
 from hoigs.training.train import OnStart, OnStep, Report, TrainedRun, silent, train
 
 
@@ -39,23 +43,12 @@ class AutoRun:
     after: After
 
 
+@verb(TrainOptions, "spec")
 @callers_random_state()
 def auto(
-    clip: Path | str,
-    spec: str | Path | None = None,
+    clip: Path | str | None,
     *,
-    out: Path | str | None = None,
-    overrides: Sequence[str] = (),
-    rasterizer: str | None = None,
-    device: str = "auto",
-    resume: bool = False,
-    overwrite: bool = False,
-    allow_faults: bool = False,
-    evaluate: bool = True,
-    chunk: int | None = None,
-    plugins: Sequence[Path | str] = (),
-    view: bool = False,
-    port: int = 8090,
+    options: TrainOptions,
     on_found: Callable[[Needs], None] | None = None,
     on_start: OnStart | None = None,
     on_step: OnStep | None = None,
@@ -64,58 +57,64 @@ def auto(
 ) -> AutoRun:
     """Find how much of a spec a clip needs, train that, prune it, and compress it.
 
-    The answer of `needs` is written to OUT-needs, the compressed copy to OUT-compact.
+    The answer of `needs` is written to OUT-needs, the compressed copy to OUT-compact; OUT is by
+    default runs/CLIP-SPEC-auto. With `resume` the training in OUT goes on with the answer that it
+    was started with. The reader is the one that recognises the clip, and there is no budget of
+    time.
 
     Args:
         clip: a clip folder, or "builtin:NAME", of a layout that one reader alone recognises.
-        spec: a name or a file, to be reduced; by default "hoigs".
-        out: the run folder; by default runs/CLIP-SPEC-auto.
-        resume: continue the training in `out`, with the answer that it was started with.
         on_found: called with the result of the search, before the training.
-        overrides, rasterizer, device, overwrite, allow_faults, evaluate, chunk, plugins, view,
-            port, on_start, on_step, progress, report: as for `train`.
+        on_start, on_step, progress, report: as for `train`.
 
     Raises:
         HoigsError: anything wrong with the input, or the run to resume was pruned already.
     """
-    if chunk is not None:
-        overrides = [*overrides, f"train.chunk={chunk}"]
-    name = str(spec or DEFAULT_SPEC)
-    path = Path(out) if out is not None else Path("runs") / f"{clip_name(clip)}-{Path(name).stem}"
-    if out is None:
+    if clip is None:
+        raise HoigsError(f"{NO_CLIP}; without --auto, --resume takes the run's own")
+    if options.budget is not None:
+        raise HoigsError("--auto has a budget of its own: leave --budget out")
+    if options.reader or options.reader_settings:
+        raise HoigsError(
+            "--auto takes no --reader and no --reader-set: it chooses the reader of CLIP"
+        )
+    if isinstance(options.spec, Spec):
+        raise HoigsError("--auto reduces a spec by its name or file, not a Spec")
+    name = str(options.spec or DEFAULT_SPEC)
+    if options.out is not None:
+        path = Path(options.out)
+    else:
+        path = Path("runs") / f"{clip_name(clip)}-{Path(name).stem}"
         path = path.with_name(f"{path.name}-auto")
     answer, compact = needs_of(path), compact_of(path)
-    device = pick_device(device)
+    device, plugins = pick_device(options.device), options.plugins
+    trained = options.changed(spec=answer / "spec.yaml", out=path, device=device, evaluate=False)
     found: Needs | None = None
-    if resume:
+    if options.resume:
         _require_unfinished(path, answer)
     else:
         for folder in (path, compact):  # before the search, which may take hours
-            RunFolder(folder).refuse_existing(overwrite, [clip], resumable=True)
+            RunFolder(folder).refuse_existing(options.overwrite, [clip], resumable=True)
         found = needs(
-            clip, name, out=answer, overrides=overrides, rasterizer=rasterizer, device=device,
-            overwrite=overwrite, allow_faults=allow_faults, plugins=plugins, report=report,
+            clip, name, out=answer, overrides=options.spec_settings(), device=device,
+            overwrite=options.overwrite, allow_faults=options.allow_faults, plugins=plugins,
+            report=report,
         )  # fmt: skip
-        overrides, rasterizer = (), None  # the answer holds them
+        trained = trained.changed(overrides=(), rasterizer=None, chunk=None)  # the answer has them
         if on_found is not None:
             on_found(found)
-    run = train(
-        clip, answer / "spec.yaml", out=path, overrides=overrides, rasterizer=rasterizer,
-        device=device, resume=resume, overwrite=overwrite, allow_faults=allow_faults,
-        evaluate=False, plugins=plugins, view=view, port=port, on_start=on_start,
-        on_step=on_step, report=report,
-    )  # fmt: skip
+    run = train(clip, options=trained, on_start=on_start, on_step=on_step, report=report)
     report(f"pruning {path}:")
     trained_s = run.session.trainer.elapsed
     after = finish(
-        path, compact, device=device, plugins=plugins, overwrite=overwrite,
+        path, compact, device=device, plugins=plugins, overwrite=options.overwrite,
         clock=(found.seconds, trained_s, found.full_seconds) if found else None,
         report=lambda line: report(f"  {line}"),
     )  # fmt: skip
     add_to_answer(after, answer)
     report(f"run: {path}, compressed: {compact}, reasons: {answer / 'needs.md'}")
-    if evaluate:
-        scored = evaluate_run(path, device=device, plugins=plugins, progress=progress)
+    if options.evaluate:
+        scored = evaluate_run(path, options=options.part(EvaluateOptions), progress=progress)
         report(f"report: {scored.report}")
         run = replace(run, evaluated=scored)
     return AutoRun(run, compact, answer, found, after)

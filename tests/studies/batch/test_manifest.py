@@ -43,6 +43,9 @@ def test_yaml_and_csv_give_the_same_rows(tmp_path):
         ("row:\n  - video: one.mp4\n", r'm\.yaml:1:\S* row: .*"rows"'),
         ("rows:\n  - {video: one.mp4, clip: one.mp4}\n", r"m\.yaml:2.*video.*clip"),
         ("rows:\n  - video: one.mp4\n    auto: maybe\n", r"m\.yaml:3:\S* auto: .*'maybe'"),
+        ("rows:\n  - clip: one.mp4\n    train: {chunck: 16}\n", r'm\.yaml:3:\S* train: .*"chunk"'),
+        ("rows:\n  - clip: one.mp4\n    train: {chunk: many}\n", r"m\.yaml:3:\S* train: .*chunk"),
+        ("rows:\n  - clip: one.mp4\n    train: {plugins: a.py}\n", r"m\.yaml:3:.* plugins"),
         ("rows:\n  - video: one.mp4\n    name: ../x\n", r"m\.yaml:3:\S* name: "),
         (
             "rows:\n  - video: one.mp4\n  - video: one.mp4\n",
@@ -56,6 +59,20 @@ def test_mistakes_are_found_where_they_are(tmp_path, text, message):
     (tmp_path / "m.yaml").write_text(text)
     with pytest.raises(ManifestError, match=message):
         read_manifest(tmp_path / "m.yaml")
+
+
+def test_a_row_has_the_options_of_a_training(tmp_path):
+    (tmp_path / "m.yaml").write_text(
+        "rows:\n  - clip: builtin:carry\n    auto: true\n    set: {train.steps: 5}\n"
+        "    train: {chunk: 16, allow_faults: true}\n"
+    )
+    (row,) = read_manifest(tmp_path / "m.yaml")
+    stage = next(s for s in stages_of(row, tmp_path) if s.name == "train")
+    options = [*stage.command]
+    for words in (["--chunk", "16"], ["--allow-faults"], ["--set", "train.steps=5"], ["--no-eval"],
+                  ["--auto"], ["--out", str(tmp_path / "run")]):  # fmt: skip
+        place = options.index(words[0])
+        assert options[place : place + len(words)] == words
 
 
 def test_rows_are_checked_before_a_folder_is_made(tmp_path):
