@@ -99,7 +99,7 @@ def test_static_camera_and_ball(
 def test_files_beside_the_clip(static: tuple[Path, PrepareReport, list[float]]) -> None:
     out, _, _ = static
     numbers = json.loads((out / "report.json").read_text())
-    assert numbers["frames"] == FRAMES and numbers["seconds"]["writing"] > 0
+    assert numbers["frames"] == FRAMES and numbers["seconds"]["write"] > 0
     assert "estimated from the person" in (out / "report.md").read_text()
     overlay = VideoFrames(out / "overlay.mp4")
     assert (len(overlay), overlay.width) == (FRAMES, WIDTH)

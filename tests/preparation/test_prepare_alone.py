@@ -28,10 +28,10 @@ from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.estimators.tools import MEDIAPIPE
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.preparation.estimates.plan import EstimatorPlan, plan_estimators
+from hoigs.preparation.kept import PLAN
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.prepare import prepare, work_folder
 from hoigs.preparation.prompts import with_prompts
-from hoigs.preparation.stages import PLAN
 from hoigs.preparation.video.source import SourceError, find_source
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -173,7 +173,7 @@ def test_another_click_makes_only_the_object_again(
     better = common | {"options": OPTIONS.model_copy(update={"overwrite": True})}
     report = prepare(alone, out, object=["20,36", "52,30@9"], **better)
     changed = {name for name, when in made(out).items() if before[name] != when}
-    assert changed == {"object_masks", "masks", "object", "depth", "scene"}
+    assert changed == {"object_masks", "masks", "objects", "scene"}
     assert report.object_observed == 1 and "a note on the ball" in report.warnings
     assert (out / "object.jpg").is_file() and "object.jpg" in (out / "report.html").read_text()
     assert check_clip(out) == []

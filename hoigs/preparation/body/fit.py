@@ -19,7 +19,7 @@ from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit_problem import FitProblem
 from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Found, Joint, Unknowns
 from hoigs.preparation.body.kinematics import PER_FRAME, nearest_turn
-from hoigs.preparation.body.landmarks import ENOUGH, LandmarkTrack
+from hoigs.preparation.body.landmarks import ENOUGH, Landmarks
 from hoigs.preparation.body.mask_fit import Masks
 from hoigs.preparation.body.normal_equations import REACH, NormalEquations
 from hoigs.preparation.body.start import first_guess
@@ -81,7 +81,7 @@ STRETCHES, SHORTEST = 10, 8  # in which frames that stand for all are taken; fra
 
 def fit_in_windows(
     body: BodyModel,
-    landmarks: LandmarkTrack,
+    landmarks: Landmarks,
     cameras: Sequence[Camera],
     times: Float[Tensor, " F"],
     options: FitOptions,
@@ -182,7 +182,7 @@ def _share(progress: Callable[[float], None] | None, count: int, number: int, do
 
 def fit_body(
     body: BodyModel,
-    landmarks: LandmarkTrack,
+    landmarks: Landmarks,
     cameras: Sequence[Camera],
     *,
     options: FitOptions | None = None,

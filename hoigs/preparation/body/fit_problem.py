@@ -15,7 +15,7 @@ from hoigs.core.values.camera import Camera, pinhole_pixels
 from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Found, Unknowns
 from hoigs.preparation.body.ground_scale import ground_scale
 from hoigs.preparation.body.kinematics import Kinematics, Posed, nearest_turn
-from hoigs.preparation.body.landmarks import FEET, TORSO, LandmarkPoints, LandmarkTrack, points_of
+from hoigs.preparation.body.landmarks import FEET, TORSO, LandmarkPoints, Landmarks, points_of
 from hoigs.preparation.body.mask_fit import MaskFit, Masks, Project
 from hoigs.preparation.body.normal_equations import REACH, NormalEquations
 from hoigs.preparation.body.priors import REST_LASTS as LASTS
@@ -45,7 +45,7 @@ class FitProblem:
     def __init__(
         self,
         body: BodyModel,
-        landmarks: LandmarkTrack,
+        landmarks: Landmarks,
         cameras: Sequence[Camera],
         times: Float[Tensor, " F"],
         options: FitOptions,

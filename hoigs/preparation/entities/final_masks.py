@@ -12,9 +12,7 @@ from scipy import ndimage
 
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.choose_frames import blank_pixels
-from hoigs.preparation.entities.people import FittedPeople
-from hoigs.preparation.estimates.given import GivenMasks
-from hoigs.preparation.estimates.reader import FoundObject, UndistortedEstimates
+from hoigs.preparation.estimates.given import FoundObject, GivenMasks
 from hoigs.preparation.masks.mask_stack import MaskStack, largest_parts
 from hoigs.preparation.masks.separate import Images, separate
 from hoigs.preparation.objects.ball import BallTrack
@@ -139,8 +137,9 @@ def _disc_masks(together: MaskStack, ball: BallTrack) -> tuple[MaskStack, MaskSt
 
 def final_masks(
     given: GivenMasks,
-    estimates: UndistortedEstimates,
-    people: FittedPeople,
+    ball: BallTrack | None,
+    others: Mapping[str, MaskStack],
+    fitted: Bool[np.ndarray, " F"] | None,
     found: FoundObject | None,
     track: CameraTrack,
     images: Images,
@@ -152,29 +151,26 @@ def final_masks(
     """The masks, and what they were made from.
 
     Args:
-        given: of the first person and object. estimates: with those of further people.
+        given: of the first person and object. ball: the object, if it was tracked as one.
+        others: of further people. fitted: frames whose body was fitted to landmarks; None: nobody.
         found: objects that were followed in the video, the first and further ones.
         images: gives the undistorted frames anew on every call.
         silhouettes: gives the fitted body's; called only if masks must be separated.
         keep_black: take flat black patches for a part of the scene.
         folder: for temporary files.
     """
-    first = people.first
-    fitted = np.zeros(len(track.positions), bool) if first is None else first.found
-    human, object_masks, text = entity_masks(
-        given, estimates.ball, images, silhouettes, fitted, folder
-    )
+    fitted = np.zeros(len(track.positions), bool) if fitted is None else fitted
+    human, object_masks, text = entity_masks(given, ball, images, silhouettes, fitted, folder)
     further: dict[str, MaskStack] = {}
     if found is not None:
         text = f"{text}: {found.provenance}"
         if found.further:
             human, object_masks, further = _further(human, object_masks, found, track)
     things = [object_masks, *further.values()]
-    masks = {name: person.masks for name, person in estimates.further.items()}
-    others = without_others(masks, human, things)
-    shown = [human, *others.values(), *things]
+    people = without_others(others, human, things)
+    shown = [human, *people.values(), *things]
     blank = _nothing(human) if keep_black else _blank(images, shown)
-    return EntityMasks(human, object_masks, blank, further, others), text
+    return EntityMasks(human, object_masks, blank, further, people), text
 
 
 def _further(

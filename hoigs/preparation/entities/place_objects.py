@@ -2,84 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from functools import partial
 
 from hoigs.core.reporting import ranges
-from hoigs.core.values.camera import Camera
-from hoigs.preparation.entities.final_masks import EntityMasks
-from hoigs.preparation.entities.people import FittedPeople
-from hoigs.preparation.estimates.reader import UndistortedEstimates
-from hoigs.preparation.masks.separate import Images
+from hoigs.preparation.draft import Draft
 from hoigs.preparation.objects.hands import nearest_person
 from hoigs.preparation.objects.make_object import MadeObject, doubts, make_object
 from hoigs.preparation.options import PrepareOptions
 
 
-@dataclass(frozen=True)
-class PlacedObjects:
-    """The objects that are seen at all, by name, and sentences for the report.
-
-    Attributes:
-        provenance: "object" of the first one, "object NAME" of others.
-    """
-
-    objects: dict[str, MadeObject] = field(default_factory=dict)
-    provenance: dict[str, str] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
-
-
 def place_objects(
-    masks: EntityMasks,
-    estimates: UndistortedEstimates,
-    people: FittedPeople,
-    cameras: Sequence[Camera],
-    parents: Sequence[int],
-    images: Images,
-    options: PrepareOptions,
-    fps: float,
-    progress: Callable[[float], None],
-) -> PlacedObjects:
-    """Tracks and shapes of all objects that the masks show.
+    draft: Draft, options: PrepareOptions, progress: Callable[[float], None]
+) -> Draft:
+    """The draft with tracks and shapes of all objects that the masks show.
 
-    Args:
-        estimates: with the first object's disc, if it was tracked as a ball, and the first
-            person's landmarks. people: the fitted bodies; an object goes with the hands of the one
-            who is nearest to it. parents: of their joints.
-        images: gives the undistorted frames anew on every call.
+    An object goes with the hands of the person who is nearest to it.
     """
-    placed, count = PlacedObjects(), len(options.objects)
-    humans, ball = masks.humans(), estimates.ball
+    masks, cameras, count = draft.masks, draft.cameras, len(options.objects)
+    humans, person = masks.humans(), draft.undistorted.person
+    joints = {owner: one.joints for owner, one in draft.bodies.items()}
     for k, name in enumerate(options.objects):
         first = k == 0
         stack = masks.object if first else masks.further.get(name)
-        disc = ball if first else None
+        disc = draft.ball if first else None
         what = "the object" if count == 1 else f"the object {name}"
         if disc is None and (stack is None or not stack.coverage().any()):
-            _without(name, what, options, placed)
+            draft = _without(draft, name, what, options)
             continue
         assert stack is not None
-        joints = {owner: person.joints for owner, person in people.people.items()}
         owner = nearest_person(joints, stack, cameras)
         made = make_object(
             disc, stack, humans, masks.other_objects(None if first else name), cameras,
-            None if owner is None else people.people[owner].joints, parents, images,
+            None if owner is None else joints[owner], draft.body.parents, draft.images,
             way=options.object_track, radius=options.ball_radius, count=options.object_points,
-            fps=fps, progress=partial(_share, progress, k, count),
-            depths=None if people.nobody is None else people.nobody.depths,
+            fps=draft.video.fps, progress=partial(_share, progress, k, count),
+            depths=draft.unit.depths,
         )  # fmt: skip
-        placed.objects[name] = made
-        placed.provenance["object" if first else f"object {name}"] = made.track.provenance
-        if len(people.people) > 1:
-            placed.provenance[f"hands at {name}"] = (
-                f"{owner}'s, who is nearest to it in most frames"
-            )
-        marks = None if estimates.landmarks is None else estimates.landmarks.image
+        provenance = {"object" if first else f"object {name}": made.track.provenance}
+        if len(draft.bodies) > 1:
+            provenance[f"hands at {name}"] = f"{owner}'s, who is nearest to it in most frames"
         windows = options.chunk is not None and options.chunk < len(cameras)
-        said = [*doubts(stack, marks), *_remarks(made, disc is not None, windows)]
-        placed.warnings.extend(text.replace("the object", what) for text in said)
-    return placed
+        said = doubts(stack, None if person is None else person.image)
+        said += _remarks(made, disc is not None, windows)
+        unknown = {}
+        if made.confidence.way != "texture and hands":
+            unknown[f"rotation of {name}"] = made.confidence.reason
+        draft = draft.noting(
+            [text.replace("the object", what) for text in said], provenance, unknown,
+            objects={**draft.objects, name: made},
+        )  # fmt: skip
+    return draft
 
 
 def _share(progress: Callable[[float], None], number: int, count: int, done: float) -> None:
@@ -87,20 +60,22 @@ def _share(progress: Callable[[float], None], number: int, count: int, done: flo
     progress((number + done) / count)
 
 
-def _without(name: str, what: str, options: PrepareOptions, placed: PlacedObjects) -> None:
-    """Says that an object is not in the clip."""
+def _without(draft: Draft, name: str, what: str, options: PrepareOptions) -> Draft:
+    """Notes that an object is not in the clip."""
     if len(options.objects) > 1:
-        placed.warnings.append(
+        said = (
             f"{what} was not found, so the clip has none of that name; point at it in another "
             f"frame: --object {name}=X,Y@FRAME"
         )
-        return
-    placed.provenance["object"] = "none: the clip shows the person alone"
-    if options.find_object:
-        placed.warnings.append(
-            "no object was found, so the clip has none; point at it with --object X,Y, or "
-            "say that there is none with --object none"
-        )
+        return draft.noting([said], unknown={name: "it was not found"})
+    provenance = {"object": "none: the clip shows the person alone"}
+    if not options.find_object:
+        return draft.noting(provenance=provenance)
+    said = (
+        "no object was found, so the clip has none; point at it with --object X,Y, or say that "
+        "there is none with --object none"
+    )
+    return draft.noting([said], provenance, {name: "it was not found"})
 
 
 def _remarks(made: MadeObject, disc: bool, windows: bool) -> list[str]:

@@ -6,63 +6,40 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 
-from hoigs.core.interfaces.estimator import Landmarks
+from hoigs.core.interfaces import estimator
 from hoigs.core.values.lens import Undistortion
-from hoigs.preparation.body.landmarks import FrameFates, LandmarkTrack
+from hoigs.preparation.body.landmarks import FrameFates, Landmarks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import NobodyFoundError
 
 
-@dataclass(frozen=True)
-class RawLandmarks:
-    """Landmarks of the chosen frames, distortion still in; NaN where they were not found.
-
-    Attributes:
-        image: x, y, relative depth (pixels of the frames) and visibility. world: metres about the
-            hips' middle, and visibility; NaN if the estimator sees the image only.
-        source: for the report.
-        fates: of the chosen frames, by their position.
-    """
-
-    image: Float[np.ndarray, "F 33 4"]
-    world: Float[np.ndarray, "F 33 4"]
-    source: str = "MediaPipe"
-    fates: FrameFates = field(default_factory=FrameFates)
-
-    def undistorted(self, undistort: Undistortion, positions: Sequence[int]) -> LandmarkTrack:
-        """On the cameras' undistorted images; `positions` are those of frames with a camera."""
-        rows = list(positions)
-        image = self.image[rows].copy()
-        image[..., :2] = undistort.pixels(image[..., :2])
-        return LandmarkTrack.from_mediapipe(image, self.world[rows])
-
-
 def chosen_landmarks(
-    track: Landmarks, video: Frames, what: str, source: str = "MediaPipe"
-) -> RawLandmarks:
-    """Landmarks of a whole video, in its own pixels, as those of the chosen frames.
+    track: estimator.Landmarks, video: Frames, what: str, source: str = "MediaPipe"
+) -> Landmarks:
+    """Landmarks of a whole video, in its own pixels, as those of the chosen frames, at their size.
 
     Raises:
         NobodyFoundError: no person is found in them; `what` names where they come from.
     """
-    image, world = track.image_xyzv[video.indices].astype(np.float64), track.world_xyzv
-    image[..., :3] *= video.width / video.native_width
-    if world is None:
-        places = np.full_like(image, np.nan)
+    image = track.image_xyzv[video.indices].astype(np.float64)[..., [0, 1, 3]]
+    image[..., :2] *= video.width / video.native_width
+    if track.world_xyzv is None:
+        world = np.full_like(image, np.nan)
     else:
-        places = world[video.indices].astype(np.float64)
+        world = track.world_xyzv[video.indices].astype(np.float64)[..., :3]
     fates = FrameFates.at(track.lost, track.repaired, video.indices)
-    raw = RawLandmarks(image, places, source, fates)
-    if not LandmarkTrack.from_mediapipe(raw.image, raw.world).found.any():
+    found = Landmarks(torch.from_numpy(image), torch.from_numpy(world), source, fates)
+    if not found.found.any():
         raise NobodyFoundError(
             f"{what}: no person was found in the {len(image)} chosen frames; the body of a person "
             "whose shoulders, hips and some of the limbs are in the picture can be fitted"
         )
-    return raw
+    return found
 
 
 @dataclass(frozen=True)
@@ -105,3 +82,54 @@ class GivenMasks:
                 for name, stack in self.named().items()
             }
         )
+
+
+@dataclass(frozen=True)
+class FrameEstimates:
+    """Landmarks and masks of the frames: as found, or on the cameras' undistorted images.
+
+    Attributes:
+        landmarks: by person, the first one's first; none: nobody is looked for, and the person's
+            masks are empty.
+        further: masks of people but the first, by name.
+    """
+
+    landmarks: dict[str, Landmarks]
+    masks: GivenMasks
+    further: dict[str, MaskStack] = field(default_factory=dict)
+
+    @property
+    def person(self) -> Landmarks | None:
+        """The first person's."""
+        return next(iter(self.landmarks.values()), None)
+
+    def undistorted(self, undistort: Undistortion, positions: Sequence[int]) -> FrameEstimates:
+        """On the cameras' undistorted images; `positions` are those of frames with a camera."""
+        return FrameEstimates(
+            {name: one.undistorted(undistort, positions) for name, one in self.landmarks.items()},
+            self.masks.undistorted(undistort, positions),
+            {
+                name: MaskStack(undistort.mask(stack[i]) for i in positions)
+                for name, stack in self.further.items()
+            },
+        )
+
+
+@dataclass(frozen=True)
+class FoundObject:
+    """The object's masks from an estimator of its own, of the chosen frames, distortion still in.
+
+    Attributes:
+        confidence: of each chosen frame, 0..1; None: not computed.
+        boxes: frame of the video and box x0, y0, x1, y1 in its pixels where the object was proposed
+            because no prompt said where it is.
+        notes: for the report.
+        further: other objects by name (`PrepareOptions.further_objects`).
+    """
+
+    masks: MaskStack
+    provenance: str
+    confidence: Float[np.ndarray, " F"] | None = None
+    boxes: list[tuple[float, ...]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    further: dict[str, FoundObject] = field(default_factory=dict)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import (
@@ -18,17 +18,20 @@ from hoigs.core.interfaces.estimator import (
     Estimates,
     Estimator,
     FramePrompt,
-    Landmarks,
     PromptPoint,
     VideoRequest,
     checked,
 )
 from hoigs.core.interfaces.estimator import Frames as FrameArrays
-from hoigs.preparation.body.landmarks import LandmarkTrack
-from hoigs.preparation.estimates.given import GivenMasks, RawLandmarks, chosen_landmarks
+from hoigs.preparation.body.landmarks import Landmarks
+from hoigs.preparation.estimates.given import (
+    FoundObject,
+    FrameEstimates,
+    GivenMasks,
+    chosen_landmarks,
+)
 from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.objects.ball import BallTrack
-from hoigs.preparation.options import Place, PrepareOptions, PromptAt
+from hoigs.preparation.options import Place, PrepareOptions, Prompt, PromptAt
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.pictures import resized_mask
 from hoigs.preparation.video.source import Source, SourceError
@@ -38,97 +41,37 @@ Estimators = Mapping[Place, Estimator]
 
 
 @dataclass(frozen=True)
-class RawPerson:
-    """Landmarks and masks of one of further people, likewise."""
-
-    landmarks: RawLandmarks
-    masks: MaskStack
-
-
-@dataclass(frozen=True)
-class RawEstimates:
-    """Landmarks and masks of the chosen frames, at their size; distortion still in.
-
-    Attributes:
-        landmarks: of the first person; None: nobody is looked for, and the person's masks are
-            empty.
-        further: other people by name (`PrepareOptions.further_people`).
-    """
-
-    landmarks: RawLandmarks | None
-    masks: GivenMasks
-    further: dict[str, RawPerson] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class FoundObject:
-    """The object's masks from an estimator of its own, of the chosen frames, distortion still in.
-
-    Attributes:
-        confidence: of each chosen frame, 0..1; None: not computed.
-        boxes: frame of the video and box x0, y0, x1, y1 in its pixels where the object was proposed
-            because no prompt said where it is.
-        notes: for the report.
-        further: other objects by name (`PrepareOptions.further_objects`).
-    """
-
-    masks: MaskStack
-    provenance: str
-    confidence: Float[np.ndarray, " F"] | None = None
-    boxes: list[tuple[float, ...]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    further: dict[str, FoundObject] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class UndistortedPerson:
-    """`RawPerson` on the cameras' undistorted images."""
-
-    landmarks: LandmarkTrack
-    masks: MaskStack
-
-
-@dataclass(frozen=True)
-class UndistortedEstimates:
-    """`RawEstimates` on the cameras' undistorted images, and the object if it is a tracked ball."""
-
-    landmarks: LandmarkTrack | None
-    masks: GivenMasks
-    ball: BallTrack | None
-    further: dict[str, UndistortedPerson] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class EstimateReader:
     """Runs the estimator of each kind: a given one, or that of the files beside the video.
 
     Attributes:
+        people, prompts: who is followed, and where or what each entity is.
         work: folder for what estimators keep between runs.
     """
 
     source: Source
     video: Frames
+    people: tuple[str, ...]
+    prompts: Mapping[str, Prompt]
     options: PrepareOptions
     estimators: Estimators
     work: Path
 
-    def landmarks_and_masks(self, progress: Callable[[float], None]) -> RawEstimates:
+    def landmarks_and_masks(self, progress: Callable[[float], None]) -> FrameEstimates:
         """Landmarks first: they are read fast, and a clip without them cannot be made."""
-        if not self.options.people:
-            return RawEstimates(None, self._objects_alone(progress))
-        first, *further = self.options.people
-        landmarks = {name: self._landmarks(name, progress) for name in self.options.people}
+        if not self.people:
+            return FrameEstimates({}, self._objects_alone(progress))
+        first, *further = self.people
+        landmarks = {name: self._landmarks(name, progress) for name in self.people}
         masks = self._masks((first, self.options.object), progress)
         if not further:
-            return RawEstimates(landmarks[first], masks)
+            return FrameEstimates(landmarks, masks)
         found = self.estimate("masks", progress).masks
         assert found is not None  # `checked` saw to it
         stacks = {name: self._stack(self._given(found, name)) for name in further}
         together = zip(*stacks.values(), strict=True)
         masks = replace(masks, others=MaskStack(np.logical_or.reduce(rows) for rows in together))
-        return RawEstimates(
-            landmarks[first], masks, {n: RawPerson(landmarks[n], stacks[n]) for n in further}
-        )
+        return FrameEstimates(landmarks, masks, stacks)
 
     def _given(self, found: EntityMasks, name: str) -> FrameArrays:
         """Masks of a person.
@@ -208,7 +151,7 @@ class EstimateReader:
         except ValueError as error:
             raise SourceError(f"estimators.{role}: {error}") from error
 
-    def people(self) -> tuple[FramePrompt, ...]:
+    def seen(self) -> tuple[FramePrompt, ...]:
         """A box about everybody, from a quick look; see `Estimator.people`. Empty where files
         beside the video say who is meant."""
         if {"landmarks", "masks"} & set(self.source.beside):
@@ -237,14 +180,14 @@ class EstimateReader:
 
     def _known(self) -> Estimates | None:
         """What was found of people; estimators keep their results, so this is fast."""
-        if not self.options.people:
+        if not self.people:
             return None
         masks = self.estimate("masks", lambda _done: None).masks
         return Estimates(masks, self.estimate("landmarks", lambda _done: None).landmarks)
 
     def notes_on_person(self) -> tuple[str, ...]:
         """What the estimator of masks finds doubtful in those of the person."""
-        if "masks" not in self.estimators or not self.options.people:
+        if "masks" not in self.estimators or not self.people:
             return ()
         masks = self.estimate("masks", lambda _done: None).masks
         return () if masks is None else masks.notes
@@ -258,28 +201,36 @@ class EstimateReader:
 
     def _entities(self, kind: Place) -> tuple[EntityRequest, ...]:
         options = self.options
-        people = tuple(_request(options, name, "human") for name in options.people)
-        thing = _request(options, options.object, "object")
+        people = tuple(self._asked(name, "human") for name in self.people)
+        thing = self._asked(options.object, "object")
         if kind == "object":
-            return (thing, *(_request(options, n, "object") for n in options.further_objects))
+            return (thing, *(self._asked(n, "object") for n in options.further_objects))
         if kind == "masks" and kind in self.source.beside:
             return tuple(e for e in (*people, thing) if e.name in self.source.masked)
         return (*people, thing) if self.of_both else people
+
+    def _asked(self, name: str, kind: Literal["human", "object"]) -> EntityRequest:
+        prompt = self.prompts.get(name)
+        if prompt is None:
+            return EntityRequest(name, kind)
+        further = tuple(FramePrompt(at.frame or 0, _points(at), at.box) for at in prompt.further)
+        return EntityRequest(
+            name, kind, prompt.text, _points(prompt), prompt.box, prompt.frame or 0, further
+        )
 
     @property
     def of_both(self) -> bool:
         """The estimator of masks gives those of the object, too."""
         return self.options.find_object and "object" not in self.estimators
 
-    def _landmarks(self, name: str, progress: Callable[[float], None]) -> RawLandmarks:
+    def _landmarks(self, name: str, progress: Callable[[float], None]) -> Landmarks:
         tracks = self.estimate("landmarks", progress).landmarks
         who = f"estimators.landmarks: {_name(self.estimators['landmarks'])}"
         if name not in tracks:
             raise SourceError(f"{who} gave landmarks of {_listed(tracks)}, not of {name}")
-        track: Landmarks = tracks[name]
-        if len(self.options.people) > 1:
+        if len(self.people) > 1:
             who += f", {name}"
-        return chosen_landmarks(track, self.video, who, track.provenance or "given")
+        return chosen_landmarks(tracks[name], self.video, who, tracks[name].provenance or "given")
 
     def _masks(self, names: tuple[str, str], progress: Callable[[float], None]) -> GivenMasks:
         found = self.estimate("masks", progress).masks
@@ -316,15 +267,6 @@ def paths_of(estimator: Estimator, folder: Path) -> list[Path]:
     values += [item for value in values if isinstance(value, dict) for item in value.values()]
     paths = (folder / v.expanduser() for v in values if isinstance(v, Path))
     return sorted(path for path in paths if path.exists())
-
-
-def _request(options: PrepareOptions, name: str, kind) -> EntityRequest:
-    prompt = options.prompts.get(name)
-    if prompt is None:
-        return EntityRequest(name, kind)
-    further = tuple(FramePrompt(at.frame or 0, _points(at), at.box) for at in prompt.further)
-    points = _points(prompt)
-    return EntityRequest(name, kind, prompt.text, points, prompt.box, prompt.frame or 0, further)
 
 
 def _points(prompt: PromptAt) -> tuple[PromptPoint, ...]:

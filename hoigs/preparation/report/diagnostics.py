@@ -36,6 +36,7 @@ class Measures:
         scene_points: number of points that start the background.
         provenance: what each part was made from, and how weak it is.
         warnings: what to know before training.
+        unknown: what the video does not show and is supposed, and why.
         seconds: time by stage.
         registered: part of the chosen frames that have a camera; None for a static camera.
         reprojection_px: of COLMAP's points, mean; None for a static camera.
@@ -77,6 +78,7 @@ class Measures:
     landmarks: dict[str, dict[str, Any]] = field(default_factory=dict)
     provenance: dict[str, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    unknown: dict[str, str] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     registered: float | None = None
     reprojection_px: float | None = None

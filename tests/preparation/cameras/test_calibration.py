@@ -12,9 +12,10 @@ from tiny import FRAMES, HEIGHT, WIDTH
 
 from hoigs.core.errors import SpecError
 from hoigs.core.values.lens import Lens
+from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
 from hoigs.preparation.cameras.choose import choose_cameras
-from hoigs.preparation.estimates.given import GivenMasks, RawLandmarks
+from hoigs.preparation.estimates.given import GivenMasks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.options import PrepareOptions, load_options
 from hoigs.preparation.video.frames import VideoFrames
@@ -135,7 +136,7 @@ def test_sizes_have_to_agree() -> None:
 def test_a_still_cameras_frames_are_undistorted(tiny_video: Path, tmp_path: Path) -> None:
     unseen = np.full((FRAMES, 33, 4), np.nan)
     nothing = [np.zeros((HEIGHT // 2, WIDTH // 2), bool)] * FRAMES
-    everything = RawLandmarks(unseen, unseen), GivenMasks(human=MaskStack(nothing))
+    everything = Landmarks.from_mediapipe(unseen, unseen), GivenMasks(human=MaskStack(nothing))
     options = load_options(
         flags={"camera": "static", "intrinsics": f"90,92,{WIDTH / 2 - 0.5},{HEIGHT / 2},-0.3,0,0,0"}
     )

@@ -12,10 +12,11 @@ import torch
 from PIL import Image
 from scipy import ndimage
 
+from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.cameras.choose import choose_cameras
 from hoigs.preparation.cameras.motion import background_motion
 from hoigs.preparation.cameras.sfm import _what_to_do, structure_from_motion
-from hoigs.preparation.estimates.given import GivenMasks, RawLandmarks
+from hoigs.preparation.estimates.given import GivenMasks
 from hoigs.preparation.masks.mask_stack import MaskStack
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames, open_frames
@@ -66,9 +67,9 @@ def recorded(folder: Path, steps: list[float], block: bool = True) -> tuple[Fram
     return open_frames(folder), GivenMasks(together=masks)
 
 
-def nobody(count: int) -> RawLandmarks:
+def nobody(count: int) -> Landmarks:
     unseen = np.full((count, 33, 4), np.nan)
-    return RawLandmarks(unseen, unseen)
+    return Landmarks.from_mediapipe(unseen, unseen)
 
 
 def test_a_camera_that_stands_still(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def test_frames_alone_with_priors_by_options(bare_frames: Path, tmp_path: Path) 
     # edited masks are seen by the next run
     (bare_frames.parent / "estimators/sam2/object/00003.png").unlink()
     with pytest.raises(HoigsError, match="lacks 1 of 8 frames: 3"):
-        prepare(bare_frames, out, body=AnnyBody(), options=options, redo=["writing"])
+        prepare(bare_frames, out, body=AnnyBody(), options=options, redo=["write"])
 
 
 def test_frames_are_ordered_by_number(bare_frames: Path) -> None:
@@ -150,7 +150,7 @@ def test_landmarks_without_space_are_enough(tiny_source: Path, tmp_path: Path) -
 def test_a_prior_of_other_evidence_is_refused(tiny_source: Path, tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="FlatPrior provides landmarks, not masks"):
         prepare_until(
-            "evidence", tiny_source, tmp_path / "clip", body=AnnyBody(),
+            "estimates", tiny_source, tmp_path / "clip", body=AnnyBody(),
             options=PrepareOptions(fit_steps=3), estimators={"masks": FlatPrior()},
         )  # fmt: skip
 
@@ -188,7 +188,7 @@ def test_commands_of_options_need_permission(tiny_source: Path, tmp_path: Path) 
     for run in (
         lambda: prepare(tiny_source, tmp_path / "clip", body=AnnyBody(), options=options),
         lambda: prepare_until(
-            "evidence", tiny_source, tmp_path / "clip", body=AnnyBody(), options=options
+            "estimates", tiny_source, tmp_path / "clip", body=AnnyBody(), options=options
         ),
     ):
         with pytest.raises(SpecError) as refused:

@@ -136,7 +136,7 @@ def test_a_clip_with_depth(tiny_source: Path, tmp_path: Path) -> None:
     assert float(depth[torch.from_numpy(human)].median()) == pytest.approx(2.8, abs=0.4)
     # taken up again, it is the same
     again = prepare(
-        tiny_source, out, body=AnnyBody(), redo=["writing"], options=options,
+        tiny_source, out, body=AnnyBody(), redo=["write"], options=options,
         estimators={"depth": WallDepth()},
     )  # fmt: skip
     assert again.depth_residual == report.depth_residual
