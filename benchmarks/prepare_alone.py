@@ -43,7 +43,7 @@ from estimates.training import Training, trained
 from PIL import Image
 
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.preparation.estimates.given import FoundObject, FrameEstimates
+from hoigs.preparation.estimates.reader import FoundObject, FrameEstimates
 from hoigs.preparation.kept import last_kept
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.prepare import prepare, prepare_until, work_folder

@@ -21,15 +21,14 @@ from hoigs.core.model.standing import world_of_people
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import POSES_ESTIMATED, BodyTrack
 from hoigs.core.values.world import World
-from hoigs.preparation.cameras.camera_track import parallax
-from hoigs.preparation.cameras.multiview import angular_factor, full_factor
+from hoigs.preparation.cameras.camera_track import angular_factor, full_factor, parallax
+from hoigs.preparation.depth import DepthSource
 from hoigs.preparation.draft import Draft
-from hoigs.preparation.entities.people import Body
 from hoigs.preparation.objects.make_object import MadeObject
 from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.people import Body
 from hoigs.preparation.report.overlay import OverlayVideo, save_object_picture, several, shown_frame
 from hoigs.preparation.report.report import PrepareReport
-from hoigs.preparation.scene.depth import DepthSource
 from hoigs.preparation.video.source import SourceError
 
 BODY_JOINTS = 22  # without the hands', which are not fitted

@@ -16,16 +16,16 @@ from hoigs.core.interfaces.estimator import FramePrompt
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.body.body_files import FileBody
 from hoigs.preparation.cameras.camera_track import CameraTrack
-from hoigs.preparation.entities.final_masks import EntityMasks
-from hoigs.preparation.entities.people import Body, Unit
-from hoigs.preparation.estimates.given import FoundObject, FrameEstimates, GivenMasks
-from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.depth import DepthFit
+from hoigs.preparation.estimates.reader import FoundObject, FrameEstimates, GivenMasks
+from hoigs.preparation.final_masks import EntityMasks
+from hoigs.preparation.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack
 from hoigs.preparation.objects.make_object import MadeObject
 from hoigs.preparation.options import PrepareOptions, Prompt
+from hoigs.preparation.people import Body, Unit
 from hoigs.preparation.report.report import PrepareReport
-from hoigs.preparation.scene.depth import DepthFit
-from hoigs.preparation.scene.scene_points import ScenePoints
+from hoigs.preparation.scene_points import ScenePoints
 from hoigs.preparation.video.frames import FrameList, Frames
 from hoigs.preparation.video.source import Source
 from hoigs.preparation.work_folder import WorkFolder

@@ -22,7 +22,7 @@ import hoigs
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.draft import Draft
-from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.mask_stack import MaskStack
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.work_folder import Result, WorkFolder, digest
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,30 +18,31 @@ import torch
 from jaxtyping import Float
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.reporting import Progress
+from hoigs.core.reporting import Progress, ranges
 from hoigs.preparation.body.mask_fit import silhouette
 from hoigs.preparation.cameras.calibration import calibration_file
 from hoigs.preparation.cameras.choose import choose_cameras, known_lens
-from hoigs.preparation.choose_frames import choose_frames, stored_width
 from hoigs.preparation.clip_writing import write_clip_folder
+from hoigs.preparation.depth import POOR, DepthSource, fit_depth, seen_points, seen_surface
 from hoigs.preparation.draft import Draft
-from hoigs.preparation.entities.final_masks import blank_warning, final_masks
-from hoigs.preparation.entities.people import (
+from hoigs.preparation.estimates.reader import EstimateReader, Estimators, identity, paths_of
+from hoigs.preparation.final_masks import blank_warning, final_masks
+from hoigs.preparation.kept import PLAN, kept, key_of
+from hoigs.preparation.mask_stack import MaskStack
+from hoigs.preparation.objects.ball import load_ball, refine_ball
+from hoigs.preparation.objects.hands import nearest_person
+from hoigs.preparation.objects.make_object import MadeObject, doubts, make_object
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.people import (
     chosen_people,
     fit_people,
     people_warnings,
     unit_of_object,
 )
-from hoigs.preparation.entities.place_objects import place_objects
-from hoigs.preparation.estimates.reader import EstimateReader, Estimators, identity, paths_of
-from hoigs.preparation.kept import PLAN, kept, key_of
-from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.objects.ball import load_ball, refine_ball
-from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.prompts import check_prompts, placed_prompts
-from hoigs.preparation.scene.depth import POOR, DepthSource, fit_depth, seen_points, seen_surface
-from hoigs.preparation.scene.scene_points import camera_scene, static_scene
-from hoigs.preparation.video.frames import open_frames
+from hoigs.preparation.scene_points import camera_scene, static_scene
+from hoigs.preparation.video.container import Span, missing_frames
+from hoigs.preparation.video.frames import FrameList, Frames, open_frames
 from hoigs.preparation.video.source import NobodyFoundError, SourceError
 from hoigs.preparation.work_folder import fingerprint
 
@@ -88,6 +90,80 @@ def frames(
     video = open_frames(path, width, known=found.frames)
     known_lens(options, video)
     return found.noting(notes, video=video, clicks=clicks)
+
+
+NEARLY_BLACK = 16  # of 255
+PROBES = 5  # frames, one of which must show something
+
+
+def require_pictures(frames: Frames) -> None:
+    """That a video shows something.
+
+    Raises:
+        SourceError: some frames from all over it are all black.
+    """
+    places = np.linspace(0, len(frames) - 1, min(PROBES, len(frames))).round().astype(int)
+    brightest = 0
+    for place in places.tolist():  # the first one settles it for nearly every video
+        brightest = max(brightest, int(np.quantile(frames.read(frames.indices[place]), 0.99)))
+        if brightest > NEARLY_BLACK:
+            return
+    raise SourceError(
+        f"{frames.path} is black: in {len(places)} frames from all over it nothing is brighter "
+        f"than {brightest} of 255"
+    )
+
+
+LARGEST, REDUCED = 1920, 1280  # longer sides, pixels: of frames that are kept, and of smaller ones
+FEWEST = 3  # motion is judged by accelerations
+
+
+def choose_frames(path: Path, options: PrepareOptions) -> tuple[FrameList, list[str]]:
+    """The chosen frames, and what is to be said of them.
+
+    Args:
+        path: a video, or a folder of images. options: how many, how dense and from when to when.
+
+    Raises:
+        SourceError: fewer than three are left, or they have nothing in them.
+    """
+    span = Span.of(options.start, options.end)
+    frames = open_frames(
+        path, options.width, options.every, options.max_frames, fps=options.fps,
+        pick=options.pick, rate=options.folder_fps, span=span,
+    )  # fmt: skip
+    if len(frames) < FEWEST:
+        raise SourceError(
+            f"{path}: {len(frames)} of its frames would be used, as the options are; a "
+            "clip shows motion, and needs three or more"
+        )
+    require_pictures(frames)
+    notes = []
+    if path.is_file() and span.end is None and options.max_frames is None:
+        notes += missing_frames(path, frames.total)
+    if frames.uneven:
+        notes.append(
+            f"the chosen frames are not evenly spaced (a variable frame rate, or the "
+            f"sharpest of each few): the clip keeps their true times, {frames.fps:.4g} a "
+            "second on average"
+        )
+    return frames.list, [*notes, *frames.notes]
+
+
+def stored_width(found: FrameList) -> tuple[int | None, list[str]]:
+    """The width of stored frames where none is given; smaller if they are larger than a clip needs.
+
+    Returns:
+        None for their own width; and what is to be said of it.
+    """
+    longest = max(found.native_width, found.native_height)
+    if longest <= LARGEST:
+        return None, []
+    width = round(found.native_width * REDUCED / longest)
+    return width, [
+        f"frames of {found.native_width}x{found.native_height} are stored at a width of {width}"
+        " (--width keeps more)"
+    ]
 
 
 def estimates(
@@ -271,6 +347,94 @@ def objects(
 ) -> Draft:
     """Tracks and shapes of all objects that the masks show."""
     return kept(draft, "objects", options, lambda: place_objects(draft, options, progress))
+
+
+def place_objects(
+    draft: Draft, options: PrepareOptions, progress: Callable[[float], None]
+) -> Draft:
+    """The draft with tracks and shapes of all objects that the masks show.
+
+    An object goes with the hands of the person who is nearest to it.
+    """
+    masks, cameras, count = draft.masks, draft.cameras, len(options.objects)
+    humans, person = masks.humans(), draft.undistorted.person
+    joints = {owner: one.joints for owner, one in draft.bodies.items()}
+    for k, name in enumerate(options.objects):
+        first = k == 0
+        stack = masks.object if first else masks.further.get(name)
+        disc = draft.ball if first else None
+        what = "the object" if count == 1 else f"the object {name}"
+        if disc is None and (stack is None or not stack.coverage().any()):
+            draft = _without(draft, name, what, options)
+            continue
+        assert stack is not None
+        owner = nearest_person(joints, stack, cameras)
+        made = make_object(
+            disc, stack, humans, masks.other_objects(None if first else name), cameras,
+            None if owner is None else joints[owner], draft.body.parents, draft.images,
+            way=options.object_track, radius=options.ball_radius, count=options.object_points,
+            fps=draft.video.fps, progress=partial(_share, progress, k, count),
+            depths=draft.unit.depths,
+        )  # fmt: skip
+        provenance = {"object" if first else f"object {name}": made.track.provenance}
+        if len(draft.bodies) > 1:
+            provenance[f"hands at {name}"] = f"{owner}'s, who is nearest to it in most frames"
+        windows = options.chunk is not None and options.chunk < len(cameras)
+        said = doubts(stack, None if person is None else person.image)
+        said += _remarks(made, disc is not None, windows)
+        unknown = {}
+        if made.confidence.way != "texture and hands":
+            unknown[f"rotation of {name}"] = made.confidence.reason
+        draft = draft.noting(
+            [text.replace("the object", what) for text in said], provenance, unknown,
+            objects={**draft.objects, name: made},
+        )  # fmt: skip
+    return draft
+
+
+def _share(progress: Callable[[float], None], number: int, count: int, done: float) -> None:
+    """The progress of one of several equal works."""
+    progress((number + done) / count)
+
+
+def _without(draft: Draft, name: str, what: str, options: PrepareOptions) -> Draft:
+    """Notes that an object is not in the clip."""
+    if len(options.objects) > 1:
+        said = (
+            f"{what} was not found, so the clip has none of that name; point at it in another "
+            f"frame: --object {name}=X,Y@FRAME"
+        )
+        return draft.noting([said], unknown={name: "it was not found"})
+    provenance = {"object": "none: the clip shows the person alone"}
+    if not options.find_object:
+        return draft.noting(provenance=provenance)
+    said = (
+        "no object was found, so the clip has none; point at it with --object X,Y, or say that "
+        "there is none with --object none"
+    )
+    return draft.noting([said], provenance, {name: "it was not found"})
+
+
+def _remarks(made: MadeObject, disc: bool, windows: bool) -> list[str]:
+    """Sentences on frames that do not show it, on poses that are not known well, and on memory."""
+    said, confidence = [], made.confidence
+    lost = (~made.track.observed).nonzero().flatten().tolist()
+    if lost:
+        said.append(f"the object is not seen in {len(lost)} frames: {ranges(lost)}")
+    if confidence.way == "ball" and not disc:
+        said.append(f"the object: {confidence.reason}; if it is none, --set object_track=texture")
+    if confidence.way == "texture and hands" and windows:
+        said.append(
+            "the object is tracked by texture in all frames at once, whose small images are in "
+            "memory together whatever --chunk is; --set object_track=outline needs none, and does "
+            "not track its rotation"
+        )
+    if confidence.way == "outline":
+        said.append(
+            "the object's rotation is not tracked but for its roll, and its shape is a cushion "
+            f"inflated from one outline: {confidence.reason}. Training has to find both"
+        )
+    return said
 
 
 def scene(

@@ -20,7 +20,7 @@ from hoigs.core.errors import ClipError, HoigsError, SpecError
 from hoigs.core.values.clip import Clip
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.preparation.entities import place_objects
+from hoigs.preparation import stages
 from hoigs.preparation.objects.make_object import MadeObject, make_object
 from hoigs.preparation.prepare import PrepareOptions, PrepareReport, prepare
 from hoigs.preparation.video.frames import VideoFrames
@@ -264,7 +264,7 @@ def test_what_windows_do_not_bound_is_said(
         confidence = replace(made.confidence, way="texture and hands", outline=outline)
         return replace(made, confidence=confidence)
 
-    monkeypatch.setattr(place_objects, "make_object", by_texture)
+    monkeypatch.setattr(stages, "make_object", by_texture)
     for chunk, count in ((8, 1), (12, 0)):
         out = tmp_path / str(chunk)
         _, report = prepared(tiny_source, out, body, chunk=chunk, overlap=4, fit_steps=3)

@@ -23,10 +23,13 @@ from hoigs.preparation.cameras.camera_track import (
 )
 from hoigs.preparation.cameras.focal import static_focal
 from hoigs.preparation.cameras.known import given_cameras, megasam_cameras, vggt_cameras
-from hoigs.preparation.cameras.motion import BackgroundMotion, background_motion
 from hoigs.preparation.cameras.sfm import structure_from_motion
-from hoigs.preparation.cameras.turning_cameras import turning_cameras
-from hoigs.preparation.estimates.given import GivenMasks
+from hoigs.preparation.cameras.turning_cameras import (
+    BackgroundMotion,
+    background_motion,
+    turning_cameras,
+)
+from hoigs.preparation.estimates.reader import GivenMasks
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import MEGASAM, VGGT, SourceError

@@ -34,7 +34,7 @@ from hoigs.plugins.estimators.object_tracker.scene import (
 from hoigs.plugins.estimators.object_tracker.tracker import color_model
 from hoigs.plugins.estimators.tools import MEDIAPIPE
 from hoigs.preparation.kept import last_kept
-from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.mask_stack import MaskStack
 from hoigs.preparation.prepare import work_folder
 from hoigs.preparation.video.pictures import resized_mask
 from hoigs.viewing.annotate.video import ScrubbedVideo

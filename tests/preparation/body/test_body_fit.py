@@ -22,14 +22,18 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_problem import FitProblem
-from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Unknowns
-from hoigs.preparation.body.ground_scale import ground_scale
+from hoigs.preparation.body.fit_problem import (
+    BodyFit,
+    FitOptions,
+    FitProblem,
+    Unknowns,
+    ground_scale,
+)
+from hoigs.preparation.body.kinematics import NormalEquations
 from hoigs.preparation.body.landmarks import FrameFates, Landmarks, points_of
-from hoigs.preparation.body.normal_equations import NormalEquations
 from hoigs.preparation.body.priors import beyond
 from hoigs.preparation.body.start import limb_pose
-from hoigs.preparation.entities.people import fates_said, stature
+from hoigs.preparation.people import fates_said, stature
 from hoigs.preparation.report.overlay import overlay_frame
 
 FRAMES, WIDTH, HEIGHT, FOCAL = 9, 640, 480, 600.0

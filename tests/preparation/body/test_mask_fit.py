@@ -9,11 +9,10 @@ from torch import Tensor
 
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_values import BodyFit
-from hoigs.preparation.body.kinematics import PER_FRAME
+from hoigs.preparation.body.fit_problem import BodyFit
+from hoigs.preparation.body.kinematics import PER_FRAME, NormalEquations
 from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.body.mask_fit import MaskFit, posed, silhouette
-from hoigs.preparation.body.normal_equations import NormalEquations
 
 UNSEEN = slice(5, FRAMES)
 KNEE, ANKLE, WRIST = 5, 8, 20

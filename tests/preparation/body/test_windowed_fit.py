@@ -14,9 +14,9 @@ from hoigs.core.maths.frame_times import Chunking
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit import fit_body, spread
-from hoigs.preparation.body.fit_values import BodyFit, FitOptions
+from hoigs.preparation.body.fit_problem import BodyFit, FitOptions
+from hoigs.preparation.body.kinematics import NormalEquations
 from hoigs.preparation.body.landmarks import Landmarks
-from hoigs.preparation.body.normal_equations import NormalEquations
 
 FRAMES, CHUNKING, QUICK = 48, Chunking(24, 10), FitOptions(steps=20)
 

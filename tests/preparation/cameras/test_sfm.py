@@ -14,10 +14,10 @@ from scipy import ndimage
 
 from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.cameras.choose import choose_cameras
-from hoigs.preparation.cameras.motion import background_motion
 from hoigs.preparation.cameras.sfm import _what_to_do, structure_from_motion
-from hoigs.preparation.estimates.given import GivenMasks
-from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.cameras.turning_cameras import background_motion
+from hoigs.preparation.estimates.reader import GivenMasks
+from hoigs.preparation.mask_stack import MaskStack
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames, open_frames
 from hoigs.preparation.video.source import SourceError

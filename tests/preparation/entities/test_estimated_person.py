@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from hoigs.preparation.body.landmarks import Landmarks
-from hoigs.preparation.entities.people import _unseen
+from hoigs.preparation.people import _unseen
 
 
 def test_parts_out_of_view_are_named() -> None:

@@ -7,9 +7,15 @@ import pytest
 import torch
 
 from hoigs.core.values.camera import Camera
-from hoigs.preparation.masks.mask_stack import MaskStack, long_axis, outlines_of
-from hoigs.preparation.objects.shape import ColorSampler, inflated_outline, sphere_points
-from hoigs.preparation.objects.track import apparent_size, hand_depths, held_object
+from hoigs.preparation.mask_stack import MaskStack, long_axis, outlines_of
+from hoigs.preparation.objects.shape import (
+    ColorSampler,
+    apparent_size,
+    hand_depths,
+    held_object,
+    inflated_outline,
+    sphere_points,
+)
 from hoigs.preparation.video.source import SourceError
 
 WIDTH, HEIGHT, F = 80, 60, 9

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hoigs.core.values.camera import Camera
-from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import (
     FLESH,
     NoBallError,

@@ -12,13 +12,12 @@ import torch
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
-from hoigs.preparation.masks.mask_stack import MaskStack, outlines_of
+from hoigs.preparation.mask_stack import MaskStack, outlines_of
 from hoigs.preparation.objects import make_object as making
-from hoigs.preparation.objects.alignment import Aligned, Poses
-from hoigs.preparation.objects.crops import make_crops
-from hoigs.preparation.objects.flights import ballistic, flights_by_texture
+from hoigs.preparation.objects.alignment import Aligned, Poses, make_crops
 from hoigs.preparation.objects.hands import hand_motion, upward
 from hoigs.preparation.objects.make_object import ObjectWay, make_object
+from hoigs.preparation.objects.search import ballistic, flights_by_texture
 from hoigs.preparation.objects.shape import completed, hull, with_samples
 from hoigs.preparation.objects.tracked import (
     ObjectConfidence,

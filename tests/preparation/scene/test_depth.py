@@ -15,8 +15,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.lens import Undistortion
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.preparation.prepare import PrepareOptions, prepare
-from hoigs.preparation.scene.depth import (
+from hoigs.preparation.depth import (
     Anchors,
     DepthSource,
     fit_depth,
@@ -26,6 +25,7 @@ from hoigs.preparation.scene.depth import (
     solve,
     to_metres,
 )
+from hoigs.preparation.prepare import PrepareOptions, prepare
 from hoigs.preparation.video.frames import VideoFrames
 from hoigs.preparation.video.source import SourceError
 

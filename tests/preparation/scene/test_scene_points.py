@@ -11,7 +11,7 @@ import torch
 from tiny import FRAMES, HEIGHT, WIDTH, background, masks, picture
 
 from hoigs.core.values.camera import Camera
-from hoigs.preparation.scene.background_points import (
+from hoigs.preparation.scene_points import (
     PlateView,
     background_plate,
     plate_points,

@@ -20,12 +20,12 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.body_files import FileBody
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_values import FitOptions, Joint
+from hoigs.preparation.body.fit_problem import FitOptions, Joint
 from hoigs.preparation.body.landmarks import FrameFates, Landmarks
 from hoigs.preparation.body.mask_fit import posed
 from hoigs.preparation.cameras.camera_track import CameraTrack
-from hoigs.preparation.estimates.given import FrameEstimates
-from hoigs.preparation.masks.mask_stack import MaskStack, outlines_of
+from hoigs.preparation.estimates.reader import FrameEstimates
+from hoigs.preparation.mask_stack import MaskStack, outlines_of
 from hoigs.preparation.objects.ball import BallTrack
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames
