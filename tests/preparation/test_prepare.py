@@ -46,7 +46,7 @@ def static(
         make_source(folder / "source", tiny_video),
         folder / "clip",
         body=body,
-        options=PrepareOptions(fit_steps=60),
+        options=PrepareOptions(fit_steps=25),
         progress=lambda done, _: seen.append(done),
     )
     return folder / "clip", report, seen
@@ -149,7 +149,7 @@ def test_moving_camera_and_masks_apart(tiny_source: Path, tmp_path: Path, body: 
             folder = tiny_source / f"masks/{name}"
             folder.mkdir(parents=True, exist_ok=True)
             Image.fromarray(mask).save(folder / f"{i:05d}.png")
-    clip, report = prepared(tiny_source, tmp_path / "clip", body, fit_steps=60)
+    clip, report = prepared(tiny_source, tmp_path / "clip", body, fit_steps=25)
     assert report.camera == "moving" and 0.35 < report.scene_scale < 0.7
     assert (tmp_path / "clip/colmap/cameras.txt").is_file()
     for i in (2, 9):
@@ -222,7 +222,7 @@ def test_real_videos(
         every=every,
         max_frames=8,
         width=320,
-        fit_steps=60,
+        fit_steps=25,
     )
     assert report.camera == camera and report.object_scale_spread < spread
     assert report.body_residual_px < 0.04 * 320

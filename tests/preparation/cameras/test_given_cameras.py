@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hoigs.preparation.cameras import known as given_cameras
+from hoigs.preparation.cameras.known import given_cameras
 from hoigs.preparation.video.source import SourceError, find_source
 from tests.preparation.tiny import FRAMES, HEIGHT, WIDTH
 

@@ -122,7 +122,7 @@ class WallDepth(Estimator):
 
 def test_a_clip_with_depth(tiny_source: Path, tmp_path: Path) -> None:
     out = tmp_path / "clip"
-    options = PrepareOptions(fit_steps=60, overlay_width=0)
+    options = PrepareOptions(fit_steps=25, overlay_width=0)
     report = prepare(
         tiny_source, out, body=AnnyBody(), options=options, estimators={"depth": WallDepth()}
     )
