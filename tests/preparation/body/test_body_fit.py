@@ -331,11 +331,11 @@ def test_mediapipe_arrays_and_missing_frames() -> None:
 def test_too_little_to_fit_is_refused() -> None:
     cameras = [camera()] * FRAMES
     landmarks = seen_by(cameras, truth())
-    with pytest.raises(HoigsError, match=rf"3 cameras but landmarks of {FRAMES} frames"):
+    with pytest.raises(HoigsError, match=rf"3 .*{FRAMES} "):
         fit_body(body(), landmarks, cameras[:3])
     image = landmarks.image.clone()
     image[1:] = torch.nan
-    with pytest.raises(HoigsError, match=r"in 1 of 9 frames.*at least 2"):
+    with pytest.raises(HoigsError, match=r"1 of 9 .* 2"):
         fit_body(body(), replace(landmarks, image=image), cameras)
 
 

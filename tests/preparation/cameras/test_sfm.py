@@ -151,7 +151,7 @@ def test_a_turning_camera_of_which_some_frames_show_no_background(tmp_path: Path
     turned = poses[1] @ poses[0].mT  # half way to frame 2
     assert float(torch.rad2deg(torch.acos(turned[0, 0]))) == pytest.approx(5.0, abs=0.2)
     hidden[2][:] = True
-    with pytest.raises(SourceError, match=r"background of 4 of 4 frames"):
+    with pytest.raises(SourceError, match=r"4 of 4"):
         choose()
 
 
@@ -188,7 +188,7 @@ def test_frames_without_features_are_refused_with_advice(tmp_path: Path) -> None
         Image.new("RGB", (WIDTH, HEIGHT), (90, 90, 90)).save(folder / f"{i}.png")
     video = open_frames(folder)
     empty = GivenMasks(together=MaskStack([np.zeros((HEIGHT, WIDTH), bool)] * 4))
-    with pytest.raises(SourceError, match=r"gave cameras to 0 of 4 frames.*--camera static"):
+    with pytest.raises(SourceError, match=r"0 of 4 .*--camera static"):
         choose_cameras(
             video,
             nobody(4),

@@ -189,5 +189,5 @@ def test_apparent_size_is_the_median_over_whole_masks() -> None:
 
 def test_an_object_never_seen_is_refused() -> None:
     masks = MaskStack([np.zeros((HEIGHT, WIDTH), bool)] * F)
-    with pytest.raises(SourceError, match="empty in every frame"):
+    with pytest.raises(SourceError, match="every frame"):
         held_object(masks, *held()[1:], 500)

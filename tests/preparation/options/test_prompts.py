@@ -27,18 +27,18 @@ def test_clicks_by_frame() -> None:
 @pytest.mark.parametrize(
     ("texts", "message"),
     [
-        (["1,2,3"], "neither a point nor a box"),
-        (["-1,2,3,4"], "neither a point nor a box"),
+        (["1,2,3"], "1,2,3"),
+        (["-1,2,3,4"], "-1,2,3,4"),
         (["9,9,3,3"], "x0 < x1"),
-        (["640;402"], "neither a point, a box nor words"),
-        (["ball@3"], "neither a point, a box nor words"),
-        (["ball", "football"], "described twice"),
-        (["-3,4"], "only points that are not on it"),
-        (["0,0,3,4", "0,0,5,6"], "has a box already"),
-        (["none", "3,4"], "leave the others out"),
-        (["kettle=none"], "leave the others out, and names"),
-        (["human=1,2"], "human is the person's name"),
-        (["kettle="], "neither a point, a box nor words"),
+        (["640;402"], "640;402"),
+        (["ball@3"], "ball@3"),
+        (["ball", "football"], "ball.*football"),
+        (["-3,4"], "--object"),
+        (["0,0,3,4", "0,0,5,6"], "0,0,5,6"),
+        (["none", "3,4"], "--object none"),
+        (["kettle=none"], "--object none"),
+        (["human=1,2"], "human"),
+        (["kettle="], "--object"),
     ],
 )
 def test_what_is_wrong_is_named(texts: list[str], message: str) -> None:
@@ -99,9 +99,9 @@ def test_a_person_is_chosen_as_an_object_is() -> None:
     assert with_prompts(PrepareOptions(), (), person="anna=320,210").human == "anna"
     alone = with_prompts(PrepareOptions(), "ball=3,4", person="none")
     assert alone.people == () and alone.objects == ("ball",)
-    with pytest.raises(SpecError, match="leave nothing to fit"):
+    with pytest.raises(SpecError, match=r"--person.*--object"):
         with_prompts(PrepareOptions(), "none", person="none")
-    with pytest.raises(SpecError, match="leave the others out"):
+    with pytest.raises(SpecError, match="--person"):
         with_prompts(PrepareOptions(), person=["none", "3,4"], texts=())
 
 
@@ -111,5 +111,5 @@ def test_several_people_have_names() -> None:
     assert set(options.prompts) == {"object", "anna", "ben"}
     both = with_prompts(PrepareOptions(), (), person=["3,2", "anna=5,2"])
     assert both.people == ("human", "anna")
-    with pytest.raises(SpecError, match="ball is an object's name"):
+    with pytest.raises(SpecError, match="ball"):
         with_prompts(PrepareOptions(), "ball=3,4", person="ball=3,2")
