@@ -40,8 +40,8 @@ import torch._dynamo  # what an optimizer's first step imports, for seconds
 from hoigs.core.clip_folder.check import check_clip
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.estimators.tools import MEDIAPIPE
+from hoigs.preparation.kept import PLAN
 from hoigs.preparation.prepare import PrepareOptions, prepare, work_folder
-from hoigs.preparation.stages import PLAN
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/preparation"))
 from tiny import FRAMES, landmarks, make_source, picture

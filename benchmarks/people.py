@@ -113,13 +113,13 @@ def measure(folder: Path, out: Path, clicks: tuple[str, ...], true: dict[str, An
     """Figures of both."""
     start = time.perf_counter()
     prepare_until(
-        "evidence", folder / "crossing.mp4", out, person=clicks, object="none", yes=True,
+        "estimates", folder / "crossing.mp4", out, person=clicks, object="none", yes=True,
         options=PrepareOptions(camera="static"),
     )  # fmt: skip
     seconds = round(time.perf_counter() - start, 1)
     raw = evidence(work_folder(out))
     assert raw.masks.human is not None
-    masks = {"a": raw.masks.human, "b": raw.further["b"].masks}
+    masks = {"a": raw.masks.human, "b": raw.further["b"]}
     rows: dict[str, Any] = {"seconds": seconds}
     for name, stack in masks.items():
         own, other = true[name], true["b" if name == "a" else "a"]

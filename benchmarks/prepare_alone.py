@@ -42,14 +42,12 @@ from estimates.figures import draw_masks
 from estimates.training import Training, trained
 from PIL import Image
 
-from hoigs.core.system.npz import load_arrays
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.preparation.estimates.reader import FoundObject, RawEstimates
-from hoigs.preparation.kept_stages import from_result
+from hoigs.preparation.estimates.reader import FoundObject, FrameEstimates
+from hoigs.preparation.kept import last_kept
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.prepare import prepare, prepare_until, work_folder
 from hoigs.preparation.prompts import split_name
-from hoigs.preparation.work_folder import ARRAYS, RESULT, Result
 
 SHARED = Path(os.environ.get("HOIGS_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 CLICKS = {
@@ -133,21 +131,15 @@ def processor_seconds() -> float:
     return used.user + used.system + used.children_user + used.children_system
 
 
-def evidence(work: Path) -> RawEstimates:
+def evidence(work: Path) -> FrameEstimates:
     """What the estimators of the person found."""
-    found: RawEstimates = _result(work / "evidence")
+    found: FrameEstimates = last_kept(work, "estimates")["estimates"]
     return found
 
 
 def object_found(work: Path) -> FoundObject | None:
     """What the object's estimator found; None before it has."""
-    folder = work / "object_masks"
-    return _result(folder) if (folder / RESULT).is_file() else None
-
-
-def _result(folder: Path) -> Any:
-    content = json.loads((folder / RESULT).read_text())
-    return from_result(Result(content["values"]["made"], load_arrays(folder / ARRAYS)))
+    return last_kept(work, "object_masks").get("found_object")
 
 
 def supplied(source: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -167,7 +159,7 @@ def disc(shape: tuple[int, int], ball: np.ndarray, wider: float = 0) -> np.ndarr
     return found
 
 
-def person_against(raw: RawEstimates, source: Path) -> dict[str, Any]:
+def person_against(raw: FrameEstimates, source: Path) -> dict[str, Any]:
     """Intersection over union of the person's masks."""
     human, (together, balls) = raw.masks.human, supplied(source)
     if human is None or together is None:
@@ -182,7 +174,7 @@ def person_against(raw: RawEstimates, source: Path) -> dict[str, Any]:
     }
 
 
-def object_against(raw: RawEstimates, found: FoundObject, source: Path) -> dict[str, Any]:
+def object_against(raw: FrameEstimates, found: FoundObject, source: Path) -> dict[str, Any]:
     """Intersection over union of the object's masks, or of person and object together."""
     together, balls = supplied(source)
     if balls is not None:
@@ -226,16 +218,16 @@ def _scored(name: str, scores: list[float]) -> dict[str, float]:
     }
 
 
-def landmarks_against(raw: RawEstimates, source: Path) -> dict[str, Any]:
+def landmarks_against(raw: FrameEstimates, source: Path) -> dict[str, Any]:
     """Pixels between landmarks."""
-    found = np.isfinite(raw.landmarks.image[..., 0]).any(1)
+    found = np.isfinite(raw.person.image[..., 0]).any(1)
     row: dict[str, Any] = {"frames": len(found), "frames_with_landmarks": int(found.sum())}
     path = source / "pose_mediapipe.npz"
     if not path.is_file():
         return {**row, "landmarks_px": f"not computed: none are supplied with {source.name}"}
     given = np.load(path)["image_xyzv"]
-    seen = (given[..., 3] > VISIBLE) & (raw.landmarks.image[..., 3] > VISIBLE)
-    off = np.linalg.norm(given[..., :2] - raw.landmarks.image[..., :2], axis=-1)[seen]
+    seen = (given[..., 3] > VISIBLE) & (raw.person.image[..., 2].numpy() > VISIBLE)
+    off = np.linalg.norm(given[..., :2] - raw.person.image[..., :2].numpy(), axis=-1)[seen]
     return {
         **row,
         "frames_with_supplied_landmarks": int(np.isfinite(given[..., 0]).any(1).sum()),

@@ -24,8 +24,8 @@ from hoigs.core.maths.frame_times import Chunking
 from hoigs.core.values.camera import Camera
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_values import BodyFit
-from hoigs.preparation.body.landmarks import LandmarkTrack
+from hoigs.preparation.body.fit_problem import BodyFit
+from hoigs.preparation.body.landmarks import Landmarks
 
 WIDTH, HEIGHT, FOCAL, FPS = 1280, 720, 1536.0, 24
 
@@ -37,7 +37,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     arrays = np.load(arguments.source / "pose_mediapipe.npz")
-    marks = LandmarkTrack.from_mediapipe(arrays["image_xyzv"], arrays["world_xyzv"])
+    marks = Landmarks.from_mediapipe(arrays["image_xyzv"], arrays["world_xyzv"])
     K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     cameras = [Camera(K, torch.eye(4), WIDTH, HEIGHT)] * len(marks.image)
     body, times = AnnyBody(), torch.arange(len(cameras)) / FPS

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Sequence
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -12,127 +17,148 @@ from jaxtyping import Float
 
 from hoigs.core.clip_folder.write import ClipWriter
 from hoigs.core.interfaces.body import PELVIS
+from hoigs.core.model.standing import world_of_people
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.clip import POSES_ESTIMATED
-from hoigs.preparation.cameras.camera_track import parallax
-from hoigs.preparation.cameras.multiview import angular_factor, full_factor
-from hoigs.preparation.entities.people import FittedBody
+from hoigs.core.values.clip import POSES_ESTIMATED, BodyTrack
+from hoigs.core.values.world import World
+from hoigs.preparation.cameras.camera_track import angular_factor, full_factor, parallax
+from hoigs.preparation.depth import DepthSource
+from hoigs.preparation.draft import Draft
 from hoigs.preparation.objects.make_object import MadeObject
-from hoigs.preparation.pipeline import Pipeline
+from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.people import Body
 from hoigs.preparation.report.overlay import OverlayVideo, save_object_picture, several, shown_frame
 from hoigs.preparation.report.report import PrepareReport
-from hoigs.preparation.stages import Cleanup
 from hoigs.preparation.video.source import SourceError
 
 BODY_JOINTS = 22  # without the hands', which are not fitted
 
 
-def write_clip_folder(made: Pipeline, cleanup: Cleanup) -> PrepareReport:
-    """Writes and checks what the other stages made, and gives the folder its name."""
-    options = made.options
-    entities: dict[str, Literal["human", "object"]] = dict.fromkeys(made.people.people, "human")
-    entities |= dict.fromkeys(made.objects_made, "object")
+def write_clip_folder(
+    draft: Draft,
+    options: PrepareOptions,
+    maps: DepthSource | None,
+    progress: Callable[[float], None],
+) -> Draft:
+    """Writes and checks what the other stages made, and gives the folder its name; the draft with
+    its report."""
+    entities: dict[str, Literal["human", "object"]] = dict.fromkeys(draft.bodies, "human")
+    entities |= dict.fromkeys(draft.objects, "object")
     if not entities:
         raise SourceError(
             "no object was found in a clip without people: point at it with --object X,Y"
         )
+    cleanup = Cleanup(draft.out.absolute(), draft.work.root)
     with ClipWriter(
-        made.out, fps=made.video.fps, entities=entities, image_format=options.image_format,
-        quality=options.quality, depth_kind="none" if made.depth is None else "metric",
+        draft.out, fps=draft.video.fps, entities=entities, image_format=options.image_format,
+        quality=options.quality, depth_kind="none" if draft.depth is None else "metric",
         depth_dtype=np.float16,
     ) as writer:  # fmt: skip
         cleanup.register(writer.root)
-        with made.stages.stage("writing"):
-            _write_frames(made, writer)
-        for name, poses in made.body_tracks().items():
-            writer.set_body(name, poses)
-        for name, thing in made.objects_made.items():
+        start = time.perf_counter()
+        _write_frames(draft, options, maps, writer, progress)
+        seconds = round(time.perf_counter() - start, 2)
+        draft = replace(draft, seconds={**draft.seconds, "write": seconds})
+        for name, person in draft.bodies.items():
+            writer.set_body(name, BodyTrack(options.body, person.poses, person.provenance))
+        for name, thing in draft.objects.items():
             writer.set_object(name, thing.track)
-        writer.set_points(made.scene.points, made.scene.colors)
-        writer.set_world(made.world())
-        if made.video.uneven:
-            writer.set_times(made.video.times)
-        if made.track.model is not None:
-            writer.set_colmap(made.track.model)
+        writer.set_points(draft.scene.points, draft.scene.colors)
+        # up and floor by the people who stand, else by the cameras
+        people = [(draft.body, person.poses) for person in draft.bodies.values()]
+        world = world_of_people(people, draft.video.fps) if people else None
+        writer.set_world(World.guessed(draft.cameras) if world is None else world)
+        if draft.video.uneven:
+            writer.set_times(draft.video.times)
+        if draft.track.model is not None:
+            writer.set_colmap(draft.track.model)
         writer.provenance.update(
-            made.provenance,
-            video=made.source.video.name,
-            frames=made.video.indices,
+            draft.provenance,
+            video=draft.source.video.name,
+            frames=draft.video.indices,
+            unknown=draft.unknown,
             **{POSES_ESTIMATED: True},
         )
-        report = _report(made, writer.name)
-        report.save(writer.root)
+        draft = replace(draft, report=_report(draft, options, writer.name))
+        draft.report.save(writer.root)
     cleanup.remove()
-    return report
+    return draft
 
 
-def _write_frames(made: Pipeline, writer: ClipWriter) -> None:
-    options = made.options
-    picture = _object_picture(made)
-    count = len(made.people.people)
-    overlay = OverlayVideo(
-        writer.root / "overlay.mp4",
-        made.video.fps,
-        options.overlay_width,
-        several(made.body.faces, count),
-    )
-    with overlay:
-        people = [person.posed(made.body) for person in made.people.people.values()]
-        nobody = [torch.zeros(0, 3)]
-        rows = zip(made.images(), made.cameras, made.masks.blank, strict=True)
-        stacks, tracks = made.people_masks(), {n: t.track for n, t in made.objects_made.items()}
-        for i, (image, camera, blank) in enumerate(made.stages.track(rows, len(made.video))):
-            vertices = torch.cat(nobody + [next(one)[0] for one in people])
-            masks = {n: stack[i] for n, stack in stacks.items()}
-            human = np.logical_or.reduce([np.zeros_like(blank), *masks.values()])
-            masks |= {n: made.object_masks(n)[i] for n in tracks}
-            points = [t.points @ t.rotations[i].mT + t.translations[i] for t in tracks.values()]
-            writer.add_frame(image, camera, masks, made.metres(i), blank)
-            objects = made.masks.objects(i)
+def _write_frames(
+    draft: Draft,
+    options: PrepareOptions,
+    maps: DepthSource | None,
+    writer: ClipWriter,
+    progress: Callable[[float], None],
+) -> None:
+    picture = _object_picture(draft, options)
+    people = [person.posed(draft.body) for person in draft.bodies.values()]
+    stacks = {name: draft.mask_of(name) for name in (*draft.bodies, *draft.objects)}
+    tracks = [made.track for made in draft.objects.values()]
+    with OverlayVideo(
+        writer.root / "overlay.mp4", draft.video.fps, options.overlay_width,
+        several(draft.body.faces, len(people)),
+    ) as overlay:  # fmt: skip
+        rows = zip(draft.images(), draft.cameras, draft.masks.blank, strict=True)
+        for i, (image, camera, blank) in enumerate(rows):
+            vertices = torch.cat([torch.zeros(0, 3), *(next(one)[0] for one in people)])
+            masks = {name: stack[i] for name, stack in stacks.items()}
+            shown = [masks[name] for name in draft.bodies]
+            human = np.logical_or.reduce([np.zeros_like(blank), *shown])
+            depth = None if draft.depth is None or maps is None else draft.depth.metres(maps[i], i)
+            writer.add_frame(image, camera, masks, depth, blank)
+            objects = draft.masks.objects(i)
             if i == picture:
                 save_object_picture(writer.root, image, objects)
-            overlay.add(
-                image, camera, vertices, human, objects, torch.cat([torch.zeros(0, 3), *points])
-            )
+            points = [t.points @ t.rotations[i].mT + t.translations[i] for t in tracks]
+            points = [torch.zeros(0, 3), *points]
+            overlay.add(image, camera, vertices, human, objects, torch.cat(points))
+            progress((i + 1) / len(draft.video))
 
 
-def _object_picture(made: Pipeline) -> int | None:
+def _object_picture(draft: Draft, options: PrepareOptions) -> int | None:
     """Position of the frame that shows which object was taken; None where nobody had to choose."""
-    if made.object is None or made.found_object is None:
+    if options.object not in draft.objects or draft.found_object is None:
         return None
-    prompt = made.options.prompts.get(made.options.object)
+    prompt = draft.prompts.get(options.object)
     prompted = [at.frame or 0 for at in prompt.places()] if prompt else []
-    coverage = made.masks.object.coverage().tolist()
-    return shown_frame(made.video.indices, made.found_object.boxes, prompted, coverage)
+    coverage = draft.masks.object.coverage().tolist()
+    return shown_frame(draft.video.indices, draft.found_object.boxes, prompted, coverage)
 
 
-def _report(made: Pipeline, name: str) -> PrepareReport:
-    middle = torch.median(made.scene.points, dim=0).values
-    options, person, figures = made.options, made.people.first, made.track.figures
-    coverage = made.people_masks()
-    joints = [one.joints[:, :BODY_JOINTS] for one in made.people.people.values()]
-    places = [thing.track.translations[:, None] for thing in made.objects_made.values()]
+def _report(draft: Draft, options: PrepareOptions, name: str) -> PrepareReport:
+    middle = torch.median(draft.scene.points, dim=0).values
+    person, figures, depth = draft.person, draft.track.figures, draft.depth
+    joints = [one.joints[:, :BODY_JOINTS] for one in draft.bodies.values()]
+    places = [thing.track.translations[:, None] for thing in draft.objects.values()]
     moving = torch.cat([*joints, *places], 1)
     middle_of_motion = moving[:, PELVIS]  # of the first person, or the first object
-    coverage |= {held: made.object_masks(held) for held in made.objects_made}
-    depth = made.depth
+    measures = {
+        held: {
+            "object_observed": float(thing.track.observed.float().mean()),
+            "object_scale_spread": thing.spread,
+            **_object_measures(thing),
+        }
+        for held, thing in draft.objects.items()
+    }
+    first = measures.pop(options.object, {"object_observed": None, "object_scale_spread": None})
     return PrepareReport(
         name=name,
-        video=made.source.video.name,
-        frames=len(made.video),
-        width=made.video.width,
-        height=made.video.height,
-        fps=made.video.fps,
-        camera=made.track.kind,
-        parallax_degrees=parallax(made.cameras, middle),
-        coverage={n: m.coverage().round(5).tolist() for n, m in coverage.items()},
+        video=draft.source.video.name,
+        frames=len(draft.video),
+        width=draft.video.width,
+        height=draft.video.height,
+        fps=draft.video.fps,
+        camera=draft.track.kind,
+        parallax_degrees=parallax(draft.cameras, middle),
+        coverage={
+            name: draft.mask_of(name).coverage().round(5).tolist()
+            for name in (*draft.bodies, *draft.objects)
+        },
         body_residual_px=None if person is None else person.residual_px,
-        scene_scale=made.people.world.scene_scale,
-        object_scale_spread=None if made.object_made is None else made.object_made.spread,
-        object_observed=(
-            None if made.object is None else float(made.object.observed.float().mean())
-        ),
-        scene_points=len(made.scene.points),
+        scene_scale=draft.unit.metres,
+        scene_points=len(draft.scene.points),
         body={} if person is None else person.report,
         landmarks={
             name: {
@@ -140,44 +166,37 @@ def _report(made: Pipeline, name: str) -> PrepareReport:
                 "lost": one.fates.lost,
                 "repaired": one.fates.repaired,
             }
-            for name, one in made.people.people.items()
+            for name, one in draft.bodies.items()
         },
-        provenance=made.provenance,
-        warnings=made.warnings,
-        seconds=made.stages.seconds,
+        provenance=draft.provenance,
+        warnings=list(draft.warnings),
+        unknown=draft.unknown,
+        seconds=draft.seconds,
         registered=figures["registered"] / figures["images"] if "registered" in figures else None,
         reprojection_px=figures.get("reprojection_px"),
         displacement_px=figures.get("displacement_px"),
-        sharpness=[round(value, 4) for value in made.video.sharpness],
+        sharpness=[round(value, 4) for value in draft.video.sharpness],
         body_residuals_px=[] if person is None else _numbers(person.residuals.numpy(), 2),
-        body_residual_m=None if person is None else _metres_off(person, made.cameras),
+        body_residual_m=None if person is None else _metres_off(person, draft.cameras),
         further_people={
             name: {
                 "body_residual_px": other.residual_px,
-                "body_residual_m": _metres_off(other, made.cameras),
+                "body_residual_m": _metres_off(other, draft.cameras),
             }
-            for name, other in list(made.people.people.items())[1:]
+            for name, other in list(draft.bodies.items())[1:]
         },
         depth_residual=None if depth is None else depth.typical,
         depth_residuals=[] if depth is None else _numbers(depth.residual, 4),
         depth_against="" if depth is None else depth.against,
-        **({} if made.object_made is None else _object_measures(made.object_made)),
+        **first,
         object_name=options.object,
-        further_objects={
-            other: {
-                "object_observed": float(thing.track.observed.float().mean()),
-                "object_scale_spread": thing.spread,
-                **_object_measures(thing),
-            }
-            for other, thing in made.objects_made.items()
-            if other != options.object
-        },
-        omega=angular_factor(made.cameras, middle_of_motion, made.video.fps),
-        big_omega=full_factor(made.cameras, moving),
+        further_objects=measures,
+        omega=angular_factor(draft.cameras, middle_of_motion, draft.video.fps),
+        big_omega=full_factor(draft.cameras, moving),
     )
 
 
-def _metres_off(person: FittedBody, cameras: Sequence[Camera]) -> float:
+def _metres_off(person: Body, cameras: Sequence[Camera]) -> float:
     """The distance from the landmarks at the person's."""
     return round(person.residual_px * person.distance(cameras) / float(cameras[0].K[0, 0]), 4)
 
@@ -199,3 +218,42 @@ def _object_measures(made: MadeObject) -> dict[str, Any]:
 def _numbers(values: Float[np.ndarray, " F"], digits: int) -> list[float | None]:
     """For JSON, which knows no NaN."""
     return [round(v, digits) if math.isfinite(v) else None for v in values.tolist()]
+
+
+# Temporary folders beside a clip that a killed process left: the next run removes them.
+
+RECORD = "writing.json"
+
+
+class Cleanup:
+    """Removes what the writing of one clip leaves beside it if the process is killed.
+
+    Only folders are removed that a run registered before it filled them, or whose names and
+    contents are those of a half-replaced clip.
+
+    Args:
+        clip: the folder to be made. work: the work folder, which one process at a time uses.
+    """
+
+    def __init__(self, clip: Path, work: Path) -> None:
+        self.clip, self._record = clip, work / RECORD
+
+    def register(self, temporary: Path) -> None:
+        """To be called before anything large is in this temporary folder."""
+        part = self._record.with_name("." + RECORD)
+        part.write_text(json.dumps({"temporary": temporary.name}), encoding="utf-8")
+        part.replace(self._record)
+
+    def remove(self) -> None:
+        """Removes the registered folder, if it is there, and clips that a new one has replaced."""
+        beside = self.clip.parent
+        if self._record.is_file():
+            name = json.loads(self._record.read_text(encoding="utf-8"))["temporary"]
+            folder = beside / name
+            if name.startswith(f".{self.clip.name}.") and folder.is_dir():
+                shutil.rmtree(folder)
+            self._record.unlink()
+        if self.clip.is_dir():
+            for folder in beside.glob(f".{self.clip.name}.old.*"):
+                if [p.name for p in folder.iterdir()] in ([], ["clip"]):
+                    shutil.rmtree(folder)

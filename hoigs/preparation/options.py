@@ -17,10 +17,10 @@ from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.errors import explain
 from hoigs.core.spec.loader import Document, load_overrides, read_document
 from hoigs.core.spec.schema import ComponentSpec
-from hoigs.preparation.body.fit_values import FitOptions
+from hoigs.preparation.body.fit_problem import FitOptions
 from hoigs.preparation.objects.make_object import ObjectWay
+from hoigs.preparation.video.container import Span
 from hoigs.preparation.video.frames import Pick
-from hoigs.preparation.video.span import Span
 
 Place = EstimateKind | Literal["object"]  # "object": masks of the object alone
 Preset = Literal["auto", "offline", "hub", "files"]

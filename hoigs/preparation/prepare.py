@@ -21,8 +21,10 @@ from hoigs.core.system.files import named
 from hoigs.core.system.random_state import callers_random_state
 from hoigs.core.system.threads import short_waits_when_busy
 from hoigs.core.system.urls import local_path
+from hoigs.preparation import stages
 from hoigs.preparation.body.body_files import BodyFileEstimator, body_beside
-from hoigs.preparation.clip_writing import write_clip_folder
+from hoigs.preparation.clip_writing import Cleanup
+from hoigs.preparation.draft import Draft
 from hoigs.preparation.estimates.plan import (
     Consent,
     EstimatorPlan,
@@ -31,6 +33,7 @@ from hoigs.preparation.estimates.plan import (
     plan_estimators,
 )
 from hoigs.preparation.estimates.reader import Estimators
+from hoigs.preparation.kept import PLAN, check_stage, with_dependents
 from hoigs.preparation.options import (
     PrepareOptions,
     Preset,
@@ -38,10 +41,8 @@ from hoigs.preparation.options import (
     load_options,
     refuse_commands,
 )
-from hoigs.preparation.pipeline import Pipeline
 from hoigs.preparation.prompts import with_prompts, with_stored
 from hoigs.preparation.report.report import PrepareReport
-from hoigs.preparation.stages import PLAN, Cleanup, Stages, check_stage, with_dependents
 from hoigs.preparation.video.source import SourceError, find_source, find_video
 from hoigs.preparation.work_folder import WorkFolder
 
@@ -136,12 +137,11 @@ def prepare(
     }  # fmt: skip
     options = with_prompts(load_options(options, overrides, flags), object, estimators, person)
     may_replace = options.overwrite or bool(redo)
-    _, report = _run(
+    draft = _run(
         source, out, body, options, progress, redo, estimators, None, may_replace, allow_commands,
         agree if yes else consent, announce,
     )  # fmt: skip
-    assert report is not None  # the last stage makes it
-    return report
+    return draft.report
 
 
 def prepare_until(
@@ -173,11 +173,11 @@ def prepare_until(
     if stage == list(PLAN)[-1]:
         raise HoigsError(f"{stage} is the last stage: run prepare as a whole")
     options = with_prompts(load_options(options), object, estimators, person)
-    pipeline, _ = _run(
+    draft = _run(
         source, out, body, options, progress, redo, estimators, stage, True, allow_commands,
         agree if yes else consent, announce,
     )  # fmt: skip
-    return pipeline.stages.seconds
+    return draft.seconds
 
 
 @short_waits_when_busy()
@@ -195,7 +195,7 @@ def _run(
     allow_commands: bool,
     consent: Consent | None,
     announce: Callable[[EstimatorPlan], object] | None,
-) -> tuple[Pipeline, PrepareReport | None]:
+) -> Draft:
     source, out = local_path(source), Path(out)
     for name in redo:
         check_stage(name)
@@ -231,24 +231,20 @@ def _run(
         announce(plan)
     get_ready(plan, chosen, consent, progress or no_progress)
     body = body or _body(options.body)
-    stages = Stages({name: stage.weight for name, stage in PLAN.items()}, progress)
     with WorkFolder(work_folder(out)) as work:
-        cleanup = Cleanup(out.absolute(), work.root)
-        cleanup.remove()
+        Cleanup(out.absolute(), work.root).remove()
         for name in with_dependents(redo):
             work.forget(name)
-        pipeline = Pipeline(
-            found, out, body, options, chosen, stages, work, bodies,
+        draft = Draft(
+            found, out, body, work, bodies,
             lambda said: announce and announce(EstimatorPlan({}, notes=(said,))),
         )  # fmt: skip
         try:
-            pipeline.run(until)
-            report = None if until else write_clip_folder(pipeline, cleanup)
+            return stages.run(draft, options, chosen, progress or no_progress, until)
         except HoigsError:
-            if work.new and not pipeline.kept.worth_keeping:
+            if work.new and not work.worth_keeping:
                 work.discard()
             raise
-    return pipeline, report
 
 
 def _body(key: str) -> BodyModel:

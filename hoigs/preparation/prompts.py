@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -207,14 +207,14 @@ def _frame(at: PromptAt) -> str:
     return "the first frame" if at.frame is None else f"frame {at.frame}"
 
 
-def placed_prompts(options: PrepareOptions, found: FrameList) -> PrepareOptions:
-    """Options whose prompts all have a frame: the first that is used, where none is given.
+def placed_prompts(prompts: Mapping[str, Prompt], found: FrameList) -> dict[str, Prompt]:
+    """Prompts that all have a frame: the first that is used, where none is given.
 
     Raises:
         SpecError: this frame has two boxes.
     """
-    prompts = {}
-    for name, prompt in options.prompts.items():
+    placed = {}
+    for name, prompt in prompts.items():
         by_frame: dict[int | None, PromptAt] = {}
         for at in prompt.places():
             frame = found.first if at.frame is None else at.frame
@@ -224,18 +224,18 @@ def placed_prompts(options: PrepareOptions, found: FrameList) -> PrepareOptions:
             by_frame[frame] = PromptAt(
                 frame=frame, points=[*known.points, *at.points], box=known.box or at.box
             )
-        prompts[name] = _prompt(by_frame.values() or [PromptAt(frame=found.first)], prompt.text)
-    return options.model_copy(update={"prompts": prompts})
+        placed[name] = _prompt(by_frame.values() or [PromptAt(frame=found.first)], prompt.text)
+    return placed
 
 
-def check_prompts(options: PrepareOptions, found: FrameList) -> None:
+def check_prompts(prompts: Mapping[str, Prompt], found: FrameList) -> None:
     """That clicks and boxes lie in the picture, and in frames that are used.
 
     Raises:
         SpecError: naming the first that does not.
     """
     width, height = found.native_width, found.native_height
-    for name, prompt in options.prompts.items():
+    for name, prompt in prompts.items():
         for at in prompt.places():
             if at.frame is not None and not found.first <= at.frame < found.total:
                 raise SpecError(

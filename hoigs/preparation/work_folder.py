@@ -50,7 +50,10 @@ class WorkFolder:
     """Results by stage in one folder, which one process at a time uses.
 
     >>> with WorkFolder("clips/mine.prepare") as work:
-    ...     result = work.load("body", key) or work.save("body", key, make())
+    ...     result = work.load("people", key) or work.save("people", key, make())
+
+    Attributes:
+        new: whether it is made for this run. worth_keeping: whether something in it took long.
 
     Raises:
         ClipError: another process uses it.
@@ -58,6 +61,7 @@ class WorkFolder:
 
     def __init__(self, root: str | Path) -> None:
         self.root = Path(root)
+        self.worth_keeping = False
 
     def __enter__(self) -> WorkFolder:
         self.new = not self.root.exists()
@@ -73,12 +77,12 @@ class WorkFolder:
     ) -> None:
         self._lock.release()
 
-    def load(self, stage: str, key: str) -> Result | None:
-        """The stage's result, if there is a whole one for this key; others are made again."""
+    def load(self, stage: str, key: str | None = None) -> Result | None:
+        """The stage's result, if there is a whole one for this key, or for any if `key` is None."""
         folder = self.root / stage
         try:
             content = json.loads((folder / RESULT).read_text(encoding="utf-8"))
-            if content["key"] != key:
+            if key is not None and content["key"] != key:
                 return None
             return Result(content["values"], load_arrays(folder / ARRAYS), None, folder)
         except (FileNotFoundError, ValueError, KeyError, TypeError, RecursionError):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hoigs.preparation.choose_frames import stored_width
+from hoigs.preparation.stages import stored_width
 from hoigs.preparation.video.frames import FrameList
 
 

@@ -16,12 +16,17 @@ from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.maths.frame_times import Chunking
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
-from hoigs.preparation.body.fit_problem import FitProblem
-from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Found, Joint, Unknowns
-from hoigs.preparation.body.kinematics import PER_FRAME, nearest_turn
-from hoigs.preparation.body.landmarks import ENOUGH, LandmarkTrack
+from hoigs.preparation.body.fit_problem import (
+    BodyFit,
+    FitOptions,
+    FitProblem,
+    Found,
+    Joint,
+    Unknowns,
+)
+from hoigs.preparation.body.kinematics import PER_FRAME, REACH, NormalEquations, nearest_turn
+from hoigs.preparation.body.landmarks import ENOUGH, Landmarks
 from hoigs.preparation.body.mask_fit import Masks
-from hoigs.preparation.body.normal_equations import REACH, NormalEquations
 from hoigs.preparation.body.start import first_guess
 
 # Gauss-Newton on the energy of the body fit.
@@ -81,7 +86,7 @@ STRETCHES, SHORTEST = 10, 8  # in which frames that stand for all are taken; fra
 
 def fit_in_windows(
     body: BodyModel,
-    landmarks: LandmarkTrack,
+    landmarks: Landmarks,
     cameras: Sequence[Camera],
     times: Float[Tensor, " F"],
     options: FitOptions,
@@ -182,7 +187,7 @@ def _share(progress: Callable[[float], None] | None, count: int, number: int, do
 
 def fit_body(
     body: BodyModel,
-    landmarks: LandmarkTrack,
+    landmarks: Landmarks,
     cameras: Sequence[Camera],
     *,
     options: FitOptions | None = None,

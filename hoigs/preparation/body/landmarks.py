@@ -12,6 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.values.lens import Undistortion
 
 # landmark -> SMPL-X body joint
 JOINTS = {11: 16, 12: 17, 13: 18, 14: 19, 15: 20, 16: 21, 23: 1, 24: 2, 25: 4, 26: 5, 27: 7, 28: 8}
@@ -30,30 +31,102 @@ ENOUGH = 8  # landmarks of USED in the image, with which a frame counts
 
 
 @dataclass(frozen=True)
-class LandmarkTrack:
+class FrameFates:
+    """Frames whose landmarks were lost or repaired, by the reason, in words that end a sentence."""
+
+    lost: dict[str, list[int]] = field(default_factory=dict)
+    repaired: dict[str, list[int]] = field(default_factory=dict)
+
+    @staticmethod
+    def at(
+        lost: Mapping[str, Iterable[int]],
+        repaired: Mapping[str, Iterable[int]],
+        numbers: Sequence[int],
+    ) -> FrameFates:
+        """Of chosen frames alone, by their position in `numbers`, those of the frames as given."""
+        place = {number: i for i, number in enumerate(numbers)}
+
+        def chosen(reasons: Mapping[str, Iterable[int]]) -> dict[str, list[int]]:
+            rows = {
+                text: [place[i] for i in found if i in place] for text, found in reasons.items()
+            }
+            return {text: sorted(found) for text, found in rows.items() if found}
+
+        return FrameFates(chosen(lost), chosen(repaired))
+
+    def complete(self, given: Landmarks, dropped: Mapping[str, Bool[Tensor, " F"]]) -> FrameFates:
+        """With a reason for every frame that the fit goes without.
+
+        Args:
+            given: as the estimator gave them; frames that it has are not among its lost ones.
+            dropped: frames of `given` that were not believed, by the reason.
+        """
+        found = given.found
+        lost = {text: [i for i in rows if not found[i]] for text, rows in self.lost.items()}
+        unsaid = ~found
+        unsaid[[i for rows in lost.values() for i in rows]] = False
+        some = given.known.any(1)
+        every = {
+            f"fewer than {ENOUGH} of the body's landmarks were found": unsaid & some,
+            "the source has no landmarks": unsaid & ~some,
+            **dropped,
+        }
+        lost |= {text: rows.nonzero()[:, 0].tolist() for text, rows in every.items()}
+        gone = {i for rows in lost.values() for i in rows}
+        kept = {text: [i for i in rows if i not in gone] for text, rows in self.repaired.items()}
+        return FrameFates(
+            {text: rows for text, rows in lost.items() if rows},
+            {text: rows for text, rows in kept.items() if rows},
+        )
+
+    def lost_frames(self) -> list[int]:
+        return sorted(i for rows in self.lost.values() for i in rows)
+
+    def repaired_frames(self) -> list[int]:
+        return sorted({i for rows in self.repaired.values() for i in rows})
+
+
+@dataclass(frozen=True)
+class Landmarks:
     """Landmarks of one person over a clip; NaN where they were not found.
 
     Attributes:
         image: x, y in pixels of the frames, and visibility in [0, 1].
         world: metres about the hips' middle, along the camera's axes (x right, y down, z away);
             NaN where the estimator sees the image only.
+        source: for the report.
+        fates: of the frames, by their position.
     """
 
     image: Float[Tensor, "F 33 3"]
     world: Float[Tensor, "F 33 3"]
+    source: str = "MediaPipe"
+    fates: FrameFates = field(default_factory=FrameFates)
 
     @staticmethod
     def from_mediapipe(
         image_xyzv: Float[np.ndarray, "F 33 4"], world_xyzv: Float[np.ndarray, "F 33 4"]
-    ) -> LandmarkTrack:
+    ) -> Landmarks:
         """From the arrays of `pose_mediapipe.npz`."""
         image = torch.as_tensor(image_xyzv, dtype=torch.float32)[..., [0, 1, 3]]
         world = torch.as_tensor(world_xyzv, dtype=torch.float32)[..., :3]
-        return LandmarkTrack(image, world)
+        return Landmarks(image, world)
 
-    def rows(self, frames: slice | Int[Tensor, " T"]) -> LandmarkTrack:
+    def rows(self, frames: slice | Int[Tensor, " T"]) -> Landmarks:
         """Of some frames alone."""
         return replace(self, image=self.image[frames], world=self.world[frames])
+
+    def undistorted(self, undistort: Undistortion, positions: Sequence[int]) -> Landmarks:
+        """On the cameras' undistorted images; `positions` are those of frames with a camera."""
+        rows = list(positions)
+        image = self.image[rows].numpy().copy()
+        image[..., :2] = undistort.pixels(image[..., :2])
+        return replace(
+            self,
+            image=torch.from_numpy(image).float(),
+            world=self.world[rows].float(),
+            fates=FrameFates.at(self.fates.lost, self.fates.repaired, rows),
+        )
 
     @property
     def known(self) -> Bool[Tensor, "F 33"]:
@@ -103,74 +176,16 @@ class LandmarkTrack:
             jump[i] = np.linalg.norm(middle[i] - way) > JUMP * broad
         return torch.from_numpy(jump)
 
-    def without(self, frames: Bool[Tensor, " F"]) -> LandmarkTrack:
+    def without(self, frames: Bool[Tensor, " F"]) -> Landmarks:
         """The same with these frames not found."""
         image, world = self.image.clone(), self.world.clone()
         image[frames], world[frames] = torch.nan, torch.nan
-        return LandmarkTrack(image, world)
+        return replace(self, image=image, world=world)
 
     @property
     def solid(self) -> Bool[Tensor, " F"]:
         """Frames of `found` whose torso and limbs are known in space, too."""
         return self.found & torch.isfinite(self.world[:, list(SOLID)]).all(-1).all(-1)
-
-
-@dataclass(frozen=True)
-class FrameFates:
-    """Frames whose landmarks were lost or repaired, by the reason, in words that end a sentence."""
-
-    lost: dict[str, list[int]] = field(default_factory=dict)
-    repaired: dict[str, list[int]] = field(default_factory=dict)
-
-    @staticmethod
-    def at(
-        lost: Mapping[str, Iterable[int]],
-        repaired: Mapping[str, Iterable[int]],
-        numbers: Sequence[int],
-    ) -> FrameFates:
-        """Of chosen frames alone, by their position in `numbers`, those of the frames as given."""
-        place = {number: i for i, number in enumerate(numbers)}
-
-        def chosen(reasons: Mapping[str, Iterable[int]]) -> dict[str, list[int]]:
-            rows = {
-                text: [place[i] for i in found if i in place] for text, found in reasons.items()
-            }
-            return {text: sorted(found) for text, found in rows.items() if found}
-
-        return FrameFates(chosen(lost), chosen(repaired))
-
-    def complete(
-        self, given: LandmarkTrack, dropped: Mapping[str, Bool[Tensor, " F"]]
-    ) -> FrameFates:
-        """With a reason for every frame that the fit goes without.
-
-        Args:
-            given: as the estimator gave them; frames that it has are not among its lost ones.
-            dropped: frames of `given` that were not believed, by the reason.
-        """
-        found = given.found
-        lost = {text: [i for i in rows if not found[i]] for text, rows in self.lost.items()}
-        unsaid = ~found
-        unsaid[[i for rows in lost.values() for i in rows]] = False
-        some = given.known.any(1)
-        every = {
-            f"fewer than {ENOUGH} of the body's landmarks were found": unsaid & some,
-            "the source has no landmarks": unsaid & ~some,
-            **dropped,
-        }
-        lost |= {text: rows.nonzero()[:, 0].tolist() for text, rows in every.items()}
-        gone = {i for rows in lost.values() for i in rows}
-        kept = {text: [i for i in rows if i not in gone] for text, rows in self.repaired.items()}
-        return FrameFates(
-            {text: rows for text, rows in lost.items() if rows},
-            {text: rows for text, rows in kept.items() if rows},
-        )
-
-    def lost_frames(self) -> list[int]:
-        return sorted(i for rows in self.lost.values() for i in rows)
-
-    def repaired_frames(self) -> list[int]:
-        return sorted({i for rows in self.repaired.values() for i in rows})
 
 
 @dataclass(frozen=True)

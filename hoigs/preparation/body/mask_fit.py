@@ -15,8 +15,7 @@ from torch import Tensor
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
-from hoigs.preparation.body.kinematics import Kinematics, Posed
-from hoigs.preparation.body.normal_equations import NormalEquations
+from hoigs.preparation.body.kinematics import Kinematics, NormalEquations, Posed
 
 # of points in the world and the frames they are in: pixels, and their derivatives by the points
 Project = Callable[

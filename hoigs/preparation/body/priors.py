@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hoigs.core.values.moment import BodyPose
-from hoigs.preparation.body.kinematics import JOINTS, Kinematics, Posed
-from hoigs.preparation.body.normal_equations import NormalEquations
+from hoigs.preparation.body.kinematics import JOINTS, Kinematics, NormalEquations, Posed
 from hoigs.preparation.body.start import relaxed
 
 # How strongly each point of a body accelerates in a clip, estimated from noisy places of it.

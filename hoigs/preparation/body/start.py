@@ -15,7 +15,7 @@ from hoigs.core.maths.rotations import kabsch, matrices_to_axis_angle, matrices_
 from hoigs.core.maths.skinning import skin, transform_points
 from hoigs.core.values.camera import Camera, pinhole_pixels, pinhole_rays
 from hoigs.core.values.moment import BodyPose
-from hoigs.preparation.body.landmarks import JOINTS, TORSO, LandmarkTrack, points_of
+from hoigs.preparation.body.landmarks import JOINTS, TORSO, Landmarks, points_of
 
 # Limbs at the start of the body fit: hips, knees, shoulders and elbows from 3D landmarks.
 
@@ -263,7 +263,7 @@ class Start:
 
 
 def first_guess(
-    body: BodyModel, landmarks: LandmarkTrack, cameras: Sequence[Camera], find_scale: bool
+    body: BodyModel, landmarks: Landmarks, cameras: Sequence[Camera], find_scale: bool
 ) -> Start:
     """Torso by Kabsch, depth by a linear fit of the 3D landmarks to the 2D ones; where there are
     no 3D landmarks, by those of a relaxed body (`flat_start`).

@@ -13,6 +13,7 @@ from hoigs.core.system.colmap_files import choice_told
 from hoigs.core.system.npz import holds
 from hoigs.core.values.lens import Lens
 from hoigs.preparation.body.body_files import FileBody
+from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
 from hoigs.preparation.cameras.camera_track import (
     CameraTrack,
@@ -22,10 +23,13 @@ from hoigs.preparation.cameras.camera_track import (
 )
 from hoigs.preparation.cameras.focal import static_focal
 from hoigs.preparation.cameras.known import given_cameras, megasam_cameras, vggt_cameras
-from hoigs.preparation.cameras.motion import BackgroundMotion, background_motion
 from hoigs.preparation.cameras.sfm import structure_from_motion
-from hoigs.preparation.cameras.turning_cameras import turning_cameras
-from hoigs.preparation.estimates.given import GivenMasks, RawLandmarks
+from hoigs.preparation.cameras.turning_cameras import (
+    BackgroundMotion,
+    background_motion,
+    turning_cameras,
+)
+from hoigs.preparation.estimates.reader import GivenMasks
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import MEGASAM, VGGT, SourceError
@@ -42,7 +46,7 @@ class ChosenCameras:
 
 def choose_cameras(
     video: Frames,
-    landmarks: RawLandmarks | None,
+    landmarks: Landmarks | None,
     masks: GivenMasks,
     model: Path | None,
     options: PrepareOptions,
@@ -117,7 +121,7 @@ def known_lens(options: PrepareOptions, video: Frames) -> tuple[Lens, str] | Non
 
 def _static(
     video: Frames,
-    landmarks: RawLandmarks | None,
+    landmarks: Landmarks | None,
     options: PrepareOptions,
     lens: tuple[Lens, str] | None,
     motion: BackgroundMotion,
@@ -141,7 +145,7 @@ def _static(
 
 def _turning(
     video: Frames,
-    landmarks: RawLandmarks | None,
+    landmarks: Landmarks | None,
     masks: GivenMasks,
     options: PrepareOptions,
     lens: tuple[Lens, str] | None,

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.cameras.camera_track import ASSUMED_FOCAL
-from hoigs.preparation.estimates.given import RawLandmarks
 from hoigs.preparation.video.container import open_video
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import numbered_frames
@@ -281,7 +281,7 @@ class StaticFocal:
     known: bool = False
 
 
-def static_focal(video: Frames, landmarks: RawLandmarks | None, given: float | None) -> StaticFocal:
+def static_focal(video: Frames, landmarks: Landmarks | None, given: float | None) -> StaticFocal:
     """The first of: `given`, the file's metadata, a distinct estimate from the person (`focal`),
     0.8 of the longer side.
     """
@@ -294,7 +294,7 @@ def static_focal(video: Frames, landmarks: RawLandmarks | None, given: float | N
     curve = None
     if landmarks is not None:
         size = (video.width, video.height)
-        curve = focal_curve(landmarks.image[..., [0, 1, 3]], landmarks.world[..., :3], size)
+        curve = focal_curve(landmarks.image.numpy(), landmarks.world.numpy(), size)
     figures = {} if curve is None else _figures(curve, longer)
     if curve is not None and curve.distinct:
         return _estimated(curve, longer, figures)

@@ -14,8 +14,8 @@ from PIL import Image
 from hoigs.core.reporting import ranges
 from hoigs.core.values.lens import Lens
 from hoigs.preparation.cameras.camera_track import ASSUMED_FOCAL
-from hoigs.preparation.cameras.motion import grown, quiet_colmap
-from hoigs.preparation.estimates.given import GivenMasks
+from hoigs.preparation.cameras.turning_cameras import grown, quiet_colmap
+from hoigs.preparation.estimates.reader import GivenMasks
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import SourceError
 

@@ -1,5 +1,5 @@
 """What estimators find in the frames.
 
-- `plan`: which estimator gives what. `readiness`: whether all that they need is there.
-- `reader`: EstimateReader, which runs them. `given`: landmarks and masks as they come.
+- `plan`: which estimator gives what, and whether all that they need is there.
+- `reader`: EstimateReader, which runs them, and what it returns.
 """

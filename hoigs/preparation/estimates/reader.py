@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.interfaces import estimator
 from hoigs.core.interfaces.estimator import (
     EntityMasks,
     EntityRequest,
@@ -18,46 +21,117 @@ from hoigs.core.interfaces.estimator import (
     Estimates,
     Estimator,
     FramePrompt,
-    Landmarks,
     PromptPoint,
     VideoRequest,
     checked,
 )
 from hoigs.core.interfaces.estimator import Frames as FrameArrays
-from hoigs.preparation.body.landmarks import LandmarkTrack
-from hoigs.preparation.estimates.given import GivenMasks, RawLandmarks, chosen_landmarks
-from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.core.values.lens import Undistortion
+from hoigs.preparation.body.landmarks import FrameFates, Landmarks
+from hoigs.preparation.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import BallTrack
-from hoigs.preparation.options import Place, PrepareOptions, PromptAt
+from hoigs.preparation.options import Place, PrepareOptions, Prompt, PromptAt
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.pictures import resized_mask
-from hoigs.preparation.video.source import Source, SourceError
+from hoigs.preparation.video.source import NobodyFoundError, Source, SourceError
 from hoigs.preparation.work_folder import digest
 
-Estimators = Mapping[Place, Estimator]
+
+def chosen_landmarks(
+    track: estimator.Landmarks, video: Frames, what: str, source: str = "MediaPipe"
+) -> Landmarks:
+    """Landmarks of a whole video, in its own pixels, as those of the chosen frames, at their size.
+
+    Raises:
+        NobodyFoundError: no person is found in them; `what` names where they come from.
+    """
+    image = track.image_xyzv[video.indices].astype(np.float64)[..., [0, 1, 3]]
+    image[..., :2] *= video.width / video.native_width
+    if track.world_xyzv is None:
+        world = np.full_like(image, np.nan)
+    else:
+        world = track.world_xyzv[video.indices].astype(np.float64)[..., :3]
+    fates = FrameFates.at(track.lost, track.repaired, video.indices)
+    found = Landmarks(torch.from_numpy(image), torch.from_numpy(world), source, fates)
+    if not found.found.any():
+        raise NobodyFoundError(
+            f"{what}: no person was found in the {len(image)} chosen frames; the body of a person "
+            "whose shoulders, hips and some of the limbs are in the picture can be fitted"
+        )
+    return found
 
 
 @dataclass(frozen=True)
-class RawPerson:
-    """Landmarks and masks of one of further people, likewise."""
+class GivenMasks:
+    """Masks as the source has them: together, or the person's and perhaps the object's apart; and
+    those of further people, all in one."""
 
-    landmarks: RawLandmarks
-    masks: MaskStack
+    together: MaskStack | None = None
+    human: MaskStack | None = None
+    object: MaskStack | None = None
+    others: MaskStack | None = None
+
+    def named(self) -> dict[str, MaskStack]:
+        """Those that there are, by the name of the field."""
+        return {f.name: m for f in fields(self) if (m := getattr(self, f.name)) is not None}
+
+    def moving(self, frame: int) -> Bool[np.ndarray, "H W"]:
+        """Everything masked in a frame: what does not stand still with the scene."""
+        return np.logical_or.reduce([stack[frame] for stack in self.named().values()])
+
+    def persons(self, ball: BallTrack | None) -> MaskStack | None:
+        """The person's, or the nearest to it that is known before the body is fitted: with what
+        they hold, but without a tracked ball. None where only the object is masked."""
+        if self.human is not None or self.together is None:
+            return self.human
+        stack = MaskStack()
+        for frame, mask in enumerate(self.together):
+            if self.object is not None:
+                mask = mask & ~self.object[frame]
+            if ball is not None:
+                mask = mask & ~ball.disc(frame, mask.shape[1], mask.shape[0])
+            stack.append(mask)
+        return stack
+
+    def undistorted(self, undistort: Undistortion, positions: Sequence[int]) -> GivenMasks:
+        """On the cameras' undistorted images; `positions` are those of frames with a camera."""
+        return GivenMasks(
+            **{
+                name: MaskStack(undistort.mask(stack[i]) for i in positions)
+                for name, stack in self.named().items()
+            }
+        )
 
 
 @dataclass(frozen=True)
-class RawEstimates:
-    """Landmarks and masks of the chosen frames, at their size; distortion still in.
+class FrameEstimates:
+    """Landmarks and masks of the frames: as found, or on the cameras' undistorted images.
 
     Attributes:
-        landmarks: of the first person; None: nobody is looked for, and the person's masks are
-            empty.
-        further: other people by name (`PrepareOptions.further_people`).
+        landmarks: by person, the first one's first; none: nobody is looked for, and the person's
+            masks are empty.
+        further: masks of people but the first, by name.
     """
 
-    landmarks: RawLandmarks | None
+    landmarks: dict[str, Landmarks]
     masks: GivenMasks
-    further: dict[str, RawPerson] = field(default_factory=dict)
+    further: dict[str, MaskStack] = field(default_factory=dict)
+
+    @property
+    def person(self) -> Landmarks | None:
+        """The first person's."""
+        return next(iter(self.landmarks.values()), None)
+
+    def undistorted(self, undistort: Undistortion, positions: Sequence[int]) -> FrameEstimates:
+        """On the cameras' undistorted images; `positions` are those of frames with a camera."""
+        return FrameEstimates(
+            {name: one.undistorted(undistort, positions) for name, one in self.landmarks.items()},
+            self.masks.undistorted(undistort, positions),
+            {
+                name: MaskStack(undistort.mask(stack[i]) for i in positions)
+                for name, stack in self.further.items()
+            },
+        )
 
 
 @dataclass(frozen=True)
@@ -80,22 +154,7 @@ class FoundObject:
     further: dict[str, FoundObject] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class UndistortedPerson:
-    """`RawPerson` on the cameras' undistorted images."""
-
-    landmarks: LandmarkTrack
-    masks: MaskStack
-
-
-@dataclass(frozen=True)
-class UndistortedEstimates:
-    """`RawEstimates` on the cameras' undistorted images, and the object if it is a tracked ball."""
-
-    landmarks: LandmarkTrack | None
-    masks: GivenMasks
-    ball: BallTrack | None
-    further: dict[str, UndistortedPerson] = field(default_factory=dict)
+Estimators = Mapping[Place, Estimator]
 
 
 @dataclass(frozen=True)
@@ -103,32 +162,33 @@ class EstimateReader:
     """Runs the estimator of each kind: a given one, or that of the files beside the video.
 
     Attributes:
+        people, prompts: who is followed, and where or what each entity is.
         work: folder for what estimators keep between runs.
     """
 
     source: Source
     video: Frames
+    people: tuple[str, ...]
+    prompts: Mapping[str, Prompt]
     options: PrepareOptions
     estimators: Estimators
     work: Path
 
-    def landmarks_and_masks(self, progress: Callable[[float], None]) -> RawEstimates:
+    def landmarks_and_masks(self, progress: Callable[[float], None]) -> FrameEstimates:
         """Landmarks first: they are read fast, and a clip without them cannot be made."""
-        if not self.options.people:
-            return RawEstimates(None, self._objects_alone(progress))
-        first, *further = self.options.people
-        landmarks = {name: self._landmarks(name, progress) for name in self.options.people}
+        if not self.people:
+            return FrameEstimates({}, self._objects_alone(progress))
+        first, *further = self.people
+        landmarks = {name: self._landmarks(name, progress) for name in self.people}
         masks = self._masks((first, self.options.object), progress)
         if not further:
-            return RawEstimates(landmarks[first], masks)
+            return FrameEstimates(landmarks, masks)
         found = self.estimate("masks", progress).masks
         assert found is not None  # `checked` saw to it
         stacks = {name: self._stack(self._given(found, name)) for name in further}
         together = zip(*stacks.values(), strict=True)
         masks = replace(masks, others=MaskStack(np.logical_or.reduce(rows) for rows in together))
-        return RawEstimates(
-            landmarks[first], masks, {n: RawPerson(landmarks[n], stacks[n]) for n in further}
-        )
+        return FrameEstimates(landmarks, masks, stacks)
 
     def _given(self, found: EntityMasks, name: str) -> FrameArrays:
         """Masks of a person.
@@ -208,7 +268,7 @@ class EstimateReader:
         except ValueError as error:
             raise SourceError(f"estimators.{role}: {error}") from error
 
-    def people(self) -> tuple[FramePrompt, ...]:
+    def seen(self) -> tuple[FramePrompt, ...]:
         """A box about everybody, from a quick look; see `Estimator.people`. Empty where files
         beside the video say who is meant."""
         if {"landmarks", "masks"} & set(self.source.beside):
@@ -237,14 +297,14 @@ class EstimateReader:
 
     def _known(self) -> Estimates | None:
         """What was found of people; estimators keep their results, so this is fast."""
-        if not self.options.people:
+        if not self.people:
             return None
         masks = self.estimate("masks", lambda _done: None).masks
         return Estimates(masks, self.estimate("landmarks", lambda _done: None).landmarks)
 
     def notes_on_person(self) -> tuple[str, ...]:
         """What the estimator of masks finds doubtful in those of the person."""
-        if "masks" not in self.estimators or not self.options.people:
+        if "masks" not in self.estimators or not self.people:
             return ()
         masks = self.estimate("masks", lambda _done: None).masks
         return () if masks is None else masks.notes
@@ -258,28 +318,36 @@ class EstimateReader:
 
     def _entities(self, kind: Place) -> tuple[EntityRequest, ...]:
         options = self.options
-        people = tuple(_request(options, name, "human") for name in options.people)
-        thing = _request(options, options.object, "object")
+        people = tuple(self._asked(name, "human") for name in self.people)
+        thing = self._asked(options.object, "object")
         if kind == "object":
-            return (thing, *(_request(options, n, "object") for n in options.further_objects))
+            return (thing, *(self._asked(n, "object") for n in options.further_objects))
         if kind == "masks" and kind in self.source.beside:
             return tuple(e for e in (*people, thing) if e.name in self.source.masked)
         return (*people, thing) if self.of_both else people
+
+    def _asked(self, name: str, kind: Literal["human", "object"]) -> EntityRequest:
+        prompt = self.prompts.get(name)
+        if prompt is None:
+            return EntityRequest(name, kind)
+        further = tuple(FramePrompt(at.frame or 0, _points(at), at.box) for at in prompt.further)
+        return EntityRequest(
+            name, kind, prompt.text, _points(prompt), prompt.box, prompt.frame or 0, further
+        )
 
     @property
     def of_both(self) -> bool:
         """The estimator of masks gives those of the object, too."""
         return self.options.find_object and "object" not in self.estimators
 
-    def _landmarks(self, name: str, progress: Callable[[float], None]) -> RawLandmarks:
+    def _landmarks(self, name: str, progress: Callable[[float], None]) -> Landmarks:
         tracks = self.estimate("landmarks", progress).landmarks
         who = f"estimators.landmarks: {_name(self.estimators['landmarks'])}"
         if name not in tracks:
             raise SourceError(f"{who} gave landmarks of {_listed(tracks)}, not of {name}")
-        track: Landmarks = tracks[name]
-        if len(self.options.people) > 1:
+        if len(self.people) > 1:
             who += f", {name}"
-        return chosen_landmarks(track, self.video, who, track.provenance or "given")
+        return chosen_landmarks(tracks[name], self.video, who, tracks[name].provenance or "given")
 
     def _masks(self, names: tuple[str, str], progress: Callable[[float], None]) -> GivenMasks:
         found = self.estimate("masks", progress).masks
@@ -316,15 +384,6 @@ def paths_of(estimator: Estimator, folder: Path) -> list[Path]:
     values += [item for value in values if isinstance(value, dict) for item in value.values()]
     paths = (folder / v.expanduser() for v in values if isinstance(v, Path))
     return sorted(path for path in paths if path.exists())
-
-
-def _request(options: PrepareOptions, name: str, kind) -> EntityRequest:
-    prompt = options.prompts.get(name)
-    if prompt is None:
-        return EntityRequest(name, kind)
-    further = tuple(FramePrompt(at.frame or 0, _points(at), at.box) for at in prompt.further)
-    points = _points(prompt)
-    return EntityRequest(name, kind, prompt.text, points, prompt.box, prompt.frame or 0, further)
 
 
 def _points(prompt: PromptAt) -> tuple[PromptPoint, ...]:

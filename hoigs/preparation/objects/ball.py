@@ -17,7 +17,7 @@ from hoigs.core.maths.frame_times import fill_gaps, smooth
 from hoigs.core.system.npz import load_arrays
 from hoigs.core.values.camera import Camera, pinhole_rays
 from hoigs.core.values.lens import Undistortion
-from hoigs.preparation.masks.mask_stack import MaskStack, outlines_of
+from hoigs.preparation.mask_stack import MaskStack, outlines_of
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import SourceError
 

@@ -14,8 +14,8 @@ from torch import Tensor
 from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST
 from hoigs.core.maths.frame_times import fill_gaps, smooth
 from hoigs.core.values.camera import Camera
-from hoigs.preparation.masks.mask_stack import MaskStack, Outlines
-from hoigs.preparation.objects.track import hand_depths
+from hoigs.preparation.mask_stack import MaskStack, Outlines
+from hoigs.preparation.objects.shape import hand_depths
 
 # When an object rests, by the middle of its mask.
 

@@ -16,8 +16,7 @@ from torch import Tensor
 from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
-from hoigs.preparation.masks.mask_stack import MaskStack, outlines_of
-from hoigs.preparation.masks.separate import Images
+from hoigs.preparation.mask_stack import Images, MaskStack, outlines_of
 from hoigs.preparation.objects.ball import (
     BallTrack,
     Cones,
@@ -28,8 +27,7 @@ from hoigs.preparation.objects.ball import (
     contact_radius,
     require_round,
 )
-from hoigs.preparation.objects.shape import ColorSampler, sphere_points
-from hoigs.preparation.objects.track import held_object
+from hoigs.preparation.objects.shape import ColorSampler, held_object, sphere_points
 from hoigs.preparation.objects.tracked import ObjectConfidence, UntrackableError, tracked_object
 
 # What makes an object's track doubtful: seen in its masks and the landmarks, and said.

@@ -13,21 +13,20 @@ from torch import Tensor
 from hoigs.core.maths.rotations import matrices_to_quats, quats_to_matrices, slerp
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
-from hoigs.preparation.masks.mask_stack import MaskStack, Outlines, outlines_of
-from hoigs.preparation.masks.separate import Images
+from hoigs.preparation.mask_stack import Images, MaskStack, Outlines, outlines_of
 from hoigs.preparation.objects.alignment import (
     LEVELS,
     Aligned,
+    Crops,
     Held,
     Level,
     Poses,
     Surface,
     align,
+    make_crops,
 )
-from hoigs.preparation.objects.crops import Crops, make_crops
-from hoigs.preparation.objects.flights import flights_by_texture
 from hoigs.preparation.objects.hands import HandMotion, along_bones, hand_motion, no_hands
-from hoigs.preparation.objects.search import grasps_by_texture
+from hoigs.preparation.objects.search import flights_by_texture, grasps_by_texture
 from hoigs.preparation.objects.shape import completed, hull, with_samples
 
 FEWEST = 8  # frames that show the object whole

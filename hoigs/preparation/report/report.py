@@ -3,14 +3,357 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from html import escape
 from importlib import resources
 from pathlib import Path
 from string import Template
+from typing import Any
 
-from hoigs.preparation.report.diagnostics import MeasureDiagnostic, Measures, diagnose
+from hoigs.core.reporting import Diagnostic, Severity, ranges
+
+# What is measured of a preparation.
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Numbers to judge a prepared clip by.
+
+    Attributes:
+        name, frames, width, height, fps: of the clip. video: the source's file name.
+        camera: "static", "turning" or "moving". parallax_degrees: largest angle between two views
+            of the scene's middle; under about 5 the geometry is weakly known.
+        coverage: by entity, part of the image that the mask covers in each frame, 0..1.
+        body_residual_px: median distance of fitted to given landmarks, in frame pixels, of the
+            first person; None without people.
+        body: whatever else the body fit reports.
+        landmarks: by person, `found`: frames with landmarks; `lost` and `repaired`: by the reason,
+            which frames have none, and which only after more than a first look.
+        scene_scale: metres a COLMAP unit; 1 for a static camera.
+        object_scale_spread: standard deviation over frames of the object's apparent over its
+            expected size: 0.05 means that its depth is uncertain by about 5 %; None
+            without an object.
+        object_observed: part of the frames in which the object was seen.
+        scene_points: number of points that start the background.
+        provenance: what each part was made from, and how weak it is.
+        warnings: what to know before training.
+        unknown: what the video does not show and is supposed, and why.
+        seconds: time by stage.
+        registered: part of the chosen frames that have a camera; None for a static camera.
+        reprojection_px: of COLMAP's points, mean; None for a static camera.
+        displacement_px: of a static camera's background, at a width of 640; None if not measured.
+        sharpness: of each frame (`sharpness.sharpness`).
+        body_residuals_px: of each frame; None without landmarks.
+        body_residual_m: `body_residual_px` at the person's distance.
+        depth_residual: typical relative error of the depth estimator once it is in metres, against
+            `depth_against`; depth_residuals: of each frame. None without such an estimator.
+        object_way: how the object's poses were found: "texture and hands", "outline" or "ball";
+            object_reason: why not better.
+        object_agreement: of each frame, correlation of the object's texture with that of the other
+            frames; None where it shows too little. object_outline_m: metres between the mask's
+            outline and the shape's. object_iou: of each frame, intersection over union of both.
+        object_held, object_rests: parts of the frames in which hands move it, and it rests.
+        hand_distance_m: of each frame, from the nearest palm to its surface while held; negative
+            inside.
+        object_name: of the object that the measures above are of.
+        further_objects: by name, the same measures of the other objects. further_people: by name,
+            body_residual_px and body_residual_m of the other people.
+        omega, big_omega: effective multi-view factors (`multiview`).
+    """
+
+    name: str
+    video: str
+    frames: int
+    width: int
+    height: int
+    fps: float
+    camera: str
+    parallax_degrees: float
+    coverage: dict[str, list[float]]
+    body_residual_px: float | None
+    scene_scale: float
+    object_scale_spread: float | None
+    object_observed: float | None
+    scene_points: int
+    body: dict[str, Any] = field(default_factory=dict)
+    landmarks: dict[str, dict[str, Any]] = field(default_factory=dict)
+    provenance: dict[str, str] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    unknown: dict[str, str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    registered: float | None = None
+    reprojection_px: float | None = None
+    displacement_px: float | None = None
+    sharpness: list[float] = field(default_factory=list)
+    body_residuals_px: list[float | None] = field(default_factory=list)
+    body_residual_m: float | None = None
+    depth_residual: float | None = None
+    depth_residuals: list[float | None] = field(default_factory=list)
+    depth_against: str = ""
+    object_way: str = ""
+    object_reason: str = ""
+    object_agreement: list[float | None] = field(default_factory=list)
+    object_iou: list[float | None] = field(default_factory=list)
+    object_outline_m: list[float | None] = field(default_factory=list)
+    object_held: float = 0.0
+    object_rests: float = 0.0
+    hand_distance_m: list[float | None] = field(default_factory=list)
+    object_name: str = "object"
+    further_objects: dict[str, dict[str, Any]] = field(default_factory=dict)
+    further_people: dict[str, dict[str, float]] = field(default_factory=dict)
+    omega: float | None = None
+    big_omega: float | None = None
+
+
+AGREES = 0.5  # correlation of textures from which the object's rotation is trusted
+BLURRED = 0.5  # of the median sharpness: a frame below it is blurred
+
+
+@dataclass(frozen=True)
+class MeasureDiagnostic(Diagnostic):
+    """One measure, judged: `kind` is its name, `what` its meaning. `do` is "" where it is good."""
+
+    value: str = ""
+
+
+def diagnose(measures: Measures) -> list[MeasureDiagnostic]:
+    """Every measure that can be judged, in the order of the stages."""
+    return [*_cameras(measures), *_frames(measures), *_tracks(measures), *_views(measures)]
+
+
+def _judge(value: float, good: float, fair: float) -> Severity:
+    """By the largest values that are good and fair."""
+    return "good" if value <= good else "fair" if value <= fair else "bad"
+
+
+def _judged(
+    kind: str, value: str, meaning: str, severity: Severity, advice: str
+) -> MeasureDiagnostic:
+    do = "" if severity == "good" else advice
+    return MeasureDiagnostic(kind, meaning, do, severity=severity, value=value)
+
+
+def _cameras(report: Measures) -> Iterator[MeasureDiagnostic]:
+    if report.camera != "moving":
+        moved = report.displacement_px
+        yield _judged(
+            "camera",
+            report.camera,
+            "taken to turn on its spot"
+            if report.camera == "turning"
+            else "taken to stand still"
+            + (f": the background moves by {moved:.2f} px at 640" if moved is not None else ""),
+            "fair",
+            "the background has one view and no measured depth: it looks right from near the "
+            "camera only. An estimator of depth (--set estimators.depth.use=…) gives it one; "
+            "--camera moving declares that the camera does move. Give --focal: all depths "
+            "scale with it.",
+        )
+        return
+    if report.registered is not None:
+        yield _judged(
+            "frames with a camera",
+            f"{100 * report.registered:.0f} %",
+            "the others are left out of the clip",
+            _judge(1 - report.registered, 0.02, 0.2),
+            "look at the masks (everything that moves must be masked, the background not), take "
+            "sharper or more frames, or run COLMAP yourself and put its model at sparse/",
+        )
+    if report.reprojection_px is not None:
+        yield _judged(
+            "reprojection error",
+            f"{report.reprojection_px:.2f} px",
+            "of the scene's points in the images",
+            _judge(report.reprojection_px, 1.0, 2.0),
+            "cameras are off by about as much: let training refine them (train.rates.camera), or "
+            "look for movement outside the masks",
+        )
+    yield _judged(
+        "parallax",
+        f"{report.parallax_degrees:.1f}°",
+        "largest angle between two views of the scene's middle",
+        _judge(-report.parallax_degrees, -10, -5),
+        "the scene's depth is weakly known: walk around the person next time, or add an "
+        "estimator of depth",
+    )
+
+
+def _frames(report: Measures) -> Iterator[MeasureDiagnostic]:
+    for name, coverage in report.coverage.items():
+        empty = sum(value == 0 for value in coverage) / max(1, len(coverage))
+        mean = sum(coverage) / max(1, len(coverage))
+        yield _judged(
+            f"mask of {name}",
+            f"{100 * mean:.1f} %",
+            f"of the image; empty in {100 * empty:.0f} % of the frames",
+            _judge(empty, 0.05, 0.25),
+            "if it is in view there, the segmenter lost it: prompt it again in those frames",
+        )
+    if report.sharpness:
+        middle = sorted(report.sharpness)[len(report.sharpness) // 2]
+        blurred = sum(v < BLURRED * middle for v in report.sharpness) / len(report.sharpness)
+        yield _judged(
+            "blurred frames",
+            f"{100 * blurred:.0f} %",
+            "less than half as sharp as the middle one",
+            _judge(blurred, 0.05, 0.2),
+            "take the sharpest of each few frames (--every 2, --fps 15), film in more light or "
+            "move the camera slower",
+        )
+
+
+def _bodies(report: Measures) -> Iterator[MeasureDiagnostic]:
+    people = {"body": (report.body_residual_px, report.body_residual_m)}
+    for name, found in report.further_people.items():
+        people[f"body of {name}"] = found["body_residual_px"], found["body_residual_m"]
+    for name, (pixels, away) in people.items():
+        if pixels is None:
+            continue
+        metres = "" if away is None else f", {100 * away:.1f} cm"
+        yield _judged(
+            f"{name} on its landmarks",
+            f"{pixels:.1f} px{metres}",
+            "median distance of visible landmarks",
+            _judge(pixels / max(report.width, report.height), 0.01, 0.02),
+            "look at overlay.mp4: if the landmarks jump, use another estimator "
+            "(estimators.landmarks); if all of the body is off, the focal length or the cameras "
+            "are",
+        )
+
+
+def _landmarks(report: Measures) -> Iterator[MeasureDiagnostic]:
+    """Frames with landmarks of each person; every other one with its reason."""
+    for name, of in report.landmarks.items():
+        lost = sorted(i for frames in of["lost"].values() for i in frames)
+        reasons = [
+            f"{text} in {len(frames)} ({ranges(frames, most=len(frames))})"
+            for key in ("lost", "repaired")
+            for text, frames in of[key].items()
+        ]
+        one = _judged(
+            f"landmarks of {name}",
+            f"{of['found']} of {report.frames} frames",
+            "; ".join(reasons) or "all found at once",
+            _judge(len(lost) / max(1, report.frames), 0.05, 0.2),
+            "the body follows its neighbours in the other frames, and the masks: click on the "
+            "person in one of them (--person X,Y@FRAME), leave these parts out (--start, --end), "
+            "or use another estimator (estimators.landmarks)",
+        )
+        yield replace(one, frames=tuple(lost))
+
+
+def _tracks(report: Measures) -> Iterator[MeasureDiagnostic]:
+    yield from _landmarks(report)
+    yield from _bodies(report)
+    if report.object_scale_spread is not None:
+        yield _judged(
+            "object's apparent size",
+            f"± {100 * report.object_scale_spread:.1f} %",
+            "over its expected size; its depth is as uncertain",
+            _judge(report.object_scale_spread, 0.05, 0.15),
+            "the object's masks grow and shrink, or it turns: mend the masks, or give its shape as "
+            "a mesh (initializer:mesh)",
+        )
+    yield from _object_judged(report)
+    if report.depth_residual is not None:
+        yield _judged(
+            "depth",
+            f"{100 * report.depth_residual:.1f} %",
+            f"off {report.depth_against}, after its scale was fitted",
+            _judge(report.depth_residual, 0.05, 0.1),
+            "the depth network misjudges this scene: try another, or leave its loss out "
+            "(--set train.loss.depth=0)",
+        )
+
+
+def _object_judged(report: Measures) -> Iterator[MeasureDiagnostic]:
+    """The object's rotation and shape, and the hands on it."""
+    if report.object_way == "outline":
+        yield _judged(
+            "object's rotation",
+            "not tracked",
+            f"only its roll in the image is known: {report.object_reason}",
+            "bad",
+            "training has to find rotation and shape: film the object larger, sharper and whole, "
+            "mend its masks, or choose a spec whose object deforms",
+        )
+    yield from _object_outline(report)
+    if report.object_way == "ball":
+        yield _judged(
+            "object's rotation", "unknown", report.object_reason, "fair",
+            "the object does not turn in the clip; if it is no ball, --set object_track=texture",
+        )  # fmt: skip
+    if report.object_way != "texture and hands":
+        return
+    known = [v for v in report.object_agreement if v is not None]
+    trusted = sum(v >= AGREES for v in known) / max(1, len(report.object_agreement))
+    middle = sorted(known)[len(known) // 2] if known else 0.0
+    yield _judged(
+        "object's rotation",
+        f"{100 * trusted:.0f} % of the frames",
+        f"its texture agrees there with that of other frames (correlation {middle:.2f}, median); "
+        f"worst in {_worst(report.object_agreement)}",
+        _judge(1 - trusted, 0.1, 0.3),
+        "the others follow their neighbours and the hands. Where the object is hidden nothing can "
+        "be done; where it is blurred or small, take sharper frames",
+    )
+    off = [1000 * v for v in report.object_outline_m if v is not None]
+    worst = sorted(off)[int(0.95 * (len(off) - 1))]
+    yield _judged(
+        "object's shape",
+        f"{sum(off) / len(off):.0f} mm",
+        f"between its outline and the mask's ({worst:.0f} mm in the worst twentieth of the frames)",
+        _judge(report.object_scale_spread or 0.0, 0.05, 0.15),
+        "it is not rigid, or its masks are off: a spec whose object deforms may fit better",
+    )
+    palms = [1000 * v for v in report.hand_distance_m if v is not None]
+    if palms:
+        middle = sorted(palms)[len(palms) // 2]
+        yield _judged(
+            "hands on the object",
+            f"{middle:.0f} mm",
+            f"from the nearest palm to its surface, median of {len(palms)} frames in which hands "
+            f"move it; deepest inside {max(0.0, -min(palms)):.0f} mm",
+            _judge(abs(middle), 60, 120),
+            "body and object are at different distances: look at both in overlay.mp4",
+        )
+
+
+def _object_outline(report: Measures) -> Iterator[MeasureDiagnostic]:
+    known = sorted(v for v in report.object_iou if v is not None)
+    if known:
+        mean = sum(known) / len(known)
+        yield _judged(
+            "object on its mask",
+            f"IoU {mean:.2f}",
+            f"mean of its outline and the mask's; {known[int(0.05 * len(known))]:.2f} in the worst "
+            f"twentieth; worst in {_worst(report.object_iou)}",
+            _judge(1 - mean, 0.15, 0.3),
+            "look at these frames in overlay.mp4: poses, shape or masks are off there",
+        )
+
+
+def _worst(values: list[float | None], count: int = 3) -> str:
+    """The frames with the smallest values."""
+    known = [(v, i) for i, v in enumerate(values) if v is not None]
+    worst = sorted(i for _, i in sorted(known)[:count])
+    return f"frames {', '.join(map(str, worst))}"
+
+
+def _views(report: Measures) -> Iterator[MeasureDiagnostic]:
+    if report.omega is None:
+        return
+    ratio = "" if report.big_omega is None else f", {report.big_omega:.2g} times as fast as it"
+    yield _judged(
+        "effective multi-view factor",
+        f"{report.omega:.1f}°/s",
+        f"the camera goes round the person{ratio} (DyCheck's omega and Omega)",
+        _judge(-report.omega, -40, -10),
+        "each moment is seen from one side: what is hidden is guessed by the body model and the "
+        "object's rigidity. Judge by held-out cameras, not by this camera's own frames.",
+    )
+
 
 # report.html: one file, which loads nothing from the network but overlay.mp4 beside it.
 
@@ -40,7 +383,7 @@ def report_page(
             f"{report.frames} frames of {report.video}, {report.width}×{report.height} at "
             f"{report.fps:g} a second, from {camera}."
         ),
-        video=(_video() if overlay else "") + (_object() if object_picture else ""),
+        video=(_video() if overlay else "") + (_object_picture() if object_picture else ""),
         diagnostics="\n".join(map(_diagnostic, diagnostics)),
         plots=_plots(report),
         rows=_rows(rows),
@@ -57,7 +400,7 @@ def _video() -> str:
     )
 
 
-def _object() -> str:
+def _object_picture() -> str:
     return (
         "<img src='object.jpg' alt='the object in one frame' width='100%'><p class='note'>What was "
         "taken for the object. If it is something else, run the same command with <code>--object "

@@ -2,7 +2,6 @@
 
 - `source`: `find_source`, where each input lies.
 - `frames`: `open_frames`, the chosen frames, streamed.
-- `packet_index`: where frames are in a file.
-- `pictures`, `resizing`: one frame as RGB or grey, images and masks at another size.
-- `sharpness`, `blank`: how sharp a frame is, and its pixels that hold no picture.
+- `container`: where frames and times are in a file.
+- `pictures`: one frame as RGB or grey, how sharp it is, images and masks at another size.
 """

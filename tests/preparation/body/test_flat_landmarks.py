@@ -18,17 +18,17 @@ from hoigs.core.interfaces.estimator import (
 )
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_values import BodyFit
-from hoigs.preparation.body.landmarks import ENOUGH, SOLID, USED, LandmarkTrack
+from hoigs.preparation.body.fit_problem import BodyFit
+from hoigs.preparation.body.landmarks import ENOUGH, SOLID, USED, Landmarks
 from hoigs.preparation.body.start import flat_start, place, relaxed
 
 
-def flat(targets: tuple[int, ...]) -> LandmarkTrack:
+def flat(targets: tuple[int, ...]) -> Landmarks:
     """What a 2D detector of another convention sees of the body."""
     image = seen_by([camera()] * FRAMES, truth()).image.numpy()
     keypoints = np.stack([image[:, max(t, 0)] for t in targets], 1)
     found = landmarks_from_keypoints(keypoints, targets).image_xyzv
-    return LandmarkTrack.from_mediapipe(found, np.full_like(found, np.nan))
+    return Landmarks.from_mediapipe(found, np.full_like(found, np.nan))
 
 
 @cache

@@ -11,9 +11,8 @@ from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body import fit_problem
 from hoigs.preparation.body.fit_problem import FitProblem
-from hoigs.preparation.body.kinematics import PER_FRAME, Kinematics
+from hoigs.preparation.body.kinematics import PER_FRAME, Kinematics, NormalEquations
 from hoigs.preparation.body.landmarks import points_of
-from hoigs.preparation.body.normal_equations import NormalEquations
 from hoigs.preparation.body.priors import MotionPrior
 
 STEP = 1e-6

@@ -9,11 +9,10 @@ from torch import Tensor
 
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_values import BodyFit
-from hoigs.preparation.body.kinematics import PER_FRAME
-from hoigs.preparation.body.landmarks import LandmarkTrack
+from hoigs.preparation.body.fit_problem import BodyFit
+from hoigs.preparation.body.kinematics import PER_FRAME, NormalEquations
+from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.body.mask_fit import MaskFit, posed, silhouette
-from hoigs.preparation.body.normal_equations import NormalEquations
 
 UNSEEN = slice(5, FRAMES)
 KNEE, ANKLE, WRIST = 5, 8, 20
@@ -23,11 +22,11 @@ def outlines(pose: BodyPose) -> list[np.ndarray]:
     return [silhouette(vertices, body().faces, camera()) for vertices, _ in posed(body(), pose)]
 
 
-def half_seen() -> LandmarkTrack:
+def half_seen() -> Landmarks:
     whole = seen_by([camera()] * FRAMES, truth())
     image, world = whole.image.clone(), whole.world.clone()
     image[UNSEEN] = world[UNSEEN] = torch.nan
-    return LandmarkTrack(image, world)
+    return Landmarks(image, world)
 
 
 def missed(fit: BodyFit) -> Tensor:

@@ -14,9 +14,9 @@ from hoigs.core.maths.frame_times import Chunking
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit import fit_body, spread
-from hoigs.preparation.body.fit_values import BodyFit, FitOptions
-from hoigs.preparation.body.landmarks import LandmarkTrack
-from hoigs.preparation.body.normal_equations import NormalEquations
+from hoigs.preparation.body.fit_problem import BodyFit, FitOptions
+from hoigs.preparation.body.kinematics import NormalEquations
+from hoigs.preparation.body.landmarks import Landmarks
 
 FRAMES, CHUNKING, QUICK = 48, Chunking(24, 10), FitOptions(steps=20)
 
@@ -34,13 +34,13 @@ def truth() -> BodyPose:
     return pose.replace(global_orient=orient, body=angles, transl=transl)
 
 
-def noisy(cameras: list[Camera]) -> LandmarkTrack:
+def noisy(cameras: list[Camera]) -> Landmarks:
     """Landmarks that are 2 pixels and 2 cm off."""
     seen, generator = seen_by(cameras, truth()), torch.Generator().manual_seed(0)
     image, world = seen.image.clone(), seen.world.clone()
     image[..., :2] += 2 * torch.randn(image[..., :2].shape, generator=generator)
     world += 0.02 * torch.randn(world.shape, generator=generator)
-    return LandmarkTrack(image, world)
+    return Landmarks(image, world)
 
 
 @cache

@@ -12,10 +12,11 @@ from tiny import FRAMES, HEIGHT, WIDTH
 
 from hoigs.core.errors import SpecError
 from hoigs.core.values.lens import Lens
+from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
 from hoigs.preparation.cameras.choose import choose_cameras
-from hoigs.preparation.estimates.given import GivenMasks, RawLandmarks
-from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.estimates.reader import GivenMasks
+from hoigs.preparation.mask_stack import MaskStack
 from hoigs.preparation.options import PrepareOptions, load_options
 from hoigs.preparation.video.frames import VideoFrames
 from hoigs.preparation.video.source import SourceError
@@ -91,24 +92,24 @@ def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
     path = tmp_path / "calib.toml"
     second = POSE2SIM.partition("[metadata]")[0].replace("01", "02").replace("1500", "1600")
     path.write_text(POSE2SIM + second)
-    with pytest.raises(SourceError, match=r"holds cam_01, cam_02; name .*calib\.toml#cam_01"):
+    with pytest.raises(SourceError, match=r"cam_01, cam_02.*calib\.toml#cam_01"):
         read_calibration(str(path), SIZE)
     assert read_calibration(f"{path}#cam_02", SIZE)[0].params[0] == 1600
-    with pytest.raises(SourceError, match="holds cam_01, cam_02"):
+    with pytest.raises(SourceError, match="cam_01, cam_02"):
         read_calibration(f"{path}#cam_03", SIZE)
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("hello", "holds no camera; expected COLMAP's"),
-        ("1 NO_SUCH 3 4 5\n", "NO_SUCH is not a camera model"),
-        (BINARY[:-3], "cannot be read"),
-        (XML.replace("data>", "dat>"), "holds no camera"),
+        ("hello", "COLMAP"),
+        ("1 NO_SUCH 3 4 5\n", "NO_SUCH"),
+        (BINARY[:-3], "calibration.dat"),
+        (XML.replace("data>", "dat>"), "calibration.dat"),
         (XML.replace("<?xml", "<!DOCTYPE x><?xml"), "entities"),
-        (QUALISYS.replace('viewrotation="0"', 'viewrotation="90"'), "turned by 90 degrees"),
-        (OPENCV.replace("0., 0., 1. ]", "0., 1. ]"), "cannot be read"),
-        (b"\0\1\2", "cannot be read"),
+        (QUALISYS.replace('viewrotation="0"', 'viewrotation="90"'), "90"),
+        (OPENCV.replace("0., 0., 1. ]", "0., 1. ]"), "calibration.dat"),
+        (b"\0\1\2", "calibration.dat"),
     ],
 )
 def test_files_that_are_none(content: str | bytes, message: str, tmp_path: Path) -> None:
@@ -120,22 +121,22 @@ def test_files_that_are_none(content: str | bytes, message: str, tmp_path: Path)
 
 def test_sizes_have_to_agree() -> None:
     assert fitting(LENS, (960, 540), "it").params[:4] == (750, 755, 480, 270)
-    with pytest.raises(SourceError, match=r"1920x1080 .* 1080x1920: they are turned"):
+    with pytest.raises(SourceError, match=r"1920x1080 .* 1080x1920.*turned"):
         fitting(LENS, (1080, 1920), "it")
-    with pytest.raises(SourceError, match=r"1920x1080 .* 640x480: another shape"):
+    with pytest.raises(SourceError, match=r"1920x1080 .* 640x480.*shape"):
         fitting(LENS, (640, 480), "it")
-    with pytest.raises(SourceError, match=r"principal point 5000, 2 cannot"):
+    with pytest.raises(SourceError, match=r"5000, 2"):
         fitting(given_intrinsics((1500, 1500, 5000, 2), SIZE), SIZE, "it")
-    with pytest.raises(SpecError, match="3 numbers; expected fx,fy,cx,cy"):
+    with pytest.raises(SpecError, match=r"3 .*fx,fy,cx,cy"):
         load_options(flags={"intrinsics": "1,2,3"})
-    with pytest.raises(SpecError, match="focal and calibration both give"):
+    with pytest.raises(SpecError, match="focal and calibration"):
         load_options(flags={"focal": 3.0, "calibration": "x"})
 
 
 def test_a_still_cameras_frames_are_undistorted(tiny_video: Path, tmp_path: Path) -> None:
     unseen = np.full((FRAMES, 33, 4), np.nan)
     nothing = [np.zeros((HEIGHT // 2, WIDTH // 2), bool)] * FRAMES
-    everything = RawLandmarks(unseen, unseen), GivenMasks(human=MaskStack(nothing))
+    everything = Landmarks.from_mediapipe(unseen, unseen), GivenMasks(human=MaskStack(nothing))
     options = load_options(
         flags={"camera": "static", "intrinsics": f"90,92,{WIDTH / 2 - 0.5},{HEIGHT / 2},-0.3,0,0,0"}
     )
@@ -156,7 +157,5 @@ def test_a_still_cameras_frames_are_undistorted(tiny_video: Path, tmp_path: Path
     expected = same.undistortion((video.width, video.height)).image(image)
     assert (track.undistort.image(image) == expected).all() and (expected != image).any()
     moving = options.model_copy(update={"camera": "auto"})
-    with pytest.raises(
-        SourceError, match="sparse beside the video has a lens already: leave --int"
-    ):
+    with pytest.raises(SourceError, match=r"sparse.*--intrinsics"):
         choose(moving, colmap_model(tmp_path / "sparse"))

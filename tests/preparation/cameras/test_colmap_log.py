@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hoigs.preparation.cameras.motion import quiet_colmap
+from hoigs.preparation.cameras.turning_cameras import quiet_colmap
 
 pycolmap = pytest.importorskip("pycolmap")
 

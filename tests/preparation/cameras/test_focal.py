@@ -10,6 +10,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from tiny import FRAMES, landmarks, picture
 
+from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.cameras.focal import (
     LONGEST,
     SHORTEST,
@@ -18,7 +19,6 @@ from hoigs.preparation.cameras.focal import (
     focal_of_metadata,
     static_focal,
 )
-from hoigs.preparation.estimates.given import RawLandmarks
 from hoigs.preparation.video.frames import VideoFrames, open_frames
 
 WIDTH, HEIGHT = 1280, 720
@@ -86,16 +86,16 @@ def test_which_focal_length_is_taken(tiny_video: Path) -> None:
     raw[..., :2] = (image[..., :2] - (WIDTH / 2, HEIGHT / 2)) * scale + center
     raw[..., 3] = 1
     space = np.concatenate((world, np.ones((*world.shape[:2], 1))), -1)
-    assert static_focal(video, RawLandmarks(raw, space), 70.0).how == "given"
-    found = static_focal(video, RawLandmarks(raw, space), None)
+    assert static_focal(video, Landmarks.from_mediapipe(raw, space), 70.0).how == "given"
+    found = static_focal(video, Landmarks.from_mediapipe(raw, space), None)
     assert found.pixels == pytest.approx(1.1 * wide, rel=0.1) and "estimated" in found.how
     assert "estimated from the person" in found.warnings[0]
     assert found.figures["focal_low_px"] < found.pixels < found.figures["focal_high_px"]
-    flat = static_focal(video, RawLandmarks(raw, space * np.nan), None)
+    flat = static_focal(video, Landmarks.from_mediapipe(raw, space * np.nan), None)
     assert flat.pixels == 0.8 * wide and "assumed" in flat.how
     assert "too few landmarks are known in space" in flat.warnings[0]
     still = landmarks()
-    alike = RawLandmarks(still["image_xyzv"] + 0.3, still["world_xyzv"] * (1, 1, 0, 1))
+    alike = Landmarks.from_mediapipe(still["image_xyzv"] + 0.3, still["world_xyzv"] * (1, 1, 0, 1))
     assert "explain them equally well" in static_focal(video, alike, None).warnings[0]
 
 
@@ -116,7 +116,7 @@ def test_what_files_say(tmp_path: Path) -> None:
     assert found[0] == pytest.approx(26 / 43.267 * np.hypot(96, 64), rel=1e-3)
     assert "26 mm on 35 mm film" in found[1]
     nobody = np.full((FRAMES, 33, 4), np.nan)
-    chosen = static_focal(VideoFrames(path), RawLandmarks(nobody, nobody), None)
+    chosen = static_focal(VideoFrames(path), Landmarks.from_mediapipe(nobody, nobody), None)
     assert chosen.pixels == found[0] and "focal_length.35mm_equivalent" in chosen.how
     photos = tmp_path / "photos"
     photos.mkdir()

@@ -35,9 +35,9 @@ def test_a_camera_that_stands_still_needs_no_points(tmp_path, video):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"points": np.zeros((0, 3))}, "no scene points"),
+        ({"points": np.zeros((0, 3))}, "points"),
         ({"K": np.ones((3, 3, 3))}, "3 of K"),
-        ({"world_to_camera": np.full((FRAMES, 4, 4), np.nan)}, "world_to_camera is"),
+        ({"world_to_camera": np.full((FRAMES, 4, 4), np.nan)}, "world_to_camera"),
     ],
 )
 def test_what_does_not_fit_is_named(tmp_path, video, changes, named):

@@ -47,10 +47,10 @@ def test_cameras_at_the_chosen_width_and_points_of_the_wall_alone(tmp_path, vide
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        (arrays(3), "has 3 frames, and the video's last one is 10"),
-        ({"cam_c2w": np.tile(np.eye(4), (3, 1, 1))}, "its arrays are"),
-        ({"cam_c2w": np.full((FRAMES, 4, 4), np.nan)}, "not finite"),
-        ({"depths": np.zeros_like(arrays()["depths"])}, "no point of its depth"),
+        (arrays(3), " 3 frames.* 10"),
+        ({"cam_c2w": np.tile(np.eye(4), (3, 1, 1))}, "cam_c2w"),
+        ({"cam_c2w": np.full((FRAMES, 4, 4), np.nan)}, "cam_c2w"),
+        ({"depths": np.zeros_like(arrays()["depths"])}, "depth"),
     ],
 )
 def test_what_does_not_fit_is_named(tmp_path, video, changes, named):
@@ -65,7 +65,7 @@ def test_a_source_recognises_it_by_its_arrays(tmp_path, video):
     np.savez(tmp_path / "any name.npz", **arrays(1))
     assert find_source(tmp_path, given=given).cameras == tmp_path / "any name.npz"
     np.savez(tmp_path / "another.npz", **arrays(1))
-    with pytest.raises(SourceError, match=r"another.npz, any name.npz: leave"):
+    with pytest.raises(SourceError, match=r"another.npz, any name.npz"):
         find_source(tmp_path, given=given)
     np.savez(tmp_path / "cameras.npz", K=np.eye(3))
     assert find_source(tmp_path, given=given).cameras == tmp_path / "cameras.npz"

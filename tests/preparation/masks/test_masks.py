@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hoigs.preparation.masks.mask_stack import MaskStack, largest_parts
+from hoigs.preparation.mask_stack import MaskStack, largest_parts
 
 
 def test_odd_widths_survive_the_packing() -> None:

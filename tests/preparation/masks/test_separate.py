@@ -7,8 +7,8 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from hoigs.preparation.masks.mask_stack import MaskStack
-from hoigs.preparation.masks.separate import ColorOdds, _adopted, _without_strays, separate
+from hoigs.preparation.final_masks import ColorOdds, _adopted, _without_strays, separate
+from hoigs.preparation.mask_stack import MaskStack
 
 WIDTH, HEIGHT, F = 90, 120, 6
 ALL = np.ones(F, bool)

@@ -79,11 +79,11 @@ def test_smoothing_drops_outliers_and_keeps_a_ramp() -> None:
 def test_faults(tiny_source: Path) -> None:
     video, path = VideoFrames(tiny_source / "video.mp4"), tiny_source / "ball_track.npz"
     np.savez(path, xyr=truth()[:7])
-    with pytest.raises(SourceError, match=r"xyr has shape \[7, 3\], expected \[12, 3\]"):
+    with pytest.raises(SourceError, match=r"xyr.*\[7, 3\].*\[12, 3\]"):
         load_ball(path, video, Undistortion())
     np.savez(path, xyr=truth() * np.nan)
-    with pytest.raises(SourceError, match="the ball is seen in none"):
+    with pytest.raises(SourceError, match="ball"):
         load_ball(path, video, Undistortion())
     np.savez(path, other=truth())
-    with pytest.raises(SourceError, match="expected an npz with xyr"):
+    with pytest.raises(SourceError, match="xyr"):
         load_ball(path, video, Undistortion())

@@ -8,7 +8,7 @@ import torch
 
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
-from hoigs.preparation.masks.mask_stack import MaskStack
+from hoigs.preparation.mask_stack import MaskStack
 from hoigs.preparation.objects.make_object import doubts, silhouette_ious
 from hoigs.preparation.objects.shape import sphere_points
 

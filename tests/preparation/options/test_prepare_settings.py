@@ -21,5 +21,5 @@ def test_options_of_the_command_line_are_named_as_there():
     height, estimators = sorted(str(caught.value).splitlines(), reverse=True)
     assert height == "--person-height: must be between 0.4 and 2.6 metres, got 170.0"
     assert estimators.startswith("--estimators: must be")
-    with pytest.raises(SpecError, match=r"^command line: --end 2 s .* no frame is left$"):
+    with pytest.raises(SpecError, match=r"command line.*--end 2"):
         load_options(flags={"start": "5", "end": "2"})

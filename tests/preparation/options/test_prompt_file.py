@@ -55,7 +55,7 @@ def test_what_cannot_be_used_is_named(tmp_path: Path) -> None:
     write_prompts(video, StoredPrompts((), ("ann=1,2@0", "ben=3,4@0")))
     options, said = with_stored(PrepareOptions(), video)
     assert options.people == ("ann", "ben") and len(said) == 2
-    for text, message in (("[]", "version None"), ('{"version": 1, "object": [3]}', "a list of")):
+    for text, message in (("[]", "None"), ('{"version": 1, "object": [3]}', "object.*3")):
         prompt_file(video).write_text(text)
         with pytest.raises(SpecError, match=message):
             with_stored(PrepareOptions(), video)

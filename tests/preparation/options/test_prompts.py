@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from hoigs.core.errors import SpecError
-from hoigs.preparation.options import PrepareOptions
+from hoigs.preparation.options import PrepareOptions, Prompt
 from hoigs.preparation.prompts import check_prompts, parse_prompts, placed_prompts, with_prompts
 from hoigs.preparation.video.frames import FrameList
 
@@ -27,18 +27,18 @@ def test_clicks_by_frame() -> None:
 @pytest.mark.parametrize(
     ("texts", "message"),
     [
-        (["1,2,3"], "neither a point nor a box"),
-        (["-1,2,3,4"], "neither a point nor a box"),
+        (["1,2,3"], "1,2,3"),
+        (["-1,2,3,4"], "-1,2,3,4"),
         (["9,9,3,3"], "x0 < x1"),
-        (["640;402"], "neither a point, a box nor words"),
-        (["ball@3"], "neither a point, a box nor words"),
-        (["ball", "football"], "described twice"),
-        (["-3,4"], "only points that are not on it"),
-        (["0,0,3,4", "0,0,5,6"], "has a box already"),
-        (["none", "3,4"], "leave the others out"),
-        (["kettle=none"], "leave the others out, and names"),
-        (["human=1,2"], "human is the person's name"),
-        (["kettle="], "neither a point, a box nor words"),
+        (["640;402"], "640;402"),
+        (["ball@3"], "ball@3"),
+        (["ball", "football"], "ball.*football"),
+        (["-3,4"], "--object"),
+        (["0,0,3,4", "0,0,5,6"], "0,0,5,6"),
+        (["none", "3,4"], "--object none"),
+        (["kettle=none"], "--object none"),
+        (["human=1,2"], "human"),
+        (["kettle="], "--object"),
     ],
 )
 def test_what_is_wrong_is_named(texts: list[str], message: str) -> None:
@@ -62,30 +62,33 @@ def test_prompts_become_options() -> None:
     assert with_prompts(untouched, (), {"masks": object()}) is untouched
 
 
+def given(*places: str) -> dict[str, Prompt]:
+    return with_prompts(PrepareOptions(), places).prompts
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("64.5,3", r"64\.5,3 in frame 0, is outside of the picture, which is 64x48"),
-        ("1,1,20,60@2", "1,1,20,60|20,60 in frame 2, is outside"),
-        ("3,4@10", "is in frame 10; .* 0 to 9"),
+        ("64.5,3", r"64\.5,3 in frame 0.*64x48"),
+        ("1,1,20,60@2", "20,60 in frame 2"),
+        ("3,4@10", "frame 10.* 0 to 9"),
     ],
 )
 def test_prompts_outside_of_the_video(text: str, message: str) -> None:
     with pytest.raises(SpecError, match=message):
-        check_prompts(placed_prompts(with_prompts(PrepareOptions(), text), FOUND), FOUND)
-    check_prompts(with_prompts(PrepareOptions(), ["64,48", "3,4@9"]), FOUND)
+        check_prompts(placed_prompts(given(text), FOUND), FOUND)
+    check_prompts(given("64,48", "3,4@9"), FOUND)
 
 
 def test_prompts_count_frames_of_the_video_wherever_it_is_started() -> None:
     late = replace(FOUND, first=4, indices=[4, 6, 8])
-    options = with_prompts(PrepareOptions(), ["3,4", "9,9@8", "-1,1@4"])
-    prompt = placed_prompts(options, late).prompts["object"]
+    prompt = placed_prompts(given("3,4", "9,9@8", "-1,1@4"), late)["object"]
     assert [at.frame for at in prompt.places()] == [4, 8]
     assert prompt.points == [(3, 4, True), (1, 1, False)]
-    with pytest.raises(SpecError, match=r"in frame 2; .* are 4 to 9 .* whatever --start is"):
-        check_prompts(with_prompts(PrepareOptions(), "3,4@2"), late)
-    with pytest.raises(SpecError, match="frame 4 has two boxes"):
-        placed_prompts(with_prompts(PrepareOptions(), ["0,0,3,4", "0,0,5,6@4"]), late)
+    with pytest.raises(SpecError, match=r"frame 2.* 4 to 9"):
+        check_prompts(given("3,4@2"), late)
+    with pytest.raises(SpecError, match="frame 4"):
+        placed_prompts(given("0,0,3,4", "0,0,5,6@4"), late)
 
 
 def test_a_person_is_chosen_as_an_object_is() -> None:
@@ -96,9 +99,9 @@ def test_a_person_is_chosen_as_an_object_is() -> None:
     assert with_prompts(PrepareOptions(), (), person="anna=320,210").human == "anna"
     alone = with_prompts(PrepareOptions(), "ball=3,4", person="none")
     assert alone.people == () and alone.objects == ("ball",)
-    with pytest.raises(SpecError, match="leave nothing to fit"):
+    with pytest.raises(SpecError, match=r"--person.*--object"):
         with_prompts(PrepareOptions(), "none", person="none")
-    with pytest.raises(SpecError, match="leave the others out"):
+    with pytest.raises(SpecError, match="--person"):
         with_prompts(PrepareOptions(), person=["none", "3,4"], texts=())
 
 
@@ -108,5 +111,5 @@ def test_several_people_have_names() -> None:
     assert set(options.prompts) == {"object", "anna", "ben"}
     both = with_prompts(PrepareOptions(), (), person=["3,2", "anna=5,2"])
     assert both.people == ("human", "anna")
-    with pytest.raises(SpecError, match="ball is an object's name"):
+    with pytest.raises(SpecError, match="ball"):
         with_prompts(PrepareOptions(), "ball=3,4", person="ball=3,2")

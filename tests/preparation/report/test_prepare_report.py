@@ -1,14 +1,11 @@
-"""The report gives every number in JSON and in words; stages add up to one progress."""
+"""The report gives every number in JSON and in words."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
-import pytest
-
 from hoigs.preparation.report.report import PrepareReport
-from hoigs.preparation.stages import Stages
 
 
 def report() -> PrepareReport:
@@ -17,7 +14,7 @@ def report() -> PrepareReport:
         parallax_degrees=0.0, coverage={"human": [0.2] * 40, "object": [0.0] * 10 + [0.05] * 30},
         body_residual_px=3.25, scene_scale=1.0, object_scale_spread=0.021, object_observed=0.75,
         scene_points=1234, provenance={"cameras": "assumed"}, warnings=["beware of the dog"],
-        seconds={"frames": 0.5, "body": 20.0},
+        seconds={"frames": 0.5, "people": 20.0},
     )  # fmt: skip
 
 
@@ -33,16 +30,4 @@ def test_files(tmp_path: Path) -> None:
 
 def test_rows_have_three_cells() -> None:
     assert all(len(row) == 3 for row in report().rows())
-    assert ("time", "20 s", "frames 0.5, body 20.0") in report().rows()
-
-
-def test_progress_runs_from_0_to_1() -> None:
-    seen: list[tuple[float, str]] = []
-    stages = Stages({"a": 1, "b": 3}, lambda done, text: seen.append((done, text)))
-    with stages.stage("a"):
-        assert list(stages.track("xy", 2)) == ["x", "y"]
-    with stages.stage("b"):
-        stages.advance(0.5)
-    values = [done for done, _ in seen]
-    assert values == sorted(values) and values[0] == 0 and values[-1] == pytest.approx(1)
-    assert (0.625, "b") in seen and set(stages.seconds) == {"a", "b"}
+    assert ("time", "20 s", "frames 0.5, people 20.0") in report().rows()

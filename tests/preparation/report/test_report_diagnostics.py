@@ -12,9 +12,8 @@ import torch
 from test_prepare_report import report
 
 from hoigs.core.values.camera import Camera
-from hoigs.preparation.cameras.multiview import angular_factor, full_factor
-from hoigs.preparation.report.diagnostics import diagnose
-from hoigs.preparation.report.report import plot, report_page
+from hoigs.preparation.cameras.camera_track import angular_factor, full_factor
+from hoigs.preparation.report.report import diagnose, plot, report_page
 
 
 def states(**changes: object) -> dict[str, tuple[str, str]]:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from hoigs.core.values.camera import Camera
-from hoigs.preparation.scene.scene_points import densify, interpolated_depth, keyframes
+from hoigs.preparation.scene_points import densify, interpolated_depth, keyframes
 
 WIDTH, HEIGHT = 96, 64
 

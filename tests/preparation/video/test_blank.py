@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hoigs.preparation.choose_frames import blank_pixels
+from hoigs.preparation.final_masks import blank_pixels
 
 
 def picture() -> np.ndarray:

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from av.filter import Graph
 
-from hoigs.preparation.video.colors import converted
 from hoigs.preparation.video.frames import open_frames
-from hoigs.preparation.video.pictures import VideoPicture
+from hoigs.preparation.video.pictures import VideoPicture, converted
 from hoigs.preparation.video.source import SourceError, find_source
 from hoigs.viewing.annotate.video import ScrubbedVideo
 

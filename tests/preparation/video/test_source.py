@@ -39,13 +39,13 @@ def test_a_bare_video_names_all_that_is_absent(tiny_video: Path) -> None:
 def test_an_empty_folder_names_the_video_too(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"a video \(\.mp4"):
         find_source(tmp_path)
-    with pytest.raises(SourceError, match="does not exist"):
+    with pytest.raises(SourceError, match=r"nothing\b"):
         find_source(tmp_path / "nothing")
 
 
 def test_two_videos_are_ambiguous(tiny_source: Path) -> None:
     shutil.copy(tiny_source / "video.mp4", tiny_source / "other.MOV")
-    with pytest.raises(SourceError, match=r"holds 2 videos \(other\.MOV, video\.mp4\)"):
+    with pytest.raises(SourceError, match=r"other\.MOV, video\.mp4"):
         find_source(tiny_source)
 
 
@@ -61,7 +61,7 @@ def test_masks_apart(tiny_source: Path) -> None:
 
 def test_an_empty_sparse_folder_is_not_a_static_camera(tiny_source: Path) -> None:
     (tiny_source / "sparse").mkdir()
-    with pytest.raises(SourceError, match="no COLMAP model is in it"):
+    with pytest.raises(SourceError, match="COLMAP"):
         find_source(tiny_source)
     (tiny_source / "sparse/0").mkdir()
     for name in ("cameras", "images", "points3D"):
@@ -72,7 +72,7 @@ def test_an_empty_sparse_folder_is_not_a_static_camera(tiny_source: Path) -> Non
 def test_an_empty_video_is_said_before_what_is_absent(tmp_path: Path) -> None:
     (tmp_path / "video.mp4").write_bytes(b"")
     for path in (tmp_path, tmp_path / "video.mp4"):
-        with pytest.raises(SourceError, match=r"video\.mp4 is empty: 0 bytes"):
+        with pytest.raises(SourceError, match=r"video\.mp4.*0 bytes"):
             find_source(path)
 
 

@@ -1,10 +1,10 @@
-"""Masks of a video's frames: kept as bits, measured, cleaned."""
+"""Masks of all frames, packed; their outlines and parts."""
 
 from __future__ import annotations
 
 import tempfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from scipy import ndimage
 from hoigs.core.maths.frame_times import fill_gaps
 from hoigs.preparation.video.source import SourceError
 
+Images = Callable[[], Iterable[UInt8[np.ndarray, "H W 3"]]]  # all frames anew on every call
 LEVEL = 1  # of zlib, its fastest
 
 

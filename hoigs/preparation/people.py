@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -20,14 +20,14 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.body_files import FileBody
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_values import FitOptions, Joint
-from hoigs.preparation.body.landmarks import FrameFates, LandmarkTrack
+from hoigs.preparation.body.fit_problem import FitOptions, Joint
+from hoigs.preparation.body.landmarks import FrameFates, Landmarks
 from hoigs.preparation.body.mask_fit import posed
 from hoigs.preparation.cameras.camera_track import CameraTrack
-from hoigs.preparation.estimates.given import RawLandmarks
-from hoigs.preparation.estimates.reader import RawEstimates, UndistortedEstimates
-from hoigs.preparation.masks.mask_stack import MaskStack, outlines_of
-from hoigs.preparation.options import PrepareOptions, Prompt
+from hoigs.preparation.estimates.reader import FrameEstimates
+from hoigs.preparation.mask_stack import MaskStack, outlines_of
+from hoigs.preparation.objects.ball import BallTrack
+from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Frames
 
 # A clip of objects alone: what the person would have given, supposed instead and named so.
@@ -38,28 +38,27 @@ HEIGHT = 0.5  # of the object's distance: how far below a still camera the floor
 
 
 @dataclass(frozen=True)
-class Nobody:
-    """The world of a clip without a person.
+class Unit:
+    """What turns the unit of the cameras' own world into metres.
 
     Attributes:
-        scene_scale: metres a unit of the cameras' own world.
-        depths: of the object along the view, metres.
-        ground: y of the floor under a camera that stays in one place, if y points down.
+        metres: of one unit.
+        ground: y of the floor, if y points down: the largest of the first person's body, median
+            over frames.
+        distance: median depth of the first person's pelvis, or of the object, metres.
+        depths: in a clip of objects alone, of the first object along the view, metres.
     """
 
-    scene_scale: float
-    depths: Float[np.ndarray, " F"]
+    metres: float
     ground: float
-    provenance: str
-    warnings: list[str] = field(default_factory=list)
-
-    def distance(self, cameras: Sequence[Camera]) -> float:
-        """Median depth of the object, metres."""
-        return float(np.median(self.depths))
+    distance: float
+    depths: Float[np.ndarray, " F"] | None = None
 
 
-def nobody(masks: MaskStack | None, track: CameraTrack, size: float | None) -> Nobody:
-    """The world whose unit is the object's size.
+def unit_of_object(
+    masks: MaskStack | None, track: CameraTrack, size: float | None
+) -> tuple[Unit, str, list[str]]:
+    """The world whose unit is the object's size, what it was made from, and warnings.
 
     Args:
         masks: of the first object; None, or empty: nothing was found.
@@ -86,7 +85,8 @@ def nobody(masks: MaskStack | None, track: CameraTrack, size: float | None) -> N
         f"nobody is in the clip, so nothing shows its scale: the object is taken to be {SIZE:g} m "
         "across (--set object_size=0.2, if it is), and all distances follow"
     ]  # fmt: skip
-    return Nobody(scale, depths, HEIGHT * float(np.median(depths)), text, warnings)
+    distance = float(np.median(depths))
+    return Unit(scale, HEIGHT * distance, distance, depths), text, warnings
 
 
 def _own_depth(masks: MaskStack, track: CameraTrack) -> float:
@@ -114,7 +114,7 @@ POOR_FIT = 0.02  # of the image's longer side: a fit that misses by more deserve
 
 
 @dataclass(frozen=True)
-class FittedBody:
+class Body:
     """A body in the world, metres.
 
     Attributes:
@@ -150,50 +150,27 @@ class FittedBody:
         return float(torch.stack(depths).median())
 
 
-@dataclass(frozen=True)
-class FittedPeople:
-    """Everybody's body, by name, the first one's first; in a clip of objects alone, `nobody`."""
-
-    people: dict[str, FittedBody]
-    nobody: Nobody | None = None
-
-    @property
-    def first(self) -> FittedBody | None:
-        return next(iter(self.people.values()), None)
-
-    @property
-    def world(self) -> FittedBody | Nobody:
-        """What gives the world its unit, its floor and its depth."""
-        found = self.first or self.nobody
-        assert found is not None  # one of both is made
-        return found
-
-    def warnings(self) -> list[str]:
-        """Sentences for the report, which name the person where there are several."""
-        if self.nobody is not None:
-            return self.nobody.warnings
-        several = len(self.people) > 1
-        return [
-            f"{name}: {text}" if several else text
-            for name, person in self.people.items()
-            for text in person.warnings
-        ]
+def people_warnings(bodies: Mapping[str, Body]) -> list[str]:
+    """Sentences for the report, which name the person where there are several."""
+    return [
+        f"{name}: {text}" if len(bodies) > 1 else text
+        for name, person in bodies.items()
+        for text in person.warnings
+    ]
 
 
 def fit_person(
-    landmarks: LandmarkTrack,
+    landmarks: Landmarks,
     track: CameraTrack,
     body: BodyModel,
     steps: int,
     progress: Callable[[float], None] | None = None,
-    source: str = "MediaPipe",
     masks: MaskStack | None = None,
     times: Float[Tensor, " F"] | None = None,
     turns: Float[Tensor, "F 21 3"] | None = None,
     height: float | None = None,
     chunking: Chunking | None = None,
-    fates: FrameFates = FrameFates(),  # noqa: B008 - frozen
-) -> FittedBody:
+) -> Body:
     """Fits the body to landmarks, and masks if there are any, in at most `steps`; finds the scale
     of a world that has none.
 
@@ -202,14 +179,13 @@ def fit_person(
         turns: axis-angle of the body's joints 1..21, about.
         height: of the person who stands upright, metres; None: the body model's mean.
         chunking: fit window by window.
-        fates: what the estimator says of frames without landmarks, and of others.
     """
     given, strays = landmarks, landmarks.strays()
     jumps = landmarks.without(strays).jumps()
     landmarks = landmarks.without(strays | jumps)
     strays |= landmarks.strays()  # single frames between those that jumped
     landmarks = landmarks.without(strays)
-    fates = fates.complete(given, {STRAY: strays, OFF_THE_WAY: jumps & ~strays})
+    fates = given.fates.complete(given, {STRAY: strays, OFF_THE_WAY: jumps & ~strays})
     options = FitOptions(scale=not track.metric, steps=steps)
     if height is not None:
         options = replace(options, mean_size=height / stature(body))
@@ -226,7 +202,7 @@ def fit_person(
         joints[i], lowest[i] = at, vertices[:, 1].max()
     residual = float(fit.residual_px.nanmedian())
     found, solid = int(landmarks.found.sum()), int(landmarks.solid.sum())
-    return FittedBody(
+    return Body(
         poses=fit.poses,
         joints=joints,
         scene_scale=fit.scene_scale,
@@ -235,8 +211,8 @@ def fit_person(
         ground=float(lowest.median()),
         found=landmarks.found.numpy(),
         provenance=(
-            f"fitted to {source} landmarks{'' if solid else ' in the image only'} of {found} of "
-            f"{len(track.cameras)} frames{'' if masks is None else ' and to masks'}, "
+            f"fitted to {landmarks.source} landmarks{'' if solid else ' in the image only'} of "
+            f"{found} of {len(track.cameras)} frames{'' if masks is None else ' and to masks'}, "
             f"{residual:.1f} px off (median of frames); hands are not fitted"
             f"{'' if chunking is None else _windows(fit.joints, chunking)}"
         ),
@@ -308,7 +284,7 @@ def _warnings(residual: float, found: int, solid: int, cameras: Sequence[Camera]
     return warnings
 
 
-def _unseen(landmarks: LandmarkTrack) -> list[str]:
+def _unseen(landmarks: Landmarks) -> list[str]:
     """A sentence for the report if parts of the body are hardly ever seen, else nothing."""
     seen = landmarks.image[landmarks.found][..., 2] > SEEN
     parts = [name for name, marks in PARTS.items() if seen[:, marks].any(1).float().mean() < RARELY]
@@ -329,49 +305,41 @@ def _unseen(landmarks: LandmarkTrack) -> list[str]:
 
 
 def fit_people(
-    names: Sequence[str],
-    found: UndistortedEstimates,
-    raw: RawEstimates,
+    estimates: FrameEstimates,
+    ball: BallTrack | None,
     track: CameraTrack,
     body: BodyModel,
     options: PrepareOptions,
     video: Frames,
-    bodies: FileBody | None,
+    file: FileBody | None,
     progress: Callable[[float], None],
-) -> dict[str, FittedBody]:
-    """Bodies by name. The first one's gives a world without scale its unit; the others stand in it.
+) -> tuple[dict[str, Body], Unit]:
+    """Bodies by name, and the unit of a world without scale, which is the first one's; the others
+    stand in it.
 
     Args:
-        bodies: of another program, of the first person.
+        file: another program's body of the first person.
     """
-    first, *further = names
-    times = torch.tensor(video.times)
-    assert found.landmarks is not None and raw.landmarks is not None  # somebody is looked for
-    share = partial(_share, progress, len(names))
+    (first, landmarks), *further = estimates.landmarks.items()
+    times, share = torch.tensor(video.times), partial(_share, progress, len(further) + 1)
     fitted = fit_person(
-        found.landmarks, track, body, options.fit_steps, partial(share, 0), raw.landmarks.source,
-        found.masks.persons(found.ball), times,
-        None if bodies is None else bodies.rotations(video.indices), options.person_height,
-        options.chunking, fates=_of_clip(raw.landmarks, track),
+        landmarks, track, body, options.fit_steps, partial(share, 0),
+        estimates.masks.persons(ball), times,
+        None if file is None else file.rotations(video.indices), options.person_height,
+        options.chunking,
     )  # fmt: skip
-    if bodies is not None:
-        text = f"{fitted.provenance}; {bodies.used(video.indices)}"
+    if file is not None:
+        text = f"{fitted.provenance}; {file.used(video.indices)}"
         fitted = replace(fitted, provenance=text)
     people, world = {first: fitted}, _in_metres(track, fitted.scene_scale)
-    for k, name in enumerate(further):
-        person = found.further[name]
+    for k, (name, marks) in enumerate(further):
         people[name] = fit_person(
-            person.landmarks, world, body, options.fit_steps, partial(share, k + 1),
-            raw.further[name].landmarks.source, person.masks, times,
-            chunking=options.chunking, fates=_of_clip(raw.further[name].landmarks, track),
+            marks, world, body, options.fit_steps, partial(share, k + 1),
+            estimates.further[name], times, chunking=options.chunking,
         )  # fmt: skip
-    return people
-
-
-def _of_clip(landmarks: RawLandmarks, track: CameraTrack) -> FrameFates:
-    """Of the frames that have a camera."""
-    fates = landmarks.fates
-    return FrameFates.at(fates.lost, fates.repaired, track.positions)
+    scale = fitted.scene_scale
+    distance = fitted.distance([camera.scaled(scale) for camera in track.cameras])
+    return people, Unit(scale, fitted.ground, distance)
 
 
 def _share(progress: Callable[[float], None], count: int, number: int, done: float) -> None:
@@ -391,27 +359,19 @@ def _in_metres(track: CameraTrack, scale: float) -> CameraTrack:
 
 def chosen_people(
     options: PrepareOptions, found: Sequence[FramePrompt]
-) -> tuple[PrepareOptions, str]:
-    """Options with prompts of the first one found, or of all, and a sentence that says so; as they
-    were, and "", where fewer than two are found."""
+) -> tuple[dict[str, FramePrompt], str]:
+    """The first one found, or all, by name, and a sentence that says so; nobody, and "", where
+    fewer than two are found."""
     if len(found) < 2:
-        return options, ""
+        return {}, ""
     taken = found if options.everybody else found[:1]
     names = [options.human, *(f"{options.human}{k + 2}" for k in range(len(taken) - 1))]
-    prompts = {
-        name: Prompt(box=at.box, frame=at.frame) for name, at in zip(names, taken, strict=True)
-    }
-    changed = options.model_copy(
-        update={
-            "further_people": tuple(names[1:]),
-            "prompts": {**options.prompts, **prompts},
-        }
-    )
+    boxes = dict(zip(names, taken, strict=True))
     places = ", ".join(_middle(at) for at in found)
     said = f"{len(found)} people are seen in frame {found[0].frame}, at {places}: "
     if options.everybody:
-        return changed, said + f"all are fitted, as {', '.join(names)}"
-    return changed, said + (
+        return boxes, said + f"all are fitted, as {', '.join(names)}"
+    return boxes, said + (
         f"the one at {_middle(found[0])} is fitted (--person X,Y@FRAME chooses another, several "
         "with names, --person anna=X,Y; --person all takes everybody)"
     )
