@@ -6,11 +6,13 @@ import pytest
 import torch
 from raster_scenes import CUT, a_camera, images, random_scene
 
-from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.errors import RenderError
+from hoigs.core.interfaces.rasterizer import Rasterizer, RenderRequest
 from hoigs.rasterizers import compositing
 from hoigs.rasterizers.compositing import compositing_weights, prepare, splat_alphas
 from hoigs.rasterizers.oracle import OracleRasterizer
 from hoigs.rasterizers.torch_tiles import TorchRasterizer, tile_intersections
+from hoigs.rasterizers.warp import WarpRasterizer
 from hoigs.testing.rasterizer import CHECKS, RasterizerSubject
 
 
@@ -83,3 +85,12 @@ def test_the_oracle_ignores_cutoffs_by_default() -> None:
     cut = CUT.render(gaussians, camera)
     assert default.color.dtype == torch.float64
     assert 1e-4 < float((default.color - cut.color).abs().max()) < 0.1
+
+
+@pytest.mark.parametrize("rasterizer", [TorchRasterizer(), OracleRasterizer(), WarpRasterizer()])
+def test_arguments_of_another_type_are_named(rasterizer: Rasterizer) -> None:
+    gaussians, camera = random_scene(3), a_camera()
+    with pytest.raises(RenderError, match=r"gaussians is of type Camera, expected Gaussians"):
+        rasterizer.render(camera, gaussians)  # type: ignore[arg-type]
+    with pytest.raises(RenderError, match=r"request is of type int"):
+        rasterizer.render(gaussians, camera, 3)  # type: ignore[arg-type]
