@@ -6,7 +6,8 @@ import pytest
 import torch
 from raster_scenes import CUT, a_camera, images, random_scene
 
-from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.errors import RenderError
+from hoigs.core.interfaces.rasterizer import Rasterizer, RenderRequest
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers import compositing
 from hoigs.rasterizers.compositing import compositing_weights, prepare, splat_alphas
@@ -99,3 +100,12 @@ def test_gaussians_in_the_camera_and_on_its_plane(backend) -> None:  # F20
     assert output.color.isfinite().all() and not output.info["radii"][len(scene) :].any()
     assert all(field.grad.isfinite().all() for field in (leaf.means, leaf.log_scales, leaf.quats))
     assert leaf.means.grad[: len(scene)].any() and not leaf.means.grad[len(scene) :].any()
+
+
+@pytest.mark.parametrize("rasterizer", [TorchRasterizer(), OracleRasterizer(), WarpRasterizer()])
+def test_arguments_of_another_type_are_named(rasterizer: Rasterizer) -> None:
+    gaussians, camera = random_scene(3), a_camera()
+    with pytest.raises(RenderError, match=r"gaussians is of type Camera, expected Gaussians"):
+        rasterizer.render(camera, gaussians)  # type: ignore[arg-type]
+    with pytest.raises(RenderError, match=r"request is of type int"):
+        rasterizer.render(gaussians, camera, 3)  # type: ignore[arg-type]

@@ -145,8 +145,18 @@ class Rasterizer(Configurable, ABC):
 
     def check_inputs(self, gaussians: Gaussians, camera: Camera, request: RenderRequest) -> None:
         """The checks that every backend shares; call first in `render`."""
-        device = gaussians.means.device
         name = type(self).__name__
+        for key, value, kind in (
+            ("gaussians", gaussians, Gaussians),
+            ("camera", camera, Camera),
+            ("request", request, RenderRequest),
+        ):
+            if not isinstance(value, kind):
+                raise RenderError(
+                    f"{name}: {key} is of type {type(value).__name__}, expected {kind.__name__}; "
+                    "the order is render(gaussians, camera, request)"
+                )
+        device = gaussians.means.device
         if device.type not in self.capabilities.devices:
             raise RenderError(
                 f"{name}: Gaussians are on {device}, expected one of "

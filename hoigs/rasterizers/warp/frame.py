@@ -160,7 +160,7 @@ class InputValidation:
         key = tuple(
             (x.shape, x.dtype, x.device) if isinstance(x, Tensor) else x
             for value in (gaussians, camera, request)
-            for x in vars(value).values()
+            for x in getattr(value, "__dict__", {}).values()  # the check names other types
         )
         settings = self._passed.get(key)
         if settings is None:
