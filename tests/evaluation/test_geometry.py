@@ -175,14 +175,18 @@ def test_a_turned_and_shifted_object_is_told_by_how_much(known: Clip, truth: Tru
     assert found["human_accuracy"] < 0.02
 
 
-def test_transparent_gaussians_are_no_surface(known: Clip, truth: Truth) -> None:
+@pytest.mark.parametrize(("opacity", "counts"), [(0.49, False), (0.51, True)])
+def test_transparent_gaussians_are_no_surface(
+    known: Clip, truth: Truth, opacity: float, counts: bool
+) -> None:
     things = _things(truth)
     strayed = np.concatenate((things, things + 5.0), 1)
     model = _true_model(truth, strayed)
     with torch.no_grad():
-        model.entity("object").opacity_logits[600:] = -3.0
+        model.entity("object").opacity_logits[600:] = torch.tensor(opacity).logit()
     found = measure_geometry(model, known, known.split["test"])
-    assert found["object_accuracy"] < 0.02 and found["object_rotation"] < 0.02
+    assert (found["object_accuracy"] > 1000) == counts  # half of the points are 9 metres away
+    assert counts or (found["object_accuracy"] < 0.02 and found["object_rotation"] < 0.02)
 
 
 def test_what_cannot_be_measured_says_why(

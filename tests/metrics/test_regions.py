@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from hoigs.core.values.camera import Camera
@@ -49,7 +51,21 @@ def test_dilation_is_a_square_and_leaves_its_input_alone() -> None:
     expected = torch.zeros(9, 9, dtype=torch.bool)
     expected[2:7, 2:7] = True
     assert grown.equal(expected) and int(mask.sum()) == 1
-    assert dilate(mask, 0).equal(mask)
+    assert dilate(mask, 0).equal(mask) and int(dilate(mask, 1).sum()) == 9
+
+
+def test_regions_leave_out_what_shows_no_scene_and_what_is_not_known() -> None:
+    drawn = frame(a=(slice(5, 15), slice(0, 10)), box=(slice(8, 12), slice(12, 18)))
+    no_scene = torch.zeros(20, 30, dtype=torch.bool)
+    no_scene[:10] = True
+    kinds = {"a": "human", "box": "object"}
+    whole = region_masks(drawn, kinds, band=3)
+    for name, mask in region_masks(replace(drawn, ignored=no_scene), kinds, band=3).items():
+        assert mask.equal(whole[name] & ~no_scene)
+    found = region_masks(replace(drawn, unknown=frozenset({"box"})), kinds, band=3)
+    empty = {name for name, mask in found.items() if not mask.any()}
+    assert empty == {"object", "human_object", "interaction", "background"}
+    assert found["human"].equal(whole["human"]) and found["full"].all()
 
 
 def test_band_follows_the_resolution() -> None:

@@ -39,6 +39,12 @@ def test_large_ones_are_split_by_the_absolute_gradient() -> None:
     ]  # 3DGS is blind to 2
 
 
+def test_the_threshold_is_that_of_absgs() -> None:
+    stats = statistics([0.0, 0.0], absolute=[3.9e-4, 4.1e-4])
+    control = AbsoluteGradientDensity(AbsoluteGradientDensity.Config(keep=1))
+    assert sources(control, cloud([LARGE, LARGE]), stats) == [0, 1, 1]
+
+
 def test_clones_by_the_absolute_gradient_too() -> None:
     canonical = cloud([SMALL, SMALL, LARGE])
     stats = statistics([1e-3, 1e-5, 1e-3], absolute=[1e-3, 1e-3, 7e-4])

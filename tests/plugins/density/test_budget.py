@@ -9,7 +9,13 @@ from density_cases import cloud, refine, statistics, varied
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.plugins.density.budget import BudgetDensity, BudgetDensityConfig, importance, over_median
+from hoigs.plugins.density.budget import (
+    BudgetDensity,
+    BudgetDensityConfig,
+    importance,
+    over_median,
+    shares,
+)
 
 
 def seen(canonical: Gaussians, seed: int = 0):
@@ -68,6 +74,12 @@ def test_all_dead_still_reach_the_count() -> None:
     assert len(decision.canonical) == 20
 
 
+def test_all_dead_alike_still_reach_the_count() -> None:
+    canonical = cloud([0.01] * 6, [1e-4] * 6)
+    control = BudgetDensity(BudgetDensity.Config(count=9, stop=0.1))
+    assert len(refine(control, canonical, seen(canonical)).canonical) == 9
+
+
 def test_too_many_lose_the_lowest_scores() -> None:
     canonical = varied(30)
     stats = seen(canonical)
@@ -116,6 +128,20 @@ def test_the_score_is_of_medians_and_of_what_was_seen() -> None:
     torch.testing.assert_close(
         importance(canonical, stats), torch.tensor(expected), rtol=1e-4, atol=0
     )
+    canonical = cloud([0.1, 0.2, 0.1], [0.2, 0.4, 0.8])
+    stats = statistics([2e-4, 2e-4, 2e-4], [20.0, 5, 10], loss=[1.0, 1.0, 1.0])
+    # gradient 25, opacity 100, radius 10, volume 25 (Taming 3DGS, Sec. 3.2)
+    expected = [3 * sum(x) for x in ((25, 50, 20, 25), (25, 100, 5, 200), (25, 200, 10, 25))]
+    torch.testing.assert_close(
+        importance(canonical, stats), torch.tensor(expected, dtype=torch.float32)
+    )
+
+
+def test_a_draw_is_in_proportion_to_the_score() -> None:
+    score, alive = torch.tensor([1.0, 1.0, 8.0]), torch.tensor([True] * 3)
+    generator, above = torch.Generator().manual_seed(0), torch.tensor([False] * 3)
+    drawn = sum(shares(1, score, alive, above, generator) for _ in range(4000)) / 4000
+    torch.testing.assert_close(drawn, score / 10, rtol=0, atol=0.02)
 
 
 def test_draws_repeat_by_seed() -> None:
@@ -130,7 +156,7 @@ def test_draws_repeat_by_seed() -> None:
 
 def test_a_window_without_refinements_is_refused() -> None:
     canonical = varied(5)
-    with pytest.raises(HoigsError, match=r"50 steps at an interval of 100.*lower `interval`"):
+    with pytest.raises(HoigsError, match=r"50 steps .* 100"):
         refine(
             BudgetDensity(BudgetDensity.Config(count=9)),
             canonical,

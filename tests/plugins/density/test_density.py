@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from density_cases import cloud, refine, statistics
+from density_cases import EXTENT, cloud, refine, statistics
 
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.model.entity import Entity
@@ -39,6 +39,16 @@ def test_clone_split_prune_by_hand():
         new.scales[:, 0], torch.tensor([0.01, 0.01, 0.5, 0.01, 0.3125, 0.3125])
     )
     assert decision.reset_opacity is None
+
+
+def test_thresholds_are_those_of_3dgs():
+    """Gradient 2e-4, scale 1 % of the extent, opacity 0.005; each Gaussian is just on one side."""
+    small, large = 0.0099 * EXTENT, 0.0101 * EXTENT
+    canonical = cloud([small, large, small, large, small, small], [0.5] * 4 + [0.0049, 0.0051])
+    stats = statistics([2.1e-4, 2.1e-4, 1.9e-4, 1.9e-4, 2.1e-4, 0.0])
+    decision = refine(adaptive_density(keep=1), canonical, stats)
+    # 0 is cloned, 1 is split, 4 is pruned
+    assert decision.change.source.tolist() == [0, 2, 3, 5, 0, 1, 1]
 
 
 def test_split_children_are_drawn_from_the_parent():

@@ -163,6 +163,12 @@ def test_penalties_are_means_of_activated_values() -> None:
     )
 
 
+def test_penalties_of_one_and_of_none() -> None:
+    control = McmcDensity(McmcDensity.Config())
+    assert set(control.regularizers(varied(1))) == {"opacity_l1", "scale_l1"}
+    assert control.regularizers(varied(1)[:0]) == {}
+
+
 def keyed_entity() -> Entity:
     """Keyframes, rotations and opacities that differ from knot to knot."""
     generator = torch.Generator().manual_seed(5)

@@ -48,6 +48,7 @@ def test_body_parts_are_means_over_each_part(toy_body, toy_pose):
         entity.deformation.planes.time.normal_()
     tokens = entity.tokens(moment)
     assert tokens.features.shape == (16, 96) and entity.features.width == 96
+    assert not entity.features.state_dict()  # averages follow from the body
     features, places = entity.deformation.posed_field(entity.canonical, moment)
     parts = entity.deformation.field_parts()
     for part in range(16):
@@ -61,12 +62,12 @@ def test_body_parts_are_means_over_each_part(toy_body, toy_pose):
 
 
 def test_an_empty_part_is_told():
-    with pytest.raises(ValueError, match="no points of right foot"):
+    with pytest.raises(ValueError, match="right foot"):
         part_averages(torch.arange(15))
 
 
 def test_body_parts_need_a_field():
-    with pytest.raises(ValueError, match=r"requires field, but Static provides nothing"):
+    with pytest.raises(ValueError, match=r"field.*Static"):
         Entity(Gaussians.from_points(torch.randn(4, 3)), Static(), BodyPartFeatures())
 
 
@@ -136,13 +137,13 @@ def test_velocity_is_the_derivative_or_the_interpolated_tangents():
     entity.tokens(between).features.square().sum().backward()
     assert model.tangents.grad[:, 1:3].abs().max() > 0  # and no position is needed
     assert model.keyframe_means.grad is None
-    with pytest.raises(ValueError, match="no learned tangents"):
+    with pytest.raises(ValueError, match="CubicHermite"):
         thing(
             SplineMotionFeatures(SplineMotionConfig(velocity="keyframes")),
             tangents="finite-difference",
         )
     model.knots.movable = True
-    with pytest.raises(ValueError, match="at fixed keyframes"):
+    with pytest.raises(ValueError, match="CubicHermite"):
         features.bind(model, entity.canonical)
 
 
@@ -163,6 +164,27 @@ def test_rows_of_the_embedding_follow(kind):
     torch.testing.assert_close(entity.tokens(Moment(0.4)).features, before[source])
 
 
+@pytest.mark.parametrize("features", [SplineMotionFeatures(), EmbeddingFeatures()])
+def test_embeddings_start_small(features):
+    thing(features, count=400)
+    assert float(features.embedding.detach().std()) == pytest.approx(0.1, rel=0.02)
+
+
+def test_with_fewer_keyframes_velocities_are_per_longer_interval():
+    features = SplineMotionFeatures()
+    entity = thing(features)
+    settings, changed = features.with_fewer_knots(5, 3)
+    assert settings == {"keyframes": 5} and set(changed) == {"mlp.0.weight"}
+    weight = features.mlp[0].weight.detach()
+    torch.testing.assert_close(changed["mlp.0.weight"][:, :3], weight[:, :3] / 2)
+    assert torch.equal(changed["mlp.0.weight"][:, 3:], weight[:, 3:])
+    assert len(entity) == 12
+    alone = SplineMotionFeatures(SplineMotionConfig(embedding="none"))
+    assert alone.with_fewer_knots(5, 3)[0] == {}
+    tangents = SplineMotionFeatures(SplineMotionConfig(velocity="keyframes"))
+    assert tangents.with_fewer_knots(5, 3) is None
+
+
 def test_spline_motion_needs_keyframes():
     class Drifting(Static):
         provides = frozenset({"velocity"})
@@ -171,7 +193,7 @@ def test_spline_motion_needs_keyframes():
             return torch.ones_like(canonical.means)
 
     points = Gaussians.from_points(torch.randn(4, 3))
-    with pytest.raises(ValueError, match="Drifting has no keyframes"):
+    with pytest.raises(ValueError, match=r"Drifting.*keyframes"):
         Entity(points, Drifting(), SplineMotionFeatures())
     entity = Entity(
         points, Drifting(), SplineMotionFeatures(SplineMotionConfig(keyframes=3, width=7))
@@ -185,6 +207,7 @@ def test_embedding_of_a_human_stands_at_its_parts(toy_body, toy_pose):
     early = entity.tokens(Moment(0.1, poses={"human": BodyPose.zeros(betas=2)}))
     late = entity.tokens(Moment(0.9, poses={"human": toy_pose(1)}))
     assert early.features.shape == (16, 96)
+    assert set(features.state_dict()) == {"embedding"}  # averages follow from the body
     assert torch.equal(early.features, late.features)
     torch.testing.assert_close(early.positions[3], torch.tensor([0.0, 0.55, 0.0]))
     assert (early.positions - late.positions).abs().max() > 0.01

@@ -7,10 +7,13 @@ import torch
 from small_clip import small_clip, truth
 
 from hoigs.core.spec.train_schema import LossSpec
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import Frame
+from hoigs.core.values.moment import Moment
 from hoigs.metrics.image_loss import image_loss
 from hoigs.metrics.ssim import ssim
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
-from hoigs.training.losses import align_depth, depth_loss, term_weights
+from hoigs.training.losses import align_depth, crop_around, depth_loss, term_weights
 
 
 def test_supplement_weights_and_overrides():
@@ -105,6 +108,49 @@ def test_how_a_depth_prior_meets_the_render():
     assert (align_depth(depth, shifted, "metric", "scale") - depth).abs().max() > 0.2
     line = align_depth(depth, shifted, "metric", "affine")
     torch.testing.assert_close(line, depth, rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("known", [15, 16])
+def test_depth_needs_sixteen_pixels(known: int):
+    depth, prior = torch.full((8, 8), 2.0), torch.zeros(8, 8)
+    prior.view(-1)[:known] = 4.0
+    found = depth_loss(depth, torch.ones(8, 8), prior, "metric")
+    assert (found is None) == (known < 16)
+    prior[-1] = torch.inf  # unknown, too
+    again = depth_loss(depth, torch.ones(8, 8), prior, "metric")
+    assert again is None if found is None else float(again) == float(found)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "box"),
+    [
+        ((30, 70), (40, 100), (21, 79, 31, 109)),  # 0.15 of 60 is 9
+        ((30, 90), (40, 80), (21, 99, 31, 89)),
+        ((50, 54), (60, 63), (42, 62, 52, 71)),  # 8 at least
+        ((0, 60), (100, 120), (0, 69, 91, 120)),  # within the frame
+        ((60, 100), (0, 60), (51, 100, 0, 69)),
+    ],
+)
+def test_a_crop_has_a_margin_and_what_may_hide_the_entity(rows, columns, box):
+    masks = {name: torch.zeros(100, 120, dtype=torch.bool) for name in ("cup", "human", "none")}
+    masks["cup"][slice(*rows), slice(*columns)] = True
+    masks["human"][:, 45:62] = True
+    no_scene = torch.zeros(100, 120, dtype=torch.bool)
+    no_scene[:, 110:] = True
+    image = torch.randint(256, (100, 120, 3), dtype=torch.uint8)
+    camera = Camera(torch.eye(3), torch.eye(4), 120, 100)
+    frame = Frame(0, Moment(0.0), camera, image, masks, None, ignored=no_scene)
+    crop = crop_around(frame, "cup")
+    top, bottom, left, right = box
+    inside = (slice(top, bottom), slice(left, right))
+    assert (crop.top, crop.left, *crop.mask.shape) == (top, left, bottom - top, right - left)
+    assert (crop.camera.height, crop.camera.width) == tuple(crop.mask.shape)
+    assert crop.area == int(masks["cup"].sum())
+    assert torch.equal(crop.pixels, image[inside]) and torch.equal(crop.cut(image), image[inside])
+    assert torch.equal(crop.mask, masks["cup"][inside])
+    hidden = (masks["human"] & ~masks["cup"]) | no_scene
+    assert torch.equal(crop.ignore, hidden[inside])
+    assert crop_around(frame, "none") is None
 
 
 def test_depth_loss_equals_its_formula():
