@@ -37,10 +37,9 @@ from hoigs.preparation.video.source import MEGASAM, VGGT, SourceError
 
 @dataclass(frozen=True)
 class ChosenCameras:
-    """Cameras, whether their COLMAP model lies in a temporary folder, and warnings."""
+    """Cameras, and warnings."""
 
     track: CameraTrack
-    own_model: bool = False
     warnings: list[str] = field(default_factory=list)
 
 
@@ -203,4 +202,4 @@ def _from_motion(
             f"structure from motion gave no camera to {lost} of {len(video)} frames: they are "
             "left out of the clip"
         )
-    return ChosenCameras(track, own_model=True, warnings=warnings)
+    return ChosenCameras(track, warnings=warnings)

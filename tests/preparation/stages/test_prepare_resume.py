@@ -5,19 +5,24 @@ from __future__ import annotations
 import errno
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.errors import ClipError, HoigsError
 from hoigs.plugins.bodies.anny import AnnyBody
-from hoigs.preparation.kept import PLAN, last_kept, with_dependents
+from hoigs.preparation.cameras.camera_track import CameraTrack
+from hoigs.preparation.draft import Draft
+from hoigs.preparation.kept import PLAN, kept, last_kept, with_dependents
 from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until, work_folder
 from hoigs.preparation.stages import STAGES
+from hoigs.preparation.video.source import Source
 from hoigs.preparation.work_folder import Result, WorkFolder, digest, fingerprint
 
 OPTIONS = PrepareOptions(fit_steps=3, overlay_width=0, max_frames=6)
@@ -79,6 +84,29 @@ def test_older_results_and_other_classes_are_not_read(tiny_source: Path, tmp_pat
     file.write_text(text.replace('"FrameList"', '"WorkFolder"'))
     with pytest.raises(KeyError, match="WorkFolder"):
         last_kept(work_folder(out), "frames")
+
+
+def test_a_model_made_in_the_work_folder_is_kept_with_the_result(tmp_path: Path) -> None:
+    none = torch.zeros(0, 3)
+    with WorkFolder(tmp_path / "work") as work:
+        for model in (work.root / "unfinished/model", tmp_path / "given"):
+            model.mkdir(parents=True)
+            _write(model / "cameras.txt", model.name)
+            draft = Draft(Source(tmp_path, tmp_path), tmp_path / "clip", AnnyBody(), work)
+            track = CameraTrack([], none, none, "", metric=True, model=model)
+            found = kept(
+                draft,
+                "frames",
+                OPTIONS,
+                lambda d=draft, t=track: d.noting(["!"], track=t),
+                model.name,
+            )
+            assert found.warnings == ("!",) and draft.warnings == ()
+            if model.name == "model":
+                shutil.rmtree(model)
+            else:
+                assert found.track.model == model
+            assert (found.track.model / "cameras.txt").read_text() == model.name
 
 
 def test_what_builds_on_what() -> None:
