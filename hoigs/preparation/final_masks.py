@@ -82,7 +82,10 @@ def separate(
     Returns:
         human, object
     """
-    size = _work_size(together[0].shape)
+    # width and height to work at
+    shape = together[0].shape
+    factor = min(1.0, WORK_SIDE / max(shape))
+    size = max(1, round(shape[1] * factor)), max(1, round(shape[0] * factor))
     wholes = MaskStack(shrink_mask(m, *size) for m in together)
     pictures = FrameFile(folder, (shrink(image, *size) for image in images()))
     small_bodies = MaskStack(shrink_mask(b, *size) for b in bodies)
@@ -109,12 +112,6 @@ def separate(
         humans.append(mask & ~object_mask)
         separated.append(object_mask)
     return humans, separated
-
-
-def _work_size(shape: tuple[int, ...]) -> tuple[int, int]:
-    """Width and height to work at."""
-    factor = min(1.0, WORK_SIDE / max(shape))
-    return max(1, round(shape[1] * factor)), max(1, round(shape[0] * factor))
 
 
 def _enlarged(

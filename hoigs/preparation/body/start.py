@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hoigs.core.interfaces.body import BodyModel
@@ -154,22 +154,7 @@ def flat_start(
     Args:
         image: x, y in pixels and visibility, NaN where not found.
     """
-    model = _landmarks(body)
-    angles = torch.arange(TURNS) * (2 * math.pi / TURNS)
-    upright = torch.diag(torch.tensor([1.0, -1.0, -1.0]))  # y down, facing the camera
-    lean = _about(2, _lean(image))[:, None]
-    turns = lean @ upright @ _about(1, angles)  # [S, TURNS, 3, 3]
-    world = torch.einsum("shij,lj->shli", turns, model)
-    steady = image.clone()
-    steady[:, list(ARMS)] = torch.nan
-    costs = torch.stack([_miss(steady, world[:, h], K) for h in range(TURNS)], 1)
-    chosen = _course(costs, STEADY * (1 - (angles[:, None] - angles).cos()))
-    rows = torch.arange(len(image))
-    return turns[rows, chosen], world[rows, chosen]
-
-
-def _landmarks(body: BodyModel) -> Float[Tensor, "33 3"]:
-    """The relaxed body's landmarks about the middle of its hips; NaN where it has none."""
+    # the relaxed body's landmarks about the middle of its hips; NaN where it has none
     points = points_of(body)
     pose = BodyPose.zeros(1)
     pose = pose.replace(body=relaxed()[None], betas=torch.zeros(1, body.num_betas))
@@ -184,7 +169,28 @@ def _landmarks(body: BodyModel) -> Float[Tensor, "33 3"]:
     )
     found = torch.full((33, 3), torch.nan)
     found[list(points.landmarks)] = places.detach()
-    return found - found[[23, 24]].mean(0)
+    model = found - found[[23, 24]].mean(0)
+    angles = torch.arange(TURNS) * (2 * math.pi / TURNS)
+    upright = torch.diag(torch.tensor([1.0, -1.0, -1.0]))  # y down, facing the camera
+    lean = _about(2, _lean(image))[:, None]
+    turns = lean @ upright @ _about(1, angles)  # [S, TURNS, 3, 3]
+    world = torch.einsum("shij,lj->shli", turns, model)
+    steady = image.clone()
+    steady[:, list(ARMS)] = torch.nan
+    costs = torch.stack([_miss(steady, world[:, h], K) for h in range(TURNS)], 1)
+    # of the sequences of hypotheses, the one that costs least, steps between them included
+    steps = STEADY * (1 - (angles[:, None] - angles).cos())
+    total, before = costs[0], []
+    for row in costs[1:]:
+        best = (total[:, None] + steps).min(0)
+        before.append(best.indices)
+        total = best.values + row
+    path = [int(total.argmin())]
+    for back in reversed(before):
+        path.append(int(back[path[-1]]))
+    chosen = torch.tensor(path[::-1])
+    rows = torch.arange(len(image))
+    return turns[rows, chosen], world[rows, chosen]
 
 
 def _about(axis: int, angle: Float[Tensor, " N"]) -> Float[Tensor, "N 3 3"]:
@@ -218,19 +224,6 @@ def _miss(
     miss = squared / (squared + OUTLIER**2)
     miss = torch.where(points[..., 2] > 0.1, miss, 1.0)
     return (weight * miss).sum(1) / total
-
-
-def _course(costs: Float[Tensor, "S H"], steps: Float[Tensor, "H H"]) -> Int[Tensor, " S"]:
-    """Of the sequences of hypotheses, the one that costs least, steps between them included."""
-    total, before = costs[0], []
-    for row in costs[1:]:
-        best = (total[:, None] + steps).min(0)
-        before.append(best.indices)
-        total = best.values + row
-    chosen = [int(total.argmin())]
-    for back in reversed(before):
-        chosen.append(int(back[chosen[-1]]))
-    return torch.tensor(chosen[::-1])
 
 
 ANKLES = (27, 28)

@@ -37,10 +37,9 @@ from hoigs.preparation.video.source import MEGASAM, VGGT, SourceError
 
 @dataclass(frozen=True)
 class ChosenCameras:
-    """Cameras, whether their COLMAP model lies in a temporary folder, and warnings."""
+    """Cameras, and warnings."""
 
     track: CameraTrack
-    own_model: bool = False
     warnings: list[str] = field(default_factory=list)
 
 
@@ -91,7 +90,16 @@ def choose_cameras(
         if motion is not None and (options.camera == "static" or motion.static):
             return _static(video, landmarks, options, still_lens, motion)
         if motion is None or motion.turned is not None:
-            return _turning(video, landmarks, masks, options, still_lens, progress)
+            focal = static_focal(video, landmarks, options.focal)
+            track, turns = turning_cameras(video, masks, still_lens, focal, progress)
+            warnings = [] if still_lens is not None or turns.spread else [*focal.warnings]
+            if turns.lost:
+                warnings.append(
+                    f"the camera turns, and the background of {len(turns.lost)} frames "
+                    f"({ranges(turns.lost)}) was not found again: their cameras lie between the "
+                    "others'"
+                )
+            return ChosenCameras(track, warnings=warnings)
     return _from_motion(video, masks, options, lens, folder, progress)
 
 
@@ -140,25 +148,6 @@ def _static(
         figures |= found.figures
         warnings += found.warnings
     track = replace(track, provenance=track.provenance + how, figures={**track.figures, **figures})
-    return ChosenCameras(track, warnings=warnings)
-
-
-def _turning(
-    video: Frames,
-    landmarks: Landmarks | None,
-    masks: GivenMasks,
-    options: PrepareOptions,
-    lens: tuple[Lens, str] | None,
-    progress: Callable[[float], None],
-) -> ChosenCameras:
-    focal = static_focal(video, landmarks, options.focal)
-    track, turns = turning_cameras(video, masks, lens, focal, progress)
-    warnings = [] if lens is not None or turns.spread else [*focal.warnings]
-    if turns.lost:
-        warnings.append(
-            f"the camera turns, and the background of {len(turns.lost)} frames "
-            f"({ranges(turns.lost)}) was not found again: their cameras lie between the others'"
-        )
     return ChosenCameras(track, warnings=warnings)
 
 
@@ -213,4 +202,4 @@ def _from_motion(
             f"structure from motion gave no camera to {lost} of {len(video)} frames: they are "
             "left out of the clip"
         )
-    return ChosenCameras(track, own_model=True, warnings=warnings)
+    return ChosenCameras(track, warnings=warnings)

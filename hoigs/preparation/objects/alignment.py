@@ -399,7 +399,11 @@ def align(
     total, done = sum(steps for _, _, steps in levels), 0
     for blur, knot, steps in levels:
         problem.set_blur(blur)
-        hats = _hats(crops.frames, knot)
+        # weights of linear interpolation between knots every `knot` frames
+        frames = crops.frames
+        knots = np.arange(frames[0], frames[-1] + knot, knot)
+        weights = np.clip(1 - np.abs(frames[:, None] - knots[None]) / knot, 0, None)
+        hats = torch.from_numpy(weights).float()
         turns = torch.zeros(hats.shape[1], 3, requires_grad=True)
         shifts = torch.zeros(hats.shape[1], 3, requires_grad=True)
         moved = torch.zeros_like(vertices, requires_grad=shape)
@@ -547,10 +551,3 @@ def _small_log(turns: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 3"]:
     cosine = (turns.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
     angle = torch.atan2(sine, cosine)
     return skew / 2 * torch.where(sine > 1e-4, angle / sine.clamp_min(1e-4), 1.0)
-
-
-def _hats(frames: Int[np.ndarray, " C"], knot: int) -> Float[Tensor, "C N"]:
-    """Weights of linear interpolation between knots every `knot` frames."""
-    knots = np.arange(frames[0], frames[-1] + knot, knot)
-    weights = np.clip(1 - np.abs(frames[:, None] - knots[None]) / knot, 0, None)
-    return torch.from_numpy(weights).float()

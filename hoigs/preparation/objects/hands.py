@@ -37,7 +37,14 @@ def resting(
     Args:
         depths: of the object along the view, about, metres. near: frames with a hand at it.
     """
-    still = _still(outlines, depths, cameras, fps)
+    # frames that have the mask's middle where it was, or will be, a moment apart
+    count, step = len(cameras), max(1, round(SHORTEST * fps / 2))
+    speed = np.full(count, np.inf)
+    for i in range(count):
+        others = [j for j in (i - step, i + step) if 0 <= j < count]
+        rows = [j for j in others if outlines.whole[i] and outlines.whole[j]]
+        speed[i] = min(_moved(outlines, depths, cameras, i, rows), default=np.inf) * fps / step
+    still = speed < STILL
     runs, _ = ndimage.label(still)
     sure = np.unique(runs[_stays(outlines, depths, cameras, fps)])
     still &= ~near | np.isin(runs, sure)
@@ -51,22 +58,6 @@ def cleaned(flags: Bool[np.ndarray, "F N"], fps: float) -> Bool[np.ndarray, "F N
     closed = ndimage.binary_closing(padded, structure)
     opened = ndimage.binary_opening(closed, structure)
     return opened[len(structure) : -len(structure)]
-
-
-def _still(
-    outlines: Outlines,
-    depths: Float[np.ndarray, " F"],
-    cameras: Sequence[Camera],
-    fps: float,
-) -> Bool[np.ndarray, " F"]:
-    """Frames that have the mask's middle where it was, or will be, a moment apart."""
-    count, step = len(cameras), max(1, round(SHORTEST * fps / 2))
-    speed = np.full(count, np.inf)
-    for i in range(count):
-        others = [j for j in (i - step, i + step) if 0 <= j < count]
-        rows = [j for j in others if outlines.whole[i] and outlines.whole[j]]
-        speed[i] = min(_moved(outlines, depths, cameras, i, rows), default=np.inf) * fps / step
-    return speed < STILL
 
 
 def _stays(

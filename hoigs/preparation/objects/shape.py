@@ -137,7 +137,13 @@ def hull(
     Args:
         radius: metres within which the object lies. samples: points on the surface.
     """
-    directions, faces = _sphere(DIVISIONS)
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=DIVISIONS)
+    directions, faces = (
+        torch.from_numpy(np.array(mesh.vertices)).float(),
+        torch.from_numpy(np.array(mesh.faces)).long(),
+    )
     reach = reaches(crops, poses, directions, radius, carved)
     return with_samples(directions * reach[:, None], faces, samples)
 
@@ -186,16 +192,6 @@ def with_samples(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "T 3"], coun
     pairs = torch.cat([faces[:, [i, (i + 1) % 3]] for i in range(3)])
     edges = torch.unique(pairs.sort(1).values, dim=0)
     return Surface(vertices, faces, faces[torch.from_numpy(chosen)], weights, edges)
-
-
-def _sphere(divisions: int) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "T 3"]]:
-    import trimesh
-
-    mesh = trimesh.creation.icosphere(subdivisions=divisions)
-    return (
-        torch.from_numpy(np.array(mesh.vertices)).float(),
-        torch.from_numpy(np.array(mesh.faces)).long(),
-    )
 
 
 # The side of an object that no frame shows: like the opposite side, within the outlines.

@@ -108,7 +108,12 @@ def tracked_object(
         assert depths is not None
         hands = no_hands(outlines, depths, cameras, fps)
     shown = outlines.observed
-    radius = _radius(outlines, hands, cameras)
+    # metres within which the object lies, from the largest extent of its outlines
+    rows = np.flatnonzero(outlines.whole)
+    metres = [
+        outlines.lengths[i] * hands.depths[i] / float(cameras[i].K[0, 0]) for i in rows.tolist()
+    ]
+    radius = 0.9 * float(np.quantile(metres, 0.95))
     behind = hands.depths + BEHIND * radius
     crops = make_crops(images, masks, humans, others, cameras, shown, SIDE, bones, behind)
     contrast = crops.contrast(BLUR)
@@ -118,7 +123,14 @@ def tracked_object(
             f"({100 * FAINTEST:.0f} % are needed)"
         )
     start = _start(hands, outlines, cameras, shown)
-    held = _held(hands, shown)
+    grasps = np.where(hands.near & hands.held[:, None], hands.pieces[:, None], -1)
+    starts = np.diff(hands.rests.astype(int), prepend=0) == 1
+    rests = np.where(hands.rests, np.cumsum(starts), -1)
+    held = Held(
+        torch.from_numpy(hands.palms[shown]).float(),
+        torch.from_numpy(grasps[shown]),
+        torch.from_numpy(rests[shown]),
+    )
     surface, found = _aligned(crops, start, held, hands, radius, fps, levels, progress)
     agreement = _over_frames(found.agreement, shown)
     typical = float(np.nanmedian(found.agreement)) if np.isfinite(found.agreement).any() else 0.0
@@ -204,26 +216,6 @@ def _start(
         for c, p, z in zip(cameras, pixels, hands.depths, strict=True)
     ]
     return Poses(torch.from_numpy(hands.rotations[shown]).float(), torch.stack(places)[shown])
-
-
-def _radius(outlines: Outlines, hands: HandMotion, cameras: Sequence[Camera]) -> float:
-    """Metres within which the object lies, from the largest extent of its outlines."""
-    rows = np.flatnonzero(outlines.whole)
-    metres = [
-        outlines.lengths[i] * hands.depths[i] / float(cameras[i].K[0, 0]) for i in rows.tolist()
-    ]
-    return 0.9 * float(np.quantile(metres, 0.95))
-
-
-def _held(hands: HandMotion, shown: Bool[np.ndarray, " F"]) -> Held:
-    grasps = np.where(hands.near & hands.held[:, None], hands.pieces[:, None], -1)
-    starts = np.diff(hands.rests.astype(int), prepend=0) == 1
-    rests = np.where(hands.rests, np.cumsum(starts), -1)
-    return Held(
-        torch.from_numpy(hands.palms[shown]).float(),
-        torch.from_numpy(grasps[shown]),
-        torch.from_numpy(rests[shown]),
-    )
 
 
 def _over_frames(

@@ -388,7 +388,8 @@ def report_page(
         plots=_plots(report),
         rows=_rows(rows),
         made=_rows(list(report.provenance.items())),
-        warnings=_warnings(report.warnings),
+        warnings=_listed("Not known", [f"{what}: {why}" for what, why in report.unknown.items()])
+        + _listed("Beware", report.warnings),
     )
 
 
@@ -471,11 +472,9 @@ def _rows(rows: Sequence[Sequence[str]]) -> str:
     return "".join(f"<tr>{row}</tr>" for row in cells)
 
 
-def _warnings(warnings: Sequence[str]) -> str:
-    if not warnings:
-        return ""
-    items = "".join(f"<li>{escape(warning)}</li>" for warning in warnings)
-    return f"<h2>Beware</h2><ul>{items}</ul>"
+def _listed(title: str, texts: Sequence[str]) -> str:
+    items = "".join(f"<li>{escape(text)}</li>" for text in texts)
+    return f"<h2>{title}</h2><ul>{items}</ul>" if texts else ""
 
 
 @dataclass(frozen=True)
@@ -544,6 +543,9 @@ class PrepareReport(Measures):
         ]
         if todo:
             lines += ["", "## What to do", "", *todo]
+        if self.unknown:
+            lines += ["", "## Not known", ""]
+            lines += [f"- **{what}**: {why}" for what, why in self.unknown.items()]
         if self.warnings:
             lines += ["", "## Beware", "", *(f"- {w}" for w in self.warnings)]
         return "\n".join(lines) + "\n"

@@ -162,7 +162,7 @@ def test_the_way_of_a_moving_camera(tmp_path: Path) -> None:
         video, nobody(COUNT), masks, None, PrepareOptions(focal=FOCAL), tmp_path, lambda _: None
     )
     track = chosen.track
-    assert chosen.own_model and track.positions == tuple(range(COUNT))
+    assert track.model is not None and track.positions == tuple(range(COUNT))
     assert track.figures["registered"] == COUNT and track.figures["reprojection_px"] < 1
     centers = np.stack([c.center.numpy() for c in track.cameras])
     way = centers - centers[0]
