@@ -4,7 +4,8 @@
     python scripts/readme_film.py runs/demo --out docs/assets/demo.webp
     hoigs prepare juggle.mp4 --out clips/juggle --width 640
     hoigs train clips/juggle --out runs/juggle --set train.steps=1200 --set train.width=480
-    python scripts/readme_film.py runs/juggle --crop 0.28,0,0.78,1 --out docs/assets/juggle.webp
+    python scripts/readme_film.py runs/juggle --crop 0.25,0,0.8,1 --part 132,186,2 \\
+        --height 272 --quality 70 --out docs/assets/juggle.webp
 
 All three panels show the same moment; while time stands still, only the camera of the third one
 moves. Renders have twice the pixels of the picture, and are averaged.

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from PIL import Image
 
 import hoigs
@@ -37,3 +39,26 @@ def test_the_first_screen_runs(monkeypatch, tmp_path):
 def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text()):
         assert "://" in target or (page.parent / target).exists(), target
+
+
+BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", README.read_text(), re.S | re.M)
+COMMANDS = [
+    line
+    for language, block in BLOCKS
+    for line in block.splitlines()
+    if not language and line.startswith("hoigs ")
+]
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_the_commands_have_these_options(line):
+    from hoigs.cli.main import app
+
+    _, name, *words = shlex.split(line, comments=True)
+    command = typer.main.get_command(app).commands[name]
+    command.make_parser(command.context_class(command)).parse_args(words)  # or NoSuchOption
+
+
+def test_enough_commands_are_tested_and_what_they_need_is_installed():
+    assert {"prepare", "train", "view"} <= {line.split()[1] for line in COMMANDS}
+    assert "pip install '.[viewer]'" in README.read_text()  # `hoigs view` needs it

@@ -78,13 +78,13 @@ class ClipHeader(_Strict):
     """clip.json."""
 
     format: Literal["hoigs-clip"] = Field(default="hoigs-clip", description='always "hoigs-clip"')
-    version: Literal[1] = Field(default=1, description="of this layout: 1")
+    version: Literal[1] = Field(default=1, description="version of this layout: 1")
     name: str = Field(min_length=1, description="for reports")
     fps: float = Field(
         gt=0, le=1e6, allow_inf_nan=False, strict=False, description="frames per second"
     )
-    width: Count = Field(description="of every image, mask and depth map, pixels")
-    height: Count = Field(description="the same, pixels")
+    width: Count = Field(description="width of every image, mask and depth map, pixels")
+    height: Count = Field(description="their height, pixels")
     frames: Count = Field(description="F, the number of frames, held-out views not counted")
     entities: dict[str, EntityHeader] = Field(
         description='name to `{"kind": "human", "body": "body:anny"}` or `{"kind": "object"}`; '
@@ -99,7 +99,7 @@ class ClipHeader(_Strict):
     )
     times: list[float] | None = Field(
         default=None,
-        description="of frames that are not evenly spaced: seconds of each since the first; `fps` "
+        description="if frames are not evenly spaced: seconds of each since the first; `fps` "
         "is then their mean rate",
     )
     world: WorldHeader | None = Field(
@@ -144,8 +144,8 @@ class ViewsHeader(_Strict):
 
     format: Literal["hoigs-views"] = Field(default="hoigs-views", description='"hoigs-views"')
     version: Literal[1] = Field(default=1, description="1")
-    width: Count = Field(description="of the held-out images, pixels")
-    height: Count = Field(description="the same, pixels")
+    width: Count = Field(description="width of the held-out images, pixels")
+    height: Count = Field(description="their height, pixels")
     frames: list[int] = Field(
         min_length=1, description="V frame numbers of the main clip: view v shows frame frames[v]"
     )

@@ -217,7 +217,7 @@ class Landmarks:
         provenance: who made them, with what, in a line.
         lost: why a frame has none, in words that end a sentence, to the frames of which it is true;
             those without landmarks that are in none are reported without a reason.
-        repaired: likewise, what it took to find them, of frames in which a first look did not.
+        repaired: how they were found, for frames in which the first attempt failed.
     """
 
     image_xyzv: Float[np.ndarray, "F 33 4"]

@@ -29,7 +29,7 @@ class Capabilities:
         fixed: options of a request that the backend cannot change, with their only value.
         image_error: largest error of an image against float64 away from cut-offs (depth: in parts
             of its largest value).
-        gradient_error: largest relative L2 error of a gradient, likewise.
+        gradient_error: largest relative L2 error of a gradient, to the same reference.
     """
 
     devices: frozenset[str]

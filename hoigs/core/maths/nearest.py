@@ -64,7 +64,7 @@ def denser(
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
     """The points, followed by new ones up to `count`, each between a point and a neighbour of it.
 
-    Colours are blended likewise. Points that are `count` or more, or fewer than LEAST, stay as they
+    Colours are blended, too. Points that are `count` or more, or fewer than LEAST, stay as they
     are.
     """
     generator = torch.Generator().manual_seed(seed)

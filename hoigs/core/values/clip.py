@@ -188,7 +188,7 @@ class Clip:
         provenance: where each part came from.
         faults: what is wrong with the clip and was accepted when it was read (`clip_folder.health`
             finds more).
-        world: up, floor and unit. Where nobody knows, up is a guess by the cameras, which
+        world: up, floor and unit. Without a source, up is guessed from the cameras, which
             `world.known` says.
 
     Raises:

@@ -413,7 +413,7 @@ class HexPlaneSkinning(SurfaceBody):
         """Means over points (or cells) of squares, except the sparsity.
 
         "offset": canonical offsets, m^2. "laplacian": offset against its neighbours' mean, m^2
-        (L_reg of HOIGS, Eq. 16); "laplacian_scale", "laplacian_color": log-scale and RGB likewise
+        (L_reg of HOIGS, Eq. 16); "laplacian_scale", "laplacian_color": for log-scale, RGB
         (`laplacian_of`). "drift": means that are free against the template's surface, m^2.
         "skinning": distance to the body's own weights (HUGS). "scale": distance of log-scales to
         the template's. "time_smoothness", "time_sparsity": see PairedPlanes. "nonrigid": offsets

@@ -59,7 +59,7 @@ class CommandConfig(ComponentConfig):
         description="how to read depth, as estimator:depth-files; paths start at {out}",
     )
     landmarks: LandmarksFilesConfig | None = Field(
-        default=None, description="how to read landmarks, as estimator:landmarks-files; likewise"
+        default=None, description="how to read landmarks, as estimator:landmarks-files does"
     )
 
     @field_validator("command")

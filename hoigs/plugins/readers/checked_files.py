@@ -217,7 +217,7 @@ class ReaderConfig(ComponentConfig):
 class VideoReaderConfig(ReaderConfig):
     """Settings of readers whose layout does not give the frames a second."""
 
-    fps: float = Field(default=30.0, gt=0, description="of the video; the layout has none")
+    fps: float = Field(default=30.0, gt=0, description="frame rate; the layout has none")
 
 
 class VideoPointsConfig(VideoReaderConfig):

@@ -48,7 +48,7 @@ class DavisConfig(VideoReaderConfig):
         default=None, gt=0, description="pixels; by default 1.2 times the longer side (COLMAP's)"
     )
     points: int = Field(default=20_000, ge=1, description="scene points to start from")
-    fps: float = Field(default=24.0, gt=0, description="of the video (DAVIS: 24)")
+    fps: float = Field(default=24.0, gt=0, description="frame rate of the video (DAVIS: 24)")
 
 
 class DavisReader(ClipReader):

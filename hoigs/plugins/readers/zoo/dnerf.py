@@ -31,7 +31,7 @@ class DnerfConfig(ReaderConfig):
 
     background: Literal["white", "black"] = Field(
         default="black",
-        description="of transparent pixels and of renders",
+        description="colour of transparent pixels and of renders",
     )
     points: int = Field(
         default=2000, ge=1, description="random points to start from where no file has any (4DGS)"

@@ -97,7 +97,7 @@ class HypernerfConfig(VideoReaderConfig):
         ge=1,
         description="reads rgb/FACTORx; by default 2 if there, else the smallest",
     )
-    fps: float = Field(default=15.0, gt=0, description="of the capture")
+    fps: float = Field(default=15.0, gt=0, description="frame rate of the capture")
 
 
 class HypernerfReader(ClipReader):
