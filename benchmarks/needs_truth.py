@@ -1,4 +1,4 @@
-"""Does `hoigs study needs` find what clips of known truth need? Case by case, seed by seed.
+"""Does `hoigs study needs` find what clips of known truth need? Right or wrong, by case and seed.
 
     python benchmarks/needs_truth.py --jobs 60 --threads 1 --minutes 20
     python benchmarks/needs_truth.py --only still glide --seeds 2 --jobs 2

@@ -1,8 +1,8 @@
 """Studies: many trainings, compared.
 
-- `chart.run.run_chart`: accuracy against cost of specs, rasterizers and budgets.
-- `tables.run.run_study`: tables of scores, such as those of the paper.
+- `compare.run.run_comparison`: accuracy against cost of specs, rasterizers and budgets, and the
+  paper's tables.
 - `stress.run.run_stress`: failure cases, each with a trigger and a criterion.
 - `needs.needs.needs`: how much of a spec a clip needs. `needs.auto.auto`: also trains the answer.
-- `jobs`: trainings as jobs in processes. `plotting`: the style of all figures.
+- `batch.batch`: many videos or clips. `jobs`, `execution`: the trainings, and where they run.
 """

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import random
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,6 +30,7 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind, Residual
 from hoigs.core.values.topology import AxisChange, TopologyChange
+from hoigs.testing import modules
 from hoigs.testing.checks import CheckError, CheckList, Need, require, require_close, require_finite
 from hoigs.testing.material import (
     FRAMES,
@@ -45,14 +44,12 @@ from hoigs.testing.material import (
     tiny_clip,
 )
 from hoigs.testing.modules import (
-    DeviceSubject,
+    ModuleSubject,
     Moments,
-    copied,
     perturb,
     plain_state,
     require_finite_gradients,
     require_gradients,
-    require_same_state,
     require_true_gradients,
     seeded,
     trained,
@@ -71,7 +68,7 @@ OUTSIDE = (-0.6, -0.01, 1.01, 1.6)
 TRAINED = tuple(i / (FRAMES - 1) for i in range(FRAMES))
 
 
-class DeformationSubject(DeviceSubject[DeformationModel]):
+class DeformationSubject(ModuleSubject[DeformationModel]):
     """The component under check: for the human if it provides a skeleton, else for the object."""
 
     @cached_property
@@ -138,6 +135,16 @@ class DeformationSubject(DeviceSubject[DeformationModel]):
             sh=0.3 * normal(4, 3),
         )
 
+    def made(self, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Entity:
+        return self.entity(seed=seed, dtype=dtype)
+
+    def cases(self, dtype: torch.dtype = torch.float32) -> Sequence[float]:
+        del dtype
+        return (0.4, 0.0, 0.77, 1.3)
+
+    def outputs(self, made: Entity, case: float) -> dict[str, Tensor]:
+        return by_name(self.draw(made, case))
+
     def at(self, entity: Entity, time: float) -> Moment:
         return moment_at(time, entity.means.dtype, entity.means.device)
 
@@ -147,6 +154,10 @@ class DeformationSubject(DeviceSubject[DeformationModel]):
 
 
 CHECKS: CheckList[DeformationSubject] = CheckList("D")
+CHECKS.check("D03")(modules.keeps_dtype_and_device)
+CHECKS.check("D05")(modules.cases_are_independent)
+CHECKS.check("D16")(modules.same_seed_same_module)
+CHECKS.check("D17")(modules.a_deep_copy_is_independent)
 
 
 def subject(cls: type[DeformationModel], config: Any, options: Options) -> DeformationSubject:
@@ -161,8 +172,7 @@ def by_name(gaussians: Gaussians) -> dict[str, Tensor]:
 
 def require_same(what: str, got: Gaussians, expected: Gaussians, atol: float = 2e-5) -> None:
     """Every field the same to `atol`, also the signs of quaternions."""
-    for name in RAW:
-        require_close(f"{what}: {name}", getattr(got, name), getattr(expected, name), atol=atol)
+    modules.require_same(what, by_name(got), by_name(expected), atol)
 
 
 def changed_by(
@@ -399,19 +409,6 @@ def shapes_for_any_number(subject: DeformationSubject) -> None:
             )
 
 
-@CHECKS.check("D03")
-def dtype_and_device_are_kept(subject: DeformationSubject) -> None:
-    """The output has dtype and device of the Gaussians, in float32 and in float64."""
-    for dtype in (torch.float32, torch.float64):
-        entity = subject.entity(dtype=dtype)
-        for name, x in by_name(subject.draw(entity, 0.4)).items():
-            require(x.dtype == dtype, f"{name} is {x.dtype} where the Gaussians are {dtype}")
-            require(
-                x.device == entity.means.device,
-                f"{name} is on {x.device} where the Gaussians are on {entity.means.device}",
-            )
-
-
 @CHECKS.check("D04")
 def order_of_rows_does_not_matter(subject: DeformationSubject) -> None:
     """Permuted rows, with their parameters, give permuted outputs."""
@@ -421,20 +418,6 @@ def order_of_rows_does_not_matter(subject: DeformationSubject) -> None:
     for time in INSIDE:
         expected = subject.draw(plain, time)[order]
         require_same(f"permuted, at {time}", subject.draw(permuted, time), expected)
-
-
-@CHECKS.check("D05")
-@torch.no_grad()
-def moments_are_independent(subject: DeformationSubject) -> None:
-    """Several moments in any order give the same as each alone."""
-    together = subject.entity()
-    order = (0.0, 0.77, 0.13, 1.3, 0.77, 0.0)
-    drawn = [(time, subject.draw(together, time).clone()) for time in order]
-    for chosen in sorted(set(order)):
-        alone = subject.draw(subject.entity(), chosen)
-        for time, got in drawn:
-            if time == chosen:
-                require_same(f"at {time}, among other moments", got, alone, atol=1e-6)
 
 
 @CHECKS.check("D06")
@@ -703,7 +686,7 @@ def evolve_reports_its_changes(subject: DeformationSubject) -> str | None:
     return f"it changed its size {len(changes)} times" if changes else None
 
 
-# D15 to D18: checkpoints, seeds and copies.
+# D15 and D18: checkpoints.
 
 
 @CHECKS.check("D15")
@@ -722,30 +705,6 @@ def a_checkpoint_restores_it(subject: DeformationSubject) -> None:
     for time in INSIDE:
         got, expected = subject.draw(fresh, time), subject.draw(entity, time)
         require_same(f"loaded, at {time}", got, expected, atol=1e-6)
-
-
-@CHECKS.check("D16")
-def same_seed_same_model(subject: DeformationSubject) -> None:
-    """Two instances from one random state of torch are equal, bit for bit."""
-    first = subject.entity()
-    random.random()  # generators that a spec does not seed must not matter
-    np.random.random()
-    second = subject.entity()
-    require_same_state("built twice from one seed", first, second)
-    require_same(
-        "built twice from one seed", subject.draw(first, 0.4), subject.draw(second, 0.4), atol=0.0
-    )
-
-
-@CHECKS.check("D17")
-def a_deep_copy_is_independent(subject: DeformationSubject) -> None:
-    """A deep copy, made after a training pass, is equal and independent."""
-    entity = subject.entity()
-    before = subject.draw(entity, 0.4).detach().clone()
-    twin = copied(entity, lambda entity: subject.draw(entity, 0.4))
-    require_same("a deep copy", subject.draw(twin, 0.4), before, atol=0.0)
-    perturb(twin, seed=8)
-    require_same("after its copy changed", subject.draw(entity, 0.4), before, atol=0.0)
 
 
 @CHECKS.check("D18")

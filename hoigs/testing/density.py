@@ -11,6 +11,7 @@ from torch import Tensor
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.density import DensityControl, DensityStatistics, Refinement
 from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.topology import TopologyChange
 from hoigs.testing.checks import CheckList, require, require_close, require_finite, require_zero
 from hoigs.testing.material import OBJECT, tiny_clip
 from hoigs.testing.modules import DeviceSubject, unchanged
@@ -118,22 +119,29 @@ def perturbs(subject: DensitySubject) -> str | None:
 RAW = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
 
-def changed(subject: DensitySubject, canonical: Gaussians) -> Refinement:
-    """The first decision that changes rows, which `changes_rows` has found to exist."""
-    found = subject.first(subject.control(), canonical)
+def changed(
+    subject: DensitySubject, canonical: Gaussians, control: DensityControl | None = None
+) -> tuple[int, Refinement]:
+    """The first step that changes rows, which `changes_rows` has found to exist."""
+    found = subject.first(control or subject.control(), canonical)
     assert found is not None
-    return found[1]
+    return found
+
+
+def rows_of(subject: DensitySubject, canonical: Gaussians) -> tuple[TopologyChange, Gaussians]:
+    """The index map of that step, and the new canonical Gaussians."""
+    decision = changed(subject, canonical)[1]
+    assert decision.change is not None
+    require(decision.canonical is not None, "a change of rows comes without canonical Gaussians")
+    assert decision.canonical is not None
+    return decision.change, decision.canonical
 
 
 @CHECKS.check("N01", changes_rows)
 def a_decision_is_an_index_map(subject: DensitySubject) -> None:
     """The index map names old rows, and comes with as many new canonical Gaussians."""
     canonical = subject.cloud()
-    decision = changed(subject, canonical)
-    change, new = decision.change, decision.canonical
-    assert change is not None
-    require(new is not None, "a change of rows comes without canonical Gaussians")
-    assert new is not None
+    change, new = rows_of(subject, canonical)
     require(len(new) == len(change), f"{len(change)} rows, but {len(new)} canonical Gaussians")
     inside = bool(((change.source >= 0) & (change.source < len(canonical))).all())
     require(inside, f"source has rows beyond the {len(canonical)} old ones")
@@ -167,9 +175,7 @@ def the_cap_is_kept(subject: DensitySubject) -> str:
 def other_rows_keep_their_values(subject: DensitySubject) -> None:
     """Rows that are neither fresh nor shared keep every canonical value, bit for bit."""
     canonical = subject.cloud()
-    decision = changed(subject, canonical)
-    change, new = decision.change, decision.canonical
-    assert change is not None and new is not None
+    change, new = rows_of(subject, canonical)
     kept = ~change.fresh
     if change.copies is not None:
         kept &= change.copies == 1
@@ -183,9 +189,7 @@ def other_rows_keep_their_values(subject: DensitySubject) -> None:
 def offsets_are_displacements(subject: DensitySubject) -> None:
     """`offsets` is the new canonical mean minus that of its source, for every row."""
     canonical = subject.cloud()
-    decision = changed(subject, canonical)
-    change, new = decision.change, decision.canonical
-    assert change is not None and new is not None
+    change, new = rows_of(subject, canonical)
     moved = new.means - canonical.means[change.source]
     require_close("offsets", change.offsets, moved, atol=1e-6, rtol=1e-5)
 
@@ -260,26 +264,24 @@ def require_same(what: str, one: dict[str, Tensor], two: dict[str, Tensor]) -> N
 def same_seed_same_decision(subject: DensitySubject) -> None:
     """A second instance decides the same, whatever torch's and Python's random state."""
     canonical = subject.cloud()
-    found = subject.first(subject.control(), canonical)
-    assert found is not None
+    step, decision = changed(subject, canonical)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(99)
         random.random()
-        again = subject.refine(subject.control(), found[0], canonical)
-    require_same("in a second instance", tensors(found[1]), tensors(again))
+        again = subject.refine(subject.control(), step, canonical)
+    require_same("in a second instance", tensors(decision), tensors(again))
 
 
 @CHECKS.check("N09", changes_rows)
 def no_state_between_steps(subject: DensitySubject) -> None:
     """Earlier steps do not change a decision, so that a resumed run is the same."""
     canonical, control = subject.cloud(), subject.control()
-    found = subject.first(control, canonical)
-    assert found is not None
+    step, decision = changed(subject, canonical, control)
     other, seen = subject.cloud(seed=1), subject.statistics(seed=1)
-    for step in range(1, found[0] + 1):
-        subject.refine(control, step, other, seen)
-    again = subject.refine(control, found[0], canonical)
-    require_same("after other steps", tensors(found[1]), tensors(again))
+    for earlier in range(1, step + 1):
+        subject.refine(control, earlier, other, seen)
+    again = subject.refine(control, step, canonical)
+    require_same("after other steps", tensors(decision), tensors(again))
 
 
 @CHECKS.check("N10")
@@ -328,8 +330,7 @@ def absolute_gradients_are_declared(subject: DensitySubject) -> None:
     if subject.control().absolute_gradients:
         return
     control, canonical, seen = subject.control(), subject.cloud(), subject.statistics()
-    found = subject.first(control, canonical)
-    assert found is not None
+    step, decision = changed(subject, canonical, control)
     seen.absolute_sum = torch.zeros_like(seen.absolute_sum)
-    again = subject.refine(control, found[0], canonical, seen)
-    require_same("without absolute gradients, undeclared", tensors(found[1]), tensors(again))
+    again = subject.refine(control, step, canonical, seen)
+    require_same("without absolute gradients, undeclared", tensors(decision), tensors(again))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import random
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -15,18 +15,17 @@ from hoigs.core.interfaces.features import FeatureExtractor
 from hoigs.core.model.entity import Entity
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.tokens import Tokens
+from hoigs.testing import modules
 from hoigs.testing.checks import CheckList, require, require_close, require_finite
 from hoigs.testing.deformation import apply, changed_by, follow
 from hoigs.testing.material import OBJECT, TinyMotion, moment_at, object_track, tiny_clip
 from hoigs.testing.modules import (
-    DeviceSubject,
+    ModuleSubject,
     Moments,
-    copied,
     perturb,
     plain_state,
     require_finite_gradients,
     require_gradients,
-    require_same_state,
     require_true_gradients,
     seeded,
     trained,
@@ -42,7 +41,7 @@ INSIDE = (0.0, 0.13, 0.5, 1.0)
 OUTSIDE = (-0.2, 1.2)
 
 
-class FeaturesSubject(DeviceSubject[FeatureExtractor]):
+class FeaturesSubject(ModuleSubject[FeatureExtractor]):
     """The component under check; it describes an entity that moves."""
 
     def entity(
@@ -68,6 +67,16 @@ class FeaturesSubject(DeviceSubject[FeatureExtractor]):
             perturb(entity.features)
         return entity.to(device=self.device, dtype=dtype).eval()
 
+    def made(self, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Entity:
+        return self.entity(seed=seed, dtype=dtype)
+
+    def cases(self, dtype: torch.dtype = torch.float32) -> Sequence[float]:
+        del dtype
+        return (0.4, 0.0, 0.77, 1.2)
+
+    def outputs(self, made: Entity, case: float) -> dict[str, Tensor]:
+        return by_name(self.tokens(made, case))
+
     def tokens(self, entity: Entity, time: float) -> Tokens:
         tokens = entity.tokens(moment_at(time, entity.means.dtype, entity.means.device))
         assert tokens is not None
@@ -75,6 +84,10 @@ class FeaturesSubject(DeviceSubject[FeatureExtractor]):
 
 
 CHECKS: CheckList[FeaturesSubject] = CheckList("F")
+CHECKS.check("F02")(modules.keeps_dtype_and_device)
+CHECKS.check("F10")(modules.same_seed_same_module)
+CHECKS.check("F11")(modules.a_deep_copy_is_independent)
+CHECKS.check("F12")(modules.cases_are_independent)
 
 
 def subject(cls: type[FeatureExtractor], config: Any, options: Options) -> FeaturesSubject:
@@ -88,8 +101,7 @@ def by_name(tokens: Tokens) -> dict[str, Tensor]:
 
 
 def require_same(what: str, got: Tokens, expected: Tokens, atol: float = 1e-5) -> None:
-    for name, x in by_name(expected).items():
-        require_close(f"{what}: {name}", by_name(got)[name], x, atol=atol)
+    modules.require_same(what, by_name(got), by_name(expected), atol)
 
 
 def learns(subject: FeaturesSubject) -> str | None:
@@ -116,16 +128,6 @@ def as_many_positions_as_features(subject: FeaturesSubject) -> None:
             tokens.positions.shape == (number, 3),
             f"{number} tokens have positions {list(tokens.positions.shape)}",
         )
-
-
-@CHECKS.check("F02")
-def dtype_and_device_are_kept(subject: FeaturesSubject) -> None:
-    """Tokens have dtype and device of the Gaussians, in float32 and in float64."""
-    for dtype in (torch.float32, torch.float64):
-        entity = subject.entity(dtype=dtype)
-        for name, x in by_name(subject.tokens(entity, 0.4)).items():
-            same = x.dtype == dtype and x.device == entity.means.device
-            require(same, f"{name} are {x.dtype} on {x.device}, the Gaussians {dtype}")
 
 
 @CHECKS.check("F03")
@@ -205,7 +207,7 @@ def as_many_tokens_as_declared(subject: FeaturesSubject) -> None:
         )
 
 
-# F08 to F12: rows, optimizer moments, checkpoints, seeds and independence of moments.
+# F08 and F09: rows, optimizer moments and checkpoints.
 
 
 @CHECKS.check("F08")
@@ -239,34 +241,3 @@ def a_checkpoint_restores_it(subject: FeaturesSubject) -> None:
     for time in INSIDE:
         expected = subject.tokens(entity, time)
         require_same(f"loaded, at {time}", subject.tokens(fresh, time), expected, atol=1e-6)
-
-
-@CHECKS.check("F10")
-def same_seed_same_features(subject: FeaturesSubject) -> None:
-    """Two instances from one random state of torch are equal, bit for bit."""
-    first = subject.entity()
-    random.random()
-    require_same_state("built twice from one seed", first, subject.entity())
-
-
-@CHECKS.check("F11")
-def a_deep_copy_is_independent(subject: FeaturesSubject) -> None:
-    """A deep copy, made after a training pass, is equal and independent."""
-    entity = subject.entity()
-    before = subject.tokens(entity, 0.4)
-    before = type(before)(before.features.detach().clone(), before.positions.detach().clone())
-    twin = copied(entity, lambda entity: subject.tokens(entity, 0.4))
-    require_same("a deep copy", subject.tokens(twin, 0.4), before, atol=0.0)
-    perturb(twin, seed=8)
-    require_same("after its copy changed", subject.tokens(entity, 0.4), before, atol=0.0)
-
-
-@CHECKS.check("F12")
-@torch.no_grad()
-def moments_are_independent(subject: FeaturesSubject) -> None:
-    """Several moments in any order give the same as each alone."""
-    together = subject.entity()
-    drawn = [(time, subject.tokens(together, time)) for time in (0.0, 0.77, 0.13, 1.2, 0.77, 0.0)]
-    for time, got in drawn:
-        alone = subject.tokens(subject.entity(), time)
-        require_same(f"at {time}, among other moments", got, alone, atol=1e-6)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import random
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ from hoigs.core.interfaces.body import PART_NAMES
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.interaction import InteractionModule
 from hoigs.core.values.tokens import EntityKind, Residual, Role, Tokens
+from hoigs.testing import modules
 from hoigs.testing.checks import (
     CheckError,
     CheckList,
@@ -24,12 +24,10 @@ from hoigs.testing.checks import (
 )
 from hoigs.testing.material import tiny_clip
 from hoigs.testing.modules import (
-    DeviceSubject,
-    copied,
+    ModuleSubject,
     perturb,
     plain_state,
     require_gradients,
-    require_same_state,
     require_true_gradients,
     seeded,
     trained,
@@ -77,7 +75,7 @@ class Inputs:
         return Inputs(tokens, roles)
 
 
-class InteractionSubject(DeviceSubject[InteractionModule]):
+class InteractionSubject(ModuleSubject[InteractionModule]):
     """The component under check."""
 
     def module(
@@ -113,11 +111,22 @@ class InteractionSubject(DeviceSubject[InteractionModule]):
             roles[name] = Role(KINDS[name], anchors, reach)
         return Inputs(tokens, roles)
 
+    def made(self, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> InteractionModule:
+        return self.module(seed=seed, dtype=dtype)
+
+    def cases(self, dtype: torch.dtype = torch.float32) -> Sequence[Inputs]:
+        return (self.inputs(dtype),)
+
+    def outputs(self, made: InteractionModule, case: Inputs) -> dict[str, Tensor]:
+        return corrections(self.run(made, case))
+
     def run(self, module: InteractionModule, inputs: Inputs) -> Mapping[str, Residual]:
         return module(inputs.tokens, inputs.roles)
 
 
 CHECKS: CheckList[InteractionSubject] = CheckList("I")
+CHECKS.check("I02")(modules.keeps_dtype_and_device)
+CHECKS.check("I13")(modules.same_seed_same_module)
 
 
 def subject(cls: type[InteractionModule], config: Any, options: Options) -> InteractionSubject:
@@ -139,10 +148,7 @@ def corrections(residuals: Mapping[str, Residual]) -> dict[str, Tensor]:
 def require_same(
     what: str, got: Mapping[str, Residual], expected: Mapping[str, Residual], atol: float = 1e-6
 ) -> None:
-    one, two = corrections(got), corrections(expected)
-    require(set(one) == set(two), f"{what}: {sorted(set(one) ^ set(two))} is present only once")
-    for name, x in two.items():
-        require_close(f"{what}: {name}", one[name], x, atol=atol)
+    modules.require_same(what, corrections(got), corrections(expected), atol)
 
 
 def learns(subject: InteractionSubject) -> str | None:
@@ -168,16 +174,6 @@ def residuals_fit_their_entities(subject: InteractionSubject) -> None:
                 shape == [COUNTS[name], 3],
                 f"{name}.means is {shape}: expected one for each token, [M, 3]",
             )
-
-
-@CHECKS.check("I02")
-def dtype_and_device_are_kept(subject: InteractionSubject) -> None:
-    """Residuals have dtype and device of the tokens, in float32 and in float64."""
-    for dtype in (torch.float32, torch.float64):
-        residuals = subject.run(subject.module(dtype=dtype), subject.inputs(dtype))
-        for name, x in corrections(residuals).items():
-            same = x.dtype == dtype and x.device == subject.device
-            require(same, f"{name} is {x.dtype} on {x.device}, the tokens {dtype}")
 
 
 @CHECKS.check("I03")
@@ -323,14 +319,6 @@ def a_checkpoint_restores_it(subject: InteractionSubject) -> None:
     require_same("loaded", subject.run(fresh, whole), subject.run(module, whole))
 
 
-@CHECKS.check("I13")
-def same_seed_same_module(subject: InteractionSubject) -> None:
-    """Two instances from one random state of torch are equal, bit for bit."""
-    first = subject.module()
-    random.random()
-    require_same_state("built twice from one seed", first, subject.module())
-
-
 @CHECKS.check("I14")
 def a_deep_copy_is_independent(subject: InteractionSubject) -> None:
     """A call keeps no state for the next one; a deep copy, made after a
@@ -339,10 +327,7 @@ def a_deep_copy_is_independent(subject: InteractionSubject) -> None:
     first = subject.run(module, whole)
     subject.run(module, whole.only("ann", "box"))
     require_same("called again", subject.run(module, whole), first)
-    twin = copied(module, lambda module: subject.run(module, whole))
-    require_same("a deep copy", subject.run(twin, whole), first)
-    perturb(twin, seed=8)
-    require_same("after its copy changed", subject.run(module, whole), first)
+    modules.a_deep_copy_is_independent(subject)
 
 
 @CHECKS.check("I15")

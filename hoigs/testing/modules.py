@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import copy
 import math
+import random
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from hoigs.core.values.topology import AxisChange, TopologyChange
-from hoigs.testing.checks import CheckError, Component, ComponentSubject, require_finite
+from hoigs.testing.checks import (
+    CheckError,
+    Component,
+    ComponentSubject,
+    require,
+    require_close,
+    require_finite,
+)
 
 Made = TypeVar("Made")
 Module = TypeVar("Module", bound=nn.Module)
@@ -29,6 +38,22 @@ class DeviceSubject(ComponentSubject[Component]):
     """A component class with its settings, and the device on which it is checked."""
 
     device: torch.device = CPU
+
+
+class ModuleSubject(DeviceSubject[Component]):
+    """A component that becomes a torch module: what the checks that kinds share run on."""
+
+    def made(self, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> nn.Module:
+        """The module, in eval mode, with perturbed parameters."""
+        raise NotImplementedError
+
+    def cases(self, dtype: torch.dtype = torch.float32) -> Sequence[Any]:
+        """Inputs of the module: moments, or entities. Those that come first are the usual ones."""
+        raise NotImplementedError
+
+    def outputs(self, made: Any, case: Any) -> dict[str, Tensor]:
+        """What the module computes of a case, by name."""
+        raise NotImplementedError
 
 
 def seeded(make: Callable[[], Made], seed: int = 0) -> Made:
@@ -238,3 +263,56 @@ def unchanged(what: str, tensors: Mapping[str, Tensor]) -> Any:
     for name, x in tensors.items():
         if not torch.equal(x.detach().nan_to_num(math.pi), before[name].nan_to_num(math.pi)):
             raise CheckError(f"{what}{name} was changed in place")
+
+
+# Checks that deformations, features and interactions share, each under a number of its own.
+
+
+def keeps_dtype_and_device(subject: ModuleSubject[Any]) -> None:
+    """The output has dtype and device of the input, in float32 and in float64."""
+    for dtype in (torch.float32, torch.float64):
+        made = subject.made(dtype=dtype)
+        for name, x in subject.outputs(made, subject.cases(dtype)[0]).items():
+            same = x.dtype == dtype and x.device.type == subject.device.type
+            require(same, f"{name} is {x.dtype} on {x.device}, the input {dtype} {subject.device}")
+
+
+def same_seed_same_module(subject: ModuleSubject[Any]) -> None:
+    """Two instances from one random state of torch are equal, bit for bit."""
+    first = subject.made()
+    random.random()  # generators that a spec does not seed must not matter
+    np.random.random()
+    second = subject.made()
+    require_same_state("built twice from one seed", first, second)
+    case = subject.cases()[0]
+    expected = subject.outputs(first, case)
+    require_same("built twice from one seed", subject.outputs(second, case), expected, atol=0.0)
+
+
+def a_deep_copy_is_independent(subject: ModuleSubject[Any]) -> None:
+    """A deep copy, made after a training pass, is equal and independent."""
+    made, case = subject.made(), subject.cases()[0]
+    before = {name: x.detach().clone() for name, x in subject.outputs(made, case).items()}
+    twin = copied(made, lambda made: subject.outputs(made, case))
+    require_same("a deep copy", subject.outputs(twin, case), before, atol=0.0)
+    perturb(twin, seed=8)
+    require_same("after its copy changed", subject.outputs(made, case), before, atol=0.0)
+
+
+@torch.no_grad()
+def cases_are_independent(subject: ModuleSubject[Any]) -> None:
+    """Several inputs in any order give the same as each alone."""
+    together, cases = subject.made(), subject.cases()[:4]
+    for case in (*cases, *reversed(cases)):
+        got = {name: x.clone() for name, x in subject.outputs(together, case).items()}
+        alone = subject.outputs(subject.made(), case)
+        require_same(f"at {case}, among others", got, alone, atol=1e-6)
+
+
+def require_same(
+    what: str, got: Mapping[str, Tensor], expected: Mapping[str, Tensor], atol: float
+) -> None:
+    """The same tensors by name, each to `atol`."""
+    require(set(got) == set(expected), f"{what}: {sorted(set(got) ^ set(expected))} is there once")
+    for name, x in expected.items():
+        require_close(f"{what}: {name}", got[name], x, atol=atol)

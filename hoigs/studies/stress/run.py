@@ -70,7 +70,7 @@ class StressStudy:
     """A study to run.
 
     Attributes:
-        cases: chosen. specs: of `jobs.variants.parse_variants`. seeds: how many, from 0.
+        cases: chosen. specs: of `jobs.results.parse_variants`. seeds: how many, from 0.
         steps, points: of every training; Gaussians at its start.
         base: settings of every clip. whole: run every value even after a seed has failed one.
         settings: overrides of every spec. out, device, plugins: as for other studies.
@@ -260,7 +260,7 @@ def run_stress(
         row.label: capabilities(
             *compose_small(
                 str(row.spec), (*study.settings, *row.settings), tuple(map(str, study.plugins))
-            )
+            )[1:]
         )
         for row in study.specs
     }

@@ -12,7 +12,7 @@ from hoigs.core.spec.schema import Spec
 from hoigs.studies.execution.local import LocalExecutor
 from hoigs.studies.jobs.job import Job
 from hoigs.studies.jobs.results import parse_variants
-from hoigs.studies.stress.capabilities import small_settings
+from hoigs.studies.stress.capabilities import capabilities, compose_small, small_settings
 from hoigs.studies.stress.case import Case, choose_cases
 from hoigs.studies.stress.run import StressStudy, block_settings, plan_chains, run_stress
 
@@ -107,3 +107,17 @@ def test_chains_share_what_they_have_in_common(tmp_path: Path) -> None:
     assert runs["F01"] == runs["F49"], "one clean clip, one training"
     with pytest.raises(HoigsError, match=r"statik.*static"):
         plan_chains(study(tmp_path, "F49", "statik"), {"statik": frozenset()})
+
+
+@pytest.mark.parametrize(
+    ("source", "has", "lacks"),
+    [
+        ("hoigs", {"body", "object", "masks", "moves", "time planes"}, {"whole picture"}),
+        ("4dgs", {"scene", "whole picture", "time planes", "networks"}, {"body", "masks"}),
+        ("ex4dgs", {"knots", "free knots", "keyed opacity"}, {"time planes"}),
+    ],
+)
+@pytest.mark.slow
+def test_capabilities_are_what_a_spec_composes(source: str, has: set[str], lacks: set[str]) -> None:
+    found = capabilities(*compose_small(source)[1:])
+    assert has <= found and not lacks & found
