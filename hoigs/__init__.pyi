@@ -82,7 +82,8 @@ from hoigs.studies.doctor import bug_report as bug_report
 from hoigs.studies.doctor import doctor as doctor
 from hoigs.studies.needs.auto import AutoRun as _AutoRun
 from hoigs.studies.needs.compress import compress as compress
-from hoigs.studies.needs.needs import needs as needs
+from hoigs.studies.needs.options import NeedsOptions as _NeedsOptions
+from hoigs.studies.needs.result import Needs as _Needs
 from hoigs.synthesis import builtin_clip as builtin_clip
 from hoigs.training.options import DemoOptions as _DemoOptions
 from hoigs.training.options import RefineOptions as _RefineOptions
@@ -434,6 +435,25 @@ def export(
     progress: Any | None = ...,
     options: _ExportOptions | None = ...,
 ) -> _Exported: ...
+
+def needs(
+    clip: _Path | str,
+    spec: str | _Path = ...,
+    *,
+    out: _Path | str | None = ...,
+    criterion: str = ...,
+    least: float = ...,
+    share: float = ...,
+    search_spaces: _Path | str | None = ...,
+    allow_faults: bool = ...,
+    rasterizer: str | None = ...,
+    device: str = ...,
+    plugins: Sequence[_Path | str] = ...,
+    overrides: Sequence[str] = ...,
+    overwrite: bool = ...,
+    report: Any = ...,
+    options: _NeedsOptions | None = ...,
+) -> _Needs: ...
 
 def refine_poses(
     clip: _Path | str,

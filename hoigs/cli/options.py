@@ -43,7 +43,8 @@ def flags(options: type[Options]) -> Callable[[Callable[..., None]], Callable[..
             given = {name: values.pop(name) for name in fields if name in values}
             unset = {parameter.name: parameter.default for parameter in made}
             set_ = {k: v for k, v in given.items() if v not in (None, [], ()) and v != unset[k]}
-            command(**values, options=options.of(None, set_, command.__name__))
+            places = {name: Flag.names_of(name, fields[name])[0] for name in set_}
+            command(**values, options=options.of(None, set_, command.__name__, places))
 
         called.__signature__ = inspect.Signature(every)  # type: ignore[attr-defined]
         called.__annotations__ = {p.name: p.annotation for p in every}

@@ -8,19 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hoigs.cli.common import (
-    AllowFaultsOption,
     ClipOption,
     DeviceOption,
     Display,
     OverwriteOption,
     PluginOption,
-    RasterizerOption,
-    SetOption,
     print_scores,
     print_table,
 )
 from hoigs.cli.options import flags
 from hoigs.evaluation.options import EvaluateOptions
+from hoigs.studies.needs.options import NeedsOptions
 from hoigs.training.options import TrainOptions
 
 if TYPE_CHECKING:
@@ -30,44 +28,14 @@ if TYPE_CHECKING:
 
 # `hoigs study needs`: find how much of a spec a clip needs; the answer is a spec.
 
-CriterionOption = Annotated[
-    str,
-    typer.Option(
-        "--criterion",
-        help="one-se: the cheapest candidate within one standard error of the best; or bic.",
-    ),
-]
-SearchSpacesOption = Annotated[
-    Path | None,
-    typer.Option("--search-spaces", help="A YAML file of search spaces in place of hoigs's own."),
-]
 
-
+@flags(NeedsOptions)
 def needs(
     clip: Annotated[
         str, typer.Argument(help="Clip folder, as `hoigs prepare` makes it, or builtin:NAME.")
     ],
-    spec: Annotated[
-        str, typer.Option("--spec", help="The spec to reduce: a name or a file.")
-    ] = "hoigs",
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder of the answer; default runs/needs-CLIP.")
-    ] = None,
-    criterion: CriterionOption = "one-se",
-    least: Annotated[
-        float, typer.Option("--least", min=0, help="Ignore gains below this, dB.")
-    ] = 0.1,
-    share: Annotated[
-        float,
-        typer.Option("--share", help="Share of the training frames to hold back (at least 3)."),
-    ] = 0.05,
-    search_spaces: SearchSpacesOption = None,
-    settings: SetOption = None,
-    rasterizer: RasterizerOption = None,
-    device: DeviceOption = "auto",
-    overwrite: OverwriteOption = False,
-    allow_faults: AllowFaultsOption = False,
-    plugin: PluginOption = None,
+    *,
+    options: NeedsOptions,
 ) -> None:
     """Find the smallest model that a clip needs, part by part, on training frames held back.
 
@@ -77,14 +45,9 @@ def needs(
     from hoigs.studies.needs.needs import needs_folder
 
     with Display() as show:
-        found = find(
-            clip, spec, out=out, criterion=criterion, least=least, share=share,
-            search_spaces=search_spaces, overrides=settings or (), rasterizer=rasterizer,
-            device=device, overwrite=overwrite, allow_faults=allow_faults, plugins=plugin or (),
-            report=show.line,
-        )  # fmt: skip
+        found = find(clip, options=options, report=show.line)
     print_needs(found)
-    answer = (out or needs_folder(clip)) / "spec.yaml"
+    answer = Path(options.out or needs_folder(clip)) / "spec.yaml"
     typer.echo(f"train it: hoigs train {clip} --spec {answer}")
 
 

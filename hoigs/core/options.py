@@ -53,11 +53,17 @@ class Options(ComponentConfig):
     model_config = ConfigDict(frozen=True)
 
     @classmethod
-    def of(cls, options: Self | None, settings: Mapping[str, Any], verb: str = "") -> Self:
+    def of(
+        cls,
+        options: Self | None,
+        settings: Mapping[str, Any],
+        verb: str = "",
+        places: Mapping[str, str] | None = None,
+    ) -> Self:
         """`options`, or the defaults, with `settings` laid over them.
 
         Args:
-            verb: what they are of, for messages.
+            verb: what they are of, and places: where each setting was given, for messages.
 
         Raises:
             HoigsError: `options` are of another verb, or a setting is unknown or of the wrong type.
@@ -71,7 +77,8 @@ class Options(ComponentConfig):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            document = Document(f"{verb}:", values)
+            where = {(name,): place for name, place in (places or {}).items()}
+            document = Document(f"{verb}:", values, values=where)
             raise HoigsError("\n".join(explain(error, cls, document, ()))) from error
 
     def given(self) -> dict[str, Any]:

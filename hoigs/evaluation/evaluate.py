@@ -71,10 +71,7 @@ def score(
         report(FITTING_SHARE * done, text)
 
     share = own_share(model, clip, split, posing) if poses == "blended" else None
-    clip = posed_clip(
-        model, clip, split=split, test_pose=poses, test_camera=cameras,
-        fit_steps=options.fit_steps, share=share, progress=posing,
-    )  # fmt: skip
+    clip = posed_clip(model, clip, options, share=share, progress=posing)
 
     # every frame of the split, and of the held-out cameras
     chosen = [("test frames" if split == "test" else f"{split} frames", clip, split)]

@@ -27,6 +27,7 @@ from hoigs.core.values.between import blend_cameras, blend_poses
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import POSES_ESTIMATED, Clip, Frame
 from hoigs.core.values.moment import BodyPose, Moment
+from hoigs.evaluation.options import ScoreOptions
 from hoigs.metrics.image_loss import image_loss
 from hoigs.metrics.psnr import region_psnr
 
@@ -195,11 +196,8 @@ def source_of_poses(clip: Clip, setting: TestPoseSetting) -> TestPose:
 def posed_clip(
     model: SceneModel,
     clip: Clip,
+    options: ScoreOptions,
     *,
-    split: str = "test",
-    test_pose: TestPose = "given",
-    test_camera: TestCamera = "given",
-    fit_steps: int = FIT_STEPS,
     share: float | None = None,
     progress: Progress | None = None,
 ) -> Clip:
@@ -218,7 +216,8 @@ def posed_clip(
     Raises:
         ValueError: there is no training frame to interpolate from.
     """
-    report = progress or no_progress
+    report, split = progress or no_progress, options.split
+    test_pose, test_camera = source_of_poses(clip, options.test_pose), options.test_camera
     trained = sorted(clip.split.get("train", ()), key=lambda p: clip.moments[p].time)
     chosen = [p for p in clip.split[split] if p not in set(trained)]
     if {"interpolated", "blended"} & {test_pose, test_camera} and chosen:
@@ -232,7 +231,7 @@ def posed_clip(
         moments, cameras = list(clip.moments), list(clip.cameras)
         for done, p in enumerate(chosen):
             fit = fit_frame(
-                model, clip[p], test_pose == "fitted", test_camera == "fitted", fit_steps
+                model, clip[p], test_pose == "fitted", test_camera == "fitted", options.fit_steps
             )
             moments[p], cameras[p] = fit.moment, fit.camera
             report((done + 1) / len(chosen), "fitting poses to test images")

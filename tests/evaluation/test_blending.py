@@ -14,6 +14,7 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import POSES_ESTIMATED, Clip, FrameStore
 from hoigs.evaluation.evaluate import score
+from hoigs.evaluation.options import ScoreOptions
 from hoigs.evaluation.posing import blended, own_share, pose_between, posed_clip
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.deformation.skinned_body import SkinnedBody
@@ -98,7 +99,7 @@ def test_noise_of_estimates_is_not_taken_for_motion(still: tuple[SceneModel, Cli
     try:
         assert own_share(model, noisy) == 0
         with torch.no_grad():
-            found = posed_clip(model, noisy, test_pose="blended")
+            found = posed_clip(model, noisy, ScoreOptions(test_pose="blended"))
             for p in TESTS:
                 shown = human(model).pose(found.moments[p]).transl
                 torch.testing.assert_close(shown, clip.moments[p].poses["human"].transl)
@@ -135,4 +136,4 @@ def test_no_share_is_interpolation_and_the_test_frame_is_not_read(
     few = replace(jolted, split={"train": [0, 4], "test": [2]})
     assert own_share(model, few) == 0
     with pytest.raises(ValueError, match="no training frames"):
-        posed_clip(model, replace(jolted, split={"test": [2]}), test_pose="blended")
+        posed_clip(model, replace(jolted, split={"test": [2]}), ScoreOptions(test_pose="blended"))

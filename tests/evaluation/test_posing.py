@@ -18,6 +18,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import POSES_ESTIMATED, Clip, FrameStore
 from hoigs.core.values.moment import BodyPose
 from hoigs.evaluation.evaluate import score
+from hoigs.evaluation.options import ScoreOptions
 from hoigs.evaluation.posing import (
     camera_between,
     fit_frame,
@@ -123,7 +124,7 @@ def test_interpolated_takes_nothing_from_the_test_frame(scene: tuple[SceneModel,
     cameras[TEST] = cameras[TEST].moved(torch.ones(3), torch.ones(3))
     spoiled = replace(spoiled, cameras=cameras)
     wanted = {"test_pose": "interpolated", "test_camera": "interpolated"}
-    ours, theirs = (posed_clip(model, c, **wanted) for c in (spoiled, clip))  # type: ignore[arg-type]
+    ours, theirs = (posed_clip(model, c, ScoreOptions(**wanted)) for c in (spoiled, clip))  # type: ignore[arg-type]
     for name, value in vars(ours.moments[TEST].poses["human"]).items():
         expected = getattr(theirs.moments[TEST].poses["human"], name)
         assert value == expected if isinstance(value, str) else torch.equal(value, expected)
@@ -133,9 +134,11 @@ def test_interpolated_takes_nothing_from_the_test_frame(scene: tuple[SceneModel,
         assert ours.moments[p] is spoiled.moments[p] and ours.cameras[p] is spoiled.cameras[p]
     low, high = (clip.moments[p].poses["human"].transl for p in TRAIN)
     torch.testing.assert_close(ours.moments[TEST].poses["human"].transl, 0.5 * (low + high))
-    assert posed_clip(model, clip) is clip
-    with pytest.raises(ValueError, match="no training frames"):
-        posed_clip(model, replace(clip, split={"test": [TEST]}), test_pose="interpolated")
+    assert posed_clip(model, clip, ScoreOptions()) is clip
+    with pytest.raises(ValueError, match="training frames"):
+        posed_clip(
+            model, replace(clip, split={"test": [TEST]}), ScoreOptions(test_pose="interpolated")
+        )
 
 
 def turned(a: BodyPose, b: BodyPose) -> Tensor:
@@ -184,7 +187,7 @@ def test_fitted_cameras(scene: tuple[SceneModel, Clip]) -> None:
     cameras = list(clip.cameras)
     cameras[TEST] = cameras[TEST].moved(torch.tensor([0.01, -0.01, 0.005]), torch.full((3,), 0.01))
     wrong = replace(clip, cameras=cameras)
-    fitted = posed_clip(model, wrong, test_camera="fitted", fit_steps=40)
+    fitted = posed_clip(model, wrong, ScoreOptions(test_camera="fitted", fit_steps=40))
     exact, given, found = (c.cameras[TEST].world_to_camera for c in (clip, wrong, fitted))
     assert (found[:3, :3] - exact[:3, :3]).norm() < 0.5 * (given[:3, :3] - exact[:3, :3]).norm()
     assert fitted.moments[TEST].poses["human"] is not None

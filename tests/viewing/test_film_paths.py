@@ -168,17 +168,17 @@ def test_compared_and_transparent_files(run, tmp_path):
 def test_bad_input_is_answered_and_leaves_nothing(hoigs, tmp_path):
     out = tmp_path / "x.mp4"
     for arguments, words in (
-        (["--path", "bulet-time"], 'did you mean "bullet-time"?'),
-        (["--background", "transparent"], "transparent videos end with .webm, .mov, .gif"),
-        (["--background", "whiet"], "expected a colour"),
-        (["--entities", "humn"], 'did you mean "human"?'),
-        (["--width", "63"], "even number"),
-        (["--from", "40"], "error: --from 40: the clip has frames 0 to 11\n"),
-        (["--fps", "nan"], "error: --fps nan: expected a positive number\n"),
-        (["--entities", "foo"], "--entities foo: this run has scene, human, object\n"),
+        (["--path", "bulet-time"], ['"bullet-time"']),
+        (["--background", "transparent"], [".webm", ".mov", ".gif"]),
+        (["--background", "whiet"], ["whiet"]),
+        (["--entities", "humn"], ["--entities humn", '"human"']),
+        (["--width", "63"], ["width 63"]),
+        (["--from", "40"], ["--from 40", "0 to 11"]),
+        (["--fps", "nan"], ["--fps", "nan"]),
+        (["--entities", "foo"], ["--entities foo", "scene, human, object"]),
     ):
         done = hoigs("render", tiny_run(), "--out", out, *arguments)
-        assert done.code == 2 and words in done.err, (arguments, done.err)
+        assert done.code == 2 and all(word in done.err for word in words), (arguments, done.err)
     done = hoigs("render", tiny_run(), "--out", tmp_path / "x.avi")
-    assert done.code == 2 and "videos end with .mp4" in done.err
+    assert done.code == 2 and ".mp4" in done.err
     assert not list(tmp_path.iterdir())

@@ -21,6 +21,7 @@ from hoigs.runs.run_folder import RunFolder
 from hoigs.studies.needs.after_training import After, add_to_answer, finish
 from hoigs.studies.needs.compress import compact_of
 from hoigs.studies.needs.needs import needs
+from hoigs.studies.needs.options import NeedsOptions
 from hoigs.studies.needs.result import Needs
 from hoigs.training.options import TrainOptions
 from hoigs.training.train import OnStart, OnStep, Report, TrainedRun, silent, train
@@ -95,11 +96,10 @@ def auto(
     else:
         for folder in (path, compact):  # before the search, which may take hours
             RunFolder(folder).refuse_existing(options.overwrite, [clip], resumable=True)
-        found = needs(
-            clip, name, out=answer, overrides=options.spec_settings(), device=device,
-            overwrite=options.overwrite, allow_faults=options.allow_faults, plugins=plugins,
-            report=report,
-        )  # fmt: skip
+        search = options.part(NeedsOptions).changed(
+            spec=name, out=answer, device=device, overrides=options.spec_settings(), rasterizer=None
+        )
+        found = needs(clip, options=search, report=report)
         trained = trained.changed(overrides=(), rasterizer=None, chunk=None)  # the answer has them
         if on_found is not None:
             on_found(found)
