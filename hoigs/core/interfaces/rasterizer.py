@@ -146,14 +146,14 @@ class Rasterizer(Configurable, ABC):
     def check_inputs(self, gaussians: Gaussians, camera: Camera, request: RenderRequest) -> None:
         """The checks that every backend shares; call first in `render`."""
         name = type(self).__name__
-        for key, value, kind in (
+        for key, passed, kind in (
             ("gaussians", gaussians, Gaussians),
             ("camera", camera, Camera),
             ("request", request, RenderRequest),
         ):
-            if not isinstance(value, kind):
+            if not isinstance(passed, kind):
                 raise RenderError(
-                    f"{name}: {key} is of type {type(value).__name__}, expected {kind.__name__}; "
+                    f"{name}: {key} is of type {type(passed).__name__}, expected {kind.__name__}; "
                     "the order is render(gaussians, camera, request)"
                 )
         device = gaussians.means.device
