@@ -77,7 +77,9 @@ class Options(ComponentConfig):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            where: dict[tuple[str | int, ...], str] = {(name,): place for name, place in (places or {}).items()}
+            where: dict[tuple[str | int, ...], str] = {
+                (name,): place for name, place in (places or {}).items()
+            }
             document = Document(f"{verb}:", values, values=where)
             raise HoigsError("\n".join(explain(error, cls, document, ()))) from error
 
