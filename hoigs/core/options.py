@@ -22,7 +22,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.registry.settings import spelled
 from hoigs.core.spec.errors import explain
-from hoigs.core.spec.loader import Document
+from hoigs.core.spec.loader import Document, Place
 
 Result = TypeVar("Result")
 
@@ -77,9 +77,7 @@ class Options(ComponentConfig):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            where: dict[tuple[str | int, ...], str] = {
-                (name,): place for name, place in (places or {}).items()
-            }
+            where: dict[Place, str] = {(name,): place for name, place in (places or {}).items()}
             document = Document(f"{verb}:", values, values=where)
             raise HoigsError("\n".join(explain(error, cls, document, ()))) from error
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,7 +23,8 @@ from hoigs.synthesis.named import clip_config
 def test_what_is_trained_on_which_clip(
     options, specs, steps, width, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked, lines = {}, []
+    asked: dict[str, Any] = {}
+    lines: list[str] = []
 
     def train(clip, *, options, **_):
         spec = Spec.load(options.spec, overrides=options.spec_settings())  # each knows its keys
