@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from hoigs.core.options import Options
+from hoigs.core.options import Flag, Options
 from hoigs.core.spec.train_schema import TestCamera, TestPoseSetting
 from hoigs.evaluation.protocol import Pixels
 from hoigs.runs.options import RunOptions
@@ -27,7 +27,7 @@ class EvaluateOptions(RunOptions):
     """Cameras of test frames: given, interpolated or fitted. Default: the spec's."""
     fit_steps: Annotated[int, Field(ge=1)] | None = None
     """Steps for each frame with fitted. Default: the spec's."""
-    report: bool = True
+    report: Annotated[bool, Flag("--report/--no-report")] = True
     """Write report.html."""
 
     def protocol(self) -> dict[str, str | int]:

@@ -16,7 +16,7 @@ from hoigs.cli.main import app
 # command -> functions that it wraps; together they have every option
 FUNCTIONS = {
     "train": (hoigs.train, hoigs.auto),
-    "needs": (hoigs.needs,),
+    "study needs": (hoigs.needs,),
     "eval": (hoigs.evaluate,),
     "prepare": (hoigs.prepare, hoigs.prepare_until),
     "refine": (hoigs.refine_poses,),
@@ -55,7 +55,9 @@ PYTHON = {"on_start", "on_step", "on_found", "progress", "report", "body", "esti
 
 def options_of(command: str) -> dict[str, Any]:
     """Argument name -> default of everything that a command takes."""
-    parser = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
+    parser: Any = typer.main.get_command(app)
+    for name in command.split():
+        parser = parser.commands[name]
     found = {}
     for parameter in parser.params:
         if parameter.name == "help":

@@ -56,8 +56,8 @@ def test_every_command_and_option_is_there(made):
     page = made.cli_page()
     for command in ("train", "prepare", "plugins new", "plugins show", "study compare"):
         assert f"## hoigs {command}\n" in page
-    assert "| `--resume` | Continue the run in --out, with its own spec and clip. |  |" in page
-    assert "| `--slow` | Play this many times slower, with moments between. | `1.0` |" in page
+    assert "| `--resume` | Continue the run in --out" in page
+    assert "| `--slow` | Play this many times slower" in page
 
 
 def test_the_schema_page_has_every_key(made):

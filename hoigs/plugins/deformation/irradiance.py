@@ -40,9 +40,7 @@ class Irradiance(nn.Module):
 
 def mid_grey(sh: Float[Tensor, "N B 3"]) -> Float[Tensor, "B 1"]:
     """SH coefficients of the colour 0.5, to which those of Gaussians are relative."""
-    grey = sh.new_zeros(sh.shape[1], 1)
-    grey[0] = 0.5 / SH_C0
-    return grey
+    return torch.cat((sh.new_full((1, 1), 0.5 / SH_C0), sh.new_zeros(sh.shape[1] - 1, 1)))
 
 
 def turned_normals(

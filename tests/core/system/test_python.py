@@ -69,12 +69,11 @@ def test_a_job_imports_nothing_from_its_folder(trap):
 def test_a_pool_imports_nothing_from_its_folder(trap):
     code = (
         "from hoigs.studies.stress import run\n"
-        "run._one_thread = int\n"
-        "if __name__ == '__main__':\n"
-        "    with run.processes(1, 1) as pool: print(pool.submit(abs, -3).result())\n"
+        "run._one_thread, run._make_clip = int, print\n"
+        "if __name__ == '__main__': run.make_clips(['a clip'], 1)\n"
     )
     script = trap.with_name("elsewhere") / "main.py"
     script.parent.mkdir()
     script.write_text(code)
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
-    assert not trap.exists() and done.stdout.strip() == "3", done.stderr
+    assert not trap.exists() and done.stdout.strip() == "a clip", done.stderr
