@@ -47,7 +47,7 @@ PAGED = {
 def opened(out: Path, *settings: str, **options: bool) -> Session:
     return Session.open(
         None if options else CLIP, None if options else "hoigs", out=out,
-        overrides=[*SMALL, *settings], **options,
+        overrides=[*SMALL, *settings], device="cpu", **options,
     )  # fmt: skip
 
 
