@@ -220,7 +220,7 @@ def _scored(name: str, scores: list[float]) -> dict[str, float]:
 
 def landmarks_against(raw: FrameEstimates, source: Path) -> dict[str, Any]:
     """Pixels between landmarks."""
-    found = np.isfinite(raw.person.image[..., 0]).any(1)
+    found = np.isfinite(np.asarray(raw.person.image)[..., 0]).any(1)
     row: dict[str, Any] = {"frames": len(found), "frames_with_landmarks": int(found.sum())}
     path = source / "pose_mediapipe.npz"
     if not path.is_file():
