@@ -54,10 +54,13 @@ def test_links_lead_somewhere(page):
 
 def test_every_command_and_option_is_there(made):
     page = made.cli_page()
-    for command in ("train", "prepare", "plugins new", "plugins show", "study compare"):
+    commands = ("train", "prepare", "plugins new", "plugins show", "spec check", "study compare")
+    for command in commands:
         assert f"## hoigs {command}\n" in page
-    assert "| `--resume` | Continue the run in --out" in page
-    assert "| `--slow` | Play this many times slower" in page
+    resume = "Continue the run in --out, with its own spec and clip unless others are given."
+    assert f"| `--resume` | {resume} |  |" in page
+    slow = "Play this many times slower, with moments between frames computed by the model."
+    assert f"| `--slow` | {slow} | `1.0` |" in page
 
 
 def test_the_schema_page_has_every_key(made):

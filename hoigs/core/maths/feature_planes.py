@@ -61,7 +61,8 @@ def axis_pairs(
 ) -> Float[Tensor, "P N 2"]:
     """Two coordinates of each point for each plane."""
     xyz = points.unbind(1)
-    return torch.stack([torch.stack((xyz[first], xyz[second]), 1) for first, second in axes])
+    chosen = torch.stack([xyz[axis] for pair in axes for axis in pair])
+    return chosen.unflatten(0, (len(axes), 2)).mT
 
 
 def timed_pairs(
@@ -69,8 +70,8 @@ def timed_pairs(
 ) -> Float[Tensor, "P N 2"]:
     """One coordinate of each point for each plane, paired with a time in [0, 1] as 2 t - 1."""
     xyz = points.unbind(1)
-    moment = filled(points, (len(points),), 2 * time - 1)
-    return torch.stack([torch.stack((xyz[axis], moment), 1) for axis in axes])
+    chosen = torch.stack([xyz[axis] for axis in axes])
+    return torch.stack((chosen, filled(points, tuple(chosen.shape), 2 * time - 1)), -1)
 
 
 def roughness(values: Float[Tensor, "*shape"], dim: int = 1) -> Float[Tensor, ""]:

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hoigs.core.device import constant
 from hoigs.core.maths.nearest import surface_normals
 from hoigs.core.maths.rotations import quats_to_matrices, relative_quats
 from hoigs.core.maths.spherical_harmonics import irradiance_basis
@@ -40,7 +41,7 @@ class Irradiance(nn.Module):
 
 def mid_grey(sh: Float[Tensor, "N B 3"]) -> Float[Tensor, "B 1"]:
     """SH coefficients of the colour 0.5, to which those of Gaussians are relative."""
-    return torch.cat((sh.new_full((1, 1), 0.5 / SH_C0), sh.new_zeros(sh.shape[1] - 1, 1)))
+    return constant(((0.5 / SH_C0,), *((0.0,),) * (sh.shape[1] - 1)), sh)
 
 
 def turned_normals(

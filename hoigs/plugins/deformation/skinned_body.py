@@ -314,8 +314,8 @@ class SkinnedBody(DeformationModel):
         joints: tuple[int, ...],
     ) -> Float[Tensor, "A 3"]:
         """World positions of some joints, before alpha; `places`: of all, in the zero pose."""
-        chosen = [torch.stack([x[joint] for joint in joints]) for x in (transforms, places)]
-        return transform_points(*chosen)
+        posed = transform_points(transforms, places)
+        return torch.stack([posed[joint] for joint in joints])
 
     def scaled(
         self, points: Float[Tensor, "N 3"], pelvis: Float[Tensor, " 3"], moment: Moment
