@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import random
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -40,20 +41,20 @@ class DeviceSubject(ComponentSubject[Component]):
     device: torch.device = CPU
 
 
-class ModuleSubject(DeviceSubject[Component]):
+class ModuleSubject(DeviceSubject[Component], ABC):
     """A component that becomes a torch module: what the checks that kinds share run on."""
 
+    @abstractmethod
     def made(self, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> nn.Module:
         """The module, in eval mode, with perturbed parameters."""
-        raise NotImplementedError
 
+    @abstractmethod
     def cases(self, dtype: torch.dtype = torch.float32) -> Sequence[Any]:
         """Inputs of the module: moments, or entities. Those that come first are the usual ones."""
-        raise NotImplementedError
 
+    @abstractmethod
     def outputs(self, made: Any, case: Any) -> dict[str, Tensor]:
         """What the module computes of a case, by name."""
-        raise NotImplementedError
 
 
 def seeded(make: Callable[[], Made], seed: int = 0) -> Made:

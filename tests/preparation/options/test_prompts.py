@@ -111,5 +111,5 @@ def test_several_people_have_names() -> None:
     assert set(options.prompts) == {"object", "anna", "ben"}
     both = with_prompts(PrepareOptions(), (), person=["3,2", "anna=5,2"])
     assert both.people == ("human", "anna")
-    with pytest.raises(SpecError, match="ball"):
+    with pytest.raises(SpecError, match="ball is an object's name"):
         with_prompts(PrepareOptions(), "ball=3,4", person="ball=3,2")

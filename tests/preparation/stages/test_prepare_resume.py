@@ -120,7 +120,7 @@ def test_what_builds_on_what() -> None:
 def test_unknown_and_last_stages(tiny_source: Path, tmp_path: Path) -> None:
     with pytest.raises(HoigsError, match=r"camera.*cameras"):
         prepare(tiny_source, tmp_path / "clip", body=AnnyBody(), redo=["camera"])
-    with pytest.raises(HoigsError, match="write"):
+    with pytest.raises(HoigsError, match="write is the last"):
         prepare_until("write", tiny_source, tmp_path / "clip", body=AnnyBody())
 
 

@@ -33,7 +33,7 @@ def test_every_and_max_frames(tiny_video: Path) -> None:
 def test_width(tiny_video: Path) -> None:
     video = VideoFrames(tiny_video, width=48)
     assert next(iter(video)).shape == (32, 48, 3)
-    with pytest.raises(SourceError, match="96"):
+    with pytest.raises(SourceError, match="video's 96"):
         VideoFrames(tiny_video, width=97)
 
 

@@ -47,7 +47,7 @@ def test_gain_is_paired():
 def test_gain_refuses_other_frames_and_single_ones():
     with pytest.raises(ValueError, match="3 and 2"):
         gain(score(1, 2, 3), score(1, 2))
-    with pytest.raises(ValueError, match="1"):
+    with pytest.raises(ValueError, match="two or more"):
         gain(score(1), score(2))
 
 

@@ -17,12 +17,12 @@ from hoigs.studies.stress.verdict import Verdict, in_short, rate_of
 
 
 def test_all_files_are_written_whole(tmp_path: Path) -> None:
-    paths = write_stress(table(cases=choose_cases("F01,F15,F27,F50,F51")), tmp_path)
+    paths = write_stress(table(), tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(p.name for p in paths)
     assert {p.suffix for p in paths} == {".json", ".csv", ".md", ".png", ".svg"}
     for path in tmp_path.glob("*.png"):
         with Image.open(path) as image:
-            assert min(image.size) > 300
+            assert min(image.size) > 1000
             assert len(image.convert("RGB").getcolors(1 << 20) or ()) > 50
     svg = (tmp_path / "stress-matrix.svg").read_text()
     for words in ("F01", "F51", "fast motion is smoothed over", "static-3dgs", MACHINE, "2030-01"):
