@@ -28,12 +28,13 @@ class Graph:
 
     def __init__(self, narrow: float = 1.0, turned: bool = False) -> None:
         self.narrow, self.turned, self.looks = narrow, turned, 0
+        self.places = dict(PLACES)
 
     def process(self, given: dict) -> Box:
         self.looks += 1
         sure = 1.0 if abs(given["square"].y_center - 0.5) < 0.1 else 0.7
         points = [Box(x=-1.0, y=-1.0, z=0.0, visibility=0.0) for _ in range(33)]
-        for mark, (x, y) in PLACES.items():
+        for mark, (x, y) in self.places.items():
             x, y = 80 + (x - 80) * self.narrow, 89 - y if self.turned else y
             points[mark] = Box(x=x / 160, y=y / 90, z=0.0, visibility=sure)
         rows = Box(landmark=points)
@@ -70,6 +71,16 @@ def test_nobody_who_stands_on_their_head_and_no_search_in_every_frame() -> None:
     pose = guided(graph)
     assert [pose.process(IMAGE, None) for _ in range(AGAIN + 1)] == [None] * (AGAIN + 1)
     assert graph.looks == 16
+
+
+def test_a_guess_of_the_head_chooses_a_square_and_does_not_end_it() -> None:
+    graph = Graph()
+    pose = guided(graph)
+    pose.process(IMAGE, None)
+    graph.places[0] = (80, 20)  # out of view, guessed below the shoulders
+    points, _, _ = pose.process(IMAGE, None)
+    np.testing.assert_allclose(points[11, :2], (110, 10), atol=1e-9)
+    assert guided(graph).process(IMAGE, None) is None
 
 
 def test_the_mask_of_people_has_a_say_until_somebody_is_found() -> None:

@@ -104,7 +104,9 @@ class GuidedPose:
         points, space, mask = found
         broad = np.ptp(points[SHOULDERS, 0])
         near = broad >= max(NARROW * max(width, height), SAME * self.broad)
-        person = near and upright(points) and not self.doubt(points, mask, wide)
+        # the head is out of view: its guess tells a good square, and nothing once one is followed
+        person = near and upright(points, head=self.square is None)
+        person = person and not self.doubt(points, mask, wide)
         points[HEAD, 3] = 0.0  # one that can be seen is found by the detector
         x, y = points[LEGS, :2].astype(int).clip(0, [width - 1, height - 1]).T
         points[LEGS, 3] *= mask[y, x]  # not on the person: on a table before them
@@ -152,10 +154,10 @@ def seen_in(graph, rect, image, square):
     return points, space, np.array(found.mask)
 
 
-def upright(points) -> bool:
-    """Whether the head is above the shoulders, and they above the hips."""
-    head, hips = points[0, 1], points[HIPS, 1].mean()
-    return bool(head < points[SHOULDERS, 1].mean() < hips)
+def upright(points, *, head: bool) -> bool:
+    """Whether the shoulders are above the hips, and, with `head`, the head above the shoulders."""
+    shoulders, hips = points[SHOULDERS, 1].mean(), points[HIPS, 1].mean()
+    return bool(shoulders < hips and (not head or points[0, 1] < shoulders))
 
 
 def score(visibility) -> float:

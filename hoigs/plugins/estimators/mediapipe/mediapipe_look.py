@@ -69,7 +69,7 @@ class Look:
     def upper_body(self, image, square):
         """How sure, middle and side of a square about somebody whose face need not be seen."""
         one = seen_in(*self.landmarks, image, square)
-        if one is None or not upright(one[0]):
+        if one is None or not upright(one[0], head=True):
             return None
         points = one[0].copy()
         points[HEAD, 3] = 0.0
