@@ -204,7 +204,7 @@ def test_targets_are_not_overwritten(tiny_source: Path, tmp_path: Path, body: An
     assert not (tmp_path / "third").exists()
     with pytest.raises(SourceError, match="is a clip already"):
         prepare(out, tmp_path / "other", body=body)
-    with pytest.raises(ClipError, match="source.* not empty"):
+    with pytest.raises(ClipError, match=r"source.* not empty"):
         prepare(tiny_source, tiny_source, body=body)
 
 
