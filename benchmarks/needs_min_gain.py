@@ -59,7 +59,7 @@ def every_candidate(case: str, seed: int, options: argparse.Namespace) -> dict[s
 def replayed(cell: dict[str, Any], min_gain: float) -> str:
     """The candidate that successive halving chooses with a `min_gain`."""
     from hoigs.studies.needs.result import Settings
-    from hoigs.studies.needs.search_space import Plan, Score, StepBudget, successive_halving
+    from hoigs.studies.needs.search_space import Plan, Rule, Score, StepBudget, successive_halving
 
     names = list(cell["scores"])
 
@@ -71,7 +71,7 @@ def replayed(cell: dict[str, Any], min_gain: float) -> str:
     rounds = Plan(tuple(cell["alive"]), tuple(cell["until"]))
     frames = len(score(0, rounds.until[0]).psnr)
     halving = successive_halving(rounds, [1.0] * len(names), frames, score, StepBudget(math.inf),
-                    least=Settings().least, min_gain=min_gain)  # fmt: skip
+                    rule=Rule(least=Settings().least, min_gain=min_gain))  # fmt: skip
     return names[halving.chosen]
 
 

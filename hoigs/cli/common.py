@@ -22,56 +22,12 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", help="Set one key of the spec: train.steps=500. Repeatable."),
 ]
-RasterizerOption = Annotated[
-    str | None,
-    typer.Option("--rasterizer", help="Rasterizer: warp, torch, oracle or a plugin."),
-]
 DeviceOption = Annotated[
     str, typer.Option("--device", help="cpu, cuda, or auto: cuda if available.")
-]
-SeedsOption = Annotated[int, typer.Option("--seeds", min=1, help="Number of seeds: 0, 1 …")]
-JobsOption = Annotated[int, typer.Option("--jobs", min=1, help="Trainings at a time.")]
-ThreadsOption = Annotated[
-    int | None,
-    typer.Option("--threads", min=1, help="Threads of each training; default cores / jobs."),
-]
-ExecutorOption = Annotated[
-    str,
-    typer.Option(
-        "--executor",
-        help="Where they run: local, ray (pip install 'hoigs[ray]'), or MODULE:CLASS of your own.",
-    ),
-]
-AddressOption = Annotated[
-    str | None,
-    typer.Option(
-        "--address", help="Ray cluster to join: auto, HOST:PORT. Default: Ray on this machine only."
-    ),
-]
-MinutesOption = Annotated[
-    float | None,
-    typer.Option(
-        "--minutes",
-        help="Stop after this time and write the results so far; the same command continues.",
-    ),
 ]
 ClipOption = Annotated[
     Path | None,
     typer.Option("--clip", help="The clip, if it was moved: a folder or builtin:NAME."),
-]
-LpipsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--lpips-weights",
-        help="File of LPIPS weights; default $HOIGS_LPIPS_WEIGHTS, or else AlexNet's, shipped.",
-    ),
-]
-AllowFaultsOption = Annotated[
-    bool,
-    typer.Option(
-        "--allow-faults",
-        help="Continue without masks, images and depth that are missing or broken.",
-    ),
 ]
 OverwriteOption = Annotated[
     bool, typer.Option("--overwrite", help="Replace what hoigs wrote to --out before.")
@@ -82,13 +38,6 @@ PluginOption = Annotated[
         "--plugin", help="Also load this Python file as a plugin; its code runs. Repeatable."
     ),
 ]
-
-
-def study_device(device: str, executor: str) -> str:
-    """`pick_device`; a GPU for jobs on other machines need not be in this one."""
-    from hoigs.runs.choices import pick_device
-
-    return pick_device(device) if executor == "local" or device == "auto" else device
 
 
 def print_table(

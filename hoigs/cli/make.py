@@ -12,6 +12,7 @@ import typer
 from hoigs.cli.common import Display, print_scores, print_table
 from hoigs.cli.options import flags
 from hoigs.core.system.files import printable
+from hoigs.preparation.options import PrepareOptions
 from hoigs.training.options import DemoOptions, RefineOptions
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ def _compare(runs: dict[str, TrainedRun]) -> None:
 # `hoigs prepare`: make a clip folder from a video.
 
 
+@flags(PrepareOptions)
 def prepare(
     source: Annotated[
         Path,
@@ -63,162 +65,29 @@ def prepare(
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="Clip folder to make.")],
-    object_at: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--object",
-            help="The object: a point 640,402 or 640,402@FRAME, one beside it -700,380, a box "
-            'x0,y0,x1,y1, words "football" (with --estimators hub), or none. Repeatable.',
-        ),
-    ] = None,
-    person: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--person",
-            help="Which person to fit where several are seen: a point on them, 320,210 or "
-            "320,210@FRAME, or a box, as with --object; several people with names, "
-            "anna=320,210; all, or none. Repeatable.",
-        ),
-    ] = None,
-    estimators: Annotated[
-        str | None,
-        typer.Option(
-            "--estimators",
-            help="What finds landmarks and masks that no file beside the video gives: offline "
-            "(MediaPipe and hoigs's tracker; default), hub (networks), or files (nothing does).",
-        ),
-    ] = None,
-    yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Install and download what is needed, unasked.")
-    ] = False,
-    width: Annotated[
-        int | None, typer.Option("--width", help="Resize frames; default: the video's own.")
-    ] = None,
-    camera: Annotated[
-        str | None,
-        typer.Option(
-            "--camera",
-            help="auto, static, turning (on its spot), moving (COLMAP's model beside the video, or "
-            "structure from motion) or sfm (structure from motion in any case).",
-        ),
-    ] = None,
-    max_frames: Annotated[
-        int | None, typer.Option("--max-frames", help="Use only the first frames.")
-    ] = None,
-    every: Annotated[
-        int | None, typer.Option("--every", help="Use the sharpest of each n frames.")
-    ] = None,
-    fps: Annotated[
-        float | None, typer.Option("--fps", help="Use this many frames a second, the sharpest.")
-    ] = None,
-    start: Annotated[
-        str | None,
-        typer.Option(
-            "--start", help="Start here: 2.5 (seconds), 1:02.5, or 75f (frame 75 of the video)."
-        ),
-    ] = None,
-    end: Annotated[str | None, typer.Option("--end", help="End before this, likewise.")] = None,
-    focal: Annotated[
-        float | None, typer.Option("--focal", help="Focal length in pixels of the video, if known.")
-    ] = None,
-    intrinsics: Annotated[
-        str | None,
-        typer.Option(
-            "--intrinsics",
-            help="The lens, in pixels of the video: fx,fy,cx,cy or fx,fy,cx,cy,k1,k2,p1,p2.",
-        ),
-    ] = None,
-    calibration: Annotated[
-        str | None,
-        typer.Option(
-            "--calibration",
-            help="The lens, in a file of COLMAP, OpenCV, Qualisys or Pose2Sim; FILE#NAME of "
-            "several.",
-        ),
-    ] = None,
-    person_height: Annotated[
-        float | None,
-        typer.Option(
-            "--person-height",
-            help="Of the person standing, metres: the unit of the world comes from it.",
-        ),
-    ] = None,
-    chunk: Annotated[
-        int | None,
-        typer.Option(
-            "--chunk", help="For a long video: fit the body in windows of so many frames."
-        ),
-    ] = None,
-    overlap: Annotated[
-        int | None,
-        typer.Option(
-            "--overlap",
-            help="Frames that two windows share; default: a quarter of --chunk, 50 at most.",
-        ),
-    ] = None,
-    keep_black: Annotated[
-        bool | None,
-        typer.Option(
-            "--keep-black", help="Train on uniform black areas; default: they are ignored."
-        ),
-    ] = None,
-    overwrite: Annotated[bool | None, typer.Option("--overwrite", help="Replace the clip.")] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            help="Any option: estimators.masks.use=estimator:masks-files, "
-            "estimators.masks.path=sam2. Repeatable.",
-        ),
-    ] = None,
-    file: Annotated[
-        Path | None, typer.Option("--options", help="YAML or TOML file of options.")
-    ] = None,
-    allow_commands: Annotated[
-        bool,
-        typer.Option(
-            "--allow-commands",
-            help="Let options run the programs that they name (estimator:command, "
-            "estimator:mediapipe).",
-        ),
-    ] = False,
-    redo: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--redo", help="Run this stage again, and those that depend on it. Repeatable."
-        ),
-    ] = None,
     stage: Annotated[
         str | None, typer.Option("--stage", help="Stop after this stage; no clip is written.")
     ] = None,
+    *,
+    options: PrepareOptions,
 ) -> None:
     """Make a clip folder from a video with the given estimators, and a report."""
-    from hoigs.preparation.options import load_options
     from hoigs.preparation.prepare import prepare as run
     from hoigs.preparation.prepare import prepare_until, work_folder
 
-    flags = {
-        "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
-        "start": start, "end": end, "focal": focal, "intrinsics": intrinsics,
-        "calibration": calibration, "person_height": person_height, "keep_black": keep_black,
-        "overwrite": overwrite, "preset": estimators, "chunk": chunk, "overlap": overlap,
-    }  # fmt: skip
-    options = load_options(file, settings or (), flags)
     if stage is not None:
         with Display() as show:
             seconds = prepare_until(
-                stage, source, out, options=options, progress=show.fraction,
-                redo=redo or (), allow_commands=allow_commands, object=object_at or (),
-                person=person or (), yes=yes, consent=_consent(), announce=_announce,
+                stage, source, out, options=options, consent=_consent(), announce=_announce,
+                progress=show.fraction,
             )  # fmt: skip
         rows = [(name, f"{value:.1f} s") for name, value in seconds.items()]
         print_table(f"stages kept in {work_folder(out)}", ("stage", "made in"), rows)
         return
     with Display() as show:
         report = run(
-            source, out, options=options, progress=show.fraction,
-            redo=redo or (), allow_commands=allow_commands, object=object_at or (),
-            person=person or (), yes=yes, consent=_consent(), announce=_announce,
+            source, out, options=options, consent=_consent(), announce=_announce,
+            progress=show.fraction,
         )  # fmt: skip
     print_table(f"prepared {out}", ("what", "value", "note"), report.rows())
     for warning in report.warnings:
@@ -294,12 +163,5 @@ def annotate(
     """Click on the people and objects of a video, see their masks, and prepare it."""
     from hoigs.viewing.annotate.server import annotate as serve
 
-    serve(
-        video,
-        out,
-        port=port,
-        overrides=settings or (),
-        options=file,
-        open_browser=browser,
-        report=typer.echo,
-    )
+    options = PrepareOptions.of(file, {"overrides": settings or ()}, "annotate")
+    serve(video, out, port=port, options=options, open_browser=browser, report=typer.echo)

@@ -60,6 +60,8 @@ def _flag(name: str, annotation: Any, marks: list[Any], text: str) -> Any:
     names = Flag.names_of(name, found)
     least = next((mark.ge for mark in marks if getattr(mark, "ge", None) is not None), None)
     shown = " ".join(text.split()) + (" Repeatable." if get_origin(annotation) is tuple else "")
+    if found is not None and found.kind is not None:
+        kind = found.kind | None
     option = typer.Option(*names, help=shown, min=least, hidden=found is not None and found.hidden)
     return Annotated[kind, option]
 

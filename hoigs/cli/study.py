@@ -10,22 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hoigs.cli.common import (
-    AddressOption,
-    DeviceOption,
-    ExecutorOption,
-    JobsOption,
-    LpipsOption,
-    MinutesOption,
-    PluginOption,
-    SeedsOption,
-    SetOption,
-    ThreadsOption,
-    print_table,
-    study_device,
-)
+from hoigs.cli.common import print_table
+from hoigs.cli.options import flags
 from hoigs.core.system.files import printable
-from hoigs.core.system.threads import available_cpus
+from hoigs.studies.options import (
+    BatchOptions,
+    CompareOptions,
+    ExecutionOptions,
+    StressOptions,
+    WorkOptions,
+)
 
 if TYPE_CHECKING:
     from hoigs.studies.batch.batch import Batch, Work
@@ -33,60 +27,11 @@ if TYPE_CHECKING:
     from hoigs.studies.jobs.results import Row
 
 
+@flags(CompareOptions)
 def compare(
     clips: Annotated[list[str] | None, typer.Argument(help="Clip folders or builtin:NAME.")] = None,
-    specs: Annotated[
-        str | None,
-        typer.Option(
-            "--specs",
-            help="Specs with commas between, each [LABEL=]SPEC[+KEY=VALUE…]: hoigs,mine.yaml,"
-            "hoigs+interaction.use=interaction:none; default hoigs,static, or none with --table.",
-        ),
-    ] = None,
-    table: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--table",
-            help="Also the rows of a table of the paper, beside the numbers that it prints: "
-            "comparison, ablation-object-motion, ablation-interaction, ablation-human-feature, "
-            "object-prior, mask-depth-source, or all. Repeatable.",
-        ),
-    ] = None,
-    rasterizers: Annotated[
-        str,
-        typer.Option("--rasterizers", help="Rasterizers: warp,torch …; default each spec's own."),
-    ] = "",
-    budgets: Annotated[
-        str, typer.Option("--budgets", help="Steps: 200,1000; default each spec's own.")
-    ] = "",
-    seeds: SeedsOption = 3,
-    out: Annotated[Path, typer.Option("--out", help="Folder of runs and results.")] = Path(
-        "runs/compare"
-    ),
-    jobs: JobsOption = 1,
-    threads: ThreadsOption = None,
-    executor: ExecutorOption = "local",
-    address: AddressOption = None,
-    minutes: MinutesOption = None,
-    add: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--add",
-            help="Also draw the results of this chart.json; without CLIPS, only those. Repeatable.",
-        ),
-    ] = None,
-    mix_machines: Annotated[
-        bool,
-        typer.Option("--mix-machines", help="Draw times that were measured on different machines."),
-    ] = False,
-    rerun: Annotated[
-        str | None,
-        typer.Option("--rerun", help="Train CLIP/RUN again and print the differences."),
-    ] = None,
-    settings: SetOption = None,
-    device: DeviceOption = "auto",
-    lpips_weights: LpipsOption = None,
-    plugin: PluginOption = None,
+    *,
+    options: CompareOptions,
 ) -> None:
     """Compare accuracy and cost of methods. The same command continues an interrupted study.
 
@@ -94,12 +39,9 @@ def compare(
     chart.csv, chart.json, and chart-CLIP.png and .svg with training curves beside them. With
     --rerun, the exit code is 1 if a PSNR differs by more than 0.05 dB on the same machine.
     """
-    from hoigs.studies.execution.local import make_executor
-
-    each = threads or max(1, available_cpus() // jobs)
-    where = make_executor(executor, jobs, each, address)
-    if rerun is not None:
-        _rerun(out, rerun, where)
+    where = options.place()
+    if options.rerun is not None:
+        _rerun(options.out, options.rerun, where)
         return
     from hoigs.core.errors import HoigsError
     from hoigs.studies.compare.data import load_chart, merged_about
@@ -110,36 +52,35 @@ def compare(
     from hoigs.studies.jobs.job import Job
     from hoigs.studies.jobs.results import parse_variants
 
-    if not clips and not add:
+    if not clips and not options.add:
         raise HoigsError("name a clip: `hoigs study compare builtin:carry --specs hoigs,static`")
     require_plotly()
-    loaded = {path: load_chart(path) for path in add or ()}
+    loaded = {path: load_chart(path) for path in options.add}
     others = [cell for added, _ in loaded.values() for cell in added]
-    rows: dict[str, Sequence[Row]] = dict(choose_tables(table or ()))
-    if specs is not None or not rows:
-        rows[""] = parse_variants("hoigs,static" if specs is None else specs)
+    rows: dict[str, Sequence[Row]] = dict(choose_tables(options.table))
+    if options.specs is not None or not rows:
+        rows[""] = parse_variants("hoigs,static" if options.specs is None else options.specs)
     study = Comparison(
         clips=clips or [],
         rows=rows,
-        out=out.resolve(),
-        rasterizers=[r.strip() for r in rasterizers.split(",") if r.strip()],
-        budgets=_steps(budgets),
-        seeds=seeds,
-        settings=tuple(settings or ()),
-        device=study_device(device, executor),
-        lpips_weights=lpips_weights.resolve() if lpips_weights else None,
-        plugins=tuple(p.resolve() for p in plugin or ()),
+        out=options.out.resolve(),
+        rasterizers=[r.strip() for r in options.rasterizers.split(",") if r.strip()],
+        budgets=_steps(options.budgets),
+        seeds=options.seeds,
+        settings=options.settings,
+        device=options.where(),
+        lpips_weights=options.lpips_weights.resolve() if options.lpips_weights else None,
+        plugins=tuple(p.resolve() for p in options.plugins),
     )
 
     def report(job: Job, word: str) -> None:
         typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
 
-    limit = None if minutes is None else 60 * minutes
-    cells = run_comparison(study, executor=where, limit_s=limit, report=report)
-    about = _about_chart(study.settings, study.device, jobs, each)
+    cells = run_comparison(study, executor=where, limit_s=options.limit_s(), report=report)
+    about = _about_chart(study.settings, study.device, options)
     if not clips:  # nothing was run
         about = merged_about({path: made for path, (_, made) in loaded.items()})
-    for path in write_chart([*cells, *others], study.out, about, mix_machines=mix_machines):
+    for path in write_chart([*cells, *others], study.out, about, mix_machines=options.mix_machines):
         typer.echo(f"wrote {path}")
     if any(cell.missing for cell in cells):
         typer.echo("some trainings are not done; chart.md gives the reason")
@@ -158,7 +99,7 @@ def _steps(text: str) -> list[int]:
 
 
 def _about_chart(
-    settings: tuple[str, ...], device: str, jobs: int, threads: int
+    settings: tuple[str, ...], device: str, options: ExecutionOptions
 ) -> dict[str, object]:
     from datetime import UTC, datetime
 
@@ -167,7 +108,7 @@ def _about_chart(
     return {
         "date": datetime.now(UTC).date().isoformat(),
         "settings": " ".join(settings) or "none",
-        "runs at a time": f"{jobs}, {threads} threads each, on {device}",
+        "runs at a time": f"{options.jobs}, {options.each()} threads each, on {device}",
         "versions": ", ".join(f"{name} {value}" for name, value in versions().items()),
     }
 
@@ -198,44 +139,13 @@ def _rerun(out: Path, cell: str, executor: Executor) -> None:
 # `hoigs study stress`: named failure cases, for every spec that they concern.
 
 
-def stress(
-    cases: Annotated[
-        str,
-        typer.Option(
-            "--cases", help="Ids and families with commas between: F01,F10,motion,camera; or all."
-        ),
-    ] = "all",
-    specs: Annotated[
-        str,
-        typer.Option("--specs", help="Specs with commas between: hoigs,4dgs@matched,mine.yaml."),
-    ] = "hoigs,static",
-    seeds: SeedsOption = 3,
-    steps: Annotated[int, typer.Option("--steps", min=1, help="Steps of every training.")] = 300,
-    points: Annotated[
-        int, typer.Option("--points", min=50, help="Initial Gaussians of every model.")
-    ] = 4000,
-    width: Annotated[int, typer.Option("--width", min=32, help="Width of the clips, pixels.")] = 96,
-    whole: Annotated[
-        bool, typer.Option("--whole", help="Run harder values even after a seed has failed one.")
-    ] = False,
-    out: Annotated[Path, typer.Option("--out", help="Folder of runs and results.")] = Path(
-        "runs/stress"
-    ),
-    jobs: JobsOption = 1,
-    threads: ThreadsOption = None,
-    executor: ExecutorOption = "local",
-    address: AddressOption = None,
-    minutes: MinutesOption = None,
-    settings: SetOption = None,
-    device: DeviceOption = "cpu",
-    plugin: PluginOption = None,
-) -> None:
+@flags(StressOptions)
+def stress(*, options: StressOptions) -> None:
     """Find out where methods break. The same command continues an interrupted study.
 
     Each case trains on clips that get harder until a spec breaks. Writes stress.md, .csv and .json,
     stress-matrix.png and .svg, and stress-curves.png and .svg.
     """
-    from hoigs.studies.execution.local import make_executor
     from hoigs.studies.jobs.job import Job
     from hoigs.studies.jobs.results import definition, parse_variants
     from hoigs.studies.stress.case import choose_cases
@@ -244,35 +154,33 @@ def stress(
     from hoigs.studies.stress.verdict import make_table
 
     study = StressStudy(
-        cases=choose_cases(cases),
-        specs=parse_variants(specs),
-        out=out.resolve(),
-        seeds=seeds,
-        steps=steps,
-        points=points,
-        base=BASE.replace("width=96", f"width={width}"),
-        whole=whole,
-        settings=tuple(settings or ()),
-        device=study_device(device, executor),
-        plugins=tuple(p.resolve() for p in plugin or ()),
+        cases=choose_cases(options.cases),
+        specs=parse_variants(options.specs),
+        out=options.out.resolve(),
+        seeds=options.seeds,
+        steps=options.steps,
+        points=options.points,
+        base=BASE.replace("width=96", f"width={options.width}"),
+        whole=options.whole,
+        settings=options.settings,
+        device=options.where(),
+        plugins=tuple(p.resolve() for p in options.plugins),
     )
-    each = threads or max(1, available_cpus() // jobs)
-    where = make_executor(executor, jobs, each, address)
+    where, limit = options.place(), options.limit_s()
 
     def report(job: Job, word: str) -> None:
         typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
 
-    limit = None if minutes is None else 60 * minutes
     verdicts = run_stress(study, executor=where, limit_s=limit, report=report, log=typer.echo)
     definitions = {row.label: definition(row) for row in study.specs}
-    table = make_table(study.cases, definitions, verdicts, _about_cases(study, jobs, each))
+    table = make_table(study.cases, definitions, verdicts, _about_cases(study, options))
     for path in write_stress(table, study.out):
         typer.echo(f"wrote {path}")
     if any(v.status == "not run" for v in verdicts):
         typer.echo("some trainings are not done; the same command continues them")
 
 
-def _about_cases(study: object, jobs: int, threads: int) -> dict[str, object]:
+def _about_cases(study: object, options: ExecutionOptions) -> dict[str, object]:
     from datetime import UTC, datetime
 
     from hoigs.runs.run_folder import versions
@@ -284,103 +192,52 @@ def _about_cases(study: object, jobs: int, threads: int) -> dict[str, object]:
         "trainings": f"{study.steps} steps from {study.points} Gaussians, seeds 0 to "
         f"{study.seeds - 1}, on built-in clips with {study.base.replace('&', ', ')}",
         "settings": " ".join(study.settings) or "none",
-        "runs at a time": f"{jobs}, {threads} threads each, on {study.device}",
+        "runs at a time": f"{options.jobs}, {options.each()} threads each, on {study.device}",
         "versions": ", ".join(f"{name} {value}" for name, value in versions().items()),
     }
 
 
 # `hoigs batch` and `hoigs work`: many videos or clips, on any number of machines.
 
-RetriesOption = Annotated[
-    int, typer.Option("--retries", min=0, help="Further attempts at stages of a row that fail.")
-]
 LAST = 8  # ended rows that the live table shows
 
 
+@flags(BatchOptions)
 def batch(
     manifest: Annotated[
         Path, typer.Argument(help="YAML or CSV: one row a video or clip, with its settings.")
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder of the rows and the summary.")],
-    spec: Annotated[
-        str | None, typer.Option("--spec", help="Spec of rows that name none; default hoigs.")
-    ] = None,
-    auto: Annotated[
-        bool, typer.Option("--auto", help="As for `hoigs train`, for rows that do not set it.")
-    ] = False,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Keys of the spec for rows without `set`. Repeatable."),
-    ] = None,
-    export: Annotated[
-        list[str] | None,
-        typer.Option("--export", help="Format for rows without `export`; default ply. Repeatable."),
-    ] = None,
-    device: Annotated[
-        str | None, typer.Option("--device", help="cpu, cuda or auto, for rows that name none.")
-    ] = None,
-    jobs: JobsOption = 1,
-    threads: ThreadsOption = None,
-    executor: ExecutorOption = "local",
-    address: AddressOption = None,
-    retries: RetriesOption = 1,
-    limit: Annotated[
-        int | None, typer.Option("--limit", min=1, help="Only this many rows, the first.")
-    ] = None,
-    only: Annotated[
-        str | None, typer.Option("--only", help="failed: only rows whose last attempt failed.")
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Check the manifest and print what would run.")
-    ] = False,
+    *,
+    options: BatchOptions,
 ) -> None:
     """Prepare, train, evaluate and export every row of a manifest.
 
     The same command continues where it was stopped, stage by stage. A row that fails does not stop
     the others, and keeps its logs. Exit code 1: some rows failed.
     """
-    from hoigs.core.errors import HoigsError
     from hoigs.studies.batch.batch import batch as run
 
-    if only not in (None, "failed"):
-        raise HoigsError(f'--only {only}: expected "failed"')
-    given = {
-        "spec": spec,
-        "auto": auto or None,
-        "set": settings,
-        "export": export,
-        "device": device,
-    }
-    defaults = {key: value for key, value in given.items() if value is not None}
     with _shown() as show:
-        done = run(
-            manifest, out, defaults=defaults, jobs=jobs, threads=threads, executor=executor,
-            address=address, retries=retries, limit=limit, only_failed=only == "failed",
-            dry_run=dry_run, **show,
-        )  # fmt: skip
-    if dry_run:
+        done = run(manifest, out, options=options, **show)
+    if options.dry_run:
         for name, commands in done.plan.items():
             typer.echo(f"{name}:" + ("".join(f"\n  {c}" for c in commands) or " done"))
         return
     _finish(done)
 
 
+@flags(WorkOptions)
 def work(
     out: Annotated[Path, typer.Argument(help="Folder that `hoigs batch` was given as --out.")],
-    jobs: JobsOption = 1,
-    threads: ThreadsOption = None,
-    executor: ExecutorOption = "local",
-    address: AddressOption = None,
-    retries: RetriesOption = 1,
+    *,
+    options: WorkOptions,
 ) -> None:
     """Help with a batch: work on its rows that nobody works on, until none is left."""
     from hoigs.studies.batch.batch import work as run
 
     with _shown() as show:
-        done = run(
-            out, jobs=jobs, threads=threads, executor=executor, address=address, retries=retries,
-            **show,
-        )  # fmt: skip
+        done = run(out, options=options, **show)
     _finish(done)
 
 

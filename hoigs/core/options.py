@@ -13,7 +13,7 @@ import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 from pydantic import ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
@@ -33,10 +33,11 @@ class Flag:
     Args:
         names: declarations, "--set" or "--eval/--no-eval"; none: the option has no flag.
         hidden: leave it out of --help.
+        kind: type of what is written, where the option's own validator reads another one.
     """
 
-    def __init__(self, *names: str, hidden: bool = False) -> None:
-        self.names, self.hidden = names, hidden
+    def __init__(self, *names: str, hidden: bool = False, kind: type | None = None) -> None:
+        self.names, self.hidden, self.kind = names, hidden, kind
 
     @staticmethod
     def names_of(option: str, flag: Flag | None) -> tuple[str, ...]:
@@ -51,6 +52,9 @@ class Options(ComponentConfig):
     """
 
     model_config = ConfigDict(frozen=True)
+
+    shown: ClassVar[tuple[str, ...] | None] = None
+    """The options that have a flag, in their order; None: all."""
 
     @classmethod
     def of(
@@ -129,9 +133,13 @@ def _plain(value: Any) -> Any:
 def fields_of(options: type[Options]) -> Iterator[tuple[str, FieldInfo, Flag | None]]:
     """Name, field and flag of every option, those that several verbs share last."""
     shared = {name for base in options.__mro__[1:] for name in getattr(base, "model_fields", ())}
-    for name in sorted(options.model_fields, key=shared.__contains__):
+    names = sorted(options.model_fields, key=shared.__contains__)
+    if (shown := options.shown) is not None:
+        names.sort(key=lambda name: shown.index(name) if name in shown else len(shown))
+    for name in names:
         field = options.model_fields[name]
-        yield name, field, next((m for m in field.metadata if isinstance(m, Flag)), None)
+        flag = next((m for m in field.metadata if isinstance(m, Flag)), None)
+        yield name, field, flag if shown is None or name in shown else Flag()
 
 
 def verb(
@@ -190,16 +198,23 @@ def _signature(
             default=inspect.Parameter.empty if field.is_required() else field.default,
             annotation=spelled(field.annotation).replace("path", "Path"),
         )
-        for name, field, _ in fields_of(options)
+        for name, field in _listed(options)
     }
     whole = own["options"].replace(
         annotation=f"{options.__name__} | None", default=None, kind=inspect.Parameter.KEYWORD_ONLY
     )
-    every = {**own, **fields, "options": whole}
+    every = {**fields, **own, "options": whole}
     first = [every[name].replace(kind=inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in places]
     callbacks = [own[name] for name in own if name not in (*places, "options")]
-    rest = [*(fields[name] for name in fields if name not in places), *callbacks, whole]
+    rest = [f for name, f in fields.items() if name not in places and name not in own]
+    rest = [*rest, *callbacks, whole]
     return inspect.Signature([*first, *rest])
+
+
+def _listed(options: type[Options]) -> list[tuple[str, FieldInfo]]:
+    """The options that a signature has; the others can be given as keywords, too."""
+    shown = options.shown or options.model_fields
+    return [(name, field) for name, field, _ in fields_of(options) if name in shown]
 
 
 FLAG = re.compile(r"--([a-z][a-z-]*)")
@@ -220,7 +235,7 @@ def _documented(text: str, options: type[Options]) -> str:
     end = next((i for i in range(start, len(lines)) if not lines[i].strip()), len(lines))
     entries = [
         entry
-        for name, field, _ in fields_of(options)
+        for name, field in _listed(options)
         for entry in textwrap.wrap(
             f"{name}: {FLAG.sub(_keyword, field.description or '')}",
             96,

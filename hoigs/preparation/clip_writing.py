@@ -119,9 +119,9 @@ def _write_frames(
 
 def _object_picture(draft: Draft, options: PrepareOptions) -> int | None:
     """Position of the frame that shows which object was taken; None where nobody had to choose."""
-    if options.object not in draft.objects or draft.found_object is None:
+    if options.object_name not in draft.objects or draft.found_object is None:
         return None
-    prompt = draft.prompts.get(options.object)
+    prompt = draft.prompts.get(options.object_name)
     prompted = [at.frame or 0 for at in prompt.places()] if prompt else []
     coverage = draft.masks.object.coverage().tolist()
     return shown_frame(draft.video.indices, draft.found_object.boxes, prompted, coverage)
@@ -142,7 +142,9 @@ def _report(draft: Draft, options: PrepareOptions, name: str) -> PrepareReport:
         }
         for held, thing in draft.objects.items()
     }
-    first = measures.pop(options.object, {"object_observed": None, "object_scale_spread": None})
+    first = measures.pop(
+        options.object_name, {"object_observed": None, "object_scale_spread": None}
+    )
     return PrepareReport(
         name=name,
         video=draft.source.video.name,
@@ -189,7 +191,7 @@ def _report(draft: Draft, options: PrepareOptions, name: str) -> PrepareReport:
         depth_residuals=[] if depth is None else _numbers(depth.residual, 4),
         depth_against="" if depth is None else depth.against,
         **first,
-        object_name=options.object,
+        object_name=options.object_name,
         further_objects=measures,
         omega=angular_factor(draft.cameras, middle_of_motion, draft.video.fps),
         big_omega=full_factor(draft.cameras, moving),

@@ -54,10 +54,10 @@ PLAN = {
     "estimates": Stage(
         30,
         ("frames",),
-        ("human", "further_people", "find_person", "everybody", "object"),
+        ("human_name", "further_people", "find_person", "everybody", "object_name"),
         slow=True,
     ),
-    "object_masks": Stage(30, ("estimates",), ("object", "further_objects"), slow=True),
+    "object_masks": Stage(30, ("estimates",), ("object_name", "further_objects"), slow=True),
     "cameras": Stage(3, ("frames", "estimates"), ("camera", "focal", "intrinsics", "calibration")),
     "people": Stage(
         46,

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.errors import PluginError, SpecError
-from hoigs.core.interfaces.context import BuildContext
-from hoigs.core.interfaces.estimator import EstimateKind, Estimator
-from hoigs.core.maths.frame_times import Chunking
-from hoigs.core.registry.registry import Registry, default_registry
+from hoigs.core.errors import SpecError
+from hoigs.core.interfaces.estimator import EstimateKind
+from hoigs.core.options import Flag, Options
 from hoigs.core.spec.errors import explain
 from hoigs.core.spec.loader import Document, load_overrides, read_document
 from hoigs.core.spec.schema import ComponentSpec
-from hoigs.preparation.body.fit_problem import FitOptions
-from hoigs.preparation.objects.make_object import ObjectWay
 from hoigs.preparation.video.container import Span
 from hoigs.preparation.video.frames import Pick
 
+if TYPE_CHECKING:
+    from hoigs.core.maths.frame_times import Chunking
+
+ObjectWay = Literal["auto", "ball", "texture", "outline"]
+FIT_STEPS = 40  # of the body fit, at most
 Place = EstimateKind | Literal["object"]  # "object": masks of the object alone
 Preset = Literal["auto", "offline", "hub", "files"]
 
@@ -55,18 +56,24 @@ class Prompt(PromptAt):
         return [*first, *self.further]
 
 
-class PrepareOptions(ComponentConfig):
+class PrepareOptions(Options):
     """Settings of `prepare`; the defaults suit a phone's video of one person and one object."""
 
     width: int | None = Field(
         default=None,
         ge=16,
-        description="width of the stored frames, pixels; None keeps the video's, but makes frames "
-        "whose longer side is over 1920 pixels smaller, to 1280",
+        description="Resize frames to this width, pixels; default: the video's own, and 1280 "
+        "where its longer side is over 1920.",
     )
-    every: int = Field(default=1, ge=1, description="take every n-th frame")
+    every: int = Field(
+        default=1,
+        ge=1,
+        description="Use one of each n frames: the sharpest.",
+    )
     fps: float | None = Field(
-        default=None, gt=0, description="frames a second to take, in place of `every`"
+        default=None,
+        gt=0,
+        description="Use this many frames a second, the sharpest, in place of --every.",
     )
     pick: Pick = Field(
         default="sharpest",
@@ -77,13 +84,16 @@ class PrepareOptions(ComponentConfig):
     )
     start: str | float | None = Field(
         default=None,
-        description="where in the video to start: 2.5 (seconds), 1:02.5, or 75f (frame 75)",
+        description="Start here: 2.5 (seconds), 1:02.5, or 75f (frame 75 of the video).",
     )
     end: str | float | None = Field(
-        default=None, description="where to end, likewise; the frame there is not used"
+        default=None,
+        description="End before this: 7.5, 1:07.5, or 225f.",
     )
     max_frames: int | None = Field(
-        default=None, ge=1, description="stop after so many chosen frames"
+        default=None,
+        ge=1,
+        description="Use only the first frames.",
     )
     image_format: Literal["jpg", "png"] = Field(
         default="jpg", description="format of stored frames"
@@ -91,55 +101,52 @@ class PrepareOptions(ComponentConfig):
     quality: int = Field(default=95, ge=1, le=100, description="quality of jpg frames")
     camera: Literal["auto", "static", "turning", "moving", "sfm"] = Field(
         default="auto",
-        description='"static": it never moves; "turning": it turns on its spot, as on a tripod; '
-        '"moving": the COLMAP model beside the video, or '
-        'structure from motion without one; "sfm": structure from motion in any case; "auto": the '
-        "COLMAP model, or else whether the background moves decides",
+        description="auto, static (it never moves), turning (on its spot, as on a tripod), moving"
+        " (COLMAP's model beside the video, or structure from motion) or sfm "
+        "(structure from motion in any case). auto: COLMAP's model, or else whether "
+        "the background moves decides.",
     )
     focal: float | None = Field(
         default=None,
         gt=0,
-        description="focal length in pixels of the *video's* own size, for a camera that "
-        "stays in one place; None: "
-        "what the file's metadata give, or the landmarks if they determine it, or else 0.8 x the "
-        "longer side (64 degrees); it scales all depths",
+        description="Focal length in pixels of the video's own size, if known; default: what the "
+        "file's metadata give, or the landmarks if they determine it, or else 0.8 x "
+        "the longer side (64 degrees). It scales all depths.",
     )
-    intrinsics: tuple[float, ...] | None = Field(
+    intrinsics: Annotated[tuple[float, ...] | None, Flag("--intrinsics", kind=str)] = Field(
         default=None,
-        description="fx, fy, cx, cy and perhaps k1, k2, p1, p2 of the lens, in pixels of the "
-        "video's own size, as OpenCV has them; frames are undistorted, and the lens is not refined",
+        description="The lens, in pixels of the video's own size: fx,fy,cx,cy or "
+        "fx,fy,cx,cy,k1,k2,p1,p2 as OpenCV has them. Frames are undistorted.",
     )
     calibration: str | None = Field(
         default=None,
-        description="file with the lens: COLMAP's cameras, OpenCV's FileStorage, Qualisys, or a "
-        "TOML of Pose2Sim; FILE#NAME where it holds several",
+        description="The lens, in a file of COLMAP, OpenCV, Qualisys or Pose2Sim; FILE#NAME where"
+        " the file holds several.",
     )
     body: str = Field(default="body:anny", description="key of the body model, for the clip")
     person_height: float | None = Field(
         default=None,
-        description="of the person standing, metres; None: the body model's mean. A camera that "
-        "stays in one place shows no size, and structure from motion none either: the unit of the "
-        "world comes from it",
+        description="Height of the person standing, metres: the unit of the world comes from it; "
+        "default: the body model's mean.",
     )
-    fit_steps: int = Field(
-        default=FitOptions.steps, ge=1, description="steps of the body fit, at most"
-    )
+    fit_steps: int = Field(default=FIT_STEPS, ge=1, description="steps of the body fit, at most")
     chunk: int | None = Field(
         default=None,
         ge=1,
-        description="frames of a window, for long videos: the body is fitted window by window, "
-        "with one shape for all; None: all frames at once",
+        description="For a long video: fit the body in windows of this many frames, with one "
+        "shape for all.",
     )
     overlap: int | None = Field(
         default=None,
         ge=1,
-        description="frames that neighbouring windows share; None: a quarter of them, at most 50",
+        description="Frames that neighbouring windows share; default: a quarter of --chunk, 50 at"
+        " most.",
     )
-    preset: Preset = Field(
+    preset: Annotated[Preset, Flag("--estimators")] = Field(
         default="auto",
-        description='what finds that which no file beside the video gives: "offline": MediaPipe '
-        'and a tracker of hoigs; "hub": networks of the Hugging Face hub; "files": nothing, the '
-        'files must be there; "auto": offline',
+        description="What finds landmarks and masks that no file beside the video gives: offline "
+        "(MediaPipe and hoigs's tracker; auto is the same), hub (networks of the "
+        "Hugging Face hub), or files (nothing does).",
     )
     estimators: dict[Place, ComponentSpec] = Field(
         default_factory=dict,
@@ -161,7 +168,7 @@ class PrepareOptions(ComponentConfig):
     prompts: dict[str, Prompt] = Field(
         default_factory=dict, description="by entity, where or what it is"
     )
-    human: str = Field(default="human", description="name of the person's entity")
+    human_name: str = Field(default="human", description="name of the person's entity")
     everybody: bool = Field(
         default=False,
         description="fit all people who are seen by a quick look, where no prompt says who",
@@ -171,7 +178,7 @@ class PrepareOptions(ComponentConfig):
         description="names of more people, each with a prompt; the estimators of landmarks and "
         "masks give those of all",
     )
-    object: str = Field(default="object", description="name of the object's entity")
+    object_name: str = Field(default="object", description="name of the object's entity")
     further_objects: tuple[str, ...] = Field(
         default=(),
         description="names of more objects, each with a prompt; estimators.object follows them all",
@@ -208,12 +215,98 @@ class PrepareOptions(ComponentConfig):
     )
     keep_black: bool = Field(
         default=False,
-        description="train on flat black patches too, which are ignored by default",
+        description="Train on uniform black areas; default: they are ignored.",
     )
-    overwrite: bool = Field(default=False, description="replace an older clip at the target")
+    overwrite: bool = Field(
+        default=False,
+        description="Replace an older clip at --out.",
+    )
     overlay_width: int = Field(
         default=640, ge=0, description="width of overlay.mp4, pixels; 0 writes none"
     )
+
+    object: tuple[str, ...] = Field(
+        default=(),
+        description="Where the object is: a point 640,402 or 640,402@FRAME, a point that is not "
+        'on it -700,380, a box x0,y0,x1,y1, words "football" (with --estimators hub),'
+        " or none; several objects with names, kettle=640,402. Default: what `hoigs "
+        "annotate` stored beside the video, or a search.",
+    )
+    person: tuple[str, ...] = Field(
+        default=(),
+        description="Which person to fit where several are seen: a point on them, 320,210 or "
+        "320,210@FRAME, or a box; several people with names, anna=320,210; all, or "
+        "none.",
+    )
+    yes: Annotated[bool, Flag("--yes", "-y")] = Field(
+        default=False,
+        description="Install and download what is needed, unasked.",
+    )
+    overrides: Annotated[tuple[str, ...], Flag("--set")] = Field(
+        default=(),
+        description="Any option: estimators.masks.use=estimator:masks-files, "
+        "estimators.masks.path=sam2.",
+    )
+    file: Annotated[Path | None, Flag("--options")] = Field(
+        default=None,
+        description="YAML or TOML file of options.",
+    )
+    allow_commands: bool = Field(
+        default=False,
+        description="Let options run the programs that they name (estimator:command, "
+        "estimator:mediapipe).",
+    )
+    redo: tuple[str, ...] = Field(
+        default=(),
+        description="Run this stage again, and those that depend on it.",
+    )
+
+    shown: ClassVar = (
+        "object", "person", "preset", "yes", "width", "camera", "max_frames", "every", "fps",
+        "start", "end", "focal", "intrinsics", "calibration", "person_height", "chunk", "overlap",
+        "keep_black", "overwrite", "overrides", "file", "allow_commands", "redo",
+    )  # fmt: skip
+
+    @classmethod
+    def of(
+        cls,
+        options: Self | Path | str | None = None,
+        settings: Mapping[str, Any] | None = None,
+        verb: str = "prepare",
+        places: Mapping[str, str] | None = None,
+    ) -> Self:
+        """Options, ready-made or from a YAML or TOML file, with `settings` laid over them.
+
+        Raises:
+            SpecError: everything that is wrong, a line each, with its position.
+        """
+        given = dict(settings or {})
+        file, overrides = given.pop("file", None), tuple(given.pop("overrides", ()))
+        if file is not None:
+            options = file
+        if isinstance(options, Path | str):
+            document = read_document(Path(options))
+            _refuse_callers(document)
+        elif options is None or isinstance(options, cls):
+            document = Document("options", {} if options is None else options.given())
+        else:
+            raise SpecError(f"{verb}: options must be {cls.__name__} or a file, got {options!r}")
+        names = {name: (places or {}).get(name, _flag_of(cls, name)) for name in given}
+        at: dict[tuple[str | int, ...], str] = {(name,): place for name, place in names.items()}
+        document = document.merged(Document("command line", given, dict(at), dict(at)))
+        if overrides:
+            laid = load_overrides(list(overrides))
+            _refuse_callers(laid)
+            document = document.merged(laid)
+        try:
+            made = cls.model_validate(document.data)
+        except ValidationError as error:
+            raise SpecError("\n".join(explain(error, cls, document, ()))) from error
+        if made.estimators:  # so that errors in them are reported at once, too
+            from hoigs.preparation.estimates.installed import installed_estimators
+
+            installed_estimators(made, document)
+        return made
 
     @property
     def own_cameras(self) -> bool:
@@ -223,17 +316,29 @@ class PrepareOptions(ComponentConfig):
     @property
     def chunking(self) -> Chunking | None:
         """How the clip is cut into windows; None: it is not."""
+        from hoigs.core.maths.frame_times import Chunking
+
         return None if self.chunk is None else Chunking.of(self.chunk, self.overlap)
 
     @property
     def people(self) -> tuple[str, ...]:
         """Names of all people, the first one's first."""
-        return (self.human, *self.further_people) if self.find_person else ()
+        return (self.human_name, *self.further_people) if self.find_person else ()
 
     @property
     def objects(self) -> tuple[str, ...]:
         """Names of all objects, the first one's first."""
-        return (self.object, *self.further_objects)
+        return (self.object_name, *self.further_objects)
+
+    @field_validator("object", "person", "redo", mode="before")
+    @classmethod
+    def _several(cls, value: Any) -> Any:
+        return (value,) if isinstance(value, str) else value
+
+    @field_validator("calibration", mode="before")
+    @classmethod
+    def _text(cls, value: Any) -> Any:
+        return str(value) if isinstance(value, Path) else value
 
     @field_validator("intrinsics", mode="before")
     @classmethod
@@ -286,114 +391,34 @@ class PrepareOptions(ComponentConfig):
         return self
 
 
-# Options of `prepare` from a file and from KEY=VALUE settings, and the estimators that they
-# name.
+# what a file beside a stranger's video, or a row of a manifest, must not decide
+CALLERS = ("allow_commands", "yes", "file", "overrides")
 
-_OPTIONS = {"preset": "estimators"}  # whose names on the command line are others
+
+def _refuse_callers(document: Document) -> None:
+    wrong = [name for name in CALLERS if name in document.data]
+    if wrong:
+        lines = (
+            f"{document.where((name,))} {name}: only the caller decides this, by "
+            f"{_flag_of(PrepareOptions, name)} or prepare({name}=…)"
+            for name in wrong
+        )
+        raise SpecError("\n".join(lines))
+
+
+def _flag_of(options: type[Options], name: str) -> str:
+    """How the command line writes an option."""
+    field = options.model_fields.get(name)
+    marks = () if field is None else field.metadata
+    names = Flag.names_of(name, next((m for m in marks if isinstance(m, Flag)), None))
+    return names[0].partition("/")[0]
 
 
 def load_options(
     file: PrepareOptions | Path | str | None = None,
     settings: Sequence[str] = (),
     flags: Mapping[str, Any] | None = None,
-    registry: Registry | None = None,
 ) -> PrepareOptions:
-    """Options from a YAML or TOML file, or ready-made, with settings and flags laid over them.
-
-    Args:
-        settings: "estimators.masks.use=estimator:masks-files".
-        flags: options by name; None leaves one alone.
-
-    Raises:
-        SpecError: everything that is wrong, a line each, with its position.
-    """
-    if isinstance(file, PrepareOptions):
-        document = Document("options", file.model_dump(mode="json"))
-    else:
-        document = Document("options") if file is None else read_document(Path(file))
+    """`PrepareOptions.of`, with flags of which None leaves an option alone."""
     given = {name: value for name, value in (flags or {}).items() if value is not None}
-    places: dict[tuple[str | int, ...], str] = {
-        (name,): f"--{_OPTIONS.get(name, name).replace('_', '-')}" for name in given
-    }
-    document = document.merged(Document("command line", given, dict(places), dict(places)))
-    if settings:
-        document = document.merged(load_overrides(list(settings)))
-    try:
-        options = PrepareOptions.model_validate(document.data)
-    except ValidationError as error:
-        raise SpecError("\n".join(explain(error, PrepareOptions, document, ()))) from error
-    installed_estimators(
-        options, document, registry
-    )  # so that errors in them are reported at once, too
-    return options
-
-
-def installed_estimators(
-    options: PrepareOptions, document: Document | None = None, registry: Registry | None = None
-) -> dict[Place, Estimator]:
-    """The estimators that `options.estimators` names, built from their plugins.
-
-    Args:
-        document: where the options came from, for messages.
-
-    Raises:
-        SpecError: an estimator is unknown, gives something else, or its settings are wrong.
-    """
-    registry = registry or default_registry()
-    document = document or Document("options", options.model_dump(mode="json"))
-    estimators: dict[Place, Estimator] = {}
-    problems: list[str] = []
-    for role, spec in options.estimators.items():
-        kind: EstimateKind = "masks" if role == "object" else role
-        place = ("estimators", role)
-        at = f"{document.where((*place, 'use'))} estimators.{role}.use"
-        try:
-            component = registry.concrete(spec.use)
-            config_class = registry.config_class(spec.use)
-        except PluginError as error:
-            problems.append(f"{at}: {error}")
-            continue
-        if not issubclass(component, Estimator) or kind not in component.provides:
-            problems.append(
-                f'{at}: "{spec.use}" gives no {kind} of a video; those that do: '
-                f"{', '.join(_givers(registry, kind)) or 'none is installed'}"
-            )
-            continue
-        try:
-            config = config_class.model_validate(spec.settings)
-        except ValidationError as error:
-            problems += explain(error, config_class, document, place)
-            continue
-        estimators[role] = component.from_config(config, BuildContext())
-    if problems:
-        raise SpecError("\n".join(problems))
-    return estimators
-
-
-def refuse_commands(estimators: Mapping[Place, Estimator]) -> None:
-    """SpecError, showing the command lines, if estimators would run programs."""
-    lines = [
-        f"  estimators.{kind}: {c}"
-        for kind, estimator in estimators.items()
-        for c in estimator.commands()
-    ]
-    if lines:
-        found = "\n".join(lines)
-        raise SpecError(
-            f"these options run programs on this machine:\n{found}\n"
-            "nothing was run; if you trust them, use --allow-commands (prepare(..., "
-            "allow_commands=True))"
-        )
-
-
-def _givers(registry: Registry, kind: EstimateKind) -> list[str]:
-    """Keys of the installed estimators that give a kind of estimate."""
-    found = []
-    for key in registry.keys("estimator"):
-        try:
-            component = registry.get(key)
-        except PluginError:  # one that lacks an extra cannot be chosen now
-            continue
-        if issubclass(component, Estimator) and kind in component.provides:
-            found.append(key)
-    return found
+    return PrepareOptions.of(file, {**given, "overrides": tuple(settings)})

@@ -365,7 +365,7 @@ def chosen_people(
     if len(found) < 2:
         return {}, ""
     taken = found if options.everybody else found[:1]
-    names = [options.human, *(f"{options.human}{k + 2}" for k in range(len(taken) - 1))]
+    names = [options.human_name, *(f"{options.human_name}{k + 2}" for k in range(len(taken) - 1))]
     boxes = dict(zip(names, taken, strict=True))
     places = ", ".join(_middle(at) for at in found)
     said = f"{len(found)} people are seen in frame {found[0].frame}, at {places}: "

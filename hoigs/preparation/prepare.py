@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -15,6 +15,7 @@ from hoigs.core.clip_folder.write import refuse_to_overwrite
 from hoigs.core.errors import ClipError, HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.context import BuildContext
+from hoigs.core.options import verb
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.system.files import named
@@ -25,6 +26,7 @@ from hoigs.preparation import stages
 from hoigs.preparation.body.body_files import BodyFileEstimator, body_beside
 from hoigs.preparation.clip_writing import Cleanup
 from hoigs.preparation.draft import Draft
+from hoigs.preparation.estimates.installed import installed_estimators, refuse_commands
 from hoigs.preparation.estimates.plan import (
     Consent,
     EstimatorPlan,
@@ -34,13 +36,7 @@ from hoigs.preparation.estimates.plan import (
 )
 from hoigs.preparation.estimates.reader import Estimators
 from hoigs.preparation.kept import PLAN, check_stage, with_dependents
-from hoigs.preparation.options import (
-    PrepareOptions,
-    Preset,
-    installed_estimators,
-    load_options,
-    refuse_commands,
-)
+from hoigs.preparation.options import PrepareOptions, Preset
 from hoigs.preparation.prompts import with_prompts, with_stored
 from hoigs.preparation.report.report import PrepareReport
 from hoigs.preparation.video.source import SourceError, find_source, find_video
@@ -56,34 +52,14 @@ def work_folder(out: str | Path) -> Path:
     return out.with_name(out.name + ".prepare")
 
 
+@verb(PrepareOptions)
 def prepare(
     source: str | Path,
     out: str | Path,
     *,
-    width: int | None = None,
-    camera: str | None = None,
-    max_frames: int | None = None,
-    every: int | None = None,
-    fps: float | None = None,
-    start: str | float | None = None,
-    end: str | float | None = None,
-    focal: float | None = None,
-    intrinsics: str | Sequence[float] | None = None,
-    calibration: str | Path | None = None,
-    person_height: float | None = None,
-    chunk: int | None = None,
-    overlap: int | None = None,
-    keep_black: bool | None = None,
-    overwrite: bool | None = None,
-    object: str | Sequence[str] = (),
-    person: str | Sequence[str] = (),
-    overrides: Sequence[str] = (),
-    options: PrepareOptions | Path | str | None = None,
-    allow_commands: bool = False,
-    redo: Sequence[str] = (),
+    options: PrepareOptions,
     body: BodyModel | None = None,
     estimators: Estimators | Preset | None = None,
-    yes: bool = False,
     consent: Consent | None = None,
     announce: Callable[[EstimatorPlan], builtins.object] | None = None,
     progress: Progress | None = None,
@@ -99,28 +75,15 @@ def prepare(
             video in it; or the URL of either (`hoigs.core.storage`).
         out: the clip folder to make, with report.json, report.md and overlay.mp4 in it; it
             appears when it is whole.
-        width, camera, max_frames, every, fps, start, end, focal, intrinsics, calibration,
-            person_height, chunk, overlap, keep_black, overwrite: fields of `PrepareOptions`, laid
-            over `options`; None leaves a field as it is.
-        object: where the object is, in place of its prompt in `options`: "640,402@0", or several
-            such (`prompts.parse_prompts`); "none": there is none. Without it, the clicks that
-            `annotate` stored beside the video hold.
-        person: which person to fit where several are seen, likewise: "320,210@0"; several people
-            by names, "anna=320,210"; "all": everybody seen; "none": nobody, the clip has
-            objects alone.
-        overrides: any field likewise: "estimators.masks.use=estimator:masks-files".
-        options: ready-made, or a YAML or TOML file.
         body: the model to fit, whose key is `options.body`; by default it is made from that key.
-        progress: called with the done fraction, 0 to 1, and the stage's name.
-        redo: stages to run anew, with all that build on them; an older clip is then replaced.
         estimators: by kind of estimate, "masks", "landmarks", "object" or "depth"; those of
             `options.estimators`, which are looked up among the installed plugins, come second.
             Or a preset, in place of `options.preset`.
-        yes: install and download what is needed. consent: called with a question before that,
-            where `yes` does not answer it; None: nothing is downloaded.
+        consent: called with a question before anything is installed or downloaded, where `yes`
+            does not answer it; None: nothing is downloaded.
         announce: called with the plan before work begins; and, where several people are seen, with
             one of notes alone that say who is followed, before they are.
-        allow_commands: let `options.estimators` run the programs that they name.
+        progress: called with the done fraction, 0 to 1, and the stage's name.
 
     Raises:
         SpecError: options are wrong, or `options.estimators` would run programs, and may not.
@@ -128,35 +91,19 @@ def prepare(
         ClipError: `out` is there already, or another process is preparing it.
         HoigsError: there is no stage of a name in `redo`.
     """
-    flags = {
-        "width": width, "camera": camera, "max_frames": max_frames, "every": every, "fps": fps,
-        "start": start, "end": end, "focal": focal, "intrinsics": intrinsics,
-        "calibration": None if calibration is None else str(calibration),
-        "person_height": person_height, "chunk": chunk, "overlap": overlap,
-        "keep_black": keep_black, "overwrite": overwrite,
-    }  # fmt: skip
-    options = with_prompts(load_options(options, overrides, flags), object, estimators, person)
-    may_replace = options.overwrite or bool(redo)
-    draft = _run(
-        source, out, body, options, progress, redo, estimators, None, may_replace, allow_commands,
-        agree if yes else consent, announce,
-    )  # fmt: skip
-    return draft.report
+    talk = _Talk(consent, announce, progress or no_progress)
+    return _run((Path(source), Path(out)), options, body, estimators, talk).report
 
 
+@verb(PrepareOptions)
 def prepare_until(
     stage: str,
     source: str | Path,
     out: str | Path,
     *,
-    object: str | Sequence[str] = (),
-    person: str | Sequence[str] = (),
-    options: PrepareOptions | Path | str | None = None,
-    allow_commands: bool = False,
-    redo: Sequence[str] = (),
+    options: PrepareOptions,
     body: BodyModel | None = None,
     estimators: Estimators | Preset | None = None,
-    yes: bool = False,
     consent: Consent | None = None,
     announce: Callable[[EstimatorPlan], builtins.object] | None = None,
     progress: Progress | None = None,
@@ -172,37 +119,39 @@ def prepare_until(
     check_stage(stage)
     if stage == list(PLAN)[-1]:
         raise HoigsError(f"{stage} is the last stage: run prepare as a whole")
-    options = with_prompts(load_options(options), object, estimators, person)
-    draft = _run(
-        source, out, body, options, progress, redo, estimators, stage, True, allow_commands,
-        agree if yes else consent, announce,
-    )  # fmt: skip
-    return draft.seconds
+    talk = _Talk(consent, announce, progress or no_progress)
+    return _run((Path(source), Path(out)), options, body, estimators, talk, stage).seconds
+
+
+@dataclass(frozen=True)
+class _Talk:
+    """The caller's callbacks."""
+
+    consent: Consent | None
+    announce: Callable[[EstimatorPlan], object] | None
+    progress: Progress
 
 
 @short_waits_when_busy()
 @callers_random_state()
 def _run(
-    source: str | Path,
-    out: str | Path,
-    body: BodyModel | None,
+    paths: tuple[Path, Path],
     options: PrepareOptions,
-    progress: Progress | None,
-    redo: Sequence[str],
+    body: BodyModel | None,
     estimators: Estimators | Preset | None,
-    until: str | None,
-    may_replace: bool,
-    allow_commands: bool,
-    consent: Consent | None,
-    announce: Callable[[EstimatorPlan], object] | None,
+    talk: _Talk,
+    until: str | None = None,
 ) -> Draft:
-    source, out = local_path(source), Path(out)
-    for name in redo:
+    if isinstance(estimators, str):
+        options = options.changed(preset=estimators)
+    options = with_prompts(options)
+    source, out = local_path(paths[0]), paths[1]
+    for name in options.redo:
         check_stage(name)
-    _check_paths(source, out, may_replace)
+    _check_paths(source, out, options.overwrite or bool(options.redo) or until is not None)
     options, stored = with_stored(options, find_video(source))
     named = installed_estimators(options)
-    if not allow_commands:
+    if not options.allow_commands:
         refuse_commands(named)  # `estimators` are the caller's own code
     own = {} if isinstance(estimators, str) else (estimators or {})
     chosen = {**named, **own}
@@ -214,7 +163,7 @@ def _run(
         body = body or _body(options.body)
         chosen["landmarks"] = BodyFileEstimator(bodies.path, body)
     found = find_source(
-        source, people=options.people, object_name=options.object, given=set(chosen),
+        source, people=options.people, object_name=options.object_name, given=set(chosen),
         own_cameras=options.own_cameras,
         complete=options.preset == "files",
     )  # fmt: skip
@@ -227,20 +176,20 @@ def _run(
     for kind, spec in found.beside.items():
         specs[kind] = spec
     chosen = {**installed_estimators(PrepareOptions(estimators=specs)), **chosen}
-    if announce is not None:
-        announce(plan)
-    get_ready(plan, chosen, consent, progress or no_progress)
+    if talk.announce is not None:
+        talk.announce(plan)
+    get_ready(plan, chosen, agree if options.yes else talk.consent, talk.progress)
     body = body or _body(options.body)
     with WorkFolder(work_folder(out)) as work:
         Cleanup(out.absolute(), work.root).remove()
-        for name in with_dependents(redo):
+        for name in with_dependents(options.redo):
             work.forget(name)
         draft = Draft(
             found, out, body, work, bodies,
-            lambda said: announce and announce(EstimatorPlan({}, notes=(said,))),
+            lambda said: talk.announce and talk.announce(EstimatorPlan({}, notes=(said,))),
         )  # fmt: skip
         try:
-            return stages.run(draft, options, chosen, progress or no_progress, until)
+            return stages.run(draft, options, chosen, talk.progress, until)
         except HoigsError:
             if work.new and not work.worth_keeping:
                 work.discard()

@@ -90,22 +90,15 @@ def _boxed(at: PromptAt, numbers: list[float], text: str, what: str) -> PromptAt
     return at.model_copy(update={"box": (x0, y0, x1, y1)})
 
 
-def with_prompts(
-    options: PrepareOptions,
-    texts: str | Sequence[str],
-    preset: object = None,
-    person: str | Sequence[str] = (),
-) -> PrepareOptions:
-    """Options with the objects' and the person's prompts from texts, and a preset if `preset` is
-    the name of one.
+def with_prompts(options: PrepareOptions) -> PrepareOptions:
+    """Options whose `object` and `person` have become prompts and names of entities.
 
     The name before a text's "=" is that of its object; texts of one name are places on one object.
 
     Raises:
         SpecError: a text is wrong, or they name the person.
     """
-    texts = [texts] if isinstance(texts, str) else list(texts)
-    update: dict[str, Any] = {"preset": preset} if isinstance(preset, str) else {}
+    texts, update = options.object, {}
     named = [split_name(text) for text in texts]
     if any(place.strip() == NONE for _, place in named):
         if len(texts) > 1 or named[0][0]:
@@ -115,9 +108,9 @@ def with_prompts(
         update["find_object"] = False
     elif texts:
         update |= named_objects(named, options)
-    if person := [person] if isinstance(person, str) else list(person):
-        update |= _people(person, options, update)
-    return PrepareOptions.model_validate({**options.model_dump(), **update}) if update else options
+    if options.person:
+        update |= _people(options.person, options, update)
+    return options.changed(**update, object=(), person=()) if update else options
 
 
 def _people(
@@ -141,7 +134,7 @@ def _people(
         if len(texts) > 1 or named[0][0]:
             raise SpecError("--person all takes everybody: leave the others out, and names")
         return {"everybody": True}
-    objects = (update.get("object", options.object), *update.get("further_objects", ()))
+    objects = (update.get("object_name", options.object_name), *update.get("further_objects", ()))
     found = named_people(named, options, objects)
     return found | {"prompts": {**update.get("prompts", {}), **found["prompts"]}}
 
@@ -167,14 +160,14 @@ def named_people(
     Raises:
         SpecError: a place is wrong, or a person has an object's name.
     """
-    places = _by_name(named, options.human)
+    places = _by_name(named, options.human_name)
     for name in places:
         if name in objects:
             raise SpecError(f"--person {name}=: {name} is an object's name; give another")
     prompts = {name: parse_prompts(texts, "--person") for name, texts in places.items()}
     first, *further = prompts
     return {
-        "human": first,
+        "human_name": first,
         "further_people": tuple(further),
         "prompts": {**options.prompts, **prompts},
     }
@@ -188,16 +181,16 @@ def named_objects(
     Raises:
         SpecError: a place is wrong, or an object has the person's name.
     """
-    places = _by_name(named, options.object)
-    if options.human in places:
+    places = _by_name(named, options.object_name)
+    if options.human_name in places:
         raise SpecError(
-            f"--object {options.human}=: {options.human} is the person's name; give the object "
-            "another"
+            f"--object {options.human_name}=: {options.human_name} is the person's name; give the "
+            "object another"
         )
     prompts = {name: parse_prompts(texts) for name, texts in places.items()}
     first, *further = prompts
     return {
-        "object": first,
+        "object_name": first,
         "further_objects": tuple(further),
         "prompts": {**options.prompts, **prompts},
     }
@@ -335,8 +328,8 @@ def with_stored(
         return options, ()
     file = prompt_file(video).name
     prompts, said = options.prompts, []
-    explicit = {"object": options.object in prompts or not options.find_object,
-                "person": options.human in prompts or not options.find_person}  # fmt: skip
+    explicit = {"object": options.object_name in prompts or not options.find_object,
+                "person": options.human_name in prompts or not options.find_person}  # fmt: skip
     for kind, texts in (("person", stored.person), ("object", stored.object)):
         if not texts:
             continue
@@ -346,11 +339,11 @@ def with_stored(
         split = [split_name(text) for text in texts]
         if kind == "person":
             found: dict[str, Any] = named_people(split, options)
-            names = [found["human"], *found["further_people"]]
+            names = [found["human_name"], *found["further_people"]]
         else:
             found = named_objects(split, options)
-            names = [found["object"], *found["further_objects"]]
-        options = PrepareOptions.model_validate({**options.model_dump(), **found})
+            names = [found["object_name"], *found["further_objects"]]
+        options = options.changed(**found)
         for name in names:
             frames = ", ".join(
                 "first" if at.frame is None else str(at.frame)

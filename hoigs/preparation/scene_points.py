@@ -433,8 +433,7 @@ def static_scene(
     cameras: Sequence[Camera],
     *,
     ground: float,
-    distance: float,
-    backdrop: float,
+    wall: float,
     count: int,
     metres: Callable[[int], Float[np.ndarray, "H W"]] | None = None,
 ) -> ScenePoints:
@@ -443,8 +442,7 @@ def static_scene(
     Args:
         images: gives the frames anew. masks: of the frames.
         cameras: of the frames, all in the world's origin; they may look into other directions.
-        ground: height of the camera over the floor, metres. distance: of the person, metres.
-        backdrop: distance of the wall in distances of the person.
+        ground: height of the camera over the floor, metres. wall: distance of the wall, metres.
         count: of points, about.
         metres: measured depth of a frame, 0 where unknown; None: it is supposed everywhere.
     """
@@ -464,13 +462,10 @@ def static_scene(
         measured = median_depth(depths, (view.camera.width, view.camera.height))
     within = view.within([cameras[i] for i in sorted(chosen)])
     points, colors = plate_points(
-        plate, view.camera, ground=ground, backdrop=backdrop * distance, count=count,
+        plate, view.camera, ground=ground, backdrop=wall, count=count,
         within=within, measured=measured,
     )  # fmt: skip
-    floor = (
-        f"a level floor {ground:.2f} m below a level camera and a wall at "
-        f"{backdrop * distance:.1f} m"
-    )
+    floor = f"a level floor {ground:.2f} m below a level camera and a wall at {wall:.1f} m"
     if measured is None:
         text = f"supposed: {floor}, coloured by the median of unmasked pixels; its depth is not "
         text += "measured, and "

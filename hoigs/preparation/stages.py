@@ -178,7 +178,7 @@ def estimates(
         {kind: identity(estimator) for kind, estimator in used.items()},
         draft.source.masked,
         of_both,
-        _shown(draft, *options.people, *((options.object,) if of_both else ())),
+        _shown(draft, *options.people, *((options.object_name,) if of_both else ())),
         _object_shown(draft, options),
     ]
     draft.work.worth_keeping |= any(kind not in draft.source.beside for kind in used)
@@ -228,7 +228,7 @@ def _shown(draft: Draft, *names: str) -> dict[str, Any]:
 
 
 def _object_shown(draft: Draft, options: PrepareOptions) -> bool:
-    return options.find_object and options.object in draft.clicks
+    return options.find_object and options.object_name in draft.clicks
 
 
 def object_masks(
@@ -461,8 +461,8 @@ def scene(
             return depth.metres(maps[frame], frame)
 
         points = static_scene(
-            found.images, moving, found.cameras, ground=unit.ground, distance=unit.distance,
-            backdrop=options.backdrop, count=options.scene_points,
+            found.images, moving, found.cameras, ground=unit.ground,
+            wall=options.backdrop * unit.distance, count=options.scene_points,
             metres=None if depth is None else metres,
         )  # fmt: skip
         if depth is None:

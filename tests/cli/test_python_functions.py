@@ -41,16 +41,9 @@ RENAMED = {
 # options that choose the function: --auto is hoigs.auto, --stage is hoigs.prepare_until(stage, ...)
 # --json is another way to print what hoigs.doctor returns
 CHOOSING = {("train", "auto"), ("prepare", "stage"), ("doctor", "json")}
-# options of a command that the second of its functions is without, and why
-WITHOUT = {
-    # the options of prepare_until are ready-made
-    hoigs.prepare_until: {"width", "camera", "max_frames", "every", "fps", "focal", "keep_black",
-                          "overwrite", "overrides", "start", "end", "intrinsics", "calibration",
-                          "person_height", "chunk", "overlap"},
-}  # fmt: skip
 # arguments that only a Python caller can give: objects and callbacks
 PYTHON = {"on_start", "on_step", "on_found", "progress", "report", "body", "estimators",
-          "positions", "consent", "announce", "tick", "options"}  # fmt: skip
+          "positions", "consent", "announce", "tick", "options", "preset", "file"}  # fmt: skip
 
 
 def options_of(command: str) -> dict[str, Any]:
@@ -84,14 +77,13 @@ def test_a_function_has_every_option_of_its_command(command):
     for function in FUNCTIONS[command]:
         arguments = inspect.signature(function).parameters
         wanted = {k: v for k, v in options.items() if (command, k) not in CHOOSING}
-        wanted = {k: v for k, v in wanted.items() if k not in WITHOUT.get(function, ())}
         missing = set(wanted) - set(arguments)
         assert not missing, f"{function.__name__} is without {missing}"
         more = set(arguments) - set(options) - PYTHON
         assert not more, f"hoigs {command} is without {more}"
-        for name, default in wanted.items():
-            if default is not None or command != "prepare":  # prepare's defaults are its options'
-                assert _plain(arguments[name].default) == default, f"{function.__name__}: {name}"
+        for name in set(wanted) - PYTHON:
+            found = _plain(arguments[name].default)
+            assert found == wanted[name], f"{function.__name__}: {name}"
 
 
 def test_no_public_name_is_hidden_by_a_module():

@@ -309,10 +309,10 @@ def test_files_come_first(tiny_source: Path, alone: Path) -> None:
     (tiny_source / "pose_mediapipe.npz").unlink()
     assert chosen(tiny_source)["landmarks"] == "estimator:mediapipe"
     assert chosen(alone)["object"] == "estimator:object-tracker"
-    hub = chosen(alone, with_prompts(PrepareOptions(), "football", "hub"))
+    hub = chosen(alone, with_prompts(PrepareOptions(object="football", preset="hub")))
     assert hub["object"] == "estimator:transformers-sam2" and len(hub) == 4
     with pytest.raises(SpecError, match="SAM 2"):
-        chosen(alone, with_prompts(PrepareOptions(), ["1,2", "3,4@5"], "hub"))
+        chosen(alone, with_prompts(PrepareOptions(object=["1,2", "3,4@5"], preset="hub")))
 
 
 def rewrite(path: Path, pictures: list[np.ndarray], ticks: list[int]) -> None:

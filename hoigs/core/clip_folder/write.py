@@ -39,7 +39,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, ObjectTrack, uniform_test_split
 from hoigs.core.values.world import World
 
-# FrameFiles writes what a clip folder has of each frame: image, masks, depth, and the cameras.
+# PixelFiles writes what a clip folder has of each frame: image, masks, depth, and the cameras.
 
 Image8 = UInt8[Tensor, "H W 3"] | UInt8[np.ndarray, "H W 3"]
 Mask = Bool[Tensor, "H W"] | Bool[np.ndarray, "H W"]
@@ -59,7 +59,7 @@ def _save_mask(path: Path, mask: Mask) -> None:
     Image.fromarray(as_array(mask, np.bool_).astype(np.uint8) * 255).save(path, compress_level=3)
 
 
-class FrameFiles:
+class PixelFiles:
     """The frames of the clip itself, or of its held_out folder.
 
     Attributes:
@@ -231,8 +231,8 @@ class ClipWriter:
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         self._root = Path(tempfile.mkdtemp(prefix=f".{self.folder.name}.", dir=self.folder.parent))
         self._root.chmod(0o755)
-        self._main = FrameFiles(self._root, self.image_format, self.quality)
-        self._held_out = FrameFiles(self._root / "held_out", self.image_format, self.quality)
+        self._main = PixelFiles(self._root, self.image_format, self.quality)
+        self._held_out = PixelFiles(self._root / "held_out", self.image_format, self.quality)
         return self
 
     def __exit__(

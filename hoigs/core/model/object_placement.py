@@ -54,6 +54,38 @@ class ScaleFit:
     counted: Bool[Tensor, " F"]
 
 
+@dataclass(frozen=True)
+class Reading:
+    """One reading of what the paper leaves open in S and v_t.
+
+    The defaults differ from the paper, which is `reduce="mean", frames="all", iterations=1`,
+    because a mask that the border or a hand cuts has too small a box, which pulls a mean down and
+    leaves a median alone; and because A_proj of a thick object depends on its own size, so that one
+    evaluation of the unscaled object is biased. Evaluations after the first, at S, converge fast as
+    area is nearly quadratic in S.
+
+    Attributes:
+        reduce: how the ratios of the frames become one.
+        frames: "whole" counts masks that the image's border does not cut and that are at least as
+            large as the median one; "all" counts every mask.
+        iterations: evaluations. One places the object unscaled, as the paper does; more start from
+            the size that a flat object at v_t would have.
+        quantile: see `projected_area`.
+        front: False takes the middle of the visible front for v_t, as the paper's words read.
+        smooth: median of 5, then Savitzky-Golay, over v_t; False keeps every frame's own.
+    """
+
+    reduce: Reduce = "median"
+    frames: Frames = "whole"
+    iterations: int = 3
+    quantile: float = 0.001
+    front: bool = True
+    smooth: bool = True
+
+
+READING = Reading()
+
+
 def mask_box(mask: Bool[Tensor, "H W"]) -> tuple[int, int, int, int] | None:
     """Left, top, right, bottom (exclusive) of a mask, pixels; None of an empty one."""
     rows, columns = mask.any(1).nonzero().squeeze(1), mask.any(0).nonzero().squeeze(1)
@@ -99,39 +131,27 @@ def fit_scale(
     cameras: Sequence[Camera],
     shifts: Float[Tensor, "F 3"],
     rotations: Float[Tensor, "F 3 3"] | None = None,
+    reading: Reading = READING,
     *,
-    reduce: Reduce = "median",
-    frames: Frames = "whole",
-    iterations: int = 3,
-    quantile: float = 0.001,
     sigmas: Float[Tensor, " P"] | None = None,
 ) -> ScaleFit:
-    """S of the paper, in several readings.
-
-    Defaults differ from the paper, which is `reduce="mean", frames="all", iterations=1`, because a
-    mask that the border or a hand cuts has too small a box, which pulls a mean down and leaves a
-    median alone; and because A_proj of a thick object depends on its own size, so that one
-    evaluation of the unscaled object is biased. Evaluations after the first, at S, converge fast
-    as area is nearly quadratic in S.
+    """S of the paper.
 
     Args:
         canonical: about the object's centre, any unit.
         masks: visible pixels, one a frame; empty ones do not count.
         shifts: v_t, the object's centre in camera space, metres.
         rotations: R_obj^t C, canonical axes to camera axes; None is the identity.
-        frames: "whole" counts masks that the image's border does not cut and that are at least
-            as large as the median one; "all" counts every mask.
-        iterations: evaluations. One places the object unscaled, as the paper does; more start
-            from the size that a flat object at v_t would have.
-        quantile, sigmas: see `projected_area`; sigmas in canonical units.
+        sigmas: see `projected_area`, in canonical units.
 
     Raises:
         ValueError: no frame counts, or, with one iteration, the unscaled object reaches behind
             the camera.
     """
+    iterations = reading.iterations
     if iterations < 1:
         raise ValueError(f"fit_scale needs at least 1 iteration, got {iterations}")
-    areas, counted = _mask_areas(masks, frames)
+    areas, counted = _mask_areas(masks, reading.frames)
     turned = canonical if rotations is None else canonical @ rotations.mT
     turned = turned.expand(len(cameras), -1, 3)
     scale = 1.0 if iterations == 1 else _flat_scale(turned, areas, counted, cameras, shifts)
@@ -141,7 +161,7 @@ def fit_scale(
             projected_area(
                 scale * turned[i] + shifts[i],
                 camera,
-                quantile,
+                reading.quantile,
                 None if sigmas is None else scale * sigmas,
             )
             for i, camera in enumerate(cameras)
@@ -155,7 +175,7 @@ def fit_scale(
                 "that counts; give more iterations, or a smaller canonical shape"
             )
         chosen = ratios[used]
-        scale *= float(chosen.mean() if reduce == "mean" else chosen.median())
+        scale *= float(chosen.mean() if reading.reduce == "mean" else chosen.median())
     spread = float(ratios[used].std(correction=0) / ratios[used].mean())
     return ScaleFit(scale, spread, ratios, used)
 
@@ -269,13 +289,7 @@ def locate(
     depths: Sequence[Float[Tensor, "H W"] | None],
     cameras: Sequence[Camera],
     rotations: Float[Tensor, "F 3 3"] | None = None,
-    *,
-    reduce: Reduce = "median",
-    frames: Frames = "whole",
-    iterations: int = 3,
-    quantile: float = 0.001,
-    front: bool = True,
-    smooth: bool = True,
+    reading: Reading = READING,
 ) -> Placement:
     """S and v_t together, from masks and masked depth.
 
@@ -284,10 +298,8 @@ def locate(
     with v_t, so the two take turns.
 
     Args:
-        canonical: about the object's centre. masks, rotations, reduce, frames, iterations,
-            quantile: as `fit_scale`. depths: metres, 0 where unknown.
-        front: False takes the middle of the visible front for v_t, as the paper's words read.
-        smooth: median of 5, then Savitzky-Golay, over v_t; False keeps every frame's own.
+        canonical: about the object's centre. masks, rotations: as `fit_scale`.
+        depths: metres, 0 where unknown.
 
     Raises:
         ValueError: no frame has both mask and depth, or see `fit_scale`.
@@ -297,22 +309,19 @@ def locate(
         raise ValueError("no frame has known depth under the object's mask: its place is unknown")
     turned = canonical if rotations is None else canonical @ rotations.mT
     turned = turned.expand(len(cameras), -1, 3)
-    seen_at = torch.stack([seen_middle(t) for t in turned]) * float(front)
+    seen_at = torch.stack([seen_middle(t) for t in turned]) * float(reading.front)
     rays = pinhole_rays(torch.stack([camera.K for camera in cameras]), pixels)
     rays = torch.nn.functional.pad(rays, (0, 1), value=1.0)
     known = [m if o else torch.zeros_like(m) for m, o in zip(masks, observed.tolist(), strict=True)]
     scale = 0.0
-    for _ in range(max(2, iterations) if front else 1):
+    for _ in range(max(2, reading.iterations) if reading.front else 1):
         depth = middle - scale * seen_at[:, 2]
         across = torch.nn.functional.pad(scale * seen_at[:, :2], (0, 1))
         centers = (rays * depth[:, None] - across).numpy()
         shifts = torch.from_numpy(fill_gaps(centers, observed.numpy())).to(rays)
-        fit = fit_scale(
-            canonical, known, cameras, shifts, rotations,
-            reduce=reduce, frames=frames, iterations=iterations, quantile=quantile,
-        )  # fmt: skip
+        fit = fit_scale(canonical, known, cameras, shifts, rotations, reading)
         scale = fit.scale
-    if smooth and len(shifts) >= SMOOTHED:
+    if reading.smooth and len(shifts) >= SMOOTHED:
         shifts = torch.from_numpy(smoothed(shifts.numpy(), SMOOTHED)).to(shifts)
     return Placement(fit, shifts, observed)
 

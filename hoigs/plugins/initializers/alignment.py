@@ -6,7 +6,7 @@ HOIGS, Sec. "Object Initialization"; the formulas are those of `hoigs.core.model
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from hoigs.core.interfaces.initializer import training_frames
 from hoigs.core.model.object_placement import (
     Frames,
     Placement,
+    Reading,
     Reduce,
     ScaleFit,
     fit_scale,
@@ -260,24 +261,21 @@ def _placed(
         fit = ScaleFit(1.0, 0.0, torch.full((len(clip),), torch.nan), none)
         return Placement(fit, shifts, track.observed)
     few = canonical[:: -(-len(canonical) // FIT_POINTS)]
-    readings: dict[str, Any] = {
-        "reduce": settings.scale_reduce,
-        "frames": settings.scale_frames,
-        "iterations": settings.scale_iterations,
-        "quantile": settings.scale_quantile,
-    }
+    reading = Reading(
+        settings.scale_reduce, settings.scale_frames, settings.scale_iterations,
+        settings.scale_quantile, settings.front, settings.smooth,
+    )  # fmt: skip
     allowed = training_frames(clip)
     if settings.place == "depth":
         require_metric_depth(clip)
         unseen = [torch.zeros(c.height, c.width, dtype=torch.bool) for c in clip.cameras]
         masks = [clip.store.mask(entity, i) if i in allowed else m for i, m in enumerate(unseen)]
         depths = [clip.store.depth(i) if i in allowed else None for i in range(len(clip))]
-        readings |= {"front": settings.front, "smooth": settings.smooth}
-        return locate(few, masks, depths, clip.cameras, turns, **readings)
+        return locate(few, masks, depths, clip.cameras, turns, reading)
     chosen = allowed[:: -(-len(allowed) // FIT_FRAMES)]
     masks = [clip.store.mask(entity, i) for i in chosen]
     cameras = [clip.cameras[i] for i in chosen]
-    fit = fit_scale(few, masks, cameras, shifts[chosen], turns[chosen], **readings)
+    fit = fit_scale(few, masks, cameras, shifts[chosen], turns[chosen], reading)
     return Placement(fit, shifts, track.observed)
 
 

@@ -29,6 +29,7 @@ from hoigs.plugins.readers.checked_files import Need, VideoReaderConfig, require
 from hoigs.plugins.readers.lazy_frames import (
     LazyFrames,
     MaskFiles,
+    PixelFiles,
     image_files,
     lens_for,
     natural,
@@ -265,9 +266,13 @@ class ColmapReader(ClipReader):
         cameras = [lens.camera(v.world_to_camera) for lens, v in zip(lenses, model.views)]
         store = LazyFrames(
             folder,
-            images,
+            PixelFiles(
+                images,
+                masks={
+                    n: MaskFiles([folder / "masks" / n / f"{s}.png" for s in stems]) for n in masks
+                },
+            ),
             cameras,
-            masks={n: MaskFiles([folder / "masks" / n / f"{s}.png" for s in stems]) for n in masks},
             lenses=lenses,
             cache_mb=self.config.cache_mb,
         )

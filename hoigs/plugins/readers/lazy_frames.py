@@ -66,6 +66,25 @@ class DepthFiles:
     read: Callable[[Path], Array] | None = None
 
 
+@dataclass(frozen=True)
+class PixelFiles:
+    """The files of a clip's frames.
+
+    Attributes:
+        images: one for each frame. masks: by entity. ignored: pixels that show no scene.
+        depth: in world units.
+        background: RGB, 0..255, behind images with an alpha channel.
+        read_image: a file to uint8 [H, W, 3], for frames that are not image files.
+    """
+
+    images: Sequence[Path]
+    masks: Mapping[str, MaskFiles] | None = None
+    ignored: MaskFiles | None = None
+    depth: DepthFiles | None = None
+    background: tuple[int, int, int] = (0, 0, 0)
+    read_image: Callable[[Path], Array] | None = None
+
+
 class LazyFrames(FrameStore):
     """Frames of a dataset, one file for each image, mask and depth map.
 
@@ -76,11 +95,8 @@ class LazyFrames(FrameStore):
 
     Args:
         root: the folder of the data.
-        images: one file for each frame. cameras: the pinhole cameras of the frames.
-        masks: by entity. ignored: pixels that show no scene. depth: in world units.
+        cameras: the pinhole cameras of the frames.
         lenses: one for each frame; None, or a None among them, for a pinhole image.
-        background: RGB, 0..255, behind images with an alpha channel.
-        read_image: a file to uint8 [H, W, 3], for frames that are not image files.
         cache_mb: decoded pixels kept in memory, MiB; the least recently used go first.
 
     Raises:
@@ -92,25 +108,21 @@ class LazyFrames(FrameStore):
     def __init__(
         self,
         root: Path,
-        images: Sequence[Path],
+        files: PixelFiles,
         cameras: Sequence[Camera],
         *,
-        masks: Mapping[str, MaskFiles] | None = None,
-        ignored: MaskFiles | None = None,
-        depth: DepthFiles | None = None,
         lenses: Sequence[Lens | None] | None = None,
-        background: tuple[int, int, int] = (0, 0, 0),
-        read_image: Callable[[Path], Array] | None = None,
         cache_mb: int = 512,
     ) -> None:
-        self.root, self.images, self.cameras = Path(root), list(images), list(cameras)
-        self.masks, self.ignored_files, self.depth_files = dict(masks or {}), ignored, depth
+        self.root, self.images, self.cameras = Path(root), list(files.images), list(cameras)
+        ignored, depth = files.ignored, files.depth
+        self.masks, self.ignored_files, self.depth_files = dict(files.masks or {}), ignored, depth
         self.lenses = list(lenses) if lenses is not None else [None] * len(self.images)
-        self.background, self.cache = background, PixelCache(cache_mb)
-        self._read_image = read_image or self._decode
+        self.background, self.cache = files.background, PixelCache(cache_mb)
+        self._read_image = files.read_image or self._decode
         counts = {len(self.images), len(self.cameras), len(self.lenses)}
-        counts |= {len(files.paths) for files in self.masks.values()}
-        counts |= {len(files.paths) for files in (ignored, depth) if files is not None}
+        of_frames = [*self.masks.values(), ignored, depth]
+        counts |= {len(each.paths) for each in of_frames if each is not None}
         if len(counts) != 1:
             raise ValueError(
                 f"lists of different lengths: {sorted(counts)}; expected one entry for each frame"

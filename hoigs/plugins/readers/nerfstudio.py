@@ -22,6 +22,7 @@ from hoigs.plugins.readers.lazy_frames import (
     DepthFiles,
     LazyFrames,
     MaskFiles,
+    PixelFiles,
     dark,
     image_size,
     lens_for,
@@ -202,10 +203,12 @@ class NerfstudioReader(ClipReader):
             name=folder.resolve().name,
             store=LazyFrames(
                 folder,
-                images,
+                PixelFiles(
+                    images,
+                    ignored=MaskFiles(masks, dark) if any(masks) else None,
+                    depth=DepthFiles(depths, self.config.depth_unit) if any(depths) else None,
+                ),
                 cameras,
-                ignored=MaskFiles(masks, dark) if any(masks) else None,
-                depth=DepthFiles(depths, self.config.depth_unit) if any(depths) else None,
                 lenses=lenses,
                 cache_mb=self.config.cache_mb,
             ),

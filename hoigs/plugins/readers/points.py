@@ -50,7 +50,8 @@ def points_of_depth(
         depth = store.depth(position)
         if depth is not None:
             where = _scene(store, entities, position, depth.shape) & (depth > 0)
-            parts.append(_lifted(store, cameras, position, where, depth, count, rng, len(sources)))
+            share = -(-count // len(sources))
+            parts.append(_lifted(store, cameras, position, where, depth, share, rng))
     points, colors = (torch.cat(x) for x in zip(*parts)) if parts else (torch.zeros(0, 3),) * 2
     return (points, colors) if len(points) else None
 
@@ -85,7 +86,8 @@ def points_along_rays(
         where = _scene(store, entities, position, (camera.height, camera.width))
         inverse = rng.uniform(1 / span[1], 1 / span[0], where.shape)
         depth = torch.from_numpy(1 / inverse).float()
-        parts.append(_lifted(store, cameras, position, where, depth, count, rng, len(sources)))
+        share = -(-count // len(sources))
+        parts.append(_lifted(store, cameras, position, where, depth, share, rng))
     points, colors = (torch.cat(x) for x in zip(*parts))
     return points, colors
 
@@ -114,10 +116,9 @@ def _lifted(
     depth: Tensor,
     count: int,
     rng: np.random.Generator,
-    sources: int,
 ) -> Points:
     rows = np.flatnonzero(where.numpy())
-    chosen = torch.from_numpy(rng.choice(rows, min(-(-count // sources), len(rows)), replace=False))
+    chosen = torch.from_numpy(rng.choice(rows, min(count, len(rows)), replace=False))
     camera = cameras[position]
     grid = camera.pixel_grid().reshape(-1, 2)[chosen]
     points = camera.unproject(grid, depth.reshape(-1)[chosen])

@@ -27,6 +27,7 @@ from hoigs.preparation.body.mask_fit import MaskFit, Masks, Project
 from hoigs.preparation.body.priors import REST_LASTS as LASTS
 from hoigs.preparation.body.priors import MotionPrior, Noise, PosePrior, robust_weights
 from hoigs.preparation.body.start import Start, first_guess
+from hoigs.preparation.options import FIT_STEPS
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class FitOptions:
         scale: find the cameras' unit in metres too (a moving camera of unknown scale).
     """
 
-    steps: int = 40
+    steps: int = FIT_STEPS
     spread: float = 0.006
     space: float = 0.05
     unit: float = 0.015

@@ -216,7 +216,7 @@ def _object(source: Source, options: PrepareOptions, given: Collection[str]) -> 
         return Choice("object", "none", "--object none", 0.0)
     if source.ball is not None:
         return Choice("object", source.ball.name, "lies beside the video", 0.0)
-    if options.object in source.masked:
+    if options.object_name in source.masked:
         return Choice("object", "with the person's mask", "both lie beside the video", 0.0)
     named = options.estimators.get("masks")
     if "masks" in given and (named is None or named.use not in PERSON_ONLY):

@@ -180,7 +180,7 @@ class EstimateReader:
             return FrameEstimates({}, self._objects_alone(progress))
         first, *further = self.people
         landmarks = {name: self._landmarks(name, progress) for name in self.people}
-        masks = self._masks((first, self.options.object), progress)
+        masks = self._masks((first, self.options.object_name), progress)
         if not further:
             return FrameEstimates(landmarks, masks)
         found = self.estimate("masks", progress).masks
@@ -209,8 +209,8 @@ class EstimateReader:
         human, thing = MaskStack(nobody for _ in self.video.indices), None
         if "masks" in self.estimators and self.of_both:
             found = self.estimate("masks", progress).masks
-            if found is not None and self.options.object in found.entities:
-                thing = self._stack(found.entities[self.options.object])
+            if found is not None and self.options.object_name in found.entities:
+                thing = self._stack(found.entities[self.options.object_name])
         return GivenMasks(human=human, object=thing)
 
     def object_masks(self, progress: Callable[[float], None]) -> FoundObject:
@@ -223,7 +223,7 @@ class EstimateReader:
         assert found is not None  # `checked` saw to it
         first, *further = (
             self._found(found, name)
-            for name in (self.options.object, *self.options.further_objects)
+            for name in (self.options.object_name, *self.options.further_objects)
         )
         names = self.options.further_objects
         return replace(
@@ -319,7 +319,7 @@ class EstimateReader:
     def _entities(self, kind: Place) -> tuple[EntityRequest, ...]:
         options = self.options
         people = tuple(self._asked(name, "human") for name in self.people)
-        thing = self._asked(options.object, "object")
+        thing = self._asked(options.object_name, "object")
         if kind == "object":
             return (thing, *(self._asked(n, "object") for n in options.further_objects))
         if kind == "masks" and kind in self.source.beside:

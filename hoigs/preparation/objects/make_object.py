@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 import torch
@@ -29,6 +28,7 @@ from hoigs.preparation.objects.ball import (
 )
 from hoigs.preparation.objects.shape import ColorSampler, held_object, sphere_points
 from hoigs.preparation.objects.tracked import ObjectConfidence, UntrackableError, tracked_object
+from hoigs.preparation.options import ObjectWay
 
 # What makes an object's track doubtful: seen in its masks and the landmarks, and said.
 
@@ -122,7 +122,6 @@ def _on_object(
             yield float(mask[xy[inside, 1], xy[inside, 0]].sum() / len(xy))
 
 
-ObjectWay = Literal["auto", "ball", "texture", "outline"]
 COLOR_FRAMES = 24  # a median over more changes nothing visible
 FOOTBALL = 0.11  # metres
 COVERED, COVERS_MORE = 0.7, 0.1  # IoU with the masks below which another way is tried, and is taken

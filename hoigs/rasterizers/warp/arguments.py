@@ -50,6 +50,7 @@ class Gradients:
     """What `kernels.project_adjoint` writes, in the shapes of the inputs."""
 
     def __init__(self, inputs: Inputs, pose: bool, absolute: bool) -> None:
+        self.with_pose, self.absolute = pose, absolute
         self.means = torch.empty_like(inputs.means)
         self.quats = torch.empty_like(inputs.quats)
         self.log_scales = torch.empty_like(inputs.log_scales)

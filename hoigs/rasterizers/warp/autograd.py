@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hoigs.core.first_order import first_order
+from hoigs.rasterizers.warp.arguments import Gradients
 from hoigs.rasterizers.warp.frame import Images, Inputs, Settings, TileIntersections
 
 
@@ -57,10 +58,8 @@ class Render(torch.autograd.Function):
         )
         needs = Inputs(*ctx.needs_input_grad[2:])
         with torch.cuda.device_of(inputs.means):
-            out = ctx.pipeline.gradients(
-                inputs, ctx.settings, records, intersections, images, v,
-                pose=bool(needs.world_to_camera), absolute=bool(needs.absolute_gradients),
-            )  # fmt: skip
+            out = Gradients(inputs, bool(needs.world_to_camera), bool(needs.absolute_gradients))
+            ctx.pipeline.gradients(inputs, ctx.settings, records, intersections, images, v, out)
         background = None
         if needs.background:
             background = v.color * (1.0 - images.alpha)[..., None]

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.options import verb
 from hoigs.core.system.folder_lock import FolderLock
 from hoigs.studies.batch.folder import BATCH, BatchFolder, Stage, State, stages_of
 from hoigs.studies.batch.manifest import Row, each_row
@@ -23,10 +23,10 @@ from hoigs.studies.execution.local import (
     Executor,
     Needs,
     Process,
-    make_executor,
     why_failed,
 )
 from hoigs.studies.execution.queue import TAKEN_POLL_S, Queue, TakenError, hold
+from hoigs.studies.options import BatchOptions, WorkOptions
 
 RETRY_S = 1.0
 WRONG_INPUT = 2  # exit code that another attempt does not change
@@ -211,19 +211,12 @@ class Batch:
     plan: Mapping[str, Sequence[str]]
 
 
+@verb(BatchOptions)
 def batch(
     manifest: Path | str,
     out: Path | str,
     *,
-    defaults: Mapping[str, Any] | None = None,
-    jobs: int = 1,
-    threads: int | None = None,
-    retries: int = 1,
-    limit: int | None = None,
-    only_failed: bool = False,
-    dry_run: bool = False,
-    executor: Executor | str = "local",
-    address: str | None = None,
+    options: BatchOptions,
     report: Report = lambda work, word: None,
     tick: Callable[[Sequence[Work]], None] = lambda running: None,
 ) -> Batch:
@@ -232,42 +225,36 @@ def batch(
     Args:
         manifest: YAML or CSV; `hoigs.studies.batch.manifest.Row` has the keys of a row.
         out: folder of rows and summary. Several calls may work on it at once.
-        defaults: keys for rows that have none.
-        jobs: rows at a time. threads: of each; default cores / jobs. retries: of a failed stage.
-        limit: only the first rows. only_failed: only rows whose last attempt failed.
-        dry_run: run and write nothing.
-        executor: where the stages run: "local", this machine and its GPUs in turn; "ray", all of a
-            Ray cluster; "MODULE:CLASS"; or an Executor. address: of the cluster to join.
         report, tick: as for `hoigs.studies.batch.batch.drive`.
 
     Raises:
         HoigsError: the manifest or a folder cannot be used. A row that fails raises nothing.
     """
+    if options.only not in (None, "failed"):
+        raise HoigsError(f'--only {options.only}: expected "failed"')
     path = Path(out).absolute()
-    rows = each_row(Path(manifest), defaults)
-    if dry_run:
+    rows = each_row(Path(manifest), options.defaults())
+    if options.dry_run:
         known = BatchFolder.open(path) if (path / BATCH).exists() else BatchFolder(path)
-        chosen = islice(_chosen(rows, known, only_failed), limit)
+        chosen = islice(_chosen(rows, known, options), options.limit)
         plan = {row.name: _plan(row, known.of(row)) for row in chosen}
         return Batch(len(plan), {}, (), plan)
-    where = _executor(executor, jobs, threads, address)
+    where = options.place()
     folder = BatchFolder.begin(path, rows)
-    chosen = islice(_chosen(folder.rows(), folder, only_failed), limit)
-    return _drive(folder, chosen, where, retries, report, tick)
+    chosen = islice(_chosen(folder.rows(), folder, options), options.limit)
+    return _drive(folder, chosen, where, options.retries, report, tick)
 
 
-def _chosen(rows: Iterable[Row], folder: BatchFolder, only_failed: bool) -> Iterator[Row]:
-    return (row for row in rows if not only_failed or State.known(folder.of(row)).failed.why)
+def _chosen(rows: Iterable[Row], folder: BatchFolder, options: BatchOptions) -> Iterator[Row]:
+    again = options.only == "failed"
+    return (row for row in rows if not again or State.known(folder.of(row)).failed.why)
 
 
+@verb(WorkOptions)
 def work(
     out: Path | str,
     *,
-    jobs: int = 1,
-    threads: int | None = None,
-    retries: int = 1,
-    executor: Executor | str = "local",
-    address: str | None = None,
+    options: WorkOptions,
     report: Report = lambda work, word: None,
     tick: Callable[[Sequence[Work]], None] = lambda running: None,
 ) -> Batch:
@@ -277,14 +264,7 @@ def work(
     paths. Arguments and errors as for `batch`.
     """
     folder = BatchFolder.open(Path(out).absolute())
-    where = _executor(executor, jobs, threads, address)
-    return _drive(folder, folder.rows(), where, retries, report, tick)
-
-
-def _executor(
-    given: Executor | str, jobs: int, threads: int | None, address: str | None
-) -> Executor:
-    return make_executor(given, jobs, threads, address) if isinstance(given, str) else given
+    return _drive(folder, folder.rows(), options.place(), options.retries, report, tick)
 
 
 def _drive(

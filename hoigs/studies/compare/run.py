@@ -69,7 +69,7 @@ def plan(study: Comparison) -> list[Planned]:
     rasterizers: Sequence[str | None] = study.rasterizers or [None]
     budgets: Sequence[int | None] = study.budgets or [None]
     return [
-        _planned(study, table, row, rasterizer, budget, clip, seed, folders)
+        _planned(study, _Place(table, row, rasterizer, budget, clip, seed), folders)
         for table, rows in study.rows.items()
         for clip in study.clips
         for row in rows
@@ -79,23 +79,28 @@ def plan(study: Comparison) -> list[Planned]:
     ]
 
 
-def _planned(
-    study: Comparison,
-    table: str,
-    row: Row,
-    rasterizer: str | None,
-    budget: int | None,
-    clip: str,
-    seed: int,
-    folders: ClipFolders,
-) -> Planned:
+@dataclass(frozen=True)
+class _Place:
+    """Of a cell; None takes the spec's own."""
+
+    table: str
+    row: Row
+    rasterizer: str | None
+    budget: int | None
+    clip: str
+    seed: int
+
+
+def _planned(study: Comparison, place: _Place, folders: ClipFolders) -> Planned:
     from hoigs.core.registry.registry import default_registry
     from hoigs.core.spec.schema import Spec
     from hoigs.synthesis.named import is_named
 
+    row, clip, rasterizer = place.row, place.clip, place.rasterizer
     registry = default_registry(list(study.plugins))
     what = definition(row) if row.spec else ""
-    cell = Cell(row.label, what, "", 0, folders.get(clip)[1], seed, table=table)
+    cell = Cell(row.label, what, "", 0, folders.get(clip)[1], place.seed,
+                table=place.table)  # fmt: skip
     if row.spec is None:
         return Planned(replace(cell, missing=row.why), None)
     if row.clip_settings:
@@ -106,12 +111,12 @@ def _planned(
     if rasterizer is not None:
         key = rasterizer if ":" in rasterizer else f"rasterizer:{rasterizer}"
         settings.append(f"rasterizer.use={key}")
-    if budget is not None:
-        settings.append(f"train.steps={budget}")
+    if place.budget is not None:
+        settings.append(f"train.steps={place.budget}")
     own = Spec.load(row.spec, overrides=settings, registry=registry)
     # a few previews of any budget make its curve; --set train.preview_every takes precedence
     previews = f"train.preview_every={max(1, own.train.steps // PREVIEWS)}"
-    settings = [previews, *settings, f"train.seed={seed}"]
+    settings = [previews, *settings, f"train.seed={place.seed}"]
     folder, label, digest = folders.get(clip)
     job = make_job(
         study.out, folder, label, digest, row.spec, settings, device=study.device,

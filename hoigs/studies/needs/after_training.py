@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import torch
 
 from hoigs.core.registry.registry import default_registry
 from hoigs.runs.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
-from hoigs.runs.loaded_run import LoadedRun
+from hoigs.runs.options import RunOptions
 from hoigs.runs.run_folder import RunFolder
 from hoigs.studies.needs.compress import Compacted, compress
 from hoigs.studies.needs.prune import Cut, Pruning
@@ -62,9 +62,7 @@ def finish(
     run: Path,
     compact: Path,
     *,
-    clip: Path | str | None = None,
-    device: str = "cpu",
-    plugins: Sequence[Path | str] = (),
+    options: RunOptions,
     overwrite: bool = False,
     report: Callable[[str], None] = lambda line: None,
     clock: tuple[float, float, float] | None = None,
@@ -77,7 +75,7 @@ def finish(
     stay. Training cannot be resumed from it.
 
     Args:
-        compact: folder of the compressed copy.
+        compact: folder of the compressed copy. options: how the run is opened.
         clock: seconds of search, training and a full training.
 
     Raises:
@@ -86,8 +84,8 @@ def finish(
     began = time.perf_counter()
     RunFolder(run).refuse_existing(overwrite=True)  # before the work: it is replaced after it
     RunFolder(compact).refuse_existing(overwrite, [run])
-    loaded = LoadedRun.open(run, clip=clip, device=device, plugins=plugins)
-    registry = default_registry(plugin_files=plugins)
+    loaded = options.open(run)
+    registry = default_registry(plugin_files=options.plugins)
     view = sealed_view(loaded.clip)
     positions = selection_frames(view.split["train"])
     budget = StepBudget(max(AFTER * loaded.spec.train.steps, LEAST))
@@ -98,8 +96,8 @@ def finish(
     pruned = pruning.run()
     _replace(RunFolder(run), pruned)
     compacted = compress(
-        run, out=compact, clip=clip, positions=positions, device=device, plugins=plugins,
-        overwrite=overwrite,
+        run, out=compact, clip=options.clip, positions=positions, device=options.device,
+        plugins=options.plugins, overwrite=overwrite,
     )  # fmt: skip
     report(str(compacted))
     search_s, train_s, full_s = clock or (None, None, None)

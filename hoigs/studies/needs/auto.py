@@ -16,6 +16,7 @@ from hoigs.evaluation.evaluate_run import evaluate as evaluate_run
 from hoigs.evaluation.options import EvaluateOptions
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_name
+from hoigs.runs.options import RunOptions
 from hoigs.runs.resuming import DEFAULT_SPEC, NO_CLIP
 from hoigs.runs.run_folder import RunFolder
 from hoigs.studies.needs.after_training import After, add_to_answer, finish
@@ -107,7 +108,8 @@ def auto(
     report(f"pruning {path}:")
     trained_s = run.session.trainer.elapsed
     after = finish(
-        path, compact, device=device, plugins=plugins, overwrite=options.overwrite,
+        path, compact, options=RunOptions(device=device, plugins=plugins),
+        overwrite=options.overwrite,
         clock=(found.seconds, trained_s, found.full_seconds) if found else None,
         report=lambda line: report(f"  {line}"),
     )  # fmt: skip

@@ -274,8 +274,9 @@ class Pruning:
         entities = sum(len(names) for names in described.values())
         overrides: dict[str, Any] = {f"model.{key}.features": None for key in described}
         if off:
-            self._apply(self.trained.recomposed(overrides), "tokens", "described entities",
-                       entities, 0, 0.0, "there is no interaction to read them")  # fmt: skip
+            cut = Cut("tokens", "described entities", entities, 0, 0.0,
+                      "there is no interaction to read them")  # fmt: skip
+            self._apply(self.trained.recomposed(overrides), cut)
             return
         if not self.validator.affordable:
             return
@@ -289,9 +290,9 @@ class Pruning:
             return
         overrides["interaction"] = {"use": NO_INTERACTION}
         less = self.trained.recomposed(overrides)
-        self._apply(less, "tokens", "described entities", entities, 0, drop,
-                   f"without interaction nothing is more than {drop:.2f} dB worse",
-                   without)  # fmt: skip
+        cut = Cut("tokens", "described entities", entities, 0, drop,
+                  f"without interaction nothing is more than {drop:.2f} dB worse")  # fmt: skip
+        self._apply(less, cut, without)
 
     def planes(self) -> None:
         """Remove time planes that are one, or that may be replaced by one."""
@@ -317,7 +318,7 @@ class Pruning:
                                "worse")  # fmt: skip
                     continue
             less = self.trained.recomposed({f"model.{key}.deformation.time_resolution": 0})
-            self._apply(less, what, "values", cells, 0, drop, why, after)
+            self._apply(less, Cut(what, "values", cells, 0, drop, why), after)
 
     def knots(self) -> None:
         """Remove spline knots if a refit moves nothing by a pixel and costs at most `visible`."""
@@ -369,7 +370,7 @@ class Pruning:
             drop = self.now.drop_to(after)
             if drop <= self.visible:
                 why = f"refitted with {count}, nothing moves by {pixels:g} pixel"
-                self._apply(less, what, "knots", before, count, drop, why, after)
+                self._apply(less, Cut(what, "knots", before, count, drop, why), after)
                 return
         self._knots_kept(what, before, drop)
 
@@ -455,11 +456,10 @@ class Pruning:
         self.report(f"tuned by {steps} steps: {gained:+.2f} dB, mean of the regions")
         self.now = tuned
 
-    def _apply(self, less: Trained, what: str, unit: str, before: int, after: int, drop: float,
-              why: str, scores: Scores | None = None) -> None:  # fmt: skip
+    def _apply(self, less: Trained, cut: Cut, scores: Scores | None = None) -> None:
         self.trained = less
         self.now = scores or self.now
-        self._record(Cut(what, unit, before, after, drop, why))
+        self._record(cut)
 
     def _keep(self, what: str, unit: str, count: int, drop: float, why: str) -> None:
         self._record(Cut(what, unit, count, count, drop, why))

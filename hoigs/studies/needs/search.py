@@ -31,6 +31,7 @@ from hoigs.studies.needs.search_space import (
     Candidate,
     Halving,
     Overrides,
+    Rule,
     SearchSpace,
     StepBudget,
     as_settings,
@@ -181,10 +182,12 @@ class Search:
                 held,
                 lambda k, until: trials[tried[k].name].advance(until),
                 self.budget,
+                rule=Rule(
+                    self.settings.criterion,
+                    self.settings.least if space.least is None else space.least,
+                    space.min_gain,
+                ),
                 what=f"{space.name} {block}".strip(),
-                criterion=self.settings.criterion,
-                least=self.settings.least if space.least is None else space.least,
-                min_gain=space.min_gain,
             )
             place = cheapest_refit(tried, halving.chosen, trials, self.clip)
             if place != halving.chosen:

@@ -275,22 +275,29 @@ def near_best(
     ]
 
 
-def choose(
-    scores: Sequence[Score],
-    criterion: Criterion = "one-se",
-    least: float = 0.0,
-    min_gain: float = 0.0,
-) -> int:
+@dataclass(frozen=True)
+class Rule:
+    """How one of several candidates is chosen.
+
+    Attributes:
+        criterion: the cheapest within one standard error of the best, or the least BIC.
+        least, min_gain: as `near_best` has them, for the former.
+    """
+
+    criterion: Criterion = "one-se"
+    least: float = 0.0
+    min_gain: float = 0.0
+
+
+def choose(scores: Sequence[Score], rule: Rule) -> int:
     """Index of the candidate to keep; scores are in order of cost."""
-    if criterion == "bic":
+    if rule.criterion == "bic":
         values = [bic(score) for score in scores]
         return values.index(min(values))
-    return near_best(scores, least, min_gain).index(True)
+    return near_best(scores, rule.least, rule.min_gain).index(True)
 
 
-def ranked(
-    scores: Sequence[Score], criterion: Criterion, least: float, min_gain: float = 0.0
-) -> list[int]:
+def ranked(scores: Sequence[Score], rule: Rule) -> list[int]:
     """Indices from the likeliest choice to the least likely: candidates that may be as good as the
     best by cost, then the others by score. The best itself is always among the first two.
 
@@ -300,9 +307,9 @@ def ranked(
     exclude the one that they have to be compared with.
     """
     places = range(len(scores))
-    if criterion == "bic":
+    if rule.criterion == "bic":
         return sorted(places, key=lambda k: (bic(scores[k]), k))
-    near = near_best(scores, least, min_gain, PATIENCE)
+    near = near_best(scores, rule.least, rule.min_gain, PATIENCE)
     order = sorted(places, key=lambda k: (not near[k], k if near[k] else -scores[k].mean))
     best = max(places, key=lambda k: scores[k].mean)
     if order.index(best) > 1:
@@ -426,10 +433,8 @@ def successive_halving(
     advance: Advance,
     budget: StepBudget,
     *,
+    rule: Rule,
     what: str = "",
-    criterion: Criterion = "one-se",
-    least: float = 0.0,
-    min_gain: float = 0.0,
 ) -> Halving:
     """Halve until two candidates are left, and choose between them.
 
@@ -445,11 +450,11 @@ def successive_halving(
     alive, before = list(range(len(costs))), 0
     for count, until in zip(plan.alive, plan.until, strict=True):
         if len(alive) > count:
-            order = ranked([scores[k][before] for k in alive], criterion, least, min_gain)
+            order = ranked([scores[k][before] for k in alive], rule)
             alive = sorted(alive[place] for place in order[:count])
         for k in alive:
             budget.spend(f"{what}[{k}]", costs[k] * (until - before + SCORING * frames))
             scores[k][until] = advance(k, until)
         before = until
-    chosen = alive[choose([scores[k][before] for k in alive], criterion, least, min_gain)]
+    chosen = alive[choose([scores[k][before] for k in alive], rule)]
     return Halving(chosen, tuple(scores))

@@ -11,7 +11,7 @@ import json
 import secrets
 import traceback
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
@@ -23,7 +23,7 @@ from pydantic import ValidationError
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.system.files import json_value, name_from
-from hoigs.preparation.options import PrepareOptions, load_options
+from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.source import find_source
 from hoigs.viewing.annotate.session import Session
 
@@ -218,7 +218,6 @@ def annotate(
     out: Path | str | None = None,
     *,
     port: int = 8091,
-    overrides: Sequence[str] = (),
     options: PrepareOptions | Path | str | None = None,
     open_browser: bool = False,
     report: Callable[[str], None] = print,
@@ -232,7 +231,7 @@ def annotate(
         video: a video, or a folder with one or with frames.
         out: the clip that the page proposes; None: clips/ and the video's name.
         port: 0 finds a free one.
-        overrides, options: of the preparations that the page starts, as for `prepare`.
+        options: of the preparations that the page starts, as for `prepare`.
         open_browser: open the page in the user's browser.
         report: receives lines: the address.
         started: receives the server before it serves, for example to shut it down from a thread.
@@ -241,7 +240,7 @@ def annotate(
         SourceError: this is no video. SpecError: options, or stored clicks, are wrong.
         HoigsError: the port is in use.
     """
-    chosen = load_options(options, overrides)
+    chosen = PrepareOptions.of(options, verb="annotate")
     found = find_source(Path(video), complete=False).video
     given = Path("clips") / name_from(found.stem, "mine") if out is None else Path(out)
     session = Session(found, given, chosen)

@@ -263,7 +263,7 @@ class Session:
 
     def _look(self, said: StoredPrompts, chosen: PrepareOptions) -> None:
         """Takes up the masks of the preparation that has just ended, and began with these."""
-        self._tracked = TrackedMasks(self.out, chosen.object, chosen.human)
+        self._tracked = TrackedMasks(self.out, chosen.object_name, chosen.human_name)
         self.tracks += 1
         self._tracked_from = said
         self.clicks.forget()

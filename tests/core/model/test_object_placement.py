@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ import torch
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.model.object_placement import (
     OPENGL_TO_OPENCV,
+    Reading,
     fit_scale,
     locate,
     mask_box,
@@ -86,12 +88,12 @@ def test_the_scale_is_the_papers_formula():
         rows, columns = truth.masks[i].nonzero(as_tuple=True)
         box = (int(rows.max() - rows.min()) + 1) * (int(columns.max() - columns.min()) + 1)
         ratios.append(math.sqrt(box / float((xy.amax(0) - xy.amin(0)).prod())))
-    settings = {"reduce": "mean", "frames": "all", "iterations": 1, "quantile": 0.0}
-    fit = fit_scale(small, truth.masks, truth.cameras, shifts, turns, **settings)
+    paper = Reading(reduce="mean", frames="all", iterations=1, quantile=0.0)
+    fit = fit_scale(small, truth.masks, truth.cameras, shifts, turns, paper)
     assert fit.scale == pytest.approx(sum(ratios) / FRAMES, rel=1e-4)
     torch.testing.assert_close(fit.ratios, torch.tensor(ratios), rtol=1e-4, atol=0)
-    settings["reduce"] = "median"
-    other = fit_scale(small, truth.masks, truth.cameras, shifts, turns, **settings)
+    other = replace(paper, reduce="median")
+    other = fit_scale(small, truth.masks, truth.cameras, shifts, turns, other)
     assert other.scale == pytest.approx(sorted(ratios)[(FRAMES - 1) // 2], rel=1e-4)
 
 
@@ -99,16 +101,20 @@ def test_iterating_removes_the_bias_of_thick_objects():
     truth = Truth()
     shifts, turns = truth.in_camera()
     once = fit_scale(
-        truth.shape, truth.masks, truth.cameras, shifts, turns, iterations=1, quantile=0.0
+        truth.shape, truth.masks, truth.cameras, shifts, turns, Reading(iterations=1, quantile=0.0)
     )
-    thrice = fit_scale(truth.shape, truth.masks, truth.cameras, shifts, turns, quantile=0.0)
+    thrice = fit_scale(
+        truth.shape, truth.masks, truth.cameras, shifts, turns, Reading(quantile=0.0)
+    )
     assert abs(once.scale / TRUE_SCALE - 1) > 0.1
     assert abs(thrice.scale / TRUE_SCALE - 1) < 0.03
     assert thrice.spread < once.spread + 1e-3
     # what reaches behind the camera has no box: the paper's single evaluation is refused
     with pytest.raises(ValueError, match="behind the camera"):
-        fit_scale(9 * truth.shape, truth.masks, truth.cameras, shifts, turns, iterations=1)
-    large = fit_scale(9 * truth.shape, truth.masks, truth.cameras, shifts, turns, quantile=0.0)
+        fit_scale(9 * truth.shape, truth.masks, truth.cameras, shifts, turns, Reading(iterations=1))
+    large = fit_scale(
+        9 * truth.shape, truth.masks, truth.cameras, shifts, turns, Reading(quantile=0.0)
+    )
     assert large.scale == pytest.approx(thrice.scale / 9, rel=1e-3)
 
 
@@ -120,8 +126,8 @@ def test_cut_masks_pull_the_mean_down_and_leave_the_median():  # F19
         left, _, right, _ = mask_box(mask)
         mask[:, : (left + right) // 2] = False
     args = (truth.shape, masks, truth.cameras, shifts, turns)
-    mean = fit_scale(*args, reduce="mean", frames="all", quantile=0.0)
-    median = fit_scale(*args, quantile=0.0)
+    mean = fit_scale(*args, Reading(reduce="mean", frames="all", quantile=0.0))
+    median = fit_scale(*args, Reading(quantile=0.0))
     assert mean.scale < 0.95 * TRUE_SCALE
     assert abs(median.scale / TRUE_SCALE - 1) < 0.03
     assert mean.spread > 3 * median.spread
@@ -131,12 +137,12 @@ def test_cut_masks_pull_the_mean_down_and_leave_the_median():  # F19
 def test_masks_at_the_border_do_not_count():
     truth = Truth(path=0.75)  # it enters and leaves the image
     shifts, turns = truth.in_camera()
-    fit = fit_scale(truth.shape, truth.masks, truth.cameras, shifts, turns, quantile=0.0)
+    fit = fit_scale(truth.shape, truth.masks, truth.cameras, shifts, turns, Reading(quantile=0.0))
     assert not fit.counted[0] and not fit.counted[-1]
     assert abs(fit.scale / TRUE_SCALE - 1) < 0.03
     everything = fit_scale(
         truth.shape, truth.masks, truth.cameras, shifts, turns,
-        frames="all", reduce="mean", quantile=0.0,
+        Reading(frames="all", reduce="mean", quantile=0.0),
     )  # fmt: skip
     assert everything.counted.sum() > fit.counted.sum()
     assert everything.scale < fit.scale
@@ -223,7 +229,9 @@ def test_front_of_a_ball():  # F18
     truth = Truth(shape=1.1 * ball)
     shifts, turns = truth.in_camera()
     found = locate(truth.shape, truth.masks, truth.depths, truth.cameras, turns)
-    naive = locate(truth.shape, truth.masks, truth.depths, truth.cameras, turns, front=False)
+    naive = locate(
+        truth.shape, truth.masks, truth.depths, truth.cameras, turns, Reading(front=False)
+    )
     depth = shifts[:, 2]
     assert ((found.shifts[:, 2] - depth) / depth).abs().max() < 0.01
     assert ((naive.shifts[:, 2] - depth) / depth).abs().max() > 0.05
@@ -235,7 +243,7 @@ def test_located_and_placed_as_a_track():
     _, turns = truth.in_camera()
     masks, depths = list(truth.masks), list(truth.depths)
     masks[5], depths[7] = torch.zeros_like(masks[5]), None  # unseen, and without depth
-    found = locate(truth.shape, masks, depths, truth.cameras, turns, quantile=0.0)
+    found = locate(truth.shape, masks, depths, truth.cameras, turns, Reading(quantile=0.0))
     assert (~found.observed).nonzero().squeeze(1).tolist() == [5, 7]
     assert abs(found.fit.scale / TRUE_SCALE - 1) < 0.04
     colors = torch.rand(len(truth.shape), 3)
@@ -249,7 +257,7 @@ def test_located_and_placed_as_a_track():
         )
         torch.testing.assert_close(world, same, atol=1e-5, rtol=0)
         assert (world - truth.world(i)).norm(dim=1).mean() < 0.04  # of a thing 0.5 m long
-    jumpy = locate(truth.shape, masks, depths, truth.cameras, turns, smooth=False)
+    jumpy = locate(truth.shape, masks, depths, truth.cameras, turns, Reading(smooth=False))
     bends = [(p.shifts[2:] - 2 * p.shifts[1:-1] + p.shifts[:-2]).norm() for p in (found, jumpy)]
     assert bends[0] < bends[1]
 
@@ -266,4 +274,4 @@ def test_errors_speak():
     with pytest.raises(ValueError, match='frames="all"'):
         fit_scale(truth.shape, full, truth.cameras, shifts, turns)
     with pytest.raises(ValueError, match="at least 1 iteration"):
-        fit_scale(truth.shape, truth.masks, truth.cameras, shifts, turns, iterations=0)
+        fit_scale(truth.shape, truth.masks, truth.cameras, shifts, turns, Reading(iterations=0))

@@ -110,7 +110,7 @@ def test_names_that_no_entity_can_have_are_refused_everywhere(name) -> None:
     assert repr(name) in str(caught.value)
     if name and "/" not in name:
         with pytest.raises(SpecError, match=name):
-            with_prompts(PrepareOptions(), [f"{name}=3,4"])
+            with_prompts(PrepareOptions(object=f"{name}=3,4"))
 
 
 def test_a_model_shows_its_entities_in_a_notebook() -> None:

@@ -22,6 +22,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import EntityRequest
 from hoigs.core.reporting import no_progress
 from hoigs.core.system import downloads as hub
+from hoigs.preparation.estimates.installed import installed_estimators
 from hoigs.preparation.estimates.plan import (
     HUB_LICENCES,
     EstimatorPlan,
@@ -29,7 +30,7 @@ from hoigs.preparation.estimates.plan import (
     get_ready,
     plan_estimators,
 )
-from hoigs.preparation.options import PrepareOptions, installed_estimators
+from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.source import find_source
 
 pytest.importorskip("transformers", reason="the extra hoigs[estimators]")

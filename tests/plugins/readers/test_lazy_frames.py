@@ -12,7 +12,7 @@ from PIL import Image
 from hoigs.core.errors import ClipError
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.lens import Lens
-from hoigs.plugins.readers.lazy_frames import DepthFiles, LazyFrames, MaskFiles, dark
+from hoigs.plugins.readers.lazy_frames import DepthFiles, LazyFrames, MaskFiles, PixelFiles, dark
 
 W, H = 24, 16
 CAMERA = Camera(torch.tensor([[20.0, 0, 13], [0, 20.0, 7], [0, 0, 1]]), torch.eye(4), W, H)
@@ -30,7 +30,7 @@ def image(tmp_path: Path) -> Path:
 
 
 def test_decodes_when_asked_and_keeps_what_fits(tmp_path: Path, image: Path) -> None:
-    store = LazyFrames(tmp_path, [image, tmp_path / "absent.png"], [CAMERA] * 2)
+    store = LazyFrames(tmp_path, PixelFiles([image, tmp_path / "absent.png"]), [CAMERA] * 2)
     assert store.cache.cached_bytes == 0
     assert store.image(0) is store.image(0) and store.image(0).dtype == torch.uint8
     assert store.cache.cached_bytes == W * H * 3
@@ -43,18 +43,18 @@ def test_alpha_is_laid_over_the_background(tmp_path: Path) -> None:
     rgba = np.zeros((H, W, 4), np.uint8)
     rgba[..., 0], rgba[..., 3] = 200, 102
     path = picture(tmp_path, "a.png", rgba)
-    white = LazyFrames(tmp_path, [path], [CAMERA], background=(255, 255, 255))
+    white = LazyFrames(tmp_path, PixelFiles([path], background=(255, 255, 255)), [CAMERA])
     assert white.image(0)[0, 0].tolist() == [233, 153, 153]
-    assert LazyFrames(tmp_path, [path], [CAMERA]).image(0)[0, 0].tolist() == [80, 0, 0]
+    assert LazyFrames(tmp_path, PixelFiles([path]), [CAMERA]).image(0)[0, 0].tolist() == [80, 0, 0]
 
 
 def test_greys_of_16_bits(tmp_path: Path) -> None:
     path = picture(tmp_path, "deep.png", np.full((H, W), 100 * 257, np.uint16))
-    assert LazyFrames(tmp_path, [path], [CAMERA]).image(0)[0, 0].tolist() == [100] * 3
+    assert LazyFrames(tmp_path, PixelFiles([path]), [CAMERA]).image(0)[0, 0].tolist() == [100] * 3
     odd = tmp_path / "light.tif"
     Image.fromarray(np.full((H, W), 0.5, np.float32)).save(odd)
     with pytest.raises(ClipError, match=r"light\.tif.*0\.5"):
-        LazyFrames(tmp_path, [odd], [CAMERA]).image(0)
+        LazyFrames(tmp_path, PixelFiles([odd]), [CAMERA]).image(0)
 
 
 def test_masks_of_any_polarity_and_size(tmp_path: Path, image: Path) -> None:
@@ -62,7 +62,7 @@ def test_masks_of_any_polarity_and_size(tmp_path: Path, image: Path) -> None:
     half[2, 3] = 255
     path = picture(tmp_path, "m.png", half)
     masks = {"a": MaskFiles([path, None]), "b": MaskFiles([path, path], dark)}
-    store = LazyFrames(tmp_path, [image] * 2, [CAMERA] * 2, masks=masks)
+    store = LazyFrames(tmp_path, PixelFiles([image] * 2, masks=masks), [CAMERA] * 2)
     want = torch.zeros(H, W, dtype=torch.bool)
     want[4:6, 6:8] = True
     assert store.mask("a", 0).equal(want) and store.mask("b", 0).equal(~want)
@@ -71,7 +71,7 @@ def test_masks_of_any_polarity_and_size(tmp_path: Path, image: Path) -> None:
 
 def test_a_mask_of_another_shape_is_refused(tmp_path: Path, image: Path) -> None:
     path = picture(tmp_path, "m.png", np.zeros((H, H), np.uint8))
-    store = LazyFrames(tmp_path, [image], [CAMERA], masks={"a": MaskFiles([path])})
+    store = LazyFrames(tmp_path, PixelFiles([image], masks={"a": MaskFiles([path])}), [CAMERA])
     with pytest.raises(ClipError, match=r"m\.png is 16x16, the frame 24x16"):
         store.mask("a", 0)
 
@@ -79,7 +79,7 @@ def test_a_mask_of_another_shape_is_refused(tmp_path: Path, image: Path) -> None
 def test_an_image_of_another_size_is_refused(tmp_path: Path) -> None:
     path = picture(tmp_path, "s.png", np.zeros((H // 2, W // 2, 3), np.uint8))
     with pytest.raises(ClipError, match=r"s\.png is 12x8, its camera 24x16"):
-        LazyFrames(tmp_path, [path], [CAMERA]).image(0)
+        LazyFrames(tmp_path, PixelFiles([path]), [CAMERA]).image(0)
 
 
 def test_depth_is_scaled_and_cleaned(tmp_path: Path, image: Path) -> None:
@@ -89,18 +89,24 @@ def test_depth_is_scaled_and_cleaned(tmp_path: Path, image: Path) -> None:
     values[0, :3] = np.nan, np.inf, -1
     np.save(tmp_path / "d.npy", values)
     paths = [picture(tmp_path, "d.png", millimetres), None]
-    store = LazyFrames(tmp_path, [image] * 2, [CAMERA] * 2, depth=DepthFiles(paths, 0.001))
+    store = LazyFrames(
+        tmp_path, PixelFiles([image] * 2, depth=DepthFiles(paths, 0.001)), [CAMERA] * 2
+    )
     depth = store.depth(0)
     assert depth is not None and depth[0, 0] == 0 and depth[1, 1] == pytest.approx(1.5)
     assert store.depth(1) is None
-    store = LazyFrames(tmp_path, [image], [CAMERA], depth=DepthFiles([tmp_path / "d.npy"]))
+    store = LazyFrames(
+        tmp_path, PixelFiles([image], depth=DepthFiles([tmp_path / "d.npy"])), [CAMERA]
+    )
     depth = store.depth(0)
     assert depth is not None and depth[0, :4].tolist() == [0, 0, 0, 2]
 
 
 def test_a_depth_map_without_pixels_is_refused(tmp_path: Path, image: Path) -> None:
     np.save(tmp_path / "d.npy", np.zeros((0, W), np.float32))
-    store = LazyFrames(tmp_path, [image], [CAMERA], depth=DepthFiles([tmp_path / "d.npy"]))
+    store = LazyFrames(
+        tmp_path, PixelFiles([image], depth=DepthFiles([tmp_path / "d.npy"])), [CAMERA]
+    )
     with pytest.raises(ClipError, match=r"d\.npy is 24x0, the frame 24x16"):
         store.depth(0)
 
@@ -113,10 +119,8 @@ def test_one_map_bends_images_masks_and_depth(tmp_path: Path) -> None:
     image = picture(tmp_path, "i.png", np.repeat(blob[..., None], 3, -1))
     mask, depth = picture(tmp_path, "m.png", blob), tmp_path / "d.npy"
     np.save(depth, blob / 100)
-    store = LazyFrames(
-        tmp_path, [image], [CAMERA], masks={"a": MaskFiles([mask])}, depth=DepthFiles([depth]),
-        lenses=[lens],
-    )  # fmt: skip
+    files = PixelFiles([image], masks={"a": MaskFiles([mask])}, depth=DepthFiles([depth]))
+    store = LazyFrames(tmp_path, files, [CAMERA], lenses=[lens])
     seen = store.mask("a", 0)
     assert not seen.equal(torch.from_numpy(blob > 0)) and seen.any()
     depths = store.depth(0)
@@ -129,4 +133,4 @@ def test_one_map_bends_images_masks_and_depth(tmp_path: Path) -> None:
 
 def test_lists_of_unlike_length_are_refused(tmp_path: Path, image: Path) -> None:
     with pytest.raises(ValueError, match="different lengths"):
-        LazyFrames(tmp_path, [image] * 2, [CAMERA])
+        LazyFrames(tmp_path, PixelFiles([image] * 2), [CAMERA])

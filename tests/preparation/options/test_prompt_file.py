@@ -28,12 +28,12 @@ def test_stored_clicks_are_what_options_say(tmp_path: Path) -> None:
     write_prompts(video, StoredPrompts(TEXTS, ("7,8@3",)))
     assert [p.name for p in tmp_path.iterdir()] == ["my.prompts.json"]
     options, said = with_stored(PrepareOptions(), video)
-    assert options.prompts["object"] == with_prompts(PrepareOptions(), TEXTS).prompts["object"]
+    assert options.prompts["object"] == with_prompts(PrepareOptions(object=TEXTS)).prompts["object"]
     assert options.prompts["human"].points == [(7, 8, True)]
     assert "my.prompts.json, beside the video: object in frame 0, 4" in said
     write_prompts(video, StoredPrompts(("ball=3,4@1",)))
     named, _ = with_stored(PrepareOptions(), video)
-    assert named.object == "ball" and named.prompts["ball"].frame == 1
+    assert named.object_name == "ball" and named.prompts["ball"].frame == 1
     write_prompts(video, StoredPrompts(("cup=1,2@0", "pot=3,4@0")))
     both, said = with_stored(PrepareOptions(), video)
     assert both.objects == ("cup", "pot") and len(said) == 2
@@ -45,7 +45,7 @@ def test_options_come_first(tmp_path: Path) -> None:
     video = tmp_path / "my.mp4"
     write_prompts(video, StoredPrompts(TEXTS))
     for given in ("9,9@2", "none"):
-        options = with_prompts(PrepareOptions(), given)
+        options = with_prompts(PrepareOptions(object=given))
         kept, said = with_stored(options, video)
         assert kept == options and "your options come first" in said[0]
 

@@ -43,27 +43,27 @@ def test_clicks_by_frame() -> None:
 )
 def test_what_is_wrong_is_named(texts: list[str], message: str) -> None:
     with pytest.raises(SpecError, match=message):
-        with_prompts(PrepareOptions(), texts)
+        with_prompts(PrepareOptions(object=texts))
 
 
 def test_prompts_become_options() -> None:
-    options = with_prompts(PrepareOptions(), "3,4@2", "offline")
+    options = with_prompts(PrepareOptions(object="3,4@2", preset="offline"))
     assert options.prompts["object"].frame == 2 and options.preset == "offline"
-    assert with_prompts(PrepareOptions(), ["none"]).find_object is False
-    named = with_prompts(PrepareOptions(), ["kettle=3,4", " kettle = -5,6@7"])
-    assert named.object == "kettle" and [at.frame for at in named.prompts["kettle"].places()] == [
+    assert with_prompts(PrepareOptions(object=["none"])).find_object is False
+    named = with_prompts(PrepareOptions(object=["kettle=3,4", " kettle = -5,6@7"]))
+    assert named.object_name == "kettle" and [at.frame for at in named.prompts["kettle"].places()] == [
         None,
         7,
     ]
-    both = with_prompts(PrepareOptions(), ["kettle=3,4", "5,6@7", "kettle=7,8@9"])
+    both = with_prompts(PrepareOptions(object=["kettle=3,4", "5,6@7", "kettle=7,8@9"]))
     assert both.objects == ("kettle", "object") and set(both.prompts) == set(both.objects)
     assert len(both.prompts["kettle"].places()) == 2
     untouched = PrepareOptions()
-    assert with_prompts(untouched, (), {"masks": object()}) is untouched
+    assert with_prompts(untouched) is untouched
 
 
 def given(*places: str) -> dict[str, Prompt]:
-    return with_prompts(PrepareOptions(), places).prompts
+    return with_prompts(PrepareOptions(object=places)).prompts
 
 
 @pytest.mark.parametrize(
@@ -92,24 +92,25 @@ def test_prompts_count_frames_of_the_video_wherever_it_is_started() -> None:
 
 
 def test_a_person_is_chosen_as_an_object_is() -> None:
-    options = with_prompts(PrepareOptions(), "640,402", person=["320,210@3", "-500,200@3"])
+    options = with_prompts(PrepareOptions(object="640,402", person=["320,210@3", "-500,200@3"]))
     (at,) = options.prompts["human"].places()
     assert at.frame == 3 and at.points == [(320, 210, True), (500, 200, False)]
     assert options.prompts["object"].points == [(640, 402, True)]
-    assert with_prompts(PrepareOptions(), (), person="anna=320,210").human == "anna"
-    alone = with_prompts(PrepareOptions(), "ball=3,4", person="none")
+    assert with_prompts(PrepareOptions(person="anna=320,210")).human_name == "anna"
+    alone = with_prompts(PrepareOptions(object="ball=3,4", person="none"))
     assert alone.people == () and alone.objects == ("ball",)
     with pytest.raises(SpecError, match=r"--person.*--object"):
-        with_prompts(PrepareOptions(), "none", person="none")
+        with_prompts(PrepareOptions(object="none", person="none"))
     with pytest.raises(SpecError, match="--person"):
-        with_prompts(PrepareOptions(), person=["none", "3,4"], texts=())
+        with_prompts(PrepareOptions(person=["none", "3,4"]))
 
 
 def test_several_people_have_names() -> None:
-    options = with_prompts(PrepareOptions(), "9,9", person=["anna=3,2", "ben=5,2", "anna=4,2@7"])
+    people = ["anna=3,2", "ben=5,2", "anna=4,2@7"]
+    options = with_prompts(PrepareOptions(object="9,9", person=people))
     assert options.people == ("anna", "ben") and len(options.prompts["anna"].places()) == 2
     assert set(options.prompts) == {"object", "anna", "ben"}
-    both = with_prompts(PrepareOptions(), (), person=["3,2", "anna=5,2"])
+    both = with_prompts(PrepareOptions(person=["3,2", "anna=5,2"]))
     assert both.people == ("human", "anna")
     with pytest.raises(SpecError, match="ball is an object's name"):
-        with_prompts(PrepareOptions(), "ball=3,4", person="ball=3,2")
+        with_prompts(PrepareOptions(object="ball=3,4", person="ball=3,2"))

@@ -22,6 +22,7 @@ from hoigs.rasterizers.oracle import OracleRasterizer
 from hoigs.runs.checkpoint import latest_checkpoint, load_checkpoint
 from hoigs.runs.clip_source import read_clip
 from hoigs.runs.loaded_run import LoadedRun
+from hoigs.runs.options import RunOptions
 from hoigs.studies.needs import prune
 from hoigs.studies.needs.after_training import add_to_answer, finish, table
 from hoigs.studies.needs.compress import compress
@@ -254,7 +255,9 @@ def test_a_pruned_run_is_a_run(run, tmp_path):
     shutil.copytree(run, mine)
     compact = run.with_name("pruned-compact")
     told: list[str] = []
-    after = finish(mine, compact, report=told.append, clock=(2.0, 4.0, 5.0))
+    after = finish(
+        mine, compact, options=RunOptions(device="cpu"), report=told.append, clock=(2.0, 4.0, 5.0)
+    )
     again, small = LoadedRun.open(mine), LoadedRun.open(compact)
     assert again.model.count() == small.model.count()
     assert again.spec.model_hash() == small.spec.model_hash()

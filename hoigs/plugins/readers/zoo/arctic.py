@@ -33,6 +33,7 @@ from hoigs.plugins.readers.checked_files import (
 from hoigs.plugins.readers.lazy_frames import (
     LazyFrames,
     MaskFiles,
+    PixelFiles,
     image_files,
     image_size,
     video_moments,
@@ -115,11 +116,13 @@ class ArcticReader(ClipReader):
         track, angles = _object(place, truth[frames])
         store = LazyFrames(
             place.root,
-            images,
+            PixelFiles(
+                images,
+                masks={n: MaskFiles(paths) for n, paths in masks.items()}
+                if self.config.masks
+                else None,
+            ),
             cameras,
-            masks={n: MaskFiles(paths) for n, paths in masks.items()}
-            if self.config.masks
-            else None,
             lenses=[lens] * len(frames),
             cache_mb=self.config.cache_mb,
         )

@@ -32,7 +32,13 @@ from hoigs.plugins.readers.checked_files import (
     parse_json,
     require_files,
 )
-from hoigs.plugins.readers.lazy_frames import DepthFiles, LazyFrames, MaskFiles, video_moments
+from hoigs.plugins.readers.lazy_frames import (
+    DepthFiles,
+    LazyFrames,
+    MaskFiles,
+    PixelFiles,
+    video_moments,
+)
 from hoigs.plugins.readers.points import (
     checked_rotation,
     points_along_rays,
@@ -352,12 +358,14 @@ class BehaveReader(ClipReader):
         cameras = [camera] * len(frames)
         store = LazyFrames(
             folder,
-            images,
+            PixelFiles(
+                images,
+                masks={n: MaskFiles(paths) for n, paths in masks.items()}
+                if self.config.masks
+                else None,
+                depth=DepthFiles(depths, scale=0.001) if any(depths) else None,
+            ),
             cameras,
-            masks={n: MaskFiles(paths) for n, paths in masks.items()}
-            if self.config.masks
-            else None,
-            depth=DepthFiles(depths, scale=0.001) if any(depths) else None,
             lenses=[lens] * len(frames),
             cache_mb=self.config.cache_mb,
         )

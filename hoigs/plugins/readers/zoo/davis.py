@@ -22,6 +22,7 @@ from hoigs.plugins.readers.checked_files import Need, VideoReaderConfig, require
 from hoigs.plugins.readers.lazy_frames import (
     LazyFrames,
     MaskFiles,
+    PixelFiles,
     image_files,
     image_size,
     opened,
@@ -102,9 +103,8 @@ class DavisReader(ClipReader):
         cameras = [Camera(K, torch.eye(4), width, height)] * len(images)
         store = LazyFrames(
             root,
-            images,
+            PixelFiles(images, masks={names[i]: files for i, files in masks.items()}),
             cameras,
-            masks={names[i]: files for i, files in masks.items()},
             cache_mb=self.config.cache_mb,
         )
         points, colors = points_along_rays(store, cameras, tuple(kinds), SPAN, self.config.points)

@@ -11,7 +11,7 @@ from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.world import World
 from hoigs.plugins.readers.checked_files import Need, ReaderConfig, parse_json, require_files
-from hoigs.plugins.readers.lazy_frames import LazyFrames, timed_moments
+from hoigs.plugins.readers.lazy_frames import LazyFrames, PixelFiles, timed_moments
 from hoigs.plugins.readers.nerfstudio import TransformFrame, Transforms, lens_of
 from hoigs.plugins.readers.points import (
     Points,
@@ -92,10 +92,9 @@ class DnerfReader(ClipReader):
             name=folder.resolve().name,
             store=LazyFrames(
                 folder,
-                images,
+                PixelFiles(images, background=COLORS[self.config.background]),
                 cameras,
                 lenses=lenses,
-                background=COLORS[self.config.background],
                 cache_mb=self.config.cache_mb,
             ),
             cameras=cameras,

@@ -34,6 +34,7 @@ from hoigs.plugins.readers.lazy_frames import (
     IMAGE_SUFFIXES,
     LazyFrames,
     MaskFiles,
+    PixelFiles,
     image_size,
     lens_for,
     video_moments,
@@ -292,9 +293,8 @@ class ExavatarReader(ClipReader):
             name=folder.resolve().name,
             store=LazyFrames(
                 folder,
-                images,
+                PixelFiles(images, masks={"human": MaskFiles([files.masks[n] for n in numbers])}),
                 cameras,
-                masks={"human": MaskFiles([files.masks[n] for n in numbers])},
                 lenses=lenses,
                 cache_mb=self.config.cache_mb,
             ),

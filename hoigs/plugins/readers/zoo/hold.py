@@ -23,6 +23,7 @@ from hoigs.plugins.readers.checked_files import Need, VideoPointsConfig, require
 from hoigs.plugins.readers.lazy_frames import (
     LazyFrames,
     MaskFiles,
+    PixelFiles,
     image_files,
     image_size,
     opened,
@@ -91,7 +92,9 @@ class HoldReader(ClipReader):
             n: MaskFiles(paths, partial(_marked, VALUES[n.removeprefix("hand_")])) for n in kinds
         }
         track = _object(data["entities"].get("object"), len(images), where)
-        store = LazyFrames(build, images, cameras, masks=masks, cache_mb=self.config.cache_mb)
+        store = LazyFrames(
+            build, PixelFiles(images, masks=masks), cameras, cache_mb=self.config.cache_mb
+        )
         away = float(cameras[0].to_camera(track.translations)[:, 2].median())
         span = (NEAREST * away, FARTHEST * away)
         points, colors = points_along_rays(store, cameras, tuple(kinds), span, self.config.points)

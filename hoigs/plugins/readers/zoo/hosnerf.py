@@ -34,6 +34,7 @@ from hoigs.plugins.readers.checked_files import (
 from hoigs.plugins.readers.lazy_frames import (
     LazyFrames,
     MaskFiles,
+    PixelFiles,
     image_files,
     image_size,
     video_moments,
@@ -100,7 +101,11 @@ class HosnerfReader(ClipReader):
             masks["object"] = MaskFiles(own, _any)
         cameras = [lens.camera(w2c) for lens, w2c in zip(rig.lenses, rig.world_to_camera)]
         store: FrameStore = LazyFrames(
-            folder, images, cameras, masks=masks, lenses=rig.lenses, cache_mb=self.config.cache_mb
+            folder,
+            PixelFiles(images, masks=masks),
+            cameras,
+            lenses=rig.lenses,
+            cache_mb=self.config.cache_mb,
         )
         if "object" in kinds:
             store = _ObjectRemoved(store)

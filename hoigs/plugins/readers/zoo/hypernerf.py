@@ -26,6 +26,7 @@ from hoigs.plugins.readers.lazy_frames import (
     DepthFiles,
     LazyFrames,
     MaskFiles,
+    PixelFiles,
     dark,
     lens_for,
     natural,
@@ -143,10 +144,12 @@ class HypernerfReader(ClipReader):
             name=folder.resolve().name,
             store=LazyFrames(
                 folder,
-                images,
+                PixelFiles(
+                    images,
+                    ignored=MaskFiles(seen, dark) if any(seen) else None,
+                    depth=DepthFiles(depths, scene.scale) if any(depths) else None,
+                ),
                 cameras,
-                ignored=MaskFiles(seen, dark) if any(seen) else None,
-                depth=DepthFiles(depths, scene.scale) if any(depths) else None,
                 lenses=lenses,
                 cache_mb=self.config.cache_mb,
             ),

@@ -33,6 +33,7 @@ from hoigs.plugins.readers.lazy_frames import (
     DepthFiles,
     LazyFrames,
     MaskFiles,
+    PixelFiles,
     dark,
     image_files,
     lens_for,
@@ -115,10 +116,12 @@ class NeumanReader(ClipReader):
             name=folder.resolve().name,
             store=LazyFrames(
                 folder,
-                [files[name] for name in names],
+                PixelFiles(
+                    [files[name] for name in names],
+                    masks={"human": MaskFiles(masks, dark)},
+                    depth=DepthFiles(depth, 1 / unit, read_mvs_depth) if any(depth) else None,
+                ),
                 cameras,
-                masks={"human": MaskFiles(masks, dark)},
-                depth=DepthFiles(depth, 1 / unit, read_mvs_depth) if any(depth) else None,
                 lenses=lenses,
                 cache_mb=self.config.cache_mb,
             ),

@@ -78,20 +78,18 @@ class CpuPipeline(ABC):
         intersections: TileIntersections,
         images: Images,
         upstream: Images,
-        pose: bool,
-        absolute: bool,
-    ) -> Gradients:
-        count, stride = intersections.count, MOMENTS + inputs.channels + ABSOLUTES * absolute
+        out: Gradients,
+    ) -> None:
+        """Fill in `out`."""
+        count, stride = intersections.count, MOMENTS + inputs.channels + ABSOLUTES * out.absolute
         check_addressable(count * stride, f"{count} tile intersections")
         partials = inputs.means.new_zeros(count, stride)
         arguments = tile_arguments(inputs, settings, records, intersections, images)
         arguments += upstream_arguments(upstream, partials)
-        kernel = self.absolute_kernel if absolute else self.backward_kernel
+        kernel = self.absolute_kernel if out.absolute else self.backward_kernel
         self._tiles(kernel, intersections, arguments)
-        out = Gradients(inputs, pose, absolute)
         arguments = adjoint_arguments(inputs, settings, records, intersections, partials, out)
         self.cores.each(project_adjoint, inputs.count, arguments)
-        return out
 
     @abstractmethod
     def _tiles(self, kernel: Any, intersections: TileIntersections, arguments: list[Any]) -> None:

@@ -76,11 +76,11 @@ class CudaPipeline:
         intersections: TileIntersections,
         images: Images,
         upstream: Images,
-        pose: bool,
-        absolute: bool,
-    ) -> Gradients:
+        out: Gradients,
+    ) -> None:
+        """Fill in `out`."""
         stream, count = self.streams.current(), inputs.count
-        stride = MOMENTS + inputs.channels + ABSOLUTES * absolute
+        stride = MOMENTS + inputs.channels + ABSOLUTES * out.absolute
         capacity, tiles = intersections.count, intersections.tiles
         check_addressable(capacity * stride, f"{capacity} tile intersections")
         partials = inputs.means.new_empty(capacity, stride)
@@ -89,7 +89,7 @@ class CudaPipeline:
         arguments = tile_arguments(inputs, settings, records, intersections, images)
         arguments += upstream_arguments(upstream, partials)
         lanes = tiles * pixel_source.LANES
-        kernel = absolute_kernels.absolute_pixels if absolute else pixel_kernels.backward_pixels
+        kernel = absolute_kernels.absolute_pixels if out.absolute else pixel_kernels.backward_pixels
         stream.each(kernel, lanes, arguments, TILE_BLOCK)
 
         first, drawn = intersections.first_partial, torch.empty_like(intersections.first_partial)
@@ -97,18 +97,16 @@ class CudaPipeline:
         blocks = -(-count // gather_kernels.ROWS)
         stream.blocks(gather_kernels.gather_partials, blocks, gather_kernels.BLOCK, arguments)
         gathered = replace(intersections, tiles_per_gaussian=drawn)  # one partial each from here on
-        out = Gradients(inputs, pose, absolute)
         if settings.active_bases == 1:
             arguments = adjoint_arguments(inputs, settings, records, gathered, partials, out)
             stream.each(project_adjoint, count, arguments)
-            return out
+            return
         without_sh = replace(inputs, sh=inputs.sh[:, :0]), replace(settings, active_bases=0)
         arguments = adjoint_arguments(*without_sh, records, gathered, partials, out)
         stream.each(project_adjoint, count, arguments)
         arguments = [
             *(inputs.means, inputs.sh, inputs.sh.shape[1], settings.active_bases),
             *(inputs.world_to_camera, records, first, drawn, partials, stride),
-            *(out.sh, out.means, out.pose, int(pose), count),
+            *(out.sh, out.means, out.pose, int(out.with_pose), count),
         ]
         stream.blocks(harmonics_adjoint, -(-count // SH_BLOCK), SH_BLOCK, arguments)
-        return out
