@@ -133,9 +133,9 @@ class Controls:
     """The panel. Callbacks of viser's threads change `settings` and `clock` under `lock`.
 
     Args:
-        gui: viser's. drawing: gives modes and entities. overlays: names on offer. second: whether
-            there is a second run. wake: called after every change. act: called with the name of
-            a button and the client who pressed it: "screenshot", "add key", "clear keys", "film".
+        gui: viser's. drawing: gives modes and entities. overlays: names on offer.
+        wake: called after every change. act: called with the name of a button and the client who
+            pressed it: "screenshot", "add key", "clear keys", "film".
     """
 
     def __init__(
@@ -146,7 +146,6 @@ class Controls:
         clock: Clock,
         overlays: Sequence[str],
         *,
-        second: bool,
         wake: Callable[[], None],
         act: Callable[[str, Any], None],
     ) -> None:
@@ -156,7 +155,7 @@ class Controls:
         self._sent_at, self._sent_frame = 0.0, -1.0
         self.status = gui.add_markdown("connecting …")
         self._time()
-        self._picture(drawing, second)
+        self._picture(drawing, settings.other == "run")
         self._camera(drawing)
         self._overlays(overlays)
         self._takes(drawing)

@@ -77,7 +77,7 @@ class Viewer:
         server.scene.set_up_direction(tuple(self.up))
         self.overlays = Overlays(server.scene, clip, bodies)
         self.controls = Controls(
-            server.gui, first, self.settings, self.clock, overlays, second=len(drawings) > 1,
+            server.gui, first, self.settings, self.clock, overlays,
             wake=self._wake.set, act=self._act,
         )  # fmt: skip
         self._distance = takes.distance_to_subject(clip)
