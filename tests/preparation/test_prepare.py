@@ -109,7 +109,7 @@ def test_files_beside_the_clip(static: tuple[Path, PrepareReport, list[float]]) 
 def test_options(tiny_source: Path, tmp_path: Path, body: AnnyBody) -> None:
     clip, report = prepared(
         tiny_source, tmp_path / "clip", body, width=48, every=2, max_frames=4, focal=100.0,
-        image_format="png", human="man", object="ball",
+        image_format="png", human_name="man", object="ball",
     )  # fmt: skip
     assert (len(clip), clip.cameras[0].width) == (4, 48)
     taken = np.array(clip.provenance["frames"])  # the sharpest of each two keep their times
@@ -194,7 +194,7 @@ def test_targets_are_not_overwritten(tiny_source: Path, tmp_path: Path, body: An
     assert (out / "notes.txt").read_text() == "mine"
     (out / "notes.txt").unlink()
     report = prepare(
-        tiny_source, out, options=options, max_frames=5, overrides=["human=she"], overwrite=True
+        tiny_source, out, options=options, max_frames=5, overrides=["human_name=she"], overwrite=True
     )
     clip = ClipFolderReader().read(out)
     assert len(clip) == report.frames == 5 and set(clip.kinds) == {"she", "object"}

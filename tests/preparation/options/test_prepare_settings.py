@@ -23,3 +23,15 @@ def test_options_of_the_command_line_are_named_as_there():
     assert estimators.startswith("--estimators: must be")
     with pytest.raises(SpecError, match=r"command line.*--end 2"):
         load_options(flags={"start": "5", "end": "2"})
+
+
+@pytest.mark.parametrize("name", ["allow_commands", "yes"])
+def test_only_the_caller_permits_commands_and_downloads(tmp_path, name: str) -> None:
+    """A file beside a stranger's video, or a row of a manifest, cannot."""
+    file = tmp_path / "options.yaml"
+    file.write_text(f"{name}: true\n")
+    with pytest.raises(SpecError, match=rf"options\.yaml:1.*{name}.*--{name.replace('_', '-')}"):
+        load_options(file)
+    with pytest.raises(SpecError, match=name):
+        load_options(settings=[f"{name}=true"])
+    assert getattr(load_options(flags={name: True}), name) is True
