@@ -67,7 +67,7 @@ def compare(
         rasterizers=[r.strip() for r in options.rasterizers.split(",") if r.strip()],
         budgets=_steps(options.budgets),
         seeds=options.seeds,
-        settings=options.settings,
+        settings=options.overrides,
         device=options.where(),
         lpips_weights=options.lpips_weights.resolve() if options.lpips_weights else None,
         plugins=tuple(p.resolve() for p in options.plugins),
@@ -162,7 +162,7 @@ def stress(*, options: StressOptions) -> None:
         points=options.points,
         base=BASE.replace("width=96", f"width={options.width}"),
         whole=options.whole,
-        settings=options.settings,
+        settings=options.overrides,
         device=options.where(),
         plugins=tuple(p.resolve() for p in options.plugins),
     )

@@ -164,6 +164,8 @@ PARTS = (
      "exactly as many as asked for, grown where it matters (Taming 3DGS)"),
     ("density:none", "hoigs.plugins.density.none", "NoDensity", "NoDensityConfig",
      "the number of Gaussians stays"),
+    ("objective:tracks", "hoigs.plugins.objectives.tracks", "Tracks", "TracksConfig",
+     "2D point tracks: a pixel's point is found where its track is at another time"),
     ("initializer:depth", "hoigs.plugins.initializers.depth", "DepthInitializer",
      "DepthInitializerConfig",
      "an object's masked depth, back-projected and carried by its track"),

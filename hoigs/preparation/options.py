@@ -15,8 +15,7 @@ from hoigs.core.options import Flag, Options
 from hoigs.core.spec.errors import explain
 from hoigs.core.spec.loader import Document, load_overrides, read_document
 from hoigs.core.spec.schema import ComponentSpec
-from hoigs.preparation.video.container import Span
-from hoigs.preparation.video.frames import Pick
+from hoigs.preparation.video.container import Pick, Span
 
 if TYPE_CHECKING:
     from hoigs.core.maths.frame_times import Chunking

@@ -52,7 +52,7 @@ class StudyOptions(ExecutionOptions):
     """Number of seeds: 0, 1 …"""
     minutes: float | None = None
     """Stop after this time and write the results so far; the same command continues."""
-    settings: Annotated[tuple[str, ...], Flag("--set")] = ()
+    overrides: Annotated[tuple[str, ...], Flag("--set")] = ()
     """Set one key of every spec: train.steps=500."""
     device: str = "auto"
     """cpu, cuda, or auto: cuda if available."""
@@ -133,7 +133,7 @@ class BatchOptions(WorkOptions):
     """Spec of rows that name none; default: hoigs."""
     auto: bool = False
     """As for `hoigs train`, for rows that do not set it."""
-    settings: Annotated[tuple[str, ...], Flag("--set")] = ()
+    overrides: Annotated[tuple[str, ...], Flag("--set")] = ()
     """Keys of the spec for rows without `set`."""
     export: tuple[str, ...] = ()
     """Format for rows without `export`; default: ply."""
@@ -148,6 +148,6 @@ class BatchOptions(WorkOptions):
 
     def defaults(self) -> dict[str, Any]:
         """Keys for rows that have none."""
-        given = {"spec": self.spec, "auto": self.auto, "set": list(self.settings),
+        given = {"spec": self.spec, "auto": self.auto, "set": list(self.overrides),
                  "export": list(self.export), "device": self.device}  # fmt: skip
         return {key: value for key, value in given.items() if value}

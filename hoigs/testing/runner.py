@@ -26,6 +26,7 @@ KINDS = {
     "interaction": "hoigs.testing.interaction",
     "rasterizer": "hoigs.testing.rasterizer",
     "exporter": "hoigs.testing.exporter",
+    "objective": "hoigs.testing.objective",
 }
 PLUGIN = "hoigs.testing.plugin"
 

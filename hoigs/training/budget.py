@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from hoigs.core.errors import HoigsError, SpecError
-from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.model.compose import compose, compose_density, compose_objectives
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
@@ -182,6 +182,7 @@ def _timed(
         clip,
         settings,
         density=density,
+        objectives=compose_objectives(spec, clip, registry),
         lpips=lpips_term(spec, None, device),
     )
     trainer.step = MOST // 2 + 1  # everything is warmed up, and density control is over

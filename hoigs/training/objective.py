@@ -13,6 +13,7 @@ from hoigs.core.device import constant
 from hoigs.core.interfaces.density import DensityControl
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.model.camera_refinement import CameraRefinement
+from hoigs.core.model.objective import TrainingMoment, Weighted
 from hoigs.core.model.scene import SceneModel, SceneState
 from hoigs.core.spec.train_schema import Graphs, LossSpec
 from hoigs.core.values.camera import Camera
@@ -52,6 +53,26 @@ class ObjectiveResult:
     absolute_gradients: Float[Tensor, "N 2"] | None = None
 
 
+@dataclass(frozen=True)
+class Extras:
+    """What the loss has terms of, beside the images.
+
+    Attributes:
+        lpips: needed if `LossSpec.lpips` > 0.
+        density: of each entity; their regularizers are added.
+        faces: textures for L_face, by human. cameras: corrections, which are penalised.
+        depth_scale: factor from the units of the depth prior to metres in the world.
+        objectives: that plugins bring.
+    """
+
+    lpips: Lpips | None = None
+    density: Mapping[str, DensityControl] = field(default_factory=dict)
+    faces: Mapping[str, FaceTexture] = field(default_factory=dict)
+    cameras: CameraRefinement | None = None
+    depth_scale: float = 1.0
+    objectives: Sequence[Weighted] = ()
+
+
 class JointObjective:
     """L = w_h L_human + w_o L_object + w_s L_scene + w_d L_depth + regularizers (HOIGS Eq. 15).
 
@@ -62,11 +83,7 @@ class JointObjective:
 
     Args:
         spec: settings of the losses. depth_kind: `Clip.depth_kind` of the prior.
-        lpips: needed if `spec.lpips` > 0.
-        density: of each entity; their regularizers are added.
-        faces: textures for L_face, by human. cameras: corrections, which are penalised.
-        depth_scale: factor from the prior's units to metres in the world.
-        graphs: `TrainSpec.graphs`.
+        extras: what further terms are made from. graphs: `TrainSpec.graphs`.
 
     Attributes:
         settled: people, objects and the interaction get no gradients, and have no terms of their
@@ -80,17 +97,14 @@ class JointObjective:
         model: SceneModel,
         spec: LossSpec,
         depth_kind: str,
-        lpips: Lpips | None = None,
-        density: Mapping[str, DensityControl] | None = None,
-        faces: Mapping[str, FaceTexture] | None = None,
-        cameras: CameraRefinement | None = None,
-        depth_scale: float = 1.0,
+        extras: Extras | None = None,
         graphs: Graphs = "off",
     ) -> None:
-        self.model, self.spec, self.depth_kind, self.lpips = model, spec, depth_kind, lpips
-        self.density = dict(density or {})
-        self.faces = dict(faces or {})
-        self.cameras, self.depth_scale = cameras, depth_scale
+        extras = extras or Extras()
+        self.model, self.spec, self.depth_kind, self.lpips = model, spec, depth_kind, extras.lpips
+        self.density, self.faces = dict(extras.density), dict(extras.faces)
+        self.cameras, self.depth_scale = extras.cameras, extras.depth_scale
+        self.objectives = tuple(extras.objectives)
         self.weights = term_weights(spec)
         restrained = any(spec.regularizers.get(key, 0.0) > 0 for key in RESIDUAL_PENALTIES)
         self.graphed_scene = GraphedScene(model, graphs, self.weight_of, restrained=restrained)
@@ -116,11 +130,18 @@ class JointObjective:
         absolutes = None
         if any(control.absolute_gradients for control in self.density.values()):
             absolutes = torch.zeros_like(offsets, requires_grad=True)
+        further = () if self.settled else self.objectives
+        at = TrainingMoment(self.model, frame, camera, state, generator)
+        channels = [objective.channels(at) for objective in further]
+        drawn = [c for c in channels if c is not None]
         composite = self.model.draw(
             state.joined(),
             camera,
-            RenderRequest(screen_offsets=offsets, absolute_gradients=absolutes),
-        )
+            RenderRequest(
+                features=torch.cat(drawn, 1) if drawn else None,
+                screen_offsets=offsets, absolute_gradients=absolutes,
+            ),
+        )  # fmt: skip
         terms = self._composite(view, composite)
         terms |= self._scene_alone(frame, camera, state, composite, offsets, absolutes)
         if frame.depth is not None and self.weights["depth"] > 0:
@@ -142,6 +163,15 @@ class JointObjective:
                 if kind == "human":
                     terms |= self._human(name, frame, crop, camera, state, composite)
         weights = {name: self.weights[name.partition("/")[0]] for name in terms}
+        start = 0
+        for objective, channel in zip(further, channels, strict=True):
+            shown = None
+            if channel is not None and composite.features is not None:
+                end = start + channel.shape[1]
+                shown, start = composite.features[..., start:end], end
+            found = objective.terms(at, composite, shown)
+            terms |= found
+            weights |= dict.fromkeys(found, objective.weight)
         for name in self.model.entities:
             if self.settled and self.model.entity(name).kind != "scene":
                 continue

@@ -12,7 +12,7 @@ import torch
 
 from hoigs.core.clip_folder.health import examine, require_useful
 from hoigs.core.errors import HoigsError
-from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.model.compose import compose, compose_density, compose_objectives
 from hoigs.core.options import verb
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.reporting import Diagnostic
@@ -117,6 +117,7 @@ class Session:
                 source,
                 spec.train,
                 density=compose_density(spec, source, registry),
+                objectives=compose_objectives(spec, source, registry),
                 run=run,
                 identity={"spec_name": spec.name, "model_hash": spec.model_hash()},
                 lpips=lpips_term(spec, options.lpips_weights, device),

@@ -23,6 +23,7 @@ from hoigs.core.errors import Interrupted
 from hoigs.core.interfaces.deformation import DeformationModel, StepStatistics
 from hoigs.core.interfaces.density import DensityControl, check_rasterizer
 from hoigs.core.model.camera_refinement import CameraRefinement, check_camera_gradients
+from hoigs.core.model.objective import Weighted
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.train_schema import TrainSpec
 from hoigs.core.system.threads import short_waits_when_busy
@@ -42,7 +43,7 @@ from hoigs.training.nan_guard import (
     gradients_finite,
     require_finite_outputs,
 )
-from hoigs.training.objective import JointObjective, ObjectiveResult
+from hoigs.training.objective import Extras, JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
 from hoigs.training.time_windows import TimeWindows
 from hoigs.training.unseen import Filling
@@ -180,6 +181,7 @@ class Trainer:
         run: RunFolder | None = None,
         identity: Mapping[str, str] | None = None,
         lpips: Lpips | None = None,
+        objectives: Sequence[Weighted] = (),
     ) -> None:
         if spec.loss.lpips > 0 and lpips is None:
             raise ValueError("train.loss.lpips > 0 needs LPIPS weights: give lpips=")
@@ -197,10 +199,9 @@ class Trainer:
             check_camera_gradients(model.rasterizer)
             self.cameras = CameraRefinement.of(clip).to(model.device)
         scale = 1 / depth_factor(clip) if spec.loss.depth_fit == "auto" else 1.0
-        self.objective = JointObjective(
-            model, spec.loss, clip.depth_kind, lpips, density, faces, self.cameras, scale,
-            spec.graphs if spec.chunk is None else "off",
-        )  # fmt: skip
+        extras = Extras(lpips, density or {}, faces or {}, self.cameras, scale, objectives)
+        graphs = spec.graphs if spec.chunk is None else "off"
+        self.objective = JointObjective(model, spec.loss, clip.depth_kind, extras, graphs)
         scene_extent, frames = clip.extent(), clip.split["train"]
         self.settled = spec.steps
         if spec.passes is not None:

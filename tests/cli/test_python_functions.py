@@ -27,6 +27,7 @@ FUNCTIONS = {
     "bug-report": (hoigs.bug_report,),
     "publish": (hoigs.publish,),
     "demo": (hoigs.demo,),
+    "batch": (hoigs.batch,),
     "work": (hoigs.work,),
 }
 # option -> argument, where the names differ

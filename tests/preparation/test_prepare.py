@@ -194,7 +194,12 @@ def test_targets_are_not_overwritten(tiny_source: Path, tmp_path: Path, body: An
     assert (out / "notes.txt").read_text() == "mine"
     (out / "notes.txt").unlink()
     report = prepare(
-        tiny_source, out, options=options, max_frames=5, overrides=["human_name=she"], overwrite=True
+        tiny_source,
+        out,
+        options=options,
+        max_frames=5,
+        overrides=["human_name=she"],
+        overwrite=True,
     )
     clip = ClipFolderReader().read(out)
     assert len(clip) == report.frames == 5 and set(clip.kinds) == {"she", "object"}

@@ -9,11 +9,12 @@ import density_mutants
 import exporter_mutants
 import features_mutants
 import interaction_mutants
+import objective_mutants
 import pytest
 import reader_mutants
 
 from hoigs.plugins.readers.clip import ClipFolderReader, ClipFolderReaderConfig
-from hoigs.testing import body, density, exporter, features, interaction, reader
+from hoigs.testing import body, density, exporter, features, interaction, objective, reader
 from hoigs.testing.checks import run_checks
 from hoigs.testing.material import TinyBody
 
@@ -37,6 +38,10 @@ KINDS: dict[str, tuple[Any, ...]] = {
     "interaction": (
         interaction.CHECKS, interaction.InteractionSubject, interaction_mutants.MUTANTS,
         interaction_mutants.Right, interaction_mutants.RightConfig(),
+    ),
+    "objective": (
+        objective.CHECKS, objective.ObjectiveSubject, objective_mutants.MUTANTS,
+        objective_mutants.Right, objective_mutants.RightConfig(),
     ),
     "features": (
         features.CHECKS, features.FeaturesSubject, features_mutants.MUTANTS,

@@ -19,6 +19,7 @@ from hoigs.core.interfaces.initializer import ObjectInitializer, check_track
 from hoigs.core.interfaces.rasterizer import Rasterizer
 from hoigs.core.maths.nearest import denser
 from hoigs.core.model.entity import Entity
+from hoigs.core.model.objective import Weighted
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.schema import ComponentSpec, EntitySpec, Spec
@@ -101,6 +102,23 @@ def compose_density(
         with _errors_at(spec, *where):
             check_rasterizer(controls[name], builder.registry.get(spec.rasterizer.use))
     return controls
+
+
+def compose_objectives(
+    spec: Spec, clip: Clip, registry: Registry | None = None
+) -> tuple[Weighted, ...]:
+    """The further terms of the loss that `spec` names; those of weight 0 are left out.
+
+    Raises:
+        SpecError, PluginError: as `compose`.
+    """
+    builder = _Builder(spec, clip, registry or default_registry())
+    context = BuildContext(clip=clip, seed=spec.train.seed)
+    return tuple(
+        Weighted(name, builder.part(("objectives", name), part, context), part.weight)
+        for name, part in spec.objectives.items()
+        if part.weight > 0
+    )
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ INTERFACES: dict[str, str] = {
     "initializer": "hoigs.core.interfaces.initializer:ObjectInitializer",
     "estimator": "hoigs.core.interfaces.estimator:Estimator",
     "exporter": "hoigs.core.model.exporter:Exporter",
+    "objective": "hoigs.core.model.objective:Objective",
 }
 KINDS = tuple(INTERFACES)
 _KEY = re.compile(r"[a-z]+:[a-z0-9]+(?:[-_.][a-z0-9]+)*")

@@ -99,6 +99,13 @@ class ComponentSpec(BaseModel):
         return dict(self.model_extra or {})
 
 
+class ObjectiveSpec(ComponentSpec):
+    """A term of the loss that a plugin brings, and its weight."""
+
+    weight: float = Field(default=1.0, ge=0, allow_inf_nan=False)
+    """Factor of every loss that it gives."""
+
+
 class EntitySpec(_Strict):
     """How one entity, or every entity of a kind, is modelled."""
 
@@ -154,6 +161,8 @@ class Spec(_Strict):
     model: dict[str, EntitySpec]
     """By exact entity name or by kind (scene, human, object); the name wins. Blocks that the clip
     has no entity for are not used."""
+    objectives: dict[str, ObjectiveSpec] = Field(default_factory=dict)
+    """Terms of the loss that plugins bring, by names of your choice."""
     train: TrainSpec = TrainSpec()
     """How the model is optimised."""
     evaluation: EvaluationSpec = EvaluationSpec()
@@ -222,6 +231,8 @@ class Spec(_Strict):
                 part = getattr(block, field)
                 if part is not None:
                     yield ("model", name, field), part
+        for name, term in self.objectives.items():
+            yield ("objectives", name), term
 
     def components(self) -> dict[str, str]:
         """The key of every component by its dotted place."""
@@ -237,7 +248,8 @@ class Spec(_Strict):
 
     def hash(self) -> str:
         """SHA-256 of what a result depends on: not names and summary, nor how it is computed."""
-        sections = [f for f in type(self).model_fields if f not in ("name", "summary")]
+        left_out = {"name", "summary"} | ({"objectives"} if not self.objectives else set())
+        sections = [f for f in type(self).model_fields if f not in left_out]
         return self._digest(sections, {"train": {"graphs"}})
 
     def model_hash(self) -> str:
@@ -293,7 +305,8 @@ def _resolve(document: Document, registry: Registry) -> Spec:
         node: Any = data
         for step in place[:-1]:
             node = node[step]
-        node[place[-1]] = {"use": part.use, **settings}
+        weight = {"weight": part.weight} if isinstance(part, ObjectiveSpec) else {}
+        node[place[-1]] = {"use": part.use, **weight, **settings}
     if problems:
         raise SpecError("\n".join(problems))
     resolved = Spec.model_validate(data)
@@ -307,12 +320,15 @@ def _written_components(data: dict[str, Any]) -> Iterator[tuple[Place, Component
     model = data.get("model")
     for name in model if isinstance(model, dict) else ():
         places += [("model", name, field) for field in OF_AN_ENTITY]
+    objectives = data.get("objectives")
+    places += [("objectives", n) for n in (objectives if isinstance(objectives, dict) else ())]
     for place in places:
         block: Any = data
         for step in place:
             block = block.get(step) if isinstance(block, dict) else None
         if isinstance(block, dict) and isinstance(block.get("use"), str):
-            yield place, ComponentSpec.model_validate(block)
+            own = {k: v for k, v in block.items() if k != "weight" or place[0] != "objectives"}
+            yield place, ComponentSpec.model_validate(own)
 
 
 def _settings(
@@ -321,6 +337,8 @@ def _settings(
     """Complete settings of one component, and what is wrong with it."""
     path = ".".join(map(str, place))
     use, kind = (*place, "use"), str(place[-1])
+    if place[0] == "objectives":
+        kind = "objective"
     try:
         found = registry.component(part.use)
         if found.kind != kind:

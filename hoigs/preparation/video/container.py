@@ -6,10 +6,12 @@ import bisect
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from hoigs.core.errors import SpecError
 from hoigs.preparation.video.source import SourceError, require_regular
+
+Pick = Literal["sharpest", "first"]  # which frame of each n
 
 
 def open_video(path: Path) -> tuple[Any, Any]:

@@ -9,13 +9,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from jaxtyping import UInt8
 
 from hoigs.preparation.video.container import (
     PacketIndex,
+    Pick,
     Span,
     open_video,
     packet_index,
@@ -24,7 +25,6 @@ from hoigs.preparation.video.container import (
 from hoigs.preparation.video.pictures import FilePicture, Picture, VideoPicture, sharpness
 from hoigs.preparation.video.source import IMAGE_SUFFIXES, SourceError, numbered_frames
 
-Pick = Literal["sharpest", "first"]
 UNEVEN = 0.1  # of the gap between frames: times that are so far from even ones are kept
 FAR = 30  # frames ahead, from which on decoding begins anew at a keyframe
 LATE = 0.05  # of a window: a frame this little before it belongs to it, for times are rounded

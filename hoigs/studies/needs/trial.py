@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hoigs.core.errors import ClipError, HoigsError
 from hoigs.core.interfaces.rasterizer import RenderRequest
-from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.model.compose import compose, compose_density, compose_objectives
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.registry.registry import Registry
 from hoigs.core.spec.schema import Spec
@@ -179,8 +179,9 @@ class Trial:
             warnings.filterwarnings("ignore", message="the object turns")
             self.model = compose(spec, view, registry).to(device)
         self.trainer = Trainer(
-            self.model, view, spec.train, density=compose_density(spec, view, registry)
-        )
+            self.model, view, spec.train, density=compose_density(spec, view, registry),
+            objectives=compose_objectives(spec, view, registry),
+        )  # fmt: skip
         self.seconds = 0.0
 
     @property

@@ -51,7 +51,9 @@ def test_prompts_become_options() -> None:
     assert options.prompts["object"].frame == 2 and options.preset == "offline"
     assert with_prompts(PrepareOptions(object=["none"])).find_object is False
     named = with_prompts(PrepareOptions(object=["kettle=3,4", " kettle = -5,6@7"]))
-    assert named.object_name == "kettle" and [at.frame for at in named.prompts["kettle"].places()] == [
+    assert named.object_name == "kettle" and [
+        at.frame for at in named.prompts["kettle"].places()
+    ] == [
         None,
         7,
     ]

@@ -24,7 +24,7 @@ from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.training.face import face_loss, lookup, unwrap_faces, visible
 from hoigs.training.losses import crop_around
-from hoigs.training.objective import JointObjective
+from hoigs.training.objective import Extras, JointObjective
 from hoigs.training.session import lpips_term
 
 
@@ -127,7 +127,7 @@ def test_kabsch_and_lookup():
 def terms(**settings) -> dict[str, Tensor]:
     spec = LossSpec(background="black", ssim="torch", **settings)
     faces = unwrap_faces(portrait()[0], portrait()[1]) if spec.face > 0 else None
-    objective = JointObjective(portrait()[0], spec, "none", faces=faces)
+    objective = JointObjective(portrait()[0], spec, "none", Extras(faces=faces))
     frame = portrait()[1][1]
     return objective(frame, frame.camera, torch.Generator().manual_seed(0)).terms
 

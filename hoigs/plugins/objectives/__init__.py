@@ -1,0 +1,1 @@
+"""Terms of the loss, beside the image terms of `hoigs/training/objective.py`."""
