@@ -29,11 +29,15 @@ from hoigs.core.system.threads import (
     short_waits_when_busy,
 )
 
+MAKE, TRAIN, SEE = "From a video to a clip", "From a clip to a run", "Look at it, take it away"
+STUDY, PARTS, HELP = "Many runs", "Parts", "When something goes wrong"
+
 app = typer.Typer(
     name="hoigs",
     cls=GuardedGroup,
     help="People handling things, reconstructed from one video as moving 3D Gaussians.",
     no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -42,25 +46,25 @@ study_app = typer.Typer(no_args_is_help=True, help="Compare methods, and find th
 study_app.command("compare")(study.compare)
 study_app.command("stress")(study.stress)
 study_app.command("needs")(needs.needs)
-app.command("demo")(demo.demo)
-app.command("annotate")(annotate.annotate)
-app.command("prepare")(prepare.prepare)
-app.command("refine")(refine.refine)
-app.command("train")(train.train)
-app.command("eval")(evaluate.evaluate)
-app.command("render")(render.render)
-app.command("view")(view.view)
-app.command("export")(export.export)
-app.command("publish")(publish.publish)
-app.command("batch")(batch.batch)
-app.command("work")(batch.work)
-app.add_typer(study_app, name="study")
-app.command("compress")(compress.compress)
-app.add_typer(plugins.plugins_app, name="plugins")
-app.add_typer(spec.spec_app, name="spec")
-app.add_typer(estimators.estimators_app, name="estimators")
-app.command("doctor")(doctor.doctor)
-app.command("bug-report")(bug_report.bug_report)
+app.command("demo", rich_help_panel=MAKE)(demo.demo)
+app.command("annotate", rich_help_panel=MAKE)(annotate.annotate)
+app.command("prepare", rich_help_panel=MAKE)(prepare.prepare)
+app.command("refine", rich_help_panel=MAKE)(refine.refine)
+app.command("train", rich_help_panel=TRAIN)(train.train)
+app.command("eval", rich_help_panel=TRAIN)(evaluate.evaluate)
+app.command("render", rich_help_panel=SEE)(render.render)
+app.command("view", rich_help_panel=SEE)(view.view)
+app.command("export", rich_help_panel=SEE)(export.export)
+app.command("publish", rich_help_panel=SEE)(publish.publish)
+app.command("batch", rich_help_panel=STUDY)(batch.batch)
+app.command("work", rich_help_panel=STUDY)(batch.work)
+app.add_typer(study_app, name="study", rich_help_panel=STUDY)
+app.command("compress", rich_help_panel=TRAIN)(compress.compress)
+app.add_typer(plugins.plugins_app, name="plugins", rich_help_panel=PARTS)
+app.add_typer(spec.spec_app, name="spec", rich_help_panel=PARTS)
+app.add_typer(estimators.estimators_app, name="estimators", rich_help_panel=PARTS)
+app.command("doctor", rich_help_panel=HELP)(doctor.doctor)
+app.command("bug-report", rich_help_panel=HELP)(bug_report.bug_report)
 
 
 def _version(show: bool) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hoigs.cli.common import Display, print_scores, print_table
+from hoigs.cli.common import Display, print_table
 from hoigs.cli.options import flags
 from hoigs.core.system.files import printable
 from hoigs.preparation.options import PrepareOptions
@@ -31,9 +31,6 @@ def demo(*, options: DemoOptions) -> None:
             options=options, on_start=show.started, on_step=show.step, progress=show.fraction,
             report=show.line,
         )  # fmt: skip
-    for run in runs.values():
-        assert run.evaluated is not None
-        print_scores(run.evaluated)
     _compare(runs)
     typer.echo(
         f"demo took {time.perf_counter() - began:.0f} s; open {Path(options.out) / 'report.html'}"
@@ -41,16 +38,18 @@ def demo(*, options: DemoOptions) -> None:
 
 
 def _compare(runs: dict[str, TrainedRun]) -> None:
-    """PSNR of the runs, region by region, on the same test frames."""
+    """PSNR of the runs, region by region, on the same frames; the reports have all scores."""
     regions = ("full", "human_object", "human", "object", "interaction", "background")
-    rows, given = [], []
+    rows, given = [], ""
     for name, run in runs.items():
         assert run.evaluated is not None
-        scores = [run.evaluated.evaluation.score(region, "psnr") for region in regions]
-        rows.append((name, *(f"{s:.2f}" if isinstance(s, float) else str(s) for s in scores)))
-        given.append(run.evaluated.evaluation.views[0].protocol.given())
-    title = "; ".join(("PSNR on test frames, dB", *filter(None, given[:1])))
-    print_table(title, ("spec", *regions), rows)
+        for view in run.evaluated.evaluation.views:
+            found = [run.evaluated.evaluation.score(r, "psnr", view.name) for r in regions]
+            scores = (f"{s:.2f}" if isinstance(s, float) else str(s) for s in found)
+            rows.append((name, view.name, *scores))
+        given = run.evaluated.evaluation.views[0].protocol.given() or given
+    title = "; ".join(("PSNR, dB", *filter(None, [given])))
+    print_table(title, ("spec", "on", *regions), rows)
 
 
 # `hoigs prepare`: make a clip folder from a video.

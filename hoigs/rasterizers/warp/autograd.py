@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from hoigs.core.first_order import first_order
-from hoigs.rasterizers.warp.arguments import Gradients
 from hoigs.rasterizers.warp.frame import Images, Inputs, Settings, TileIntersections
 
 
@@ -46,6 +45,8 @@ class Render(torch.autograd.Function):
     @staticmethod
     @first_order("WarpRasterizer", "draw with rasterizer:torch, which has the second, too")
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
+        from hoigs.rasterizers.warp.arguments import Gradients  # loads Warp
+
         saved = ctx.saved_tensors
         count = len(fields(Inputs))
         inputs, (records, *saved) = Inputs(*saved[:count]), saved[count:]
