@@ -233,6 +233,7 @@ class NewKind(StrEnum):
     reader = "reader"
     rasterizer = "rasterizer"
     exporter = "exporter"
+    objective = "objective"
 
 
 SUMMARIES = {
@@ -242,6 +243,7 @@ SUMMARIES = {
     NewKind.density: "removes what can hardly be seen",
     NewKind.reader: "a folder with scene.npz and images",
     NewKind.rasterizer: "plain torch, every splat at every pixel",
+    NewKind.objective: "depth that is even where the picture is",
     NewKind.exporter: "a text file of positions and opacities for each moment",
 }
 
