@@ -107,6 +107,7 @@ class Measures:
 
 
 AGREES = 0.5  # correlation of textures from which the object's rotation is trusted
+COVERED = 0.5  # of the frames: with landmarks in fewer, the body is not good, however near to them
 BLURRED = 0.5  # of the median sharpness: a frame below it is blurred
 
 
@@ -205,20 +206,27 @@ def _frames(report: Measures) -> Iterator[MeasureDiagnostic]:
 
 def _bodies(report: Measures) -> Iterator[MeasureDiagnostic]:
     people = {"body": (report.body_residual_px, report.body_residual_m)}
+    frames = max(1, report.frames)
+    found_in = [of["found"] / frames for of in report.landmarks.values()]
     for name, found in report.further_people.items():
         people[f"body of {name}"] = found["body_residual_px"], found["body_residual_m"]
+    shares = dict(zip(people, found_in, strict=False))  # both begin with the first person
     for name, (pixels, away) in people.items():
         if pixels is None:
             continue
         metres = "" if away is None else f", {100 * away:.1f} cm"
+        share = shares.get(name, 1.0)
+        judged = _judge(pixels / max(report.width, report.height), 0.01, 0.02)
         yield _judged(
             f"{name} on its landmarks",
             f"{pixels:.1f} px{metres}",
-            "median distance of visible landmarks",
-            _judge(pixels / max(report.width, report.height), 0.01, 0.02),
+            f"median distance of visible landmarks, in the {100 * share:.0f} % of the frames that "
+            "have some",
+            judged if share >= COVERED else "bad",
             "look at overlay.mp4: if the landmarks jump, use another estimator "
             "(estimators.landmarks); if all of the body is off, the focal length or the cameras "
-            "are",
+            "are; where most frames have no landmarks, the body is a guess there: click on the "
+            "person (--person X,Y@FRAME)",
         )
 
 
