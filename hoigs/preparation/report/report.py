@@ -42,6 +42,8 @@ class Measures:
         seconds: time by stage.
         registered: part of the chosen frames that have a camera; None for a static camera.
         reprojection_px: of COLMAP's points, mean; None for a static camera.
+        focal_px: of the stored frames. focal_range: shortest and longest that it may be, as shares
+            of it; None: it is given, or of structure from motion.
         displacement_px: of a static camera's background, at a width of 640; None if not measured.
         sharpness: of each frame (`sharpness.sharpness`).
         body_residuals_px: of each frame; None without landmarks.
@@ -85,6 +87,8 @@ class Measures:
     registered: float | None = None
     reprojection_px: float | None = None
     displacement_px: float | None = None
+    focal_px: float | None = None
+    focal_range: tuple[float, float] | None = None
     sharpness: list[float] = field(default_factory=list)
     body_residuals_px: list[float | None] = field(default_factory=list)
     body_residual_m: float | None = None
@@ -148,9 +152,18 @@ def _cameras(report: Measures) -> Iterator[MeasureDiagnostic]:
             "fair",
             "the background has one view and no measured depth: it looks right from near the "
             "camera only. An estimator of depth (--set estimators.depth.use=…) gives it one; "
-            "--camera moving declares that the camera does move. Give --focal: all depths "
-            "scale with it.",
+            "--camera moving declares that the camera does move.",
         )
+        if report.focal_px is not None and report.focal_range is not None:
+            low, high = report.focal_range
+            yield _judged(
+                "focal length",
+                f"{report.focal_px:.0f} px",
+                f"{low * report.focal_px:.0f} to {high * report.focal_px:.0f} px are possible, and "
+                "all depths scale with it",
+                _judge(max(high - 1, 1 - low), 0.05, 0.25),
+                "give --focal, --intrinsics or --calibration if you know the lens",
+            )
         return
     if report.registered is not None:
         yield _judged(

@@ -16,6 +16,7 @@ HEIGHTS = (0.2, 0.5, 0.8, 1.1)  # their middles, in heights of the image
 SURE = 0.8  # mean visibility of shoulders and of the better arm, for a person to be found
 KEPT = 0.5  # the same while they are followed
 ON = 0.5  # share of the seen landmarks that lie on the frame's mask of people, to be found there
+TRIED = 3  # best squares, each of which is checked
 AGAIN = 15  # frames until a search that found nobody is repeated, or one that was lost is left
 SHOULDERS, LEFT, RIGHT, HIPS = [11, 12], [13, 15], [14, 16], [23, 24]
 HEAD, LEGS = slice(0, 11), slice(25, 33)
@@ -81,13 +82,13 @@ class GuidedPose:
         if self.wait:
             self.wait -= 1
             return None
-        found = self.search(image, wide)
-        if self.check is not None:
-            self.check.lose()
-        if found is None or self.against(image, found, SURE):
-            self.wait = AGAIN
-            return None
-        return self.follow(found)
+        for found in self.search(image, wide)[:TRIED]:
+            if self.check is not None:
+                self.check.lose()
+            if not self.against(image, found, SURE):
+                return self.follow(found)
+        self.wait = AGAIN
+        return None
 
     def against(self, image, found, least) -> int:
         """Why somebody is not believed; 0 if they are."""
@@ -100,16 +101,16 @@ class GuidedPose:
         return 0
 
     def search(self, image, wide):
-        """The best of all squares."""
+        """What is seen in all squares, the best first."""
         height, width = image.shape[:2]
         middle = width / 2 if wide is None else middle_of(wide > 0.5)
         if middle is None:
-            return None
+            return []
         squares = [(middle, y * height, s * max(width, height)) for s in SIZES for y in HEIGHTS]
         looks = (self.look(image, wide, square) for square in squares)
         # anything may look like a person in some square: here, the mask of people has to agree
         tried = [f for f in looks if f is not None and (wide is None or share_on(f[1], wide) >= ON)]
-        return max(tried, key=lambda f: f[0], default=None)
+        return sorted(tried, key=lambda f: -f[0])
 
     def look(self, image, wide, square):
         """Score (0 if they are nobody's), landmarks, places in space, mask, square, and why they
