@@ -177,6 +177,8 @@ def _report(draft: Draft, options: PrepareOptions, name: str) -> PrepareReport:
         registered=figures["registered"] / figures["images"] if "registered" in figures else None,
         reprojection_px=figures.get("reprojection_px"),
         displacement_px=figures.get("displacement_px"),
+        focal_px=round(float(draft.cameras[0].K[0, 0]), 1),
+        focal_range=_focal_range(draft),
         sharpness=[round(value, 4) for value in draft.video.sharpness],
         body_residuals_px=[] if person is None else _numbers(person.residuals.numpy(), 2),
         body_residual_m=None if person is None else _metres_off(person, draft.cameras),
@@ -196,6 +198,15 @@ def _report(draft: Draft, options: PrepareOptions, name: str) -> PrepareReport:
         omega=angular_factor(draft.cameras, middle_of_motion, draft.video.fps),
         big_omega=full_factor(draft.cameras, moving),
     )
+
+
+def _focal_range(draft: Draft) -> tuple[float, float] | None:
+    figures, width = draft.track.figures, draft.video.native_width
+    if "focal_low_px" not in figures:
+        return None
+    pixels = float(draft.cameras[0].K[0, 0]) * width / draft.cameras[0].width
+    low, high = (figures[f"focal_{end}_px"] / pixels for end in ("low", "high"))
+    return round(low, 3), round(high, 3)
 
 
 def _metres_off(person: Body, cameras: Sequence[Camera]) -> float:

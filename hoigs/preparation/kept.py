@@ -58,7 +58,9 @@ PLAN = {
         slow=True,
     ),
     "object_masks": Stage(30, ("estimates",), ("object_name", "further_objects"), slow=True),
-    "cameras": Stage(3, ("frames", "estimates"), ("camera", "focal", "intrinsics", "calibration")),
+    "cameras": Stage(
+        3, ("frames", "estimates"), ("camera", "focal", "intrinsics", "calibration"), version=2
+    ),
     "people": Stage(
         46,
         ("estimates", "cameras"),

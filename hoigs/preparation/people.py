@@ -357,13 +357,29 @@ def _in_metres(track: CameraTrack, scale: float) -> CameraTrack:
 # Who of several people is followed, where nobody was clicked on: said before the long work.
 
 
+SMALL = 0.5  # of the picture's height: a smaller person is followed by the box about them
+
+
 def chosen_people(
-    options: PrepareOptions, found: Sequence[FramePrompt]
+    options: PrepareOptions, found: Sequence[FramePrompt], height: int
 ) -> tuple[dict[str, FramePrompt], str]:
     """The first one found, or all, by name, and a sentence that says so; nobody, and "", where
-    fewer than two are found."""
-    if len(found) < 2:
+    one is found who is as large as most, and whom any look at the whole picture finds.
+
+    Args:
+        height: of the picture, pixels.
+    """
+    if not found:
         return {}, ""
+    if len(found) == 1:
+        at, share = found[0], _tall(found[0]) / height
+        if share > SMALL:
+            return {}, ""
+        return {options.human_name: at}, (
+            f"the person seen in frame {at.frame}, at {_middle(at)}, is small (about "
+            f"{100 * share:.0f} % of the picture's height) and followed from there (--person "
+            "X,Y@FRAME chooses another); limbs of people so small are known less well"
+        )
     taken = found if options.everybody else found[:1]
     names = [options.human_name, *(f"{options.human_name}{k + 2}" for k in range(len(taken) - 1))]
     boxes = dict(zip(names, taken, strict=True))
@@ -375,6 +391,11 @@ def chosen_people(
         f"the one at {_middle(found[0])} is fitted (--person X,Y@FRAME chooses another, several "
         "with names, --person anna=X,Y; --person all takes everybody)"
     )
+
+
+def _tall(at: FramePrompt) -> float:
+    assert at.box is not None
+    return at.box[3] - at.box[1]
 
 
 def _middle(at: FramePrompt) -> str:

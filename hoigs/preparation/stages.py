@@ -214,7 +214,8 @@ def _choose_people(draft: Draft, options: PrepareOptions, estimators: Estimators
     draft = draft.noting(people=options.people)
     if not options.people or any(name in draft.clicks for name in options.people):
         return draft
-    boxes, said = chosen_people(options, _reader(draft, options, estimators).seen())
+    found = _reader(draft, options, estimators).seen()
+    boxes, said = chosen_people(options, found, draft.video.native_height)
     if not said:
         return draft
     draft.announce(said)

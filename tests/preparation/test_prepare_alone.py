@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tiny import FRAMES, HEIGHT, WIDTH, landmarks, masks, picture
-from tiny_mediapipe import FAKE, FAKE_CV2, FAKE_LOOK
+from tiny_mediapipe import FAKE, FAKE_CV2, FAKE_LOOK, FAKE_MODEL
 
 from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.errors import HoigsError, SpecError
@@ -58,6 +58,8 @@ def environment(alone: Path, tmp_path: Path) -> None:
     (package / "__init__.py").write_text(FAKE.replace("KNOWN", str(known)))
     (package.parent / "cv2.py").write_text(FAKE_CV2)
     (package.parent / "mediapipe_look.py").write_text(FAKE_LOOK.replace("PEOPLE", "[]"))
+    for name, text in FAKE_MODEL.items():
+        (package.parent / f"{name}.py").write_text(text)
     start = f"import sys, runpy; sys.path.insert(0, {str(package.parent)!r}); "
     start += "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
     python = MEDIAPIPE.folder / "bin" / "python"
@@ -221,6 +223,19 @@ class Two(Estimator):
                 video.frames, lambda i, s=shift: np.roll(np.logical_or(*masks(i)), s, 1)
             )
         return Estimates(EntityMasks(stacks), tracks)
+
+
+def test_a_small_person_is_followed_by_their_box(alone: Path, tmp_path: Path) -> None:
+    class Far(Two):
+        def people(self, video) -> tuple[FramePrompt, ...]:
+            return (FramePrompt(3, (), (44, 20, 52, 20 + 0.4 * HEIGHT)),)
+
+    far = Far()
+    report = prepare(
+        alone, tmp_path / "clip", object="none", options=OPTIONS, body=AnnyBody(),
+        estimators={"landmarks": far, "masks": far},
+    )  # fmt: skip
+    assert any("40 % of the picture's height" in text for text in report.warnings)
 
 
 @pytest.mark.parametrize("person", ["all", ("anna=48,30", "ben=78,30"), ()])

@@ -42,9 +42,33 @@ class Look:
         pass
     def people(self, image):
         return PEOPLE
+    def small(self, image):
+        return []
     def faceless(self, image, found):
         return []
 """
+
+# the model of landmarks alone, which the tiny scene does without: by name of the module
+FAKE_MODEL = {
+    "mediapipe_guided": """
+def landmark_graph(complexity):
+    return None, None
+class GuidedPose:
+    def __init__(self, graph, rect, check):
+        pass
+    def process(self, image, wide):
+        return None
+""",
+    "mediapipe_check": """
+class Check:
+    def __init__(self, graph, rect):
+        pass
+    def agrees(self, image, points):
+        return True
+    def lose(self):
+        pass
+""",
+}
 
 # what the script takes of OpenCV
 FAKE_CV2 = """

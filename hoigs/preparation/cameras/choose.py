@@ -25,6 +25,7 @@ from hoigs.preparation.cameras.focal import static_focal
 from hoigs.preparation.cameras.known import given_cameras, megasam_cameras, vggt_cameras
 from hoigs.preparation.cameras.sfm import structure_from_motion
 from hoigs.preparation.cameras.turning_cameras import (
+    NEAR,
     BackgroundMotion,
     background_motion,
     turning_cameras,
@@ -90,22 +91,38 @@ def choose_cameras(
         if motion is not None and (options.camera == "static" or motion.static):
             return _static(video, landmarks, options, still_lens, motion)
         if motion is None or motion.turned is not None:
-            focal = static_focal(video, landmarks, options.focal)
-            track, turns = turning_cameras(video, masks, still_lens, focal, progress)
-            warnings = [] if still_lens is not None or turns.spread else [*focal.warnings]
-            if turns.lost:
-                warnings.append(
-                    f"the camera turns, and the background of {len(turns.lost)} frames "
-                    f"({ranges(turns.lost)}) was not found again: their cameras lie between the "
-                    "others'"
-                )
-            return ChosenCameras(track, warnings=warnings)
+            return _turning(video, landmarks, masks, options, still_lens, motion, progress)
     return _from_motion(video, masks, options, lens, folder, progress)
+
+
+def _turning(
+    video: Frames, landmarks: Landmarks | None, masks: GivenMasks, options: PrepareOptions,
+    lens: tuple[Lens, str] | None, motion: BackgroundMotion | None,
+    progress: Callable[[float], None],
+) -> ChosenCameras:  # fmt: skip
+    focal = static_focal(video, landmarks, options.focal)
+    track, turns = turning_cameras(video, masks, lens, focal, progress)
+    warnings = []
+    if lens is None and not turns.spread:
+        warnings = [*focal.warnings]
+        track = replace(track, figures=focal.figures | track.figures)
+    if motion is not None and motion.parallax > NEAR:
+        warnings.append(
+            f"{_turns(motion)}; it also changes its place, by too little to measure: its turns "
+            f"leave {motion.parallax:.1f} px, by which near parts of the scene are blurred "
+            "(--camera moving tries to find its way)"
+        )
+    if turns.lost:
+        warnings.append(
+            f"the camera turns, and the background of {len(turns.lost)} frames "
+            f"({ranges(turns.lost)}) was not found again: their cameras lie between the others'"
+        )
+    return ChosenCameras(track, warnings=warnings)
 
 
 def _turns(motion: BackgroundMotion) -> str:
     return (
-        f"the camera turns on its spot (by {motion.turned:.1f} degrees between two of the compared "
+        f"the camera turns (by {motion.turns:.1f} degrees between two of the compared "
         f"frames; the background moves by up to {motion.largest:.0f} px at a width of 640)"
     )
 
@@ -188,9 +205,12 @@ def _from_motion(
         )  # fmt: skip
     except SourceError as error:
         motion = background_motion(video, masks)
-        if motion.turned is None:
+        if not np.isfinite(motion.parallax):
             raise
-        raise SourceError(f"{_turns(motion)}. {error}") from error
+        raise SourceError(
+            f"{_turns(motion)}, and turns alone leave {motion.parallax:.1f} px of it: --camera "
+            f"turning has that error, and is nearer than --camera static. {error}"
+        ) from error
     track = colmap_cameras(video, model, partial=True)
     track = replace(
         track, provenance=f"structure from motion without the masked pixels: {track.provenance}"

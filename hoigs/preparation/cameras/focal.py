@@ -15,6 +15,8 @@ from hoigs.preparation.video.container import open_video
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import numbered_frames
 
+USUAL = (0.6, 1.2)  # longer sides: main cameras of phones, and webcams, 45 to 80 degrees wide
+
 # A still camera's focal length from the person in view: perspective-n-point with one unknown f.
 #
 # Landmarks that are known in space determine how large near parts of the person look against far
@@ -298,10 +300,12 @@ def static_focal(video: Frames, landmarks: Landmarks | None, given: float | None
     figures = {} if curve is None else _figures(curve, longer)
     if curve is not None and curve.distinct:
         return _estimated(curve, longer, figures)
-    how = "assumed: 0.8 x the longer side; all depths scale with it"
+    low, high = (round(share * longer) for share in USUAL)
+    figures |= {"focal_low_px": low, "focal_high_px": high}
+    how = f"assumed: 0.8 x the longer side; all depths scale with it; {low} to {high} px are usual"
     text = (
-        "the focal length is assumed, and every depth is proportional to it: give --focal if you "
-        f"know it ({_undecided(curve, longer)})"
+        f"the focal length is assumed ({low} to {high} px are usual), and every depth is "
+        f"proportional to it: give --focal if you know it ({_undecided(curve, longer)})"
     )
     return StaticFocal(ASSUMED_FOCAL * longer, how, figures, (text,))
 

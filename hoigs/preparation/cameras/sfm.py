@@ -89,7 +89,8 @@ def structure_from_motion(
         raise SourceError(
             f"structure from motion gave cameras to {count} of {len(video)} frames, with focal "
             f"lengths of {lengths} px to start from. {_what_to_do(best, video)}if the camera "
-            "stands still, use --camera static; if you know the lens, give --focal or "
+            "stands still, use --camera static, and if it hardly changes its place, as in a hand, "
+            "--camera turning; if you know the lens, give --focal or "
             "--calibration; else the background may lack texture, be blurred or be hidden by the "
             "masks: look at the masks, take sharper or more frames, or put a COLMAP model of your "
             "own beside the video, as sparse/"

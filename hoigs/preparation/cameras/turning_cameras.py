@@ -62,14 +62,16 @@ class BackgroundMotion:
             NaN where too few features were found again.
         matches: features found again, of each compared frame.
         features: in the first frame.
-        turned: degrees that the camera turns by at most, if turns alone explain where the features
-            of neighbouring compared frames went; None if they do not, or cannot be known.
+        turns: degrees that the camera turns by at most between two compared frames. parallax:
+            pixels by which the best turns miss four of five features at most, in the worst pair of
+            frames: what only a camera that changes its place explains. NaN: not known.
     """
 
     displacement: Float[np.ndarray, " C"]
     matches: list[int]
     features: int
-    turned: float | None = None
+    turns: float = np.nan
+    parallax: float = np.nan
 
     @property
     def known(self) -> bool:
@@ -83,6 +85,11 @@ class BackgroundMotion:
         if not self.known or seen.mean() < 0.5:
             return not self.known
         return bool(np.quantile(self.displacement[seen], 0.75) < STILL)
+
+    @property
+    def turned(self) -> float | None:
+        """Degrees that a camera turns by which hardly changes its place; None if it does."""
+        return self.turns if self.parallax < FAINT else None
 
     @property
     def largest(self) -> float:
@@ -105,15 +112,12 @@ def background_motion(video: Frames, masks: GivenMasks) -> BackgroundMotion:
     if motion.static:
         return motion
     size = (WIDTH, round(video.height * WIDTH / video.width))
-    return replace(motion, turned=_turned([paired(a, b) for a, b in pairwise(found)], size))
-
-
-def _turned(pairs: list[Pair], size: tuple[int, int]) -> float | None:
-    """Degrees of the largest turn between neighbours, if turns explain them all; else None."""
-    if min(len(one) for one, _ in pairs) < ENOUGH:
-        return None
-    share, degrees = turn_share(pairs, size)
-    return degrees if share >= SHARE else None
+    near = [paired(one, other) for one, other in pairwise(found)]
+    far = [paired(found[0], other) for other in found[2:]]
+    if min(len(one) for one, _ in near) < ENOUGH:
+        return motion
+    parallax, turns = turn_misses([p for p in (*near, *far) if len(p[0]) >= ENOUGH], size)
+    return replace(motion, turns=turns, parallax=parallax)
 
 
 def background_features(
@@ -177,35 +181,36 @@ def grown(mask: Bool[np.ndarray, "H W"], margin: float = MARGIN) -> Bool[np.ndar
 
 FOCALS = np.geomspace(0.5, 2.5, 12)  # tried, in longer sides of the image
 NEAR = 1.5  # pixels from where a rotation would put a feature
-SHARE = 0.8  # of the features that have to be as near
+SHARE = 0.8  # of the features, in how far most are off
+FAINT = 6.0  # pixels at WIDTH: with less parallax, about 0.7 degrees, structure from motion fails
 REWEIGHTINGS = 6
 
 Pair = tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 2"]]
 
 
-def turn_share(pairs: Sequence[Pair], size: tuple[int, int]) -> tuple[float, float]:
-    """How well turns explain pairs of images, and the largest of these turns.
+def turn_misses(pairs: Sequence[Pair], size: tuple[int, int]) -> tuple[float, float]:
+    """How far turns are from explaining pairs of images, and the largest of these turns.
 
     Args:
         pairs: positions of the same features in two images, pixels. size: of the images.
 
     Returns:
-        the smallest, over pairs, share of features that lie within `NEAR` pixels of where the best
-        turn puts them, for the focal length with the largest such share; and degrees.
+        the largest, over pairs, of the pixels within which four of five features lie of where the
+        best turn puts them, for the focal length with which that is least; and degrees.
     """
-    best = (0.0, 0.0)
+    best = (np.inf, 0.0)
     for focal in FOCALS * max(size):
         found = [best_turn(pair, float(focal), size) for pair in pairs]
-        share = min(share for share, _ in found)
-        if share > best[0]:
-            best = share, max(degrees(R) for _, R in found)
+        miss = max(miss for miss, _ in found)
+        if miss < best[0]:
+            best = miss, max(degrees(R) for _, R in found)
     return best
 
 
 def best_turn(
     pair: Pair, focal: float, size: tuple[int, int]
 ) -> tuple[float, Float[np.ndarray, "3 3"]]:
-    """The share of features that the best rotation explains, and that rotation."""
+    """The pixels within which the best rotation explains four of five features, and it."""
     one, two = (_rays(xy, focal, size) for xy in pair)
     weights = np.ones(len(one))
     for _ in range(REWEIGHTINGS):
@@ -214,7 +219,7 @@ def best_turn(
         seen = moved[:, :2] / moved[:, 2:] * focal + np.array(size) / 2
         off = np.linalg.norm(seen - pair[1], axis=-1)
         weights = 1 / (1 + (off / NEAR) ** 2)
-    return float((off < NEAR).mean()), R
+    return float(np.quantile(off, SHARE)), R
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
@@ -239,7 +244,8 @@ def _rays(
 STEPS = (1, 2, 4, 8, 16, 32)  # frames between those that are compared
 MATCHES = 80  # of a pair; more change nothing
 ROUNDS = 12  # of Gauss-Newton
-SURE = 0.05  # of the focal length: a larger standard deviation, and it is not determined
+SURE = 0.05  # of the focal length: with a larger error it is not determined
+FEWEST = 8  # frames of a half of the video, for which the focal length is found again
 PLAUSIBLE = (0.4, 2.5)  # longer sides
 MOST_LOST = 0.3  # of the frames may be without matches
 
@@ -259,7 +265,7 @@ class Turns:
     """Rotations from the world to each frame's camera, the focal length and how sure it is.
 
     Attributes:
-        focal: pixels. spread: its standard deviation, as a part of it; 0 if it was given.
+        focal: pixels. spread: how far it may be off, as a part of it; 0 if it was given.
         off: pixels between features and where the rotations put them, median.
         lost: frames without matches; their rotations are interpolated.
     """
@@ -305,6 +311,7 @@ def turning_cameras(
     turns = solved(matches, *start_from, K, fixed=True)
     if not known:
         free = solved(matches, *start_from, K, fixed=False)
+        free = replace(free, spread=_spread(free, matches, start_from, K, size))
         if free.spread < SURE and PLAUSIBLE[0] < free.focal / max(size) < PLAUSIBLE[1]:
             turns = free
     progress(1.0)
@@ -312,10 +319,42 @@ def turning_cameras(
     return _track(video, start, how, turns, turns.focal / K[0, 0]), turns
 
 
+def _spread(
+    free: Turns, matches: Sequence[Match], start_from: tuple[np.ndarray, tuple[int, ...]],
+    K: np.ndarray, size: tuple[int, int],
+) -> float:  # fmt: skip
+    """How far a focal length found by turns may be off, as a part of it: the largest of its
+    standard deviation, of how the halves of the video differ, and of what the distance between
+    features and their places could do to it if it were all alike.
+
+    A turn by an angle moves the sides of a picture by angle x (width / 2)^2 / focal more than its
+    middle, which is all that shows the focal length; a camera that also changes its place moves
+    near and far features apart, which may look the same.
+    """
+    count = len(free.rotations)
+    one, other = np.triu_indices(count, 1)
+    traces = np.einsum("fij,gij->fg", free.rotations, free.rotations)[one, other]
+    angle = float(np.arccos(np.clip((traces - 1) / 2, -1, 1)).max())
+    spreads = [free.spread, free.off / max(angle * (max(size) / 2) ** 2 / free.focal, 1e-9)]
+    middle = count // 2
+    halves = []
+    for rows in (range(middle), range(middle, count)):
+        own = [m for m in matches if m.one in rows and m.two in rows]
+        if len(rows) >= FEWEST and own:
+            halves.append(solved(own, *start_from, K, fixed=False).focal)
+    if len(halves) == 2:
+        spreads.append(abs(float(np.log(halves[0] / halves[1]))) / 2)
+    return max(spreads)
+
+
 def _track(video: Frames, lens: Lens, how: str, turns: Turns, zoom: float) -> CameraTrack:
+    figures = {}
     if turns.spread:
-        lens = pinhole(video, zoom * float(lens.K[0, 0]))
-        how = f"by the camera's turns, to {100 * turns.spread:.1f} %"
+        pixels = zoom * float(lens.K[0, 0])
+        lens = pinhole(video, pixels)
+        low, high = (pixels * (1 + sign * turns.spread) for sign in (-1, 1))
+        how = f"by the camera's turns, {low:.0f} to {high:.0f} px"
+        figures = {"focal_low_px": round(low, 1), "focal_high_px": round(high, 1)}
     still = static_cameras(video, lens, how)
     poses = torch.eye(4).repeat(len(video), 1, 1)
     poses[:, :3, :3] = torch.from_numpy(turns.rotations).float()
@@ -329,7 +368,7 @@ def _track(video: Frames, lens: Lens, how: str, turns: Turns, zoom: float) -> Ca
         ],
         provenance=f"{provenance}, up to {max(angles):.1f} degrees from the middle; features "
         f"outside the masks lie {turns.off:.2f} px (median, at a width of {WIDTH}) off",
-        figures=still.figures | {"turn_degrees": round(max(angles), 2)},
+        figures=still.figures | figures | {"turn_degrees": round(max(angles), 2)},
     )
 
 

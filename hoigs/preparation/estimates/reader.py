@@ -36,6 +36,8 @@ from hoigs.preparation.video.pictures import resized_mask
 from hoigs.preparation.video.source import NobodyFoundError, Source, SourceError
 from hoigs.preparation.work_folder import digest
 
+RARE = 0.05  # of the frames: what is taken for a person in fewer of them is none
+
 
 def chosen_landmarks(
     track: estimator.Landmarks, video: Frames, what: str, source: str = "MediaPipe"
@@ -53,10 +55,16 @@ def chosen_landmarks(
         world = track.world_xyzv[video.indices].astype(np.float64)[..., :3]
     fates = FrameFates.at(track.lost, track.repaired, video.indices)
     found = Landmarks(torch.from_numpy(image), torch.from_numpy(world), source, fates)
-    if not found.found.any():
+    count, frames = int(found.found.sum()), len(image)
+    if count < RARE * frames:
+        why = "; ".join(f"{text} in {len(rows)}" for text, rows in fates.lost.items())
         raise NobodyFoundError(
-            f"{what}: no person was found in the {len(image)} chosen frames; the body of a person "
-            "whose shoulders, hips and some of the limbs are in the picture can be fitted"
+            f"{what}: no person was found in "
+            + (f"{frames - count} of " if count else "")
+            + f"the {frames} chosen frames{f' ({why})' if why else ''}; the body of a person "
+            "whose shoulders, hips and some of the limbs are in the picture can be fitted. If "
+            "there is one, click on them (--person X,Y@FRAME) or choose the part that shows them "
+            "(--start, --end); if there is none, --person none prepares the object alone"
         )
     return found
 

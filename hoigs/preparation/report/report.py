@@ -42,6 +42,8 @@ class Measures:
         seconds: time by stage.
         registered: part of the chosen frames that have a camera; None for a static camera.
         reprojection_px: of COLMAP's points, mean; None for a static camera.
+        focal_px: of the stored frames. focal_range: shortest and longest that it may be, as shares
+            of it; None: it is given, or of structure from motion.
         displacement_px: of a static camera's background, at a width of 640; None if not measured.
         sharpness: of each frame (`sharpness.sharpness`).
         body_residuals_px: of each frame; None without landmarks.
@@ -85,6 +87,8 @@ class Measures:
     registered: float | None = None
     reprojection_px: float | None = None
     displacement_px: float | None = None
+    focal_px: float | None = None
+    focal_range: tuple[float, float] | None = None
     sharpness: list[float] = field(default_factory=list)
     body_residuals_px: list[float | None] = field(default_factory=list)
     body_residual_m: float | None = None
@@ -107,6 +111,7 @@ class Measures:
 
 
 AGREES = 0.5  # correlation of textures from which the object's rotation is trusted
+COVERED = 0.5  # of the frames: with landmarks in fewer, the body is not good, however near to them
 BLURRED = 0.5  # of the median sharpness: a frame below it is blurred
 
 
@@ -147,9 +152,18 @@ def _cameras(report: Measures) -> Iterator[MeasureDiagnostic]:
             "fair",
             "the background has one view and no measured depth: it looks right from near the "
             "camera only. An estimator of depth (--set estimators.depth.use=…) gives it one; "
-            "--camera moving declares that the camera does move. Give --focal: all depths "
-            "scale with it.",
+            "--camera moving declares that the camera does move.",
         )
+        if report.focal_px is not None and report.focal_range is not None:
+            low, high = report.focal_range
+            yield _judged(
+                "focal length",
+                f"{report.focal_px:.0f} px",
+                f"{low * report.focal_px:.0f} to {high * report.focal_px:.0f} px are possible, and "
+                "all depths scale with it",
+                _judge(max(high - 1, 1 - low), 0.05, 0.25),
+                "give --focal, --intrinsics or --calibration if you know the lens",
+            )
         return
     if report.registered is not None:
         yield _judged(
@@ -205,20 +219,27 @@ def _frames(report: Measures) -> Iterator[MeasureDiagnostic]:
 
 def _bodies(report: Measures) -> Iterator[MeasureDiagnostic]:
     people = {"body": (report.body_residual_px, report.body_residual_m)}
+    frames = max(1, report.frames)
+    found_in = [of["found"] / frames for of in report.landmarks.values()]
     for name, found in report.further_people.items():
         people[f"body of {name}"] = found["body_residual_px"], found["body_residual_m"]
+    shares = dict(zip(people, found_in, strict=False))  # both begin with the first person
     for name, (pixels, away) in people.items():
         if pixels is None:
             continue
         metres = "" if away is None else f", {100 * away:.1f} cm"
+        share = shares.get(name, 1.0)
+        judged = _judge(pixels / max(report.width, report.height), 0.01, 0.02)
         yield _judged(
             f"{name} on its landmarks",
             f"{pixels:.1f} px{metres}",
-            "median distance of visible landmarks",
-            _judge(pixels / max(report.width, report.height), 0.01, 0.02),
+            f"median distance of visible landmarks, in the {100 * share:.0f} % of the frames that "
+            "have some",
+            judged if share >= COVERED else "bad",
             "look at overlay.mp4: if the landmarks jump, use another estimator "
             "(estimators.landmarks); if all of the body is off, the focal length or the cameras "
-            "are",
+            "are; where most frames have no landmarks, the body is a guess there: click on the "
+            "person (--person X,Y@FRAME)",
         )
 
 

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
+from pathlib import Path
 from types import SimpleNamespace as Box
 
 import numpy as np
 import pytest
 
-from hoigs.plugins.estimators.mediapipe.mediapipe_doubts import (
-    FEW,
-    FOUND,
-    OFF,
-    SMALL,
-    doubt,
-    share_on,
+from hoigs.plugins.estimators.mediapipe import mediapipe_doubts
+from hoigs.plugins.estimators.mediapipe.mediapipe_doubts import FEW, FOUND, OFF, SMALL, doubt
+
+# as the script imports them, which knows nothing of hoigs
+sys.path.append(str(Path(mediapipe_doubts.__file__).parent))
+AGAIN, GuidedPose = (
+    getattr(importlib.import_module("mediapipe_guided"), name) for name in ("AGAIN", "GuidedPose")
 )
-from hoigs.plugins.estimators.mediapipe.mediapipe_guided import AGAIN, GuidedPose
+Check = importlib.import_module("mediapipe_check").Check
 
 IMAGE = np.zeros((90, 160, 3), np.uint8)
 # nose, shoulders, elbows, wrists, hips of someone cut off at the neck, pixels
@@ -42,13 +45,13 @@ class Graph:
 
 
 def guided(graph: Graph) -> GuidedPose:
-    return GuidedPose(graph, Box, doubt, share_on)
+    return GuidedPose(graph, Box)
 
 
 def test_the_best_square_is_followed() -> None:
     graph = Graph()
     pose = guided(graph)
-    points, _, mask = pose.process(IMAGE, None)
+    points, _, mask, _ = pose.process(IMAGE, None)
     np.testing.assert_allclose(points[11], (110, 10, 0, 1), atol=1e-9)
     assert not points[0, 3]  # what is out of view is not seen
     assert mask.shape == IMAGE.shape[:2] and pose.square[1] == pytest.approx(45)
@@ -62,8 +65,10 @@ def test_a_part_of_the_person_is_not_taken_for_the_whole() -> None:
     pose = guided(graph)
     pose.process(IMAGE, None)
     graph.narrow = 0.7
-    points, _, mask = pose.process(IMAGE, None)
-    assert np.isnan(points).all() and mask.all()
+    points, _, mask, why = pose.process(IMAGE, None)
+    assert np.isnan(points).all() and mask.all() and why == mediapipe_doubts.NARROW
+    graph.narrow, graph.turned = 1.0, True
+    assert pose.process(IMAGE, None)[3] == mediapipe_doubts.TURNED
 
 
 def test_nobody_who_stands_on_their_head_and_no_search_in_every_frame() -> None:
@@ -78,7 +83,7 @@ def test_a_guess_of_the_head_chooses_a_square_and_does_not_end_it() -> None:
     pose = guided(graph)
     pose.process(IMAGE, None)
     graph.places[0] = (80, 20)  # out of view, guessed below the shoulders
-    points, _, _ = pose.process(IMAGE, None)
+    points, _, _, _ = pose.process(IMAGE, None)
     np.testing.assert_allclose(points[11, :2], (110, 10), atol=1e-9)
     assert guided(graph).process(IMAGE, None) is None
 
@@ -89,8 +94,31 @@ def test_the_mask_of_people_has_a_say_until_somebody_is_found() -> None:
     assert guided(Graph()).process(IMAGE, elsewhere) is None
     pose = guided(Graph())
     pose.process(IMAGE, here)
-    points, _, _ = pose.process(IMAGE, elsewhere)
+    points, _, _, _ = pose.process(IMAGE, elsewhere)
     assert np.isfinite(points).all()
+
+
+class Lopsided(Graph):
+    """Sees the same pose in every picture, mirrored or not, `aside` pixels off the middle."""
+
+    def __init__(self, aside: int) -> None:
+        super().__init__()
+        self.places = {mark: (x + aside, y) for mark, (x, y) in PLACES.items()}
+
+
+@pytest.mark.parametrize(("aside", "person"), [(0, True), (3, True), (8, False)])
+def test_who_is_a_person_in_the_mirror_too(aside: int, person: bool) -> None:
+    """The shoulders are 60 pixels apart, and the mirrored pose is 2 x `aside` off."""
+    graph = Lopsided(aside)
+    pose = GuidedPose(graph, Box, Check(graph, Box))
+    assert (pose.process(IMAGE, None) is not None) == person
+    assert graph.looks == (17 if person else 19)  # 16 squares, and the mirrored pictures
+    if person:  # followed, and checked now and then
+        looks = [pose.process(IMAGE, None) and graph.looks for _ in range(8)]
+        assert looks == [*range(18, 25), 26]
+        graph.places = {mark: (x + 9, y) for mark, (x, y) in graph.places.items()}
+        fates = [pose.process(IMAGE, None)[3] for _ in range(9)]
+        assert fates == [mediapipe_doubts.SQUARE] * 7 + [mediapipe_doubts.UNLIKE] * 2
 
 
 def square(*places: slice) -> np.ndarray:

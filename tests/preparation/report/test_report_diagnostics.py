@@ -40,13 +40,17 @@ def test_every_measure_is_judged_and_advised() -> None:
     assert set(good.values()) == {("good", "")}
 
 
+def test_a_body_that_few_frames_show_is_not_good() -> None:
+    few = {"human": {"found": 4, "lost": {"dark": [*range(4, 40)]}, "repaired": {}}}
+    judged = states(body_residual_px=0.5, landmarks=few)
+    assert judged["body on its landmarks"][0] == judged["landmarks of human"][0] == "bad"
+
+
 def test_a_static_camera_is_not_asked_for_parallax() -> None:
-    judged = states(displacement_px=0.13)
-    assert (
-        "parallax" not in judged
-        and judged["camera"][0] == "fair"
-        and "--focal" in judged["camera"][1]
-    )
+    judged = states(displacement_px=0.13, focal_px=1024.0, focal_range=(0.75, 1.5))
+    assert "parallax" not in judged and judged["camera"][0] == "fair"
+    assert judged["focal length"][0] == "bad" and "--focal" in judged["focal length"][1]
+    assert states(focal_px=900.0, focal_range=(0.97, 1.03))["focal length"] == ("good", "")
 
 
 class Tags(HTMLParser):

@@ -34,7 +34,7 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.core.reporting import Progress, no_progress, ranges
 from hoigs.core.system.files import written_whole
 from hoigs.plugins.estimators import steady_masks
-from hoigs.plugins.estimators.mediapipe.mediapipe_doubts import LOST, REPAIRED, UNSURE
+from hoigs.plugins.estimators.mediapipe.mediapipe_doubts import LOST, REPAIRED
 from hoigs.plugins.estimators.tools import HEAVY, MEDIAPIPE, run_tool, settings_key
 
 # Masks of people from the bits that `mediapipe_script.py` wrote.
@@ -99,12 +99,13 @@ def _mask(rows: UInt8[np.ndarray, "h B"], width: int) -> Bool[np.ndarray, "h w"]
 
 
 SCRIPT = Path(__file__).with_name("mediapipe_script.py")
-PARTS = ("doubts", "guided", "chosen", "people", "look")
+PARTS = ("doubts", "check", "guided", "chosen", "people", "look")
 IMPORTED = [SCRIPT.with_name(f"mediapipe_{part}.py") for part in PARTS]
 INSTALL = "run `hoigs estimators install mediapipe` and leave `python` out"
 OTHERS, FOLLOWED = 0.1, 0.8  # shares of the frames, above and below which there is something to say
 LOOKS = 7  # frames that are looked at for several people, less one
 HIPS = [23, 24]  # of the 33 landmarks
+SMALL = 0.6  # of the image's height: side of the square about a person, believed if seen twice
 LONGEST = 1280  # pixels: larger frames are made smaller, which the models do in any case
 
 
@@ -222,7 +223,7 @@ class MediapipeEstimator(Estimator):
         notes = _lost(given, images) if chosen else _others(found["several"], images[people[0]])
         if not chosen:
             empty = ~found["person"][0].any((1, 2))
-            notes += _without_pose(found["fate"][0], empty, given, video.numbers)
+            notes += _without_pose(found["alone"], empty, given, video.numbers)
         notes += _changed(np.atleast_1d(changed.any(0)), given, video.numbers)
         return Estimates(EntityMasks(masks, None, text, notes=notes), landmarks)
 
@@ -298,6 +299,9 @@ def _together(
     rows: Float[np.ndarray, "N 5"], shown: Sequence[int], video: VideoRequest
 ) -> tuple[FramePrompt, ...]:
     """Everybody in the frame that shows most people, the surest first."""
+    small = rows[:, 4] < SMALL * video.height
+    if len(set(rows[small, 0])) < min(2, len(shown)):  # so small, a bush may be taken for somebody
+        rows = rows[~small]
     if not len(rows):
         return ()
     places = rows[:, 0].astype(int)
@@ -357,11 +361,10 @@ def _frames_by(fate: Mapping[int, int], words: Mapping[int, str]) -> dict[str, t
 
 
 def _without_pose(
-    fate: UInt8[np.ndarray, " N"], empty: Bool[np.ndarray, " N"], given: range,
+    lost: Bool[np.ndarray, " N"], empty: Bool[np.ndarray, " N"], given: range,
     wanted: Sequence[int],
 ) -> tuple[str, ...]:  # fmt: skip
     """What there is to say of masks of frames in which no pose was found."""
-    lost = np.isin(fate, [code for code in LOST if code != UNSURE])
     notes = []
     for which, text in (
         (lost & ~empty, "are of the segmentation of selfies alone, which may lack limbs or take "

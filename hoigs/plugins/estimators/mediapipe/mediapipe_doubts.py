@@ -16,7 +16,7 @@ CREDIBLE = 0.5  # share of the seen landmarks that have to lie on the mask
 TALL, PART = 0.3, 0.35  # of the height and of the area of the mask of people: landmarks that span
 # less, with a mask that covers less, are of something else, such as a mug
 
-FOUND, BORDER, SQUARE, NOBODY, FEW, OFF, SMALL, UNSURE, GONE = range(9)
+FOUND, BORDER, SQUARE, NOBODY, FEW, OFF, SMALL, UNSURE, GONE, UNLIKE, NARROW, TURNED = range(12)
 # in words, of frames whose person was found at a further look, and of those in which they were not
 REPAIRED = {
     BORDER: "found with a border above the picture",
@@ -29,6 +29,9 @@ LOST = {
     SMALL: "something much smaller than the people in the picture was taken for a person",
     UNSURE: "shoulders and arms were hardly seen",
     GONE: "the person was out of sight, or not told apart from others",
+    UNLIKE: "another pose was seen in the mirrored picture: it is hardly a person",
+    NARROW: "the shoulders that were seen were much narrower than the person's",
+    TURNED: "the shoulders were not seen above the hips",
 }
 
 

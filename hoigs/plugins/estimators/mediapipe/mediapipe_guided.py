@@ -9,18 +9,22 @@ It imports nothing of hoigs.
 from __future__ import annotations
 
 import numpy as np
+from mediapipe_doubts import NARROW, SQUARE, TURNED, UNLIKE, UNSURE, doubt, share_on
 
 SIZES = (0.8, 1.1, 1.5, 2.0)  # sides of the squares, in longer sides of the image
 HEIGHTS = (0.2, 0.5, 0.8, 1.1)  # their middles, in heights of the image
-FOUND = 0.8  # mean visibility of shoulders and of the better arm, for a person to be found
+SURE = 0.8  # mean visibility of shoulders and of the better arm, for a person to be found
 KEPT = 0.5  # the same while they are followed
 ON = 0.5  # share of the seen landmarks that lie on the frame's mask of people, to be found there
+TRIED = 3  # best squares, each of which is checked
 AGAIN = 15  # frames until a search that found nobody is repeated, or one that was lost is left
 SHOULDERS, LEFT, RIGHT, HIPS = [11, 12], [13, 15], [14, 16], [23, 24]
 HEAD, LEGS = slice(0, 11), slice(25, 33)
 SAME = 0.8  # of the first distance of the shoulders: less is a part of them taken for the whole
 FAR = 0.1  # of the square's side: shoulders that moved farther take it with them
-NARROW = 0.08  # of the image's longer side: shoulders closer together are those of no one so near
+LEAST_BROAD = (
+    0.08  # of the image's longer side: shoulders closer together are those of no one so near
+)
 GRAPH = """
 input_stream: "image"
 input_stream: "square"
@@ -47,74 +51,89 @@ class GuidedPose:
 
     Args:
         graph: of `landmark_graph`. rect: makes a square for it, NormalizedRect.
-        doubt: what there is against landmarks, given them, their own mask and the frame's mask of
-            people; 0: nothing. share_on: share of the visible landmarks on a mask.
+        check: `mediapipe_check.Check`, of the same graph; None: nothing is checked.
     """
 
-    def __init__(self, graph, rect, doubt, share_on) -> None:
-        self.graph, self.rect, self.doubt, self.share_on = graph, rect, doubt, share_on
+    def __init__(self, graph, rect, check=None) -> None:
+        self.graph, self.rect, self.check = graph, rect, check
         self.square: tuple[float, float, float] | None = None  # x, y of the middle and side, pixels
         self.broad = 0.0  # distance of the shoulders when the person was found, pixels
         self.wait = 0
 
     def process(self, image, wide):
-        """Landmarks in the image and in space, and the person's mask; None where nobody is found.
+        """Landmarks in the image and in space, the person's mask, and what became of the frame, of
+        `mediapipe_doubts`; None where nobody is found.
+
+        Landmarks of somebody who is not believed in this frame are NaN.
 
         Args:
             wide: the frame's mask of people, or None.
         """
         if self.square is not None:
             found = self.look(image, wide, self.square)
-            if found is not None and found[0] >= KEPT:
+            why = UNSURE if found is None else self.against(image, found, KEPT)
+            if found is not None and not why:
                 return self.follow(found)
             self.wait += 1
             if self.wait <= AGAIN:  # another square now would more often be a wrong one
                 nothing = np.full((33, 4), np.nan)
-                return None if found is None else (nothing, nothing, found[3])
+                return None if found is None else (nothing, nothing, found[3], why)
             self.square, self.wait = None, 0
         if self.wait:
             self.wait -= 1
             return None
-        found = self.search(image, wide)
-        if found is None or found[0] < FOUND:
-            self.wait = AGAIN
-            return None
-        return self.follow(found)
+        for found in self.search(image, wide)[:TRIED]:
+            if self.check is not None:
+                self.check.lose()
+            if not self.against(image, found, SURE):
+                return self.follow(found)
+        self.wait = AGAIN
+        return None
+
+    def against(self, image, found, least) -> int:
+        """Why somebody is not believed; 0 if they are."""
+        score, points, _, _, square, why = found
+        if why or score < least:
+            return why or UNSURE
+        known = self.square is not None
+        if self.check and not self.check.agrees(image, points, square, known=known):
+            return UNLIKE
+        return 0
 
     def search(self, image, wide):
-        """The best of all squares."""
+        """What is seen in all squares, the best first."""
         height, width = image.shape[:2]
         middle = width / 2 if wide is None else middle_of(wide > 0.5)
         if middle is None:
-            return None
+            return []
         squares = [(middle, y * height, s * max(width, height)) for s in SIZES for y in HEIGHTS]
         looks = (self.look(image, wide, square) for square in squares)
         # anything may look like a person in some square: here, the mask of people has to agree
-        tried = [
-            f for f in looks if f is not None and (wide is None or self.share_on(f[1], wide) >= ON)
-        ]
-        return max(tried, key=lambda f: f[0], default=None)
+        tried = [f for f in looks if f is not None and (wide is None or share_on(f[1], wide) >= ON)]
+        return sorted(tried, key=lambda f: -f[0])
 
     def look(self, image, wide, square):
-        """Score (0 if they are nobody's), landmarks, places in space, mask, square; or None."""
+        """Score (0 if they are nobody's), landmarks, places in space, mask, square, and why they
+        are nobody's; or None."""
         height, width = image.shape[:2]
         found = seen_in(self.graph, self.rect, image, square)
         if found is None:
             return None
         points, space, mask = found
         broad = np.ptp(points[SHOULDERS, 0])
-        near = broad >= max(NARROW * max(width, height), SAME * self.broad)
+        near = broad >= max(LEAST_BROAD * max(width, height), SAME * self.broad)
         # the head is out of view: its guess tells a good square, and nothing once one is followed
-        person = near and upright(points, head=self.square is None)
-        person = person and not self.doubt(points, mask, wide)
+        why = 0 if near else NARROW
+        why = why or (0 if upright(points, head=self.square is None) else TURNED)
+        why = why or doubt(points, mask, wide)
         points[HEAD, 3] = 0.0  # one that can be seen is found by the detector
         x, y = points[LEGS, :2].astype(int).clip(0, [width - 1, height - 1]).T
         points[LEGS, 3] *= mask[y, x]  # not on the person: on a table before them
-        return score(points[:, 3]) if person else 0.0, points, space, mask, square
+        return 0.0 if why else score(points[:, 3]), points, space, mask, square, why
 
     def follow(self, found):
         """Keeps the square over the person: it moves with the shoulders, if they move far."""
-        _, points, space, mask, (x, y, side) = found
+        _, points, space, mask, (x, y, side), _ = found
         middle = points[SHOULDERS, :2].mean(0)
         if self.square is None:
             self.shoulders = middle
@@ -123,7 +142,7 @@ class GuidedPose:
             self.shoulders = middle
         self.square, self.wait = (x, y, side), 0
         self.broad = self.broad or float(np.ptp(points[SHOULDERS, 0]))
-        return points, space, mask
+        return points, space, mask, SQUARE
 
 
 def landmark_graph(complexity):

@@ -6,7 +6,11 @@ looked for by its model of landmarks, in squares all over the frame. It imports 
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
+from mediapipe_check import UNLIKE, difference
+from mediapipe_chosen import same, square_of
 from mediapipe_guided import HEAD, KEPT, SHOULDERS, landmark_graph, score, seen_in, upright
 
 GRAPH = """
@@ -22,6 +26,8 @@ SQUARES, ROWS = (0.7, 1.1, 1.6), (0.35, 0.7)  # sides and middles of squares, in
 SURE, BROAD = 0.9, 0.1  # mean visibility of shoulders and arm, without a face; their distance
 MINE = 0.35  # of the square's side from somebody's hips, along the image: it is them
 FAINT = 0.5  # of the sureness of a person without a face: others come first
+TILES, OVERLAP = (0.6, 0.35), 0.4  # sides of squares for the detector, in image heights; of a side
+CLEAR = 0.85  # of the detector, in such a square: of posts, trunks and leaves it is less sure
 ROUND = 2.5  # side of the square about a person, in distances of the detector's two points
 
 
@@ -39,16 +45,52 @@ class Look:
 
     def people(self, image):
         """How sure, the hips' middle and the side of the square, pixels, of each."""
+        found = []
+        for sure, *square in self.detected(image):
+            seen = seen_in(*self.landmarks, image, square)
+            if seen is not None and score(seen[0][:, 3]) >= KEPT and self.real(image, seen, square):
+                found.append((sure, *square))
+        return found
+
+    def small(self, image):
+        """The same of those who are too small for the detector in the whole image: it is shown
+        squares all over it."""
+        height, width = image.shape[:2]
+        found: list[tuple[float, float, float, float]] = []
+        for side in (round(share * height) for share in TILES):
+            for x0, y0 in product(starts(width, side), starts(height, side)):
+                for sure, x, y, wide in self.detected(image[y0 : y0 + side, x0 : x0 + side]):
+                    found.append((sure, x + x0, y + y0, wide))
+        kept: list[tuple[float, float, float, float]] = []
+        for sure, *square in sorted(found, reverse=True):
+            if sure < CLEAR or any(same_place(square, one[1:]) for one in kept):
+                continue
+            seen = seen_in(*self.landmarks, image, square)
+            if seen is None or score(seen[0][:, 3]) < KEPT:
+                continue
+            square = square_of(seen[0])  # in which they are followed
+            again = seen_in(*self.landmarks, image, square)
+            if again is None or not same(seen[0], again[0], square[2]):
+                continue
+            if self.real(image, again, square) and not any(same_place(square, k[1:]) for k in kept):
+                kept.append((sure, *square))
+        return kept
+
+    def detected(self, image):
+        """How sure, the hips' middle and the side of the square of each that the detector finds."""
         height, width = image.shape[:2]
         found = []
-        for one in self.detector.process({"image": image}).detections or []:
+        result = self.detector.process({"image": np.ascontiguousarray(image)})
+        for one in result.detections or []:
             points = one.location_data.relative_keypoints[:2]
             hips, rim = (np.array((p.x * width, p.y * height)) for p in points)
             side = ROUND * float(np.linalg.norm(hips - rim))
-            seen = seen_in(*self.landmarks, image, (*hips, side))
-            if seen is not None and score(seen[0][:, 3]) >= KEPT:
-                found.append((float(one.score[0]), float(hips[0]), float(hips[1]), side))
+            found.append((float(one.score[0]), float(hips[0]), float(hips[1]), side))
         return found
+
+    def real(self, image, seen, square) -> bool:
+        """Whether what is seen in a square is a person in the mirror, too."""
+        return difference(*self.landmarks, image, seen[0], square) < UNLIKE
 
     def faceless(self, image, found):
         """Likewise those without a face, whom two squares show, and who are none of the found."""
@@ -76,9 +118,23 @@ class Look:
         sure = score(points[:, 3])
         if sure < SURE or np.ptp(points[SHOULDERS, 0]) < BROAD * len(image):
             return None
+        if not self.real(image, (points,), square):
+            return None
         return FAINT * sure, float(points[SHOULDERS, 0].mean()), square[1], square[2]
 
 
 def near(one, other) -> bool:
     """Whether two squares are of one person."""
     return abs(one[1] - other[1]) < MINE * max(one[3], other[3])
+
+
+def same_place(one, other) -> bool:
+    """Whether two squares, x and y of the middle and the side, are of one person."""
+    apart = np.hypot(one[0] - other[0], one[1] - other[1])
+    return bool(apart < MINE * max(one[2], other[2]))
+
+
+def starts(length, side):
+    """Where squares of a side begin that cover a length and overlap."""
+    count = int(np.ceil(max(0, length - side) / ((1 - OVERLAP) * side))) + 1
+    return np.linspace(0, max(0, length - side), count).round().astype(int)

@@ -3,8 +3,9 @@
 Reads RGB frames from standard input and writes one .npz file: of each person image_xyzv and
 world_xyzv [P, N, 33, 4], NaN where they are not found, and `fate` [P, N], what became of the frame
 (mediapipe_doubts.py); and, if masks are wanted, `person`, the bits of boolean masks
-[P, N, H, ceil(W / 8)], their `size`, and `several` [N], whether other people are seen. P is 1, or
-the number of people who were clicked on.
+[P, N, H, ceil(W / 8)], their `size`, `several` [N], whether other people are seen, and `alone` [N],
+whether the mask is of the segmentation of selfies alone. P is 1, or the number of people who were
+clicked on.
 """
 
 from __future__ import annotations
@@ -65,6 +66,8 @@ class Lookout:
 
     def add(self, place, image) -> None:
         found = self.look.people(image)
+        if not found:
+            found = self.look.small(image)
         if place % 2 == 0:
             found += self.look.faceless(image, found)
         self.rows += [(place, *one) for one in found]
@@ -88,7 +91,9 @@ class Finder:
         if self.masks:
             self.selfie = solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
             self.close = solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
-        self.guided: Any = None  # made where it is needed
+        self.check: Any = None  # made where they are needed
+        self.guided: Any = None
+        self.last: Any = None  # where the person was last, and how tall, pixels
         self.complexity = settings["pose"]["model_complexity"]
         self.following = False  # a person whom `guided` found and the detector does not
         self.people: Any = None
@@ -116,6 +121,7 @@ class Finder:
         self.person: list[list[np.ndarray | None]] = [[None] * len(frames) for _ in names]
         self.fate = np.zeros((len(names), len(frames)), np.uint8)
         self.several = np.zeros(len(frames), bool)  # others are seen beside the person followed
+        self.alone = np.zeros(len(frames), bool)  # masks of the segmentation of selfies alone
 
     def add(self, place, image) -> None:
         """The frame that comes at this place."""
@@ -127,18 +133,33 @@ class Finder:
         self.rows["image_xyzv"][0, place], self.rows["world_xyzv"][0, place] = (
             image_xyzv, world_xyzv
         )  # fmt: skip
+        seen = image_xyzv[image_xyzv[:, 3] > 0.5, :2]
+        if len(seen):
+            self.last = (*seen.min(0), *seen.max(0))
         if wide is not None:
             self.person[0][place] = self.bits(image, self.of_anybody(place, image, wide, own))
 
     def of_anybody(self, place, image, wide, own):
         """The mask of the person whom the detector took; of people, where it took nobody."""
         if own is None:
+            self.alone[place] = True
             near = self.near(image, wide > 0.5)
-            return wide if near is None else (wide + near) / 2
+            found = wide if near is None else (wide + near) / 2
+            return found if self.last is None else self.within_reach(found)
         if self.following:
             return own  # segmentation of selfies takes tables in where there is no head
         self.several[place] = self.another(wide, own)
         return self.of_one(image, wide, own)
+
+    def within_reach(self, found):
+        """A mask without the parts that are farther than a body's height from where the person was
+        last: something else that stands there."""
+        x0, y0, x1, y1 = self.last
+        tall = max(x1 - x0, y1 - y0)
+        _, parts, _, _ = self.cv2.connectedComponentsWithStats(np.uint8(found > 0.5))
+        x0, y0 = (max(0, round(v - tall)) for v in (x0, y0))
+        here = parts[y0 : max(0, round(y1 + tall)), x0 : max(0, round(x1 + tall))]
+        return np.where(np.isin(parts, np.setdiff1d(here, 0)), found, 0.0)
 
     def add_people(self, place, image, wide) -> None:
         """Those who were clicked on; where masks overlap, the model of landmarks decides."""
@@ -195,15 +216,15 @@ class Finder:
         """In the image and in space, the mask of their person, and what became of the frame; looked
         for a second time with a border above the image where they are not found, as with a head
         out of view, and then without the detector (mediapipe_guided.py)."""
-        from mediapipe_doubts import BORDER, FOUND, NOBODY, SQUARE, UNSURE, doubt, share_on
+        from mediapipe_doubts import BORDER, FOUND, NOBODY, UNLIKE, doubt
 
-        def guided():
-            found = self.guided.process(image, wide)
-            if found is None:
-                return None
-            return (*found, SQUARE if np.isfinite(found[0]).all() else UNSURE)
+        if self.check is None:
+            from mediapipe_check import Check
+            from mediapipe_guided import GuidedPose, landmark_graph
 
-        if self.following and (found := guided()) is not None:
+            graph = landmark_graph(self.complexity)
+            self.check, self.guided = Check(*graph), GuidedPose(*graph, Check(*graph))
+        if self.following and (found := self.guided.process(image, wide)) is not None:
             return found
         self.following, fate = False, NOBODY
         height, width = image.shape[:2]
@@ -219,17 +240,17 @@ class Finder:
             points = points_of(found.pose_landmarks) * [width, height + above, width, 1.0]
             points[:, 1] -= above
             own = found.segmentation_mask[above:] if self.masks else None
-            if doubted := doubt(points, own, wide):
+            doubted = doubt(points, own, wide)
+            if not doubted and not self.check.agrees(image, points):
+                doubted = UNLIKE
+            if doubted:
                 pose.reset()
                 fate = doubted if fate == NOBODY else fate
                 continue
             how = BORDER if above else FOUND
             return points, points_of(found.pose_world_landmarks), own, how
-        if self.guided is None:
-            from mediapipe_guided import GuidedPose, landmark_graph
-
-            self.guided = GuidedPose(*landmark_graph(self.complexity), doubt, share_on)
-        if (found := guided()) is not None:
+        self.check.lose()
+        if (found := self.guided.process(image, wide)) is not None:
             self.following = True
             return found
         nothing = np.full((33, 4), np.nan)
@@ -253,7 +274,7 @@ class Finder:
         rows["fate"] = self.fate
         if self.masks:
             rows["person"] = np.array(self.person)
-            rows["several"] = self.several
+            rows["several"], rows["alone"] = self.several, self.alone
         return rows
 
 
