@@ -66,8 +66,8 @@ class Extras:
     """
 
     lpips: Lpips | None = None
-    density: Mapping[str, DensityControl] = field(default_factory=dict)
-    faces: Mapping[str, FaceTexture] = field(default_factory=dict)
+    density: Mapping[str, DensityControl] | None = None
+    faces: Mapping[str, FaceTexture] | None = None
     cameras: CameraRefinement | None = None
     depth_scale: float = 1.0
     objectives: Sequence[Weighted] = ()
@@ -102,7 +102,7 @@ class JointObjective:
     ) -> None:
         extras = extras or Extras()
         self.model, self.spec, self.depth_kind, self.lpips = model, spec, depth_kind, extras.lpips
-        self.density, self.faces = dict(extras.density), dict(extras.faces)
+        self.density, self.faces = dict(extras.density or {}), dict(extras.faces or {})
         self.cameras, self.depth_scale = extras.cameras, extras.depth_scale
         self.objectives = tuple(extras.objectives)
         self.weights = term_weights(spec)

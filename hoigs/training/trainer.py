@@ -199,7 +199,7 @@ class Trainer:
             check_camera_gradients(model.rasterizer)
             self.cameras = CameraRefinement.of(clip).to(model.device)
         scale = 1 / depth_factor(clip) if spec.loss.depth_fit == "auto" else 1.0
-        extras = Extras(lpips, density or {}, faces or {}, self.cameras, scale, objectives)
+        extras = Extras(lpips, density, faces, self.cameras, scale, objectives)
         graphs = spec.graphs if spec.chunk is None else "off"
         self.objective = JointObjective(model, spec.loss, clip.depth_kind, extras, graphs)
         scene_extent, frames = clip.extent(), clip.split["train"]
