@@ -18,11 +18,18 @@ from hoigs.core.interfaces.estimator import (
     PromptPoint,
     VideoRequest,
 )
+from hoigs.plugins.estimators.object_tracker.appearance import Appearance, twins_of
 from hoigs.plugins.estimators.object_tracker.footage import ColorModel, Footage, bins_of, histogram
-from hoigs.plugins.estimators.object_tracker.path import Path, found_path, path_of
+from hoigs.plugins.estimators.object_tracker.path import (
+    Evidence,
+    Path,
+    found_path,
+    path_of,
+)
 from hoigs.plugins.estimators.object_tracker.prompts import Behind, PromptedMask, overlap, set_off
 from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Track, window_of
 from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, StaticScene, median_of
+from hoigs.plugins.estimators.object_tracker.verified import Known, proof_of, without_unproven
 
 # Frames in which an object was found best, from which it is followed again.
 #
@@ -70,6 +77,7 @@ def _set_off(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]) -> float:
 
 
 SAME = 0.7  # intersection over union from which two passes agree on a frame
+NEARLY_ALL = 0.95  # share of the frames from which no second look for the object is worth it
 
 
 def followed(
@@ -78,21 +86,42 @@ def followed(
     prompts: Sequence[PromptedMask],
     progress: Callable[[float], None] = lambda share: None,
 ) -> Track:
-    """Masks of all frames, in two passes: the second knows what is behind an object that hides a
-    person who keeps still, or follows any other from the frames in which the first found it best.
+    """Masks of the frames that are proven to show the object; those of the others are empty.
+
+    In up to three passes: the second knows what the object looks like in the frames in which the
+    first found it best, the third what is behind an object that hides a person who keeps still.
     """
-    first = tracked(footage, scene, prompts, progress=lambda x: progress(0.5 * x))
+    looks, known = _learnt(footage, prompts)
+    first = tracked(footage, scene, prompts, looks=looks, progress=lambda x: progress(0.4 * x))
+    proof = proof_of(footage, scene, prompts, first, looks, known)
+    found = without_unproven(first, proof)
+    best = anchors(footage, found, prompts)
+    if best and (proof.proven.mean() < NEARLY_ALL or not isinstance(scene, StaticScene)):
+        looks, known = _learnt(footage, [*prompts, *best])
+        again = tracked(
+            footage, scene, prompts, best, looks, lambda x: progress(0.4 + 0.3 * x)
+        )  # fmt: skip
+        found = _joined(
+            *(
+                without_unproven(t, proof_of(footage, scene, prompts, t, looks, known))
+                for t in (first, again)
+            )
+        )
     behind = None
     if isinstance(scene, StaticScene):
-        behind = Behind.of(footage, scene, first.soft > 127)
+        behind = Behind.of(footage, scene, found.soft > 127)
+    if behind is None:
+        return found
+    better = tracked_again(footage, behind, prompts, found, lambda x: progress(0.7 + 0.3 * x))
+    return without_unproven(better, proof_of(footage, scene, prompts, better, looks, known))
 
-    def second(x: float) -> None:
-        progress(0.5 + 0.5 * x)
 
-    if behind is not None:
-        return tracked_again(footage, behind, prompts, first, second)
-    best = anchors(footage, first, prompts)
-    return _joined(first, tracked(footage, scene, prompts, best, second)) if best else first
+def _learnt(footage: Footage, known: Sequence[PromptedMask]) -> tuple[Appearance, Known]:
+    """What the object looks like in known frames, and these without others that look like it."""
+    masks = {p.frame: p.soft > 0.5 for p in known}
+    looks = Appearance.learnt(footage, masks)
+    twins = twins_of(looks, masks)
+    return Appearance.learnt(footage, masks, twins) if twins else looks, Known(masks, twins)
 
 
 def tracked(
@@ -100,9 +129,14 @@ def tracked(
     scene: Scene,
     prompts: Sequence[PromptedMask],
     further: Sequence[PromptedMask] = (),
+    looks: Appearance | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Track:
-    """Masks of every frame from those of the prompted ones, and of `further` frames."""
+    """Masks of every frame from those of the prompted ones, and of `further` frames.
+
+    Args:
+        looks: learnt from these; None: not yet.
+    """
     rests = at_rest(scene, {p.frame: p.soft > 0.5 for p in prompts})
     prompts = [*prompts, *further]
     known = {p.frame: p.soft > 0.5 for p in prompts}
@@ -110,21 +144,23 @@ def tracked(
     moving = isinstance(scene, MovingScene)
     # what rests is a part of a still camera's scene; a moving one's is that of nearby frames
     used = scene if moving or not rests else None
-    path = found_path(footage, used, colors, known, progress=lambda x: progress(0.3 * x))
+    evidence = Evidence(footage, used, colors, looks or _learnt(footage, prompts)[0])
+    path = found_path(evidence, known, progress=lambda x: progress(0.3 * x))
     stands = not rests and stands_out(footage, used, path, known)
     unchanged = 1.2 if stands else 0.1
-    walk = partial(Propagation, footage, used, colors, path, unchanged=unchanged, moving=moving)
+    walk = partial(Propagation, evidence, path, unchanged=unchanged, moving=moving)
     return _walked(footage, prompts, walk, lambda x: progress(0.3 + 0.7 * x))
 
 
 def _joined(first: Track, again: Track) -> Track:
     """The first pass where both have about the same: what comes from fewer frames drifts more, but
-    is not tied to the small faults of more of them. Elsewhere the second."""
+    is not tied to the small faults of more of them. Elsewhere the surer one."""
     pairs = zip(first.soft > 127, again.soft > 127, strict=True)
-    same = np.array([overlap(a, b) > SAME for a, b in pairs])
+    same = np.array([bool(a.any()) and overlap(a, b) > SAME for a, b in pairs])
+    kept = same | (first.confidence > again.confidence)
     return Track(
-        np.where(same[:, None, None], first.soft, again.soft),
-        np.where(same, first.confidence, again.confidence),
+        np.where(kept[:, None, None], first.soft, again.soft),
+        np.where(kept, first.confidence, again.confidence),
     )
 
 
@@ -143,9 +179,8 @@ def tracked_again(
     prompts = [behind.regrown(p) for p in prompts]
     colors = color_model(footage, {p.frame: p.soft for p in prompts})
     path = path_of(before.soft > 127)
-    walk = partial(
-        Propagation, footage, behind.scene, colors, path, unchanged=0.1, moving=False, behind=behind
-    )
+    evidence = Evidence(footage, behind.scene, colors, _learnt(footage, prompts)[0])
+    walk = partial(Propagation, evidence, path, unchanged=0.1, moving=False, behind=behind)
     return _walked(footage, prompts, walk, progress)
 
 
