@@ -57,7 +57,7 @@ PLAN = {
         ("human", "further_people", "find_person", "everybody", "object"),
         slow=True,
     ),
-    "object_masks": Stage(30, ("estimates",), ("object", "further_objects"), slow=True),
+    "object_masks": Stage(30, ("estimates",), ("object", "further_objects"), slow=True, version=2),
     "cameras": Stage(3, ("frames", "estimates"), ("camera", "focal", "intrinsics", "calibration")),
     "people": Stage(
         46,

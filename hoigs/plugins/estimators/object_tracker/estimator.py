@@ -37,7 +37,9 @@ from hoigs.plugins.estimators.object_tracker.scene import (
     moving_scene,
     static_scene,
 )
+from hoigs.plugins.estimators.object_tracker.states import states_of
 from hoigs.plugins.estimators.object_tracker.tracker import (
+    Said,
     at_rest,
     color_model,
     followed,
@@ -186,7 +188,7 @@ class ObjectTrackerEstimator(Estimator):
             tracks[entity.name] = followed(footage, scene, masks, part) if masks else None
         tracks, alike = told_apart(footage, scene, prompts, tracks)
         notes += [*alike, *doubts(tracks, footage)]
-        write_tracks(file, video, footage, tracks, chosen, notes)
+        write_tracks(file, video, footage, tracks, Said(chosen, notes, states_of(footage, tracks)))
 
     def _prompted(
         self, entity: EntityRequest, footage: Footage, scene: Scene, notes: list[str]

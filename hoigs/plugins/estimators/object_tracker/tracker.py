@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path as FilePath
@@ -29,6 +30,7 @@ from hoigs.plugins.estimators.object_tracker.path import (
 from hoigs.plugins.estimators.object_tracker.prompts import Behind, PromptedMask, overlap, set_off
 from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Track, window_of
 from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, StaticScene, median_of
+from hoigs.plugins.estimators.object_tracker.states import LOST
 from hoigs.plugins.estimators.object_tracker.verified import Known, proof_of, without_unproven
 
 # Frames in which an object was found best, from which it is followed again.
@@ -254,13 +256,22 @@ def _walks(known: list[int], count: int) -> list[tuple[int, range]]:
 # Tracks in a file, so that a video is tracked once.
 
 
+@dataclass(frozen=True)
+class Said:
+    """What is said of the tracks: prompts that were chosen for objects that had none, notes, and
+    where each object is in each frame (`states.states_of`)."""
+
+    chosen: dict[str, list[FramePrompt]]
+    notes: list[str]
+    states: dict[str, list[str]]
+
+
 def write_tracks(
     file: FilePath,
     video: VideoRequest,
     footage: Footage,
     tracks: dict[str, Track | None],
-    chosen: dict[str, list[FramePrompt]],
-    notes: list[str],
+    said: Said,
 ) -> None:
     """Everything that `read_tracks` needs, under a temporary name first."""
     arrays: dict[str, np.ndarray] = {}
@@ -274,10 +285,11 @@ def write_tracks(
         arrays[f"confidence {name}"] = confidence
     about = {
         "numbers": footage.numbers,
-        "notes": notes,
+        "notes": said.notes,
+        "states": said.states,
         "chosen": {
             n: [[p.frame, [[q.x, q.y, q.inside] for q in p.points], p.box] for p in prompts]
-            for n, prompts in chosen.items()
+            for n, prompts in said.chosen.items()
             if prompts
         },
     }
@@ -304,9 +316,14 @@ def read_tracks(file: FilePath, video: VideoRequest, names: Sequence[str]) -> En
         )
         for n, prompts in about["chosen"].items()
     }
+    states = {
+        n: [about["states"][n][row[i]] if i in row else LOST for i in range(video.frames)]
+        for n in names
+    }
     return EntityMasks(
-        masks, None, "object tracker without a network", confidence, chosen, tuple(about["notes"])
-    )
+        masks, None, "object tracker, learnt on the video", confidence, chosen,
+        tuple(about["notes"]), states,
+    )  # fmt: skip
 
 
 def _mask_at(soft: np.ndarray, row: dict[int, int], video: VideoRequest, i: int) -> np.ndarray:

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
-from scipy import ndimage
 from torch import Tensor
 
 from hoigs.plugins.estimators.object_tracker.appearance import (
@@ -245,9 +244,3 @@ def without_unproven(track: Track, proof: Proof) -> Track:
     soft: UInt8[np.ndarray, "F h w"] = np.where(proof.proven[:, None, None], track.soft, 0)
     sure = np.where(proof.proven, np.minimum(proof.agreement, np.maximum(track.confidence, 0.0)), 0)
     return Track(soft, sure)
-
-
-def touches_border(mask: Bool[np.ndarray, "h w"]) -> bool:
-    """Whether a mask reaches the edge of the picture."""
-    rim = ndimage.binary_dilation(mask, iterations=2)
-    return bool(rim[0].any() or rim[-1].any() or rim[:, 0].any() or rim[:, -1].any())
