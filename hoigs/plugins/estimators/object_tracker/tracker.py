@@ -98,7 +98,8 @@ def followed(
     proof = proof_of(footage, scene, prompts, first, looks, known)
     found = without_unproven(first, proof)
     best = anchors(footage, found, prompts)
-    if best and (proof.proven.mean() < NEARLY_ALL or not isinstance(scene, StaticScene)):
+    enough = proof.proven.mean() >= NEARLY_ALL and isinstance(scene, StaticScene)
+    if best and not enough and not known.twins:  # which no looks tell apart
         looks, known = _learnt(footage, [*prompts, *best])
         again = tracked(
             footage, scene, prompts, best, looks, lambda x: progress(0.4 + 0.3 * x)
@@ -114,7 +115,9 @@ def followed(
         behind = Behind.of(footage, scene, found.soft > 127)
     if behind is None:
         return found
-    better = tracked_again(footage, behind, prompts, found, lambda x: progress(0.7 + 0.3 * x))
+    better = tracked_again(
+        footage, behind, prompts, looks, found, lambda x: progress(0.7 + 0.3 * x)
+    )
     return without_unproven(better, proof_of(footage, scene, prompts, better, looks, known))
 
 
@@ -170,6 +173,7 @@ def tracked_again(
     footage: Footage,
     behind: Behind,
     prompts: Sequence[PromptedMask],
+    looks: Appearance,
     before: Track,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Track:
@@ -181,7 +185,7 @@ def tracked_again(
     prompts = [behind.regrown(p) for p in prompts]
     colors = color_model(footage, {p.frame: p.soft for p in prompts})
     path = path_of(before.soft > 127)
-    evidence = Evidence(footage, behind.scene, colors, _learnt(footage, prompts)[0])
+    evidence = Evidence(footage, behind.scene, colors, looks)
     walk = partial(Propagation, evidence, path, unchanged=0.1, moving=False, behind=behind)
     return _walked(footage, prompts, walk, progress)
 
