@@ -27,6 +27,7 @@ from hoigs.preparation.draft import Draft
 from hoigs.preparation.objects.make_object import MadeObject
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.people import Body
+from hoigs.preparation.report.object_seen import ObjectSeen, best_click, by_state
 from hoigs.preparation.report.overlay import OverlayVideo, save_object_picture, several, shown_frame
 from hoigs.preparation.report.report import PrepareReport
 from hoigs.preparation.video.source import SourceError
@@ -195,6 +196,7 @@ def _report(draft: Draft, options: PrepareOptions, name: str) -> PrepareReport:
         **first,
         object_name=options.object_name,
         further_objects=measures,
+        objects_seen=_objects_seen(draft, options),
         omega=angular_factor(draft.cameras, middle_of_motion, draft.video.fps),
         big_omega=full_factor(draft.cameras, moving),
     )
@@ -207,6 +209,45 @@ def _focal_range(draft: Draft) -> tuple[float, float] | None:
     pixels = float(draft.cameras[0].K[0, 0]) * width / draft.cameras[0].width
     low, high = (figures[f"focal_{end}_px"] / pixels for end in ("low", "high"))
     return round(low, 3), round(high, 3)
+
+
+def _objects_seen(draft: Draft, options: PrepareOptions) -> dict[str, ObjectSeen]:
+    """By name of every object, in which frames it is seen, and how well it is placed."""
+    seen = {}
+    for name, thing in draft.objects.items():
+        place, turn = errors_of(thing, draft.cameras)
+        seen[name] = ObjectSeen(place_m=place, turn_degrees=turn)
+        found = draft.found_object
+        if found is not None and name != options.object_name:
+            found = found.further.get(name)
+        if found is None or not found.states or found.confidence is None:
+            continue
+        rows = list(draft.track.positions)
+        states, sure = [found.states[i] for i in rows], found.confidence[rows].tolist()
+        seen[name] = replace(
+            seen[name], states=by_state(states), click=best_click(states, sure, draft.video.indices)
+        )
+    return seen
+
+
+def errors_of(made: MadeObject, cameras: Sequence[Camera]) -> tuple[float | None, float | None]:
+    """Metres by which an object's place is off, and degrees by which its turn is, typically.
+
+    Across the picture it is off by as much as its outline is, and in depth by as much as its size
+    seems to change. A turn that moves its surface by what the outline is off cannot be told; it is
+    not known at all where no texture shows it.
+    """
+    track, known = made.track, made.confidence.outline[np.isfinite(made.confidence.outline)]
+    seen = track.observed.nonzero().flatten().tolist()
+    if not seen:
+        return None, None
+    away = [float((track.translations[i] - cameras[i].center).norm()) for i in seen]
+    outline = float(np.median(known)) if len(known) else 0.0
+    place = math.hypot(outline, made.spread * float(np.median(away)))
+    if made.confidence.way != "texture and hands":
+        return place, None
+    radius = float(track.points.norm(dim=-1).mean())
+    return place, math.degrees(math.atan2(outline, radius))
 
 
 def _metres_off(person: Body, cameras: Sequence[Camera]) -> float:

@@ -57,7 +57,9 @@ PLAN = {
         ("human_name", "further_people", "find_person", "everybody", "object_name"),
         slow=True,
     ),
-    "object_masks": Stage(30, ("estimates",), ("object_name", "further_objects"), slow=True),
+    "object_masks": Stage(
+        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=2
+    ),
     "cameras": Stage(
         3, ("frames", "estimates"), ("camera", "focal", "intrinsics", "calibration"), version=2
     ),

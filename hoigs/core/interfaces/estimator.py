@@ -195,6 +195,8 @@ class EntityMasks:
         confidence: mask confidence of each entity in each frame, 0..1; NaN: not computed.
         chosen: prompts found for each entity that was requested without one.
         notes: sentences for the report, on what is doubtful.
+        states: of each entity, where it is in each frame of the video: "seen" where its mask is
+            verified, else "out of the picture", "hidden by …" or "lost"; absent: not computed.
     """
 
     entities: Mapping[str, Frames] = field(default_factory=dict)
@@ -203,6 +205,7 @@ class EntityMasks:
     confidence: Mapping[str, Float[np.ndarray, " F"]] = field(default_factory=dict)
     chosen: Mapping[str, tuple[FramePrompt, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    states: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

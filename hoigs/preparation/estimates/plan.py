@@ -22,7 +22,7 @@ from hoigs.preparation.video.source import MEGASAM, VGGT, Source, numbered_frame
 # those of networks are guesses
 COST = {
     "estimator:mediapipe": 0.15,
-    "estimator:object-tracker": 0.25,
+    "estimator:object-tracker": 0.45,
     "estimator:transformers-sam2": 4.0,
     "estimator:transformers-pose": 0.6,
     "estimator:transformers-depth": 1.5,

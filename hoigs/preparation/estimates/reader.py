@@ -151,6 +151,7 @@ class FoundObject:
         boxes: frame of the video and box x0, y0, x1, y1 in its pixels where the object was proposed
             because no prompt said where it is.
         notes: for the report.
+        states: of each chosen frame (`EntityMasks.states`); empty: not computed.
         further: other objects by name (`PrepareOptions.further_objects`).
     """
 
@@ -159,6 +160,7 @@ class FoundObject:
     confidence: Float[np.ndarray, " F"] | None = None
     boxes: list[tuple[float, ...]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    states: list[str] = field(default_factory=list)
     further: dict[str, FoundObject] = field(default_factory=dict)
 
 
@@ -251,6 +253,9 @@ class EstimateReader:
             found.provenance or who,
             None if confidence is None else np.asarray(confidence)[self.video.indices],
             [(at.frame, *at.box) for at in chosen if at.box is not None],
+            states=[found.states[name][i] for i in self.video.indices]
+            if name in found.states
+            else [],
         )
 
     def estimate(self, role: Place, progress: Callable[[float], None]) -> Estimates:

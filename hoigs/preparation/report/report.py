@@ -12,6 +12,7 @@ from string import Template
 from typing import Any
 
 from hoigs.core.reporting import Diagnostic, Severity, ranges
+from hoigs.preparation.report.object_seen import SEEN, ObjectSeen, named
 
 # What is measured of a preparation.
 
@@ -59,6 +60,7 @@ class Measures:
         hand_distance_m: of each frame, from the nearest palm to its surface while held; negative
             inside.
         object_name: of the object that the measures above are of.
+        objects_seen: by name of every object, in which frames it is seen and how well it is placed.
         further_objects: by name, the same measures of the other objects. further_people: by name,
             body_residual_px and body_residual_m of the other people.
         omega, big_omega: effective multi-view factors (`multiview`).
@@ -104,6 +106,7 @@ class Measures:
     object_rests: float = 0.0
     hand_distance_m: list[float | None] = field(default_factory=list)
     object_name: str = "object"
+    objects_seen: dict[str, ObjectSeen] = field(default_factory=dict)
     further_objects: dict[str, dict[str, Any]] = field(default_factory=dict)
     further_people: dict[str, dict[str, float]] = field(default_factory=dict)
     omega: float | None = None
@@ -276,6 +279,7 @@ def _tracks(report: Measures) -> Iterator[MeasureDiagnostic]:
             "the object's masks grow and shrink, or it turns: mend the masks, or give its shape as "
             "a mesh (initializer:mesh)",
         )
+    yield from _objects_seen(report)
     yield from _object_judged(report)
     if report.depth_residual is not None:
         yield _judged(
@@ -286,6 +290,23 @@ def _tracks(report: Measures) -> Iterator[MeasureDiagnostic]:
             "the depth network misjudges this scene: try another, or leave its loss out "
             "(--set train.loss.depth=0)",
         )
+
+
+def _objects_seen(report: Measures) -> Iterator[MeasureDiagnostic]:
+    """Each object's verified frames, and the click that would help most."""
+    for name, seen in report.objects_seen.items():
+        if seen.share is None:
+            continue
+        shown = set(seen.states.get(SEEN, []))
+        advice = seen.advice or "nothing can be done where it is hidden or out of the picture"
+        one = _judged(
+            f"{name} seen",
+            f"{100 * seen.share:.0f} % of the frames",
+            f"verified: its looks, size and way agree there; {seen.unseen}",
+            _judge(1 - seen.share, 0.1, 0.4),
+            f"{advice} (--object {name}=X,Y@FRAME)" if seen.advice else advice,
+        )
+        yield replace(one, frames=tuple(i for i in range(report.frames) if i not in shown))
 
 
 def _object_judged(report: Measures) -> Iterator[MeasureDiagnostic]:
@@ -531,6 +552,8 @@ class PrepareReport(Measures):
             seen = f"{100 * measured['object_observed']:.0f} %"
             rows.append((f"{name} seen", seen, "of the frames"))
             rows.append((f"{name}'s poses", measured["object_way"], measured["object_reason"]))
+        for name, known in self.objects_seen.items():
+            rows += [(f"{name}: {what}", value, note) for what, value, note in named(known)]
         rows.append(("scene points", f"{self.scene_points}", ""))
         if self.depth_residual is not None:
             rows.append(

@@ -97,6 +97,6 @@ def _without(
     again = followed(replace(footage, blank=closed), scene, prompts)
     soft, confidence = again.soft.copy(), again.confidence.copy()
     for i in np.flatnonzero(_claimed_twice(again, other)).tolist():
-        if i in frames and i not in {p.frame for p in prompts}:
+        if i not in {p.frame for p in prompts}:  # where the other was before
             soft[i], confidence[i] = 0, 0.0
     return Track(soft, confidence)

@@ -22,6 +22,7 @@ from hoigs.core.interfaces.estimator import (
 )
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.plugins.estimators.object_tracker.alike import told_apart
+from hoigs.plugins.estimators.object_tracker.appearance import one_thread
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage, skeletons
 from hoigs.plugins.estimators.object_tracker.prompts import (
     PromptedMask,
@@ -36,7 +37,9 @@ from hoigs.plugins.estimators.object_tracker.scene import (
     moving_scene,
     static_scene,
 )
+from hoigs.plugins.estimators.object_tracker.states import states_of
 from hoigs.plugins.estimators.object_tracker.tracker import (
+    Said,
     at_rest,
     color_model,
     followed,
@@ -101,7 +104,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 10  # of what is kept in `work`; raised when masks change
+VERSION = 11  # of what is kept in `work`; raised when masks change
 SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
 
 
@@ -150,6 +153,7 @@ class ObjectTrackerEstimator(Estimator):
             "person": digest.hexdigest(),
         })  # fmt: skip
 
+    @one_thread()
     def _track(
         self, video: VideoRequest, wanted: Sequence[EntityRequest], file: Path, progress: Progress
     ) -> None:
@@ -184,7 +188,7 @@ class ObjectTrackerEstimator(Estimator):
             tracks[entity.name] = followed(footage, scene, masks, part) if masks else None
         tracks, alike = told_apart(footage, scene, prompts, tracks)
         notes += [*alike, *doubts(tracks, footage)]
-        write_tracks(file, video, footage, tracks, chosen, notes)
+        write_tracks(file, video, footage, tracks, Said(chosen, notes, states_of(footage, tracks)))
 
     def _prompted(
         self, entity: EntityRequest, footage: Footage, scene: Scene, notes: list[str]

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from hoigs.plugins.estimators.object_tracker.appearance import Appearance
 from hoigs.plugins.estimators.object_tracker.footage import ColorModel, Footage, bins_of, histogram
 from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, median_of
 
@@ -16,6 +17,7 @@ CANDIDATES = 8
 ABSENT = 1.1  # cost of a frame in which the object is not seen
 TURN = 0.8  # and of its going or coming back
 JUMP = 8.0  # and of lying, all at once, elsewhere, as if it had been there before
+BY_COLOR, BY_LOOKS = 0.4, 0.8  # weights of their log-odds
 CHANGED = 4  # units of noise by which a pixel differs from the scene
 
 
@@ -27,12 +29,22 @@ class Path:
     seen: Bool[np.ndarray, "F"]
 
 
-def object_odds(
-    footage: Footage, scene: Scene | None, colors: ColorModel, i: int
-) -> Float[np.ndarray, "h w"]:
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for an object anywhere in the video: its colours and looks, and the scene, which
+    it is none of; None where it may be a part of that."""
+
+    footage: Footage
+    scene: Scene | None
+    colors: ColorModel
+    looks: Appearance
+
+
+def object_odds(evidence: Evidence, i: int) -> Float[np.ndarray, "h w"]:
     """Log-odds of each pixel of a frame to be the object's, from what is known of it anywhere."""
-    odds = colors.odds(bins_of(footage.colors(i)))
-    odds = odds - 0.7 * footage.body(i)
+    footage, scene = evidence.footage, evidence.scene
+    odds = BY_COLOR * evidence.colors.odds(bins_of(footage.colors(i)))
+    odds = odds + BY_LOOKS * evidence.looks.odds(i) - 0.7 * footage.body(i)
     if scene is not None:
         changed = np.nan_to_num(np.tanh((scene.difference(i) - 4) / 3), nan=0.0)
         odds = odds + np.maximum(changed, -0.3)  # a plain or resting thing may look unchanged
@@ -41,18 +53,17 @@ def object_odds(
 
 
 def found_path(
-    footage: Footage,
-    scene: Scene | None,
-    colors: ColorModel,
+    evidence: Evidence,
     known: Mapping[int, Bool[np.ndarray, "h w"]],
     frames: Sequence[int] | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Path:
-    """The path through the masks at `known` frames that follows the object's colours.
+    """The path through the masks at `known` frames that follows what looks like the object.
 
     Args:
         frames: neighbours, in order of going through them; None: all. The path has as many rows.
     """
+    footage, scene, colors = evidence.footage, evidence.scene, evidence.colors
     order = list(range(len(footage)) if frames is None else frames)
     size = float(np.sqrt(np.mean([m.sum() for m in known.values()]) / np.pi))
     found = []
@@ -61,7 +72,7 @@ def found_path(
             places = np.array([center_of(known[i])])
             found.append((places, np.array([-4.0]), np.zeros(1, bool)))
         else:
-            odds = object_odds(footage, scene, colors, i)
+            odds = object_odds(evidence, i)
             places, cost = _candidates(odds, bins_of(footage.colors(i)), colors, size)
             found.append((places, cost, _still(scene, i, places, size)))
         progress((row + 1) / len(order))

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.footage import (
-    ColorModel,
-    Footage,
     Window,
     bins_of,
     histogram,
     to_features,
 )
-from hoigs.plugins.estimators.object_tracker.path import Path, center_of, found_path
+from hoigs.plugins.estimators.object_tracker.path import Evidence, Path, center_of, found_path
 from hoigs.plugins.estimators.object_tracker.prompts import Behind, PromptedMask, walked
-from hoigs.plugins.estimators.object_tracker.scene import Scene
 
 # Labels of pixels from frames in which they are known: by similar patches nearby.
 
@@ -99,7 +96,9 @@ def shift_of(
     return float(x[k]), float(y[k]), float(error[k])
 
 
+BY_COLOR, BY_LOOKS = 0.4, 0.5  # weights of their log-odds
 AGAIN, AHEAD = 6, 14  # frames after which the path is found anew, and how far
+NEAR = 0.4  # of the object's breadth: an arm before it may part it by so much
 SURE = 0.35  # confidence below which the object counts as not seen
 
 
@@ -125,16 +124,15 @@ class Propagation:
 
     def __init__(
         self,
-        footage: Footage,
-        scene: Scene | None,
-        colors: ColorModel,
+        evidence: Evidence,
         path: Path,
         start: PromptedMask,
         unchanged: float,
         moving: bool,
         behind: Behind | None = None,
     ) -> None:
-        self.footage, self.scene, self.colors, self.path = footage, scene, colors, path
+        self.footage, self.scene, self.colors = evidence.footage, evidence.scene, evidence.colors
+        self.evidence, self.path = evidence, path
         self.behind = behind
         self.unchanged = unchanged  # log-odds by which a pixel that shows the scene is not ours
         window = window_of(start.soft > 0.5)
@@ -179,7 +177,7 @@ class Propagation:
         step = 1 if i > last else -1
         ahead = range(last, last + step * (AHEAD + 1), step)
         frames = [k for k in ahead if 0 <= k < len(self.footage)]
-        found = found_path(self.footage, self.scene, self.colors, {last: mask}, frames)
+        found = found_path(replace(self.evidence, colors=self.colors), {last: mask}, frames)
         centers, seen = self.path.centers.copy(), self.path.seen.copy()
         centers[frames], seen[frames] = found.centers, found.seen
         self.path = Path(centers, seen)
@@ -243,7 +241,8 @@ class Propagation:
 
         near: colours around the object in this frame. prior: where other frames put it.
         """
-        odds = 0.6 * self.colors.odds(bins_of(colors), near)
+        odds = BY_COLOR * self.colors.odds(bins_of(colors), near)
+        odds += BY_LOOKS * window.cut(self.evidence.looks.odds(i))
         person = window.cut(self.footage.body(i))
         # a person's mask that takes in most of what is known to be the object says little
         taken = 0.5 if prior is None else float((prior * person).sum() / max(prior.sum(), 1e-6))
@@ -305,13 +304,16 @@ class Propagation:
 
 
 def _supported(mask: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """The part of a mask with most support, and others whose own is strong."""
+    """The part of a mask with most support, and others nearby whose own is strong."""
     labels, count = ndimage.label(mask)
     if count < 2:
         return mask
     rows = np.arange(1, count + 1)
     sums, means = (f(prior, labels, rows) for f in (ndimage.sum_labels, ndimage.mean))
-    kept = (sums == sums.max()) | ((sums > 0.1 * sums.max()) & (means > 0.7))
+    largest = labels == 1 + sums.argmax()
+    gaps = ndimage.minimum(ndimage.distance_transform_edt(~largest), labels, rows)
+    near = gaps < NEAR * np.sqrt(largest.sum())
+    kept = (sums == sums.max()) | ((sums > 0.1 * sums.max()) & (means > 0.7) & near)
     return np.isin(labels, rows[kept])
 
 

@@ -121,7 +121,7 @@ def without_scenery(found: Sequence[Candidate], scene: Scene, slack: float) -> l
         around = [i for i in frames[max(0, row - AROUND) : row + AROUND + 1] if i != c.frame]
         there = []
         for i in around:
-            x, y = carried(scene, c.point, c.frame, i)
+            x, y = carried(scene, np.array(c.point), c.frame, i)
             there.append(
                 any(
                     np.hypot(o.point[0] - x, o.point[1] - y) < c.radius + slack

@@ -290,11 +290,13 @@ def moving_scene(footage: Footage) -> MovingScene:
     return MovingScene(footage, homographies(footage))
 
 
-def carried(scene: Scene, point: tuple[float, float], i: int, j: int) -> Float[np.ndarray, "2"]:
-    """Where a point x, y of frame i that is a part of the scene lies in frame j."""
+def carried(
+    scene: Scene, points: Float[np.ndarray, "*N 2"], i: int, j: int
+) -> Float[np.ndarray, "*N 2"]:
+    """Where points x, y of frame i that are a part of the scene lie in frame j."""
     if isinstance(scene, MovingScene):
-        return moved_points(chained(scene.steps, i, j), np.array(point))
-    return np.array(point)
+        return moved_points(chained(scene.steps, i, j), points)
+    return points
 
 
 def median_of(differences: np.ndarray) -> float:

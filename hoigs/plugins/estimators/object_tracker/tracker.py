@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path as FilePath
@@ -18,11 +19,19 @@ from hoigs.core.interfaces.estimator import (
     PromptPoint,
     VideoRequest,
 )
+from hoigs.plugins.estimators.object_tracker.appearance import Appearance, twins_of
 from hoigs.plugins.estimators.object_tracker.footage import ColorModel, Footage, bins_of, histogram
-from hoigs.plugins.estimators.object_tracker.path import Path, found_path, path_of
+from hoigs.plugins.estimators.object_tracker.path import (
+    Evidence,
+    Path,
+    found_path,
+    path_of,
+)
 from hoigs.plugins.estimators.object_tracker.prompts import Behind, PromptedMask, overlap, set_off
 from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Track, window_of
 from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, StaticScene, median_of
+from hoigs.plugins.estimators.object_tracker.states import LOST
+from hoigs.plugins.estimators.object_tracker.verified import Known, proof_of, without_unproven
 
 # Frames in which an object was found best, from which it is followed again.
 #
@@ -70,6 +79,7 @@ def _set_off(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]) -> float:
 
 
 SAME = 0.7  # intersection over union from which two passes agree on a frame
+NEARLY_ALL = 0.95  # share of the frames from which no second look for the object is worth it
 
 
 def followed(
@@ -78,21 +88,45 @@ def followed(
     prompts: Sequence[PromptedMask],
     progress: Callable[[float], None] = lambda share: None,
 ) -> Track:
-    """Masks of all frames, in two passes: the second knows what is behind an object that hides a
-    person who keeps still, or follows any other from the frames in which the first found it best.
+    """Masks of the frames that are proven to show the object; those of the others are empty.
+
+    In up to three passes: the second knows what the object looks like in the frames in which the
+    first found it best, the third what is behind an object that hides a person who keeps still.
     """
-    first = tracked(footage, scene, prompts, progress=lambda x: progress(0.5 * x))
+    looks, known = _learnt(footage, prompts)
+    first = tracked(footage, scene, prompts, looks=looks, progress=lambda x: progress(0.4 * x))
+    proof = proof_of(footage, scene, prompts, first, looks, known)
+    found = without_unproven(first, proof)
+    best = anchors(footage, found, prompts)
+    enough = proof.proven.mean() >= NEARLY_ALL and isinstance(scene, StaticScene)
+    if best and not enough and not known.twins:  # which no looks tell apart
+        looks, known = _learnt(footage, [*prompts, *best])
+        again = tracked(
+            footage, scene, prompts, best, looks, lambda x: progress(0.4 + 0.3 * x)
+        )  # fmt: skip
+        found = _joined(
+            *(
+                without_unproven(t, proof_of(footage, scene, prompts, t, looks, known))
+                for t in (first, again)
+            )
+        )
     behind = None
     if isinstance(scene, StaticScene):
-        behind = Behind.of(footage, scene, first.soft > 127)
+        behind = Behind.of(footage, scene, found.soft > 127)
+    if behind is None:
+        return found
+    better = tracked_again(
+        footage, behind, prompts, looks, found, lambda x: progress(0.7 + 0.3 * x)
+    )
+    return without_unproven(better, proof_of(footage, scene, prompts, better, looks, known))
 
-    def second(x: float) -> None:
-        progress(0.5 + 0.5 * x)
 
-    if behind is not None:
-        return tracked_again(footage, behind, prompts, first, second)
-    best = anchors(footage, first, prompts)
-    return _joined(first, tracked(footage, scene, prompts, best, second)) if best else first
+def _learnt(footage: Footage, known: Sequence[PromptedMask]) -> tuple[Appearance, Known]:
+    """What the object looks like in known frames, and these without others that look like it."""
+    masks = {p.frame: p.soft > 0.5 for p in known}
+    looks = Appearance.learnt(footage, masks)
+    twins = twins_of(looks, masks)
+    return Appearance.learnt(footage, masks, twins) if twins else looks, Known(masks, twins)
 
 
 def tracked(
@@ -100,9 +134,14 @@ def tracked(
     scene: Scene,
     prompts: Sequence[PromptedMask],
     further: Sequence[PromptedMask] = (),
+    looks: Appearance | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Track:
-    """Masks of every frame from those of the prompted ones, and of `further` frames."""
+    """Masks of every frame from those of the prompted ones, and of `further` frames.
+
+    Args:
+        looks: learnt from these; None: not yet.
+    """
     rests = at_rest(scene, {p.frame: p.soft > 0.5 for p in prompts})
     prompts = [*prompts, *further]
     known = {p.frame: p.soft > 0.5 for p in prompts}
@@ -110,21 +149,23 @@ def tracked(
     moving = isinstance(scene, MovingScene)
     # what rests is a part of a still camera's scene; a moving one's is that of nearby frames
     used = scene if moving or not rests else None
-    path = found_path(footage, used, colors, known, progress=lambda x: progress(0.3 * x))
+    evidence = Evidence(footage, used, colors, looks or _learnt(footage, prompts)[0])
+    path = found_path(evidence, known, progress=lambda x: progress(0.3 * x))
     stands = not rests and stands_out(footage, used, path, known)
     unchanged = 1.2 if stands else 0.1
-    walk = partial(Propagation, footage, used, colors, path, unchanged=unchanged, moving=moving)
+    walk = partial(Propagation, evidence, path, unchanged=unchanged, moving=moving)
     return _walked(footage, prompts, walk, lambda x: progress(0.3 + 0.7 * x))
 
 
 def _joined(first: Track, again: Track) -> Track:
     """The first pass where both have about the same: what comes from fewer frames drifts more, but
-    is not tied to the small faults of more of them. Elsewhere the second."""
+    is not tied to the small faults of more of them. Elsewhere the surer one."""
     pairs = zip(first.soft > 127, again.soft > 127, strict=True)
-    same = np.array([overlap(a, b) > SAME for a, b in pairs])
+    same = np.array([bool(a.any()) and overlap(a, b) > SAME for a, b in pairs])
+    kept = same | (first.confidence > again.confidence)
     return Track(
-        np.where(same[:, None, None], first.soft, again.soft),
-        np.where(same, first.confidence, again.confidence),
+        np.where(kept[:, None, None], first.soft, again.soft),
+        np.where(kept, first.confidence, again.confidence),
     )
 
 
@@ -132,6 +173,7 @@ def tracked_again(
     footage: Footage,
     behind: Behind,
     prompts: Sequence[PromptedMask],
+    looks: Appearance,
     before: Track,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Track:
@@ -143,9 +185,8 @@ def tracked_again(
     prompts = [behind.regrown(p) for p in prompts]
     colors = color_model(footage, {p.frame: p.soft for p in prompts})
     path = path_of(before.soft > 127)
-    walk = partial(
-        Propagation, footage, behind.scene, colors, path, unchanged=0.1, moving=False, behind=behind
-    )
+    evidence = Evidence(footage, behind.scene, colors, looks)
+    walk = partial(Propagation, evidence, path, unchanged=0.1, moving=False, behind=behind)
     return _walked(footage, prompts, walk, progress)
 
 
@@ -219,13 +260,22 @@ def _walks(known: list[int], count: int) -> list[tuple[int, range]]:
 # Tracks in a file, so that a video is tracked once.
 
 
+@dataclass(frozen=True)
+class Said:
+    """What is said of the tracks: prompts that were chosen for objects that had none, notes, and
+    where each object is in each frame (`states.states_of`)."""
+
+    chosen: dict[str, list[FramePrompt]]
+    notes: list[str]
+    states: dict[str, list[str]]
+
+
 def write_tracks(
     file: FilePath,
     video: VideoRequest,
     footage: Footage,
     tracks: dict[str, Track | None],
-    chosen: dict[str, list[FramePrompt]],
-    notes: list[str],
+    said: Said,
 ) -> None:
     """Everything that `read_tracks` needs, under a temporary name first."""
     arrays: dict[str, np.ndarray] = {}
@@ -239,10 +289,11 @@ def write_tracks(
         arrays[f"confidence {name}"] = confidence
     about = {
         "numbers": footage.numbers,
-        "notes": notes,
+        "notes": said.notes,
+        "states": said.states,
         "chosen": {
             n: [[p.frame, [[q.x, q.y, q.inside] for q in p.points], p.box] for p in prompts]
-            for n, prompts in chosen.items()
+            for n, prompts in said.chosen.items()
             if prompts
         },
     }
@@ -269,9 +320,14 @@ def read_tracks(file: FilePath, video: VideoRequest, names: Sequence[str]) -> En
         )
         for n, prompts in about["chosen"].items()
     }
+    states = {
+        n: [about["states"][n][row[i]] if i in row else LOST for i in range(video.frames)]
+        for n in names
+    }
     return EntityMasks(
-        masks, None, "object tracker without a network", confidence, chosen, tuple(about["notes"])
-    )
+        masks, None, "object tracker, learnt on the video", confidence, chosen,
+        tuple(about["notes"]), states,
+    )  # fmt: skip
 
 
 def _mask_at(soft: np.ndarray, row: dict[int, int], video: VideoRequest, i: int) -> np.ndarray:

@@ -55,11 +55,12 @@ def test_from_anchors_a_thing_is_found_where_one_click_misses_it() -> None:
     assert score[1] > score[0] + 0.1
 
 
-def test_where_both_passes_agree_the_first_stays_and_elsewhere_the_second_counts() -> None:
+def test_where_both_passes_agree_the_first_stays_and_elsewhere_the_surer_counts() -> None:
     _, discs, first = spoilt_track()
     nearly = np.stack([ndimage.binary_erosion(d) for d in discs])
-    joined = _joined(first, Track(soft(nearly), np.full(len(discs), 0.5)))
     differs = [*SPOILT, 30]
+    first.confidence[differs] = 0.4
+    joined = _joined(first, Track(soft(nearly), np.full(len(discs), 0.5)))
     assert (joined.soft[differs] == soft(nearly)[differs]).all()
     assert (joined.confidence[differs] == 0.5).all()
     same = np.setdiff1d(np.arange(len(discs)), differs)

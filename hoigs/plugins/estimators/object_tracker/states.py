@@ -1,0 +1,65 @@
+"""Where an object is in the frames that do not show it: out of the picture, hidden, or lost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool
+
+from hoigs.plugins.estimators.object_tracker.footage import Footage
+from hoigs.plugins.estimators.object_tracker.path import center_of
+from hoigs.plugins.estimators.object_tracker.propagation import Track
+
+SEEN, OUT, LOST, PERSON = "seen", "out of the picture", "lost", "hidden by a person"
+RIM = 2  # pixels from the edge of the picture within which a mask reaches it
+COVERED = 0.5  # share of its place from which something hides it
+SAME_PLACE = 1.5  # breadths between the sightings around a gap, up to which it stayed about there
+
+
+def states_of(footage: Footage, tracks: Mapping[str, Track | None]) -> dict[str, list[str]]:
+    """The state of each object in each frame.
+
+    An object that was last seen at the edge of the picture, or is seen next at it, is out of it;
+    one that was seen before and after in about one place, which a person or another object covers
+    meanwhile, is hidden. Of all else nothing is known: it is lost.
+    """
+    masks = {name: None if t is None else t.soft > 127 for name, t in tracks.items()}
+    found = {}
+    for name, own in masks.items():
+        if own is None:
+            found[name] = [LOST] * len(footage)
+            continue
+        others = {n: m for n, m in masks.items() if n != name and m is not None}
+        seen = np.flatnonzero(own.any((1, 2)))
+        states = [SEEN if m.any() else LOST for m in own]
+        for i in np.flatnonzero(~own.any((1, 2))).tolist():
+            around = [*seen[seen < i][-1:], *seen[seen > i][:1]]
+            if any(_at_edge(own[k]) for k in around):
+                states[i] = OUT
+            elif len(around) == 2:
+                states[i] = _hidden(footage, own[around[0]], own[around[1]], others, i)
+        found[name] = states
+    return found
+
+
+def _at_edge(mask: Bool[np.ndarray, "h w"]) -> bool:
+    inner = mask[RIM:-RIM, RIM:-RIM]
+    return bool(inner.sum() < mask.sum())
+
+
+def _hidden(
+    footage: Footage,
+    before: Bool[np.ndarray, "h w"],
+    after: Bool[np.ndarray, "h w"],
+    others: Mapping[str, Bool[np.ndarray, "F h w"]],
+    i: int,
+) -> str:
+    """What covers the place of an object that stayed about where it was, in frame `i`."""
+    way = np.subtract(center_of(before), center_of(after))
+    if np.hypot(*way) > SAME_PLACE * np.sqrt(before.sum()):
+        return LOST
+    for name, masks in others.items():
+        if masks[i][before].mean() > COVERED:
+            return f"hidden by {name}"
+    return PERSON if footage.person[i][before].mean() > COVERED else LOST

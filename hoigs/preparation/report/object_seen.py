@@ -1,0 +1,90 @@
+"""How much of each object is proven to be seen, how well it is placed, and which click helps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+
+SEEN = "seen"  # `EntityMasks.states` of a frame whose mask is verified
+DOUBTFUL = 0.5  # agreement of a verified frame's cues below which a click there helps
+
+
+@dataclass(frozen=True)
+class ObjectSeen:
+    """What is known of one object's masks and track.
+
+    Attributes:
+        states: state to the frames of the clip that are in it, "seen" among them; empty: the
+            estimator of its masks did not say.
+        click: the frame of the video in which a click would help most, and why; None: none would.
+        place_m: metres by which its place is off from frame to frame, typically.
+        turn_degrees: by which its rotation is off, typically; None: its turn cannot be seen.
+    """
+
+    states: dict[str, list[int]] = field(default_factory=dict)
+    click: tuple[int, str] | None = None
+    place_m: float | None = None
+    turn_degrees: float | None = None
+
+    @property
+    def share(self) -> float | None:
+        """The part of the frames in which it is seen."""
+        count = sum(map(len, self.states.values()))
+        return len(self.states.get(SEEN, [])) / count if count else None
+
+    @property
+    def unseen(self) -> str:
+        """The other frames, by state."""
+        others = [f"{s} in {len(f)}" for s, f in self.states.items() if s != SEEN]
+        return ", ".join(others) or "in all frames"
+
+    @property
+    def place(self) -> str:
+        """Its place and turn, with their errors."""
+        place = "unknown" if self.place_m is None else f"± {1000 * self.place_m:.0f} mm"
+        turn = self.turn_degrees
+        return f"{place}, " + ("its turn cannot be seen" if turn is None else f"turn ± {turn:.0f}°")
+
+    @property
+    def advice(self) -> str:
+        """The click that would help most, or "" where none would."""
+        return "" if self.click is None else f"click it in frame {self.click[0]}: {self.click[1]}"
+
+
+def by_state(states: Sequence[str]) -> dict[str, list[int]]:
+    """The frames that are in each state."""
+    found: dict[str, list[int]] = {}
+    for i, state in enumerate(states):
+        found.setdefault(state, []).append(i)
+    return found
+
+
+def best_click(
+    states: Sequence[str], confidence: Sequence[float], numbers: Sequence[int]
+) -> tuple[int, str] | None:
+    """The middle of the longest run of frames in which the object is lost; if it never is, the
+    verified frame of most doubt."""
+    runs = [
+        [i for i, _ in group]
+        for state, group in groupby(enumerate(states), key=lambda pair: pair[1])
+        if state == "lost"
+    ]
+    if runs:
+        longest = max(runs, key=len)
+        middle = longest[len(longest) // 2]
+        count = f"{len(longest)} frames" if len(longest) > 1 else "a frame"
+        return numbers[middle], f"the middle of {count} in which it is lost, if it is in view"
+    seen = [(confidence[i], i) for i, state in enumerate(states) if state == SEEN]
+    if seen and min(seen)[0] < DOUBTFUL:
+        return numbers[min(seen)[1]], "it is seen there with most doubt"
+    return None
+
+
+def named(seen: ObjectSeen) -> Iterator[tuple[str, str, str]]:
+    """Rows of what, value and note, without the object's name."""
+    if seen.share is not None:
+        yield "seen, verified", f"{100 * seen.share:.0f} % of the frames", seen.unseen
+    yield "place", seen.place, "from frame to frame; all of it scales with its supposed distance"
+    if seen.advice:
+        yield "best click", f"frame {seen.click[0] if seen.click else ''}", seen.advice

@@ -1,0 +1,83 @@
+"""Masks of estimator:object-tracker are given only where they are proven, and the rest is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from disc_world import COUNT, RADIUS, H, W, click, masks_of, overlaps, request, texture, world
+from test_behind import footage_of
+
+from hoigs.plugins.estimators.object_tracker.propagation import Track
+from hoigs.plugins.estimators.object_tracker.states import LOST, OUT, PERSON, SEEN, states_of
+from hoigs.plugins.estimators.object_tracker.verified import _continued, _followed
+
+Y, X = np.mgrid[:H, :W] + 0.5
+
+
+def disc(x: float, y: float) -> np.ndarray:
+    return np.hypot(X - x, Y - y) < RADIUS
+
+
+def test_a_ball_that_leaves_the_picture_becomes_nothing_else(tmp_path: Path) -> None:
+    """A patch of the wall has its colours. It was followed there, and called seen."""
+    frames, people, _ = world()
+    wall, ball = texture(0, (120, 130, 90)), texture(1, (200, 60, 50))
+    discs = [disc(30 + 11 * i, 40 - 3 * i) & (Y > 0) for i in range(COUNT)]
+    for i, image in enumerate(frames):
+        image[...] = wall[:, :W]
+        image[people[i]] = 70, 80, 150
+        image[disc(20, 62)] = 200, 60, 50
+        rolled = np.roll(ball[:, :W], (-3 * i, 11 * i), (0, 1))
+        image[discs[i]] = rolled[discs[i]]
+    found = masks_of(request(tmp_path, (frames, people, discs), (click(0, 30, 40),)))
+    masks = [found.entities["object"][i] for i in range(COUNT)]
+    gone = [i for i, d in enumerate(discs) if not d.any()]
+    assert gone and not any(masks[i].any() for i in gone)
+    assert overlaps(found, discs)[:6].min() > 0.7
+    assert [found.states["object"][i] for i in gone] == [OUT] * len(gone)
+
+
+def test_states_of_a_thing_behind_the_back_and_of_one_that_nobody_knows_of() -> None:
+    person = disc(50, 40)
+    frames, people = [np.zeros((H, W, 3), np.uint8) + 90] * 5, [person] * 5
+    nothing = np.zeros((H, W), bool)
+    behind = np.stack([disc(50, 40), nothing, nothing, disc(51, 40), nothing])
+    jumped = np.stack([disc(20, 20), nothing, disc(90, 50), nothing, disc(90, 50)])
+    leaves = np.stack([disc(40, 20), disc(60, 12), disc(80, 4), nothing, nothing])
+    tracks = {
+        n: Track(np.uint8(255) * m, np.ones(5))
+        for n, m in (("behind", behind), ("jumped", jumped), ("leaves", leaves))
+    }
+    found = states_of(footage_of(frames, people), {**tracks, "never": None})
+    assert found["behind"] == [SEEN, PERSON, PERSON, SEEN, LOST]
+    assert found["jumped"] == [SEEN, LOST, SEEN, LOST, SEEN]
+    assert found["leaves"] == [SEEN] * 3 + [OUT] * 2
+    assert found["never"] == [LOST] * 5
+
+
+@pytest.mark.parametrize(
+    "places, believed",
+    [
+        ([(20, 40), (26, 40), (32, 40), (38, 40)], [1, 1, 1, 1]),
+        ([(20, 40), (26, 40), (98, 40), (32, 40)], [1, 1, 0, 1]),  # and back
+        ([(20, 20), (50, 20), (80, 20), (88, 20)], [1, 0, 0, 1]),  # as far as time allows
+    ],
+)
+def test_a_frame_to_which_the_object_jumped_is_not_believed(places, believed) -> None:
+    masks = np.stack([disc(*at) for at in places])
+    agreement = np.array([1.0, 0.9, 0.9, 0.9])
+    found = _continued(masks, agreement, agreement > 0.5, [0])
+    assert found.astype(int).tolist() == believed
+
+
+def test_of_equal_things_one_that_was_lost_or_grew_is_not_believed_again() -> None:
+    masks = np.stack([disc(20 + 4 * i, 40) for i in range(8)])
+    sure = np.full(8, 0.9)
+    assert _followed(masks, sure, sure > 0.5, [1]).all()
+    hidden = sure.copy()
+    hidden[4] = 0.1
+    assert _followed(masks, hidden, hidden > 0.5, [1]).tolist() == [True] * 4 + [False] * 4
+    masks[5] |= disc(55, 40)  # takes in its neighbour
+    assert _followed(masks, sure, sure > 0.5, [1]).tolist() == [True] * 5 + [False] * 3

@@ -1,0 +1,37 @@
+"""What is said of the frames in which an object is proven to be seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from test_prepare_report import report
+
+from hoigs.preparation.report.object_seen import ObjectSeen, best_click, by_state
+
+STATES = ["seen"] * 3 + ["lost"] * 2 + ["seen"] + ["lost"] * 3 + ["hidden by a person"]
+
+
+def test_the_best_click_is_in_the_middle_of_the_longest_loss() -> None:
+    numbers = [2 * i for i in range(len(STATES))]
+    click = best_click(STATES, [1.0] * len(STATES), numbers)
+    assert click is not None and click[0] == 14
+
+
+def test_without_a_loss_the_best_click_is_where_doubt_is_greatest_or_nowhere() -> None:
+    assert best_click(["seen"] * 3, [0.9, 0.3, 0.4], [5, 6, 7])[0] == 6  # type: ignore[index]
+    assert best_click(["seen", "out of the picture"], [0.9, 0.0], [0, 1]) is None
+
+
+def test_an_object_that_is_seen_in_few_frames_is_bad_and_its_other_frames_are_named() -> None:
+    seen = ObjectSeen(by_state(STATES), (14, "it is lost"), place_m=0.05)
+    assert seen.share == 0.4 and "turn cannot be seen" in seen.place
+    made = replace(report(), frames=len(STATES), objects_seen={"club": seen})
+    (one,) = [d for d in made.diagnostics() if d.kind == "club seen"]
+    assert one.severity == "bad" and one.frames == (3, 4, 6, 7, 8, 9)
+    assert "--object club=X,Y@FRAME" in one.do
+    assert ("club: seen, verified", "40 % of the frames") in [row[:2] for row in made.rows()]
+    whole = replace(seen, states=by_state(["seen"] * 10), click=None)
+    (one,) = [
+        d for d in replace(made, objects_seen={"club": whole}).diagnostics() if "club" in d.kind
+    ]
+    assert one.severity == "good" and not one.do
