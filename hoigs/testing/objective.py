@@ -39,7 +39,8 @@ class ObjectiveSubject(ComponentSubject[Objective]):
         Args:
             only: leave out the other entity. blind: the frame has no masks and no depth.
         """
-        clip, kinds = tiny_clip(), {HUMAN: "human", OBJECT: "object"}
+        clip = tiny_clip()
+        kinds: dict[str, EntityKind] = {HUMAN: "human", OBJECT: "object"}
         scene = SceneModel(
             {n: _entity(i, kind) for i, (n, kind) in enumerate(kinds.items()) if only in ("", n)},
             rasterizer=TorchRasterizer(),
