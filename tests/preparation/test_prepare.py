@@ -109,7 +109,7 @@ def test_files_beside_the_clip(static: tuple[Path, PrepareReport, list[float]]) 
 def test_options(tiny_source: Path, tmp_path: Path, body: AnnyBody) -> None:
     clip, report = prepared(
         tiny_source, tmp_path / "clip", body, width=48, every=2, max_frames=4, focal=100.0,
-        image_format="png", human_name="man", object="ball",
+        image_format="png", human_name="man", object_name="ball",
     )  # fmt: skip
     assert (len(clip), clip.cameras[0].width) == (4, 48)
     taken = np.array(clip.provenance["frames"])  # the sharpest of each two keep their times
