@@ -304,7 +304,7 @@ class PrepareOptions(Options):
         if made.estimators:  # so that errors in them are reported at once, too
             from hoigs.preparation.estimates.installed import installed_estimators
 
-            installed_estimators(made, document)
+            installed_estimators(made.estimators, document)
         return made
 
     @property

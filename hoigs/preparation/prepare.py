@@ -150,7 +150,7 @@ def _run(
         check_stage(name)
     _check_paths(source, out, options.overwrite or bool(options.redo) or until is not None)
     options, stored = with_stored(options, find_video(source))
-    named = installed_estimators(options)
+    named = installed_estimators(options.estimators)
     if not options.allow_commands:
         refuse_commands(named)  # `estimators` are the caller's own code
     own = {} if isinstance(estimators, str) else (estimators or {})
@@ -175,7 +175,7 @@ def _run(
     specs = plan.specs()
     for kind, spec in found.beside.items():
         specs[kind] = spec
-    chosen = {**installed_estimators(PrepareOptions(estimators=specs)), **chosen}
+    chosen = {**installed_estimators(specs), **chosen}
     if talk.announce is not None:
         talk.announce(plan)
     get_ready(plan, chosen, agree if options.yes else talk.consent, talk.progress)

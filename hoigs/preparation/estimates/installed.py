@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 from pydantic import ValidationError
 
@@ -12,25 +13,31 @@ from hoigs.core.interfaces.estimator import EstimateKind, Estimator
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.errors import explain
 from hoigs.core.spec.loader import Document
-from hoigs.preparation.options import Place, PrepareOptions
+from hoigs.core.spec.schema import ComponentSpec
+
+Place = EstimateKind | Literal["object"]  # "object": masks of the object alone
 
 
 def installed_estimators(
-    options: PrepareOptions, document: Document | None = None, registry: Registry | None = None
+    specs: Mapping[Place, ComponentSpec],
+    document: Document | None = None,
+    registry: Registry | None = None,
 ) -> dict[Place, Estimator]:
-    """The estimators that `options.estimators` names, built from their plugins.
+    """The estimators that specs name, built from their plugins.
 
     Args:
-        document: where the options came from, for messages.
+        document: where the specs came from, under `estimators`, for messages.
 
     Raises:
         SpecError: an estimator is unknown, gives something else, or its settings are wrong.
     """
     registry = registry or default_registry()
-    document = document or Document("options", options.model_dump(mode="json"))
+    if document is None:
+        data = {role: spec.model_dump(mode="json") for role, spec in specs.items()}
+        document = Document("options", {"estimators": data})
     estimators: dict[Place, Estimator] = {}
     problems: list[str] = []
-    for role, spec in options.estimators.items():
+    for role, spec in specs.items():
         kind: EstimateKind = "masks" if role == "object" else role
         place = ("estimators", role)
         at = f"{document.where((*place, 'use'))} estimators.{role}.use"

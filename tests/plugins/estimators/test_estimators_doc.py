@@ -38,7 +38,7 @@ def built(options: dict, folder: Path) -> dict[str, Estimator]:
     """Options as `hoigs prepare --options FILE` reads them, and the estimators that they name."""
     path = folder / "options.yaml"
     path.write_text(yaml.safe_dump(options))
-    return installed_estimators(load_options(path))
+    return installed_estimators(load_options(path).estimators)
 
 
 @pytest.mark.parametrize("block", BLOCKS)

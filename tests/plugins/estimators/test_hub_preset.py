@@ -202,7 +202,7 @@ def test_all_networks_of_the_preset_are_downloaded_and_find_things_in_a_frame(
         for place, spec in plan.specs().items()
         if place != "object"
     }
-    chosen = installed_estimators(PrepareOptions(estimators=specs))
+    chosen = installed_estimators(specs)
     masks = chosen["masks"].estimate(video, no_progress).masks
     assert masks is not None and masks.entities["human"][0].shape == (HEIGHT, WIDTH)
     points = chosen["landmarks"].estimate(video, no_progress).landmarks["human"]
