@@ -17,7 +17,6 @@ from jaxtyping import Float
 
 from hoigs.core.clip_folder.write import ClipWriter
 from hoigs.core.interfaces.body import PELVIS
-from hoigs.core.model.standing import world_of_people
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import POSES_ESTIMATED, BodyTrack
 from hoigs.core.values.world import World
@@ -30,6 +29,7 @@ from hoigs.preparation.people import Body
 from hoigs.preparation.report.object_seen import ObjectSeen, best_click, by_state
 from hoigs.preparation.report.overlay import OverlayVideo, save_object_picture, several, shown_frame
 from hoigs.preparation.report.report import PrepareReport
+from hoigs.preparation.upright import world_of
 from hoigs.preparation.video.source import SourceError
 
 BODY_JOINTS = 22  # without the hands', which are not fitted
@@ -65,10 +65,13 @@ def write_clip_folder(
         for name, thing in draft.objects.items():
             writer.set_object(name, thing.track)
         writer.set_points(draft.scene.points, draft.scene.colors)
-        # up and floor by the people who stand, else by the cameras
-        people = [(draft.body, person.poses) for person in draft.bodies.values()]
-        world = world_of_people(people, draft.video.fps) if people else None
-        writer.set_world(World.guessed(draft.cameras) if world is None else world)
+        world = world_of(draft, _focal_range(draft))
+        writer.set_world(world)
+        if world.is_guess:
+            why = (
+                "nobody stands, and no vertical lines are clear: the cameras are taken to be level"
+            )
+            draft = draft.noting(unknown={"up": why})
         if draft.video.uneven:
             writer.set_times(draft.video.times)
         if draft.track.model is not None:
@@ -80,7 +83,7 @@ def write_clip_folder(
             unknown=draft.unknown,
             **{POSES_ESTIMATED: True},
         )
-        draft = replace(draft, report=_report(draft, options, writer.name))
+        draft = replace(draft, report=_report(draft, options, writer.name, world))
         draft.report.save(writer.root)
     cleanup.remove()
     return draft
@@ -128,7 +131,7 @@ def _object_picture(draft: Draft, options: PrepareOptions) -> int | None:
     return shown_frame(draft.video.indices, draft.found_object.boxes, prompted, coverage)
 
 
-def _report(draft: Draft, options: PrepareOptions, name: str) -> PrepareReport:
+def _report(draft: Draft, options: PrepareOptions, name: str, world: World) -> PrepareReport:
     middle = torch.median(draft.scene.points, dim=0).values
     person, figures, depth = draft.person, draft.track.figures, draft.depth
     joints = [one.joints[:, :BODY_JOINTS] for one in draft.bodies.values()]
@@ -180,6 +183,8 @@ def _report(draft: Draft, options: PrepareOptions, name: str) -> PrepareReport:
         displacement_px=figures.get("displacement_px"),
         focal_px=round(float(draft.cameras[0].K[0, 0]), 1),
         focal_range=_focal_range(draft),
+        up_known=world.known,
+        up_within=world.within,
         sharpness=[round(value, 4) for value in draft.video.sharpness],
         body_residuals_px=[] if person is None else _numbers(person.residuals.numpy(), 2),
         body_residual_m=None if person is None else _metres_off(person, draft.cameras),

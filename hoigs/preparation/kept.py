@@ -49,7 +49,10 @@ class Stage:
 
 PLAN = {
     "frames": Stage(
-        2, (), ("width", "every", "fps", "max_frames", "pick", "folder_fps", "start", "end")
+        2,
+        (),
+        ("width", "every", "fps", "max_frames", "pick", "folder_fps", "start", "end"),
+        version=2,
     ),
     "estimates": Stage(
         30,

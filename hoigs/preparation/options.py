@@ -76,7 +76,8 @@ class PrepareOptions(Options):
     )
     pick: Pick = Field(
         default="sharpest",
-        description='which frame of each n to take: the "sharpest" or the "first"',
+        description='which frame of each n to take: the "first", or the "sharpest" if it is '
+        "clearly sharper than the first",
     )
     folder_fps: float = Field(
         default=30.0, gt=0, description="frames a second of a folder of frames"

@@ -141,11 +141,10 @@ def choose_frames(path: Path, options: PrepareOptions) -> tuple[FrameList, list[
     notes = []
     if path.is_file() and span.end is None and options.max_frames is None:
         notes += missing_frames(path, frames.total)
-    if frames.uneven:
+    if frames.variable:
         notes.append(
-            f"the chosen frames are not evenly spaced (a variable frame rate, or the "
-            f"sharpest of each few): the clip keeps their true times, {frames.fps:.4g} a "
-            "second on average"
+            "the video's frames are not evenly spaced (a variable frame rate): the clip keeps "
+            f"their true times, {frames.fps:.4g} a second on average"
         )
     return frames.list, [*notes, *frames.notes]
 

@@ -283,7 +283,7 @@ def test_a_clip_of_an_object_alone(alone: Path, tmp_path: Path) -> None:
     assert not clip.bodies and set(clip.objects) == {"object"}
     assert "nobody" in report.provenance["body"] and "--object-size" not in report.to_markdown()
     assert any("taken to be 0.3 m" in text for text in report.warnings)
-    supposed = {"unit of the world", "rotation of object", "depth of the scene"}
+    supposed = {"unit of the world", "rotation of object", "depth of the scene", "up"}
     assert set(report.unknown) == supposed and clip.provenance["unknown"] == report.unknown
     page = (out / "report.html").read_text()
     assert all(f"**{what}**" in report.to_markdown() and what in page for what in supposed)

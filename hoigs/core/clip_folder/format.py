@@ -65,6 +65,7 @@ class WorldHeader(_Strict):
     floor: Finite | None = None
     metres: bool = True
     known: How = "given"
+    within: Finite | None = None
 
     @field_validator("up")
     @classmethod

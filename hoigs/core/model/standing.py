@@ -32,6 +32,7 @@ RESTS = 0.15  # metres a second: an ankle slower than this is at rest
 SAME = 0.1  # metres: a foot that rested nearer than this to an earlier place tells nothing new
 OFF_BODY = 0.07  # radians: how far the body's mean up is off
 OFF_FLOOR = 0.03  # metres: how far a resting ankle is from its usual height
+NINE_OF_TEN = 1.645  # standard deviations
 ROUNDS = 10  # of the weighted least squares
 
 Array = np.ndarray
@@ -68,10 +69,11 @@ def world_of_people(
     if not upright:
         return None
     body_up = _unit(np.concatenate(upright).mean(0))
-    up, sure = _joined(body_up, np.concatenate(rested))
+    up, sure, within = _joined(body_up, np.concatenate(rested))
     heights = np.concatenate([(vertices @ up).min(1) for _, vertices in lowest])
     x, y, z = up.tolist()
-    return World((x, y, z), float(np.median(heights)), metres, "floor" if sure else "body")
+    floor = float(np.median(heights))
+    return World((x, y, z), floor, metres, "floor" if sure else "body", within)
 
 
 def in_known_world(clip: Clip, bodies: Mapping[str, BodyModel]) -> Clip:
@@ -127,10 +129,11 @@ def _places(ankles: Float[Array, "N 3"]) -> Float[Array, "M 3"]:
 
 def _joined(
     body_up: Float[Array, " 3"], places: Float[Array, "M 3"]
-) -> tuple[Float[Array, " 3"], bool]:
+) -> tuple[Float[Array, " 3"], bool, float]:
     """Up that is near the body's and normal to the plane of the places, each as sure as it is.
 
-    The second value tells whether the places fix both of its angles better than the body does.
+    The second value tells whether the places fix both of its angles better than the body does, the
+    third within how many degrees up is in nine of ten cases.
     """
     up = body_up
     across = np.linalg.svd(body_up[None])[2][1:]  # two directions along the floor
@@ -146,7 +149,9 @@ def _joined(
         informed = (weights[:, None] * flat).T @ flat / OFF_FLOOR**2
         tilt = -np.linalg.solve(informed + prior, flat.T @ (weights * level) / OFF_FLOOR**2)
         up = _unit(body_up + tilt @ across)
-    return up, bool(np.linalg.eigvalsh(informed)[0] > prior[0, 0])
+    spread = np.sqrt(1 / np.linalg.eigvalsh(informed + prior)[0])
+    within = round(float(np.degrees(NINE_OF_TEN * spread)), 1)
+    return up, bool(np.linalg.eigvalsh(informed)[0] > prior[0, 0]), within
 
 
 def _unit(vector: Float[Array, " 3"]) -> Float[Array, " 3"]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hoigs.core.values.camera import Camera
 
-How = Literal["given", "floor", "body", "cameras (guess)"]
+How = Literal["given", "floor", "lines", "body", "cameras (guess)"]
 GUESS: How = "cameras (guess)"
 
 
@@ -27,17 +27,21 @@ class World:
             where it is not known.
         metres: whether lengths are metres; False where their unit is arbitrary.
         known: who says so. "given": the data. "floor": feet that stood in several places.
-            "body": the people, while they stand upright. "cameras (guess)": the mean upward
-            direction of the cameras, which is wrong by as much as they are tilted.
+            "lines": vertical lines of the room. "body": the people, while they stand upright.
+            "cameras (guess)": the mean upward direction of the cameras, which is wrong by as much
+            as they are tilted.
+        within: degrees within which `up` is, in nine of ten cases; None where that is not known.
 
     Raises:
-        ValueError: `up` has no direction, `floor` is not finite, or `known` is another word.
+        ValueError: `up` has no direction, `floor` is not finite, `known` is another word, or
+            `within` is no angle.
     """
 
     up: tuple[float, float, float]
     floor: float | None = None
     metres: bool = True
     known: How = "given"
+    within: float | None = None
 
     def __post_init__(self) -> None:
         length = math.hypot(*self.up)
@@ -47,6 +51,8 @@ class World:
             raise ValueError(f"floor is {self.floor}, expected a finite number or None")
         if self.known not in get_args(How):
             raise ValueError(f"known is {self.known!r}, expected one of {', '.join(get_args(How))}")
+        if self.within is not None and not 0 <= self.within <= 180:
+            raise ValueError(f"within is {self.within}, expected 0 to 180 degrees or None")
         if abs(length - 1) < 1e-12:  # so that what is stored comes back as it was
             length = 1.0
         x, y, z = (float(value) / length for value in self.up)
@@ -75,10 +81,12 @@ class World:
         """For JSON."""
         return {
             "up": list(self.up), "floor": self.floor, "metres": self.metres, "known": self.known,
+            "within": self.within,
         }  # fmt: skip
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> World:
         """The inverse of `to_dict`; ValueError as the class."""
         x, y, z = content["up"]
-        return cls((x, y, z), content["floor"], content["metres"], content["known"])
+        within = content.get("within")  # of folders that were written before 0.3: not known
+        return cls((x, y, z), content["floor"], content["metres"], content["known"], within)

@@ -45,6 +45,8 @@ class Measures:
         reprojection_px: of COLMAP's points, mean; None for a static camera.
         focal_px: of the stored frames. focal_range: shortest and longest that it may be, as shares
             of it; None: it is given, or of structure from motion.
+        up_known: what tells which way is up (`hoigs.core.values.world.World`). up_within: degrees
+            within which it is; None: not known.
         displacement_px: of a static camera's background, at a width of 640; None if not measured.
         sharpness: of each frame (`sharpness.sharpness`).
         body_residuals_px: of each frame; None without landmarks.
@@ -91,6 +93,8 @@ class Measures:
     displacement_px: float | None = None
     focal_px: float | None = None
     focal_range: tuple[float, float] | None = None
+    up_known: str = ""
+    up_within: float | None = None
     sharpness: list[float] = field(default_factory=list)
     body_residuals_px: list[float | None] = field(default_factory=list)
     body_residual_m: float | None = None
@@ -127,7 +131,13 @@ class MeasureDiagnostic(Diagnostic):
 
 def diagnose(measures: Measures) -> list[MeasureDiagnostic]:
     """Every measure that can be judged, in the order of the stages."""
-    return [*_cameras(measures), *_frames(measures), *_tracks(measures), *_views(measures)]
+    return [
+        *_cameras(measures),
+        *_up(measures),
+        *_frames(measures),
+        *_tracks(measures),
+        *_views(measures),
+    ]
 
 
 def _judge(value: float, good: float, fair: float) -> Severity:
@@ -193,6 +203,28 @@ def _cameras(report: Measures) -> Iterator[MeasureDiagnostic]:
         _judge(-report.parallax_degrees, -10, -5),
         "the scene's depth is weakly known: walk around the person next time, or add an "
         "estimator of depth",
+    )
+
+
+UP = {
+    "floor": "feet that stood in several places", "lines": "vertical lines of the room",
+    "body": "people who stand", "given": "the data",
+}  # fmt: skip
+
+
+def _up(report: Measures) -> Iterator[MeasureDiagnostic]:
+    if not report.up_known:
+        return
+    known = report.up_within is not None
+    yield _judged(
+        "up",
+        f"± {report.up_within:.1f}°" if known else "a guess",
+        f"by {UP[report.up_known]}"
+        if report.up_known in UP
+        else "the cameras are taken to be level: it is wrong by as much as they look down or up",
+        _judge(report.up_within or 0.0, 3.0, 10.0) if known else "bad",
+        "film where walls, doors or shelves are in view, and let somebody stand for a moment; give "
+        "--focal, by which a tilt scales",
     )
 
 

@@ -65,10 +65,21 @@ def video_header(path: Path) -> tuple[int, float] | None:
         return None
 
 
+def hidden_frames(path: Path) -> int:
+    """Number of frames in a video that its edit list does not show."""
+    container, stream = open_video(path)
+    with container:
+        packets = (packet for packet in container.demux(stream) if packet.size)
+        return sum(bool(getattr(packet, "is_discard", False)) for packet in packets)
+
+
 def missing_frames(path: Path, found: int) -> list[str]:
-    """A sentence for the report if a video's header has more frames than were found."""
+    """A sentence for the report if a video's header has more frames than were found, and than its
+    edit list hides: phones and cutting programs leave frames in a file that are not shown."""
     header = video_header(path)
     if header is None or found >= MOST * header[0]:
+        return []
+    if found + hidden_frames(path) >= MOST * header[0]:
         return []
     return [
         f"the video's header gives {header[0]} frames, {found} were found: the file may be cut off"

@@ -27,6 +27,7 @@ from hoigs.preparation.video.source import IMAGE_SUFFIXES, SourceError, numbered
 
 UNEVEN = 0.1  # of the gap between frames: times that are so far from even ones are kept
 FAR = 30  # frames ahead, from which on decoding begins anew at a keyframe
+SHARPER = 1.4  # times as sharp as the first of a window: its blur is seen
 LATE = 0.05  # of a window: a frame this little before it belongs to it, for times are rounded
 
 
@@ -73,7 +74,8 @@ class Frames(ABC):
         width, height: of the frames given out.
         fps: of the frames given out, `every` allowed for; the mean of uneven ones.
         times: of the frames given out, seconds since the source's first frame. uneven: whether
-            they are not `fps` frames a second, evenly.
+            they are not `fps` frames a second, evenly. variable: whether those of the source are
+            not evenly spaced, either.
         indices: the source's frame number of each frame given out.
         total: frames in the source, up to the last one looked at.
         sharpness: of each frame given out.
@@ -123,6 +125,16 @@ class Frames(ABC):
             return False
         even = np.linspace(times[0], times[-1], len(times))
         return bool(np.abs(times - even).max() > UNEVEN * (even[1] - even[0]))
+
+    @property
+    def variable(self) -> bool:
+        """Whether the source's own frames are not evenly spaced, whichever were chosen of them."""
+        times, numbers = np.array(self.times), np.array(self.indices)
+        if len(times) < 3:
+            return False
+        step = (times[-1] - times[0]) / (numbers[-1] - numbers[0])
+        even = times[0] + step * (numbers - numbers[0])
+        return bool(np.abs(times - even).max() > UNEVEN * step)
 
     @property
     def fps(self) -> float:
@@ -237,6 +249,7 @@ class _Windows:
         self.times: list[float] = []
         self._begun: tuple[int, float] | None = None
         self._window = -1
+        self._first = 0.0  # sharpness of the window's first frame
 
     def fps(self) -> float:
         return self.rate / self.every if self.wanted_fps is None else self.wanted_fps
@@ -262,8 +275,10 @@ class _Windows:
             return True
         self._window = window
         value = sharpness(picture)
-        if not new and value <= self.sharpnesses[-1]:
+        # frames at even steps are left for those alone that are clearly sharper
+        if not new and value <= max(self.sharpnesses[-1], SHARPER * self._first):
             return True
+        self._first = value if new else self._first
         at = len(self.indices) if new else len(self.indices) - 1
         self.indices[at:], self.sharpnesses[at:], self.times[at:] = [number], [value], [seconds]
         return True

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import av
+import numpy as np
 import pytest
 from tiny import FRAMES
 
-from hoigs.preparation.video.container import missing_frames, video_header
+from hoigs.preparation.video.container import hidden_frames, missing_frames, video_header
 
 
 def test_a_video_that_is_shorter_than_its_header_says(tiny_video: Path) -> None:
@@ -15,6 +17,26 @@ def test_a_video_that_is_shorter_than_its_header_says(tiny_video: Path) -> None:
     assert missing_frames(tiny_video, FRAMES) == []
     (sentence,) = missing_frames(tiny_video, 5)
     assert "12 frames, 5 were found" in sentence
+
+
+def test_frames_that_an_edit_list_hides_are_not_missing(tmp_path: Path) -> None:
+    """A phone cuts a video by saying where to begin to show it."""
+    path, shown, hidden = tmp_path / "cut.mp4", 25, 15
+    with av.open(str(path), "w", options={"avoid_negative_ts": "disabled"}) as container:
+        stream = container.add_stream("h264", rate=25, options={"bf": "0"})
+        stream.width = stream.height = 64
+        packets = []
+        for i in range(shown + hidden):
+            image = np.full((64, 64, 3), 5 * i, np.uint8)
+            packets += stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24"))
+        for packet in (*packets, *stream.encode()):
+            packet.pts -= round(hidden / 25 / packet.time_base)
+            packet.dts = packet.pts
+            container.mux(packet)
+    header = video_header(path)
+    assert header is not None and header[0] == shown + hidden
+    assert hidden_frames(path) == hidden and missing_frames(path, shown) == []
+    assert len(missing_frames(path, 10)) == 1  # fewer than are shown: it is cut off
 
 
 def test_a_file_that_is_no_video_has_no_header(tmp_path: Path) -> None:

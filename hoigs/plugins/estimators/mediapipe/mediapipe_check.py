@@ -30,7 +30,7 @@ class Check:
     """
 
     def __init__(self, graph, rect) -> None:
-        self.graph, self.rect = graph, rect
+        self.graph, self.rect, self.most = graph, rect, UNLIKE
         self.since = EVERY  # frames since the last check
 
     def agrees(self, image, points, square=None, *, known=False) -> bool:
@@ -46,9 +46,13 @@ class Check:
         if self.since < EVERY:
             return True
         most = DOUBTED * UNLIKE if known else UNLIKE
-        same = difference(self.graph, self.rect, image, points, square) < most
+        same = self.difference(image, points, square) < most
         self.since = 0 if same else EVERY
         return same
+
+    def difference(self, image, points, square=None) -> float:
+        """As the function of this name."""
+        return difference(self.graph, self.rect, image, points, square)
 
     def lose(self) -> None:
         """Nobody is followed: whoever is found next is checked at once."""

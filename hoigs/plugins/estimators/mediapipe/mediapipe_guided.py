@@ -13,10 +13,11 @@ from mediapipe_doubts import NARROW, SQUARE, TURNED, UNLIKE, UNSURE, doubt, shar
 
 SIZES = (0.8, 1.1, 1.5, 2.0)  # sides of the squares, in longer sides of the image
 HEIGHTS = (0.2, 0.5, 0.8, 1.1)  # their middles, in heights of the image
-SURE = 0.8  # mean visibility of shoulders and of the better arm, for a person to be found
-KEPT = 0.5  # the same while they are followed
+SURE = 0.8  # mean visibility of shoulders and of the better arm, for a person to be found;
+FAIR, CLOSE = 0.35, 0.08  # or so much, if the pose in the mirror is off by so little;
+KEPT = 0.5  # and of one who was clicked on or detected
 ON = 0.5  # share of the seen landmarks that lie on the frame's mask of people, to be found there
-TRIED = 3  # best squares, each of which is checked
+TRIED = 4  # best squares, each of which is checked
 AGAIN = 15  # frames until a search that found nobody is repeated, or one that was lost is left
 SHOULDERS, LEFT, RIGHT, HIPS = [11, 12], [13, 15], [14, 16], [23, 24]
 HEAD, LEGS = slice(0, 11), slice(25, 33)
@@ -51,10 +52,10 @@ class GuidedPose:
 
     Args:
         graph: of `landmark_graph`. rect: makes a square for it, NormalizedRect.
-        check: `mediapipe_check.Check`, of the same graph; None: nothing is checked.
+        check: `mediapipe_check.Check`, of the same graph.
     """
 
-    def __init__(self, graph, rect, check=None) -> None:
+    def __init__(self, graph, rect, check) -> None:
         self.graph, self.rect, self.check = graph, rect, check
         self.square: tuple[float, float, float] | None = None  # x, y of the middle and side, pixels
         self.broad = 0.0  # distance of the shoulders when the person was found, pixels
@@ -71,7 +72,7 @@ class GuidedPose:
         """
         if self.square is not None:
             found = self.look(image, wide, self.square)
-            why = UNSURE if found is None else self.against(image, found, KEPT)
+            why = UNSURE if found is None else self.against(image, found)
             if found is not None and not why:
                 return self.follow(found)
             self.wait += 1
@@ -82,23 +83,31 @@ class GuidedPose:
         if self.wait:
             self.wait -= 1
             return None
-        for found in self.search(image, wide)[:TRIED]:
-            if self.check is not None:
-                self.check.lose()
-            if not self.against(image, found, SURE):
-                return self.follow(found)
-        self.wait = AGAIN
-        return None
+        found = self.chosen(image, self.search(image, wide))
+        if found is None:
+            self.wait = AGAIN
+            return None
+        return self.follow(found)
 
-    def against(self, image, found, least) -> int:
-        """Why somebody is not believed; 0 if they are."""
+    def chosen(self, image, tried):
+        """The one whose pose is most alike in the mirror, if it is alike; None if none is.
+
+        Shoulders just above the picture are not seen, and others that are seen may be the edge of a
+        sleeve: how well they are seen does not tell the right square."""
+        near = []
+        for found in [f for f in tried if not f[5] and f[0] >= FAIR][:TRIED]:
+            off = self.check.difference(image, found[1], found[4])
+            if off < (self.check.most if found[0] >= SURE else CLOSE):
+                near.append((off, len(near), found))
+        self.check.since = 0
+        return min(near)[2] if near else None
+
+    def against(self, image, found) -> int:
+        """Why somebody who is followed is not believed; 0 if they are."""
         score, points, _, _, square, why = found
-        if why or score < least:
+        if why or score < FAIR:
             return why or UNSURE
-        known = self.square is not None
-        if self.check and not self.check.agrees(image, points, square, known=known):
-            return UNLIKE
-        return 0
+        return 0 if self.check.agrees(image, points, square, known=True) else UNLIKE
 
     def search(self, image, wide):
         """What is seen in all squares, the best first."""
