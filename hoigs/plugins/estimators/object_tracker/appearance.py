@@ -145,7 +145,7 @@ class Appearance:
         return F.pad(full, beyond, mode="replicate")[0, 0].numpy()
 
 
-TWIN = (0.4, 2.5, 0.5)  # least and largest area of the object's, least mean probability
+TWIN = (0.7, 1.5, 0.8)  # least and largest area of the object's, least mean probability
 
 
 def twins_of(

@@ -96,7 +96,7 @@ def shift_of(
     return float(x[k]), float(y[k]), float(error[k])
 
 
-BY_COLOR, BY_LOOKS = 0.4, 0.5  # weights of their log-odds
+BY_COLOR, BY_LOOKS = 0.6, 0.2  # weights of their log-odds
 AGAIN, AHEAD = 6, 14  # frames after which the path is found anew, and how far
 NEAR = 0.4  # of the object's breadth: an arm before it may part it by so much
 SURE = 0.35  # confidence below which the object counts as not seen
