@@ -52,7 +52,9 @@ def chosen_landmarks(
     else:
         world = track.world_xyzv[video.indices].astype(np.float64)[..., :3]
     fates = FrameFates.at(track.lost, track.repaired, video.indices)
-    found = Landmarks(torch.from_numpy(image), torch.from_numpy(world), source, fates)
+    found = Landmarks(
+        torch.from_numpy(image), torch.from_numpy(world), source, fates, track.to_hips
+    )
     if not found.found.any():
         raise NobodyFoundError(
             f"{what}: no person was found in the {len(image)} chosen frames; the body of a person "
