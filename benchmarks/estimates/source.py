@@ -43,7 +43,7 @@ def landmarks(clip: Any, body: Any, noise: tuple[float, float], seed: int) -> di
     import torch
 
     from hoigs.core.maths.skinning import skin
-    from hoigs.preparation.body.landmarks import points_of
+    from hoigs.preparation.body.landmarks import points_of, towards
 
     points, rng = points_of(body), np.random.default_rng(seed)
     poses = clip.bodies["human"].poses
@@ -65,7 +65,10 @@ def landmarks(clip: Any, body: Any, noise: tuple[float, float], seed: int) -> di
             camera.width / REFERENCE_WIDTH
         )
         image[i, marks] = np.concatenate((xy, depth[:, None], np.ones((len(marks), 1))), 1)
-        seen = seen - seen[hips].mean(0) + rng.normal(size=seen.shape) * noise[1] / 100
+        # as MediaPipe gives them: of a camera that looks at the hips
+        turn = towards(camera.K[None], torch.from_numpy(xy[hips].mean(0))[None])[0].double()
+        seen = (seen - seen[hips].mean(0)) @ turn.numpy()
+        seen = seen + rng.normal(size=seen.shape) * noise[1] / 100
         space[i, marks] = np.concatenate((seen, np.ones((len(marks), 1))), 1)
     return {"image_xyzv": image, "world_xyzv": space}
 

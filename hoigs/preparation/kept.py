@@ -26,7 +26,7 @@ from hoigs.preparation.mask_stack import MaskStack
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.work_folder import Result, WorkFolder, digest
 
-FORMAT = 13  # of what is kept; another number makes older results unread
+FORMAT = 14  # of what is kept; another number makes older results unread
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,7 @@ PLAN = {
         ("estimates", "cameras"),
         ("find_object", "body", "fit_steps", "person_height", "object_size", "chunk", "overlap"),
         slow=True,
+        version=2,
     ),
     "masks": Stage(10, ("people", "object_masks"), ("keep_black",), slow=True),
     "objects": Stage(40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True),

@@ -217,6 +217,8 @@ class Landmarks:
             hips in the scale of x; visibility in [0, 1].
         world_xyzv: x, y, z in metres about the hips' middle along the camera's axes (x right,
             y down, z away), and visibility; None when the estimator sees the image only.
+        to_hips: those axes are of a camera that is turned to look at the hips' middle, as
+            MediaPipe's network sees the person, and not of the video's own.
         provenance: who made them, with what, in a line.
         lost: why a frame has none, in words that end a sentence, to the frames of which it is true;
             those without landmarks that are in none are reported without a reason.
@@ -228,6 +230,7 @@ class Landmarks:
     provenance: str = ""
     lost: Mapping[str, Sequence[int]] = field(default_factory=dict)
     repaired: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    to_hips: bool = False
 
 
 @dataclass(frozen=True)

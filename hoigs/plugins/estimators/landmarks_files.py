@@ -115,7 +115,7 @@ def _arrays(path: Path, video: VideoRequest, problems: FileDiagnostics) -> Landm
     with np.load(path, allow_pickle=False) as file:
         image = file["image_xyzv"].astype(np.float32)
         world = file["world_xyzv"].astype(np.float32) if "world_xyzv" in shapes else None
-    return Landmarks(image, world, f"MediaPipe Pose, {path.name}")
+    return Landmarks(image, world, f"MediaPipe Pose, {path.name}", to_hips=True)
 
 
 def _keypoints(

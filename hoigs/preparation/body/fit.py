@@ -231,6 +231,7 @@ def fit_body(
             f"{ENOUGH} landmarks or more were found in {int(seen.sum())} of {len(seen)} frames; a "
             "body fit needs at least 2: is the person in view?"
         )
+    landmarks = landmarks.in_cameras(torch.stack([c.K for c in cameras]))
     times = torch.arange(len(seen)) / 30.0 if times is None else times
     if not options.scale:
         points = None

@@ -57,7 +57,7 @@ class FitOptions:
 
     steps: int = FIT_STEPS
     spread: float = 0.006
-    space: float = 0.05
+    space: float = 0.1
     unit: float = 0.015
     smooth: float = 6.0
     shape: float = 0.3
@@ -235,7 +235,8 @@ REWEIGHTINGS = 3  # for the 3D landmarks' origin
 AT_ONCE = 256  # frames whose derivatives are in memory
 ALL = slice(None)
 OF_FRAMES = ("visible", "pixels", "K", "viewmats", "in_space", "space")
-LEAST_PIXELS = 3e-3  # of the width: no landmark is known better
+LEAST_IMAGE = 0.015  # metres on the person: no landmark is known better in the image
+SPACE_LASTS = 0.5  # seconds in which the error of a 3D landmark stays what it is
 
 
 class FitProblem:
@@ -282,6 +283,7 @@ class FitProblem:
         steps = (times[1:] - times[:-1]).double().clamp_min(1e-4)
         apart = torch.nn.functional.pad(steps, (1, 1), value=float(steps.median()))
         self.spacing = 0.5 * (apart[1:] + apart[:-1])  # seconds that each frame stands for
+        self.in_space *= (self.spacing / SPACE_LASTS).clamp_max(1.0)[:, None]
         self.prior = PosePrior(turns)
         torso = [self.points.index(mark) for mark in TORSO]
         self.motion = MotionPrior(self.kinematics, torso, len(rows), times, options.smooth)
@@ -290,11 +292,12 @@ class FitProblem:
         self.onto_offsets = (onto[:, :, None] * self.points.mirror[:, None]).double()  # [L, P, 3]
         surface = (onto[len(self.points.joints) :].sum(0) > 0).double()
         self.offset_spread = options.offset * (1 + (SURFACE - 1) * surface)
+        start = start or first_guess(body, landmarks, cameras, options.scale)
+        self.least_pixels = LEAST_IMAGE * self._pixels_a_metre(start)
         self.noise = Noise(
-            torch.full((len(rows),), options.spread * self.width, dtype=torch.float64),
+            torch.full((len(rows),), max(options.spread * self.width, self.least_pixels)).double(),
             torch.full((len(rows), 3), options.space, dtype=torch.float64),
         )
-        start = start or first_guess(body, landmarks, cameras, options.scale)
         if turns is not None:
             start = replace(start, body=turns)
         self.begin = Unknowns.start(start, body.num_betas, pairs)
@@ -303,6 +306,12 @@ class FitProblem:
             self.noise, self.begin = found.noise, found.begin(self.begin)
             self.placed[: found.frames] = True
             self.motion.suppose(found.ordinary)
+
+    def _pixels_a_metre(self, start: Start) -> float:
+        """Of the person in the image where the fit begins, median over frames with landmarks."""
+        root = self.kinematics.joints[0] + start.transl.double()
+        cam = self.viewmats[:, :3, :3] @ root[..., None] + start.scale * self.viewmats[:, :3, 3:]
+        return float((self.K[:, 0, 0] / cam[:, 2, 0].clamp_min(0.1))[self.seen].median())
 
     def show(self, masks: Masks, first: int = 0) -> None:
         """Look at masks in the frames without landmarks; `first` is the number of frame 0."""
@@ -390,7 +399,7 @@ class FitProblem:
         self.noise = self.noise.seen(
             (pixels - self.pixels, self.visible),
             (residuals, self.in_space),
-            LEAST_PIXELS * self.width,
+            self.least_pixels,
         )
         # where the landmarks lie at the fit's depths, along the mean camera's two image axes
         metres = cam[..., 2:] / self.K[:, None, [0, 1], [0, 1]]

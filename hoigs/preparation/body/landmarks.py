@@ -12,6 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.values.camera import pinhole_rays
 from hoigs.core.values.lens import Undistortion
 
 # landmark -> SMPL-X body joint
@@ -24,7 +25,7 @@ USED = tuple(sorted((*JOINTS, *KNUCKLES, 0, 7, 8, *FEET)))  # landmarks that `po
 SOLID = (11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)  # in space: torso and limbs start on them
 ALONE = 3  # frames: shorter runs of landmarks between gaps of as many are not believed,
 FEW = 0.2  # unless they are more than this share of those with landmarks
-SHOULDERS = [11, 12]
+SHOULDERS, HIPS = [11, 12], [23, 24]
 NEAR_GAP, AROUND, LEAST = 6, 15, 8  # frames: from a gap, to compare with, and how many of them
 JUMP = 0.34  # of the shoulders' distance from the way of those around: not this person
 ENOUGH = 8  # landmarks of USED in the image, with which a frame counts
@@ -96,12 +97,14 @@ class Landmarks:
             NaN where the estimator sees the image only.
         source: for the report.
         fates: of the frames, by their position.
+        to_hips: the axes in space are of a camera that looks at the hips' middle (`in_cameras`).
     """
 
     image: Float[Tensor, "F 33 3"]
     world: Float[Tensor, "F 33 3"]
     source: str = "MediaPipe"
     fates: FrameFates = field(default_factory=FrameFates)
+    to_hips: bool = False
 
     @staticmethod
     def from_mediapipe(
@@ -110,7 +113,18 @@ class Landmarks:
         """From the arrays of `pose_mediapipe.npz`."""
         image = torch.as_tensor(image_xyzv, dtype=torch.float32)[..., [0, 1, 3]]
         world = torch.as_tensor(world_xyzv, dtype=torch.float32)[..., :3]
-        return Landmarks(image, world)
+        return Landmarks(image, world, to_hips=True)
+
+    def in_cameras(self, K: Float[Tensor, "F 3 3"]) -> Landmarks:
+        """The same along the axes of cameras of these intrinsics.
+
+        A network that sees a square about the person, and not the lens, gives what a camera would
+        see that looks at its middle. MediaPipe's squares lie about the hips.
+        """
+        if not self.to_hips:
+            return self
+        world = self.world @ towards(K, self.image[:, HIPS, :2].mean(1)).mT.to(self.world)
+        return replace(self, world=world, to_hips=False)
 
     def rows(self, frames: slice | Int[Tensor, " T"]) -> Landmarks:
         """Of some frames alone."""
@@ -186,6 +200,17 @@ class Landmarks:
     def solid(self) -> Bool[Tensor, " F"]:
         """Frames of `found` whose torso and limbs are known in space, too."""
         return self.found & torch.isfinite(self.world[:, list(SOLID)]).all(-1).all(-1)
+
+
+def towards(K: Float[Tensor, "F 3 3"], pixels: Float[Tensor, "F 2"]) -> Float[Tensor, "F 3 3"]:
+    """Rotations to a camera's axes from those of one that is turned to look at a pixel, about its
+    own y axis and then its x axis; none where the pixel is NaN."""
+    known = torch.isfinite(pixels).all(-1, keepdim=True)
+    x, y = pinhole_rays(K, torch.where(known, pixels.to(K), K[:, :2, 2])).unbind(-1)
+    one, none = torch.ones_like(x), torch.zeros_like(x)
+    ahead = torch.nn.functional.normalize(torch.stack((x, y, one), -1), dim=-1)
+    right = torch.nn.functional.normalize(torch.stack((one, none, -x), -1), dim=-1)
+    return torch.stack((right, torch.linalg.cross(ahead, right), ahead), -1)
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,9 @@ def chosen_landmarks(
     else:
         world = track.world_xyzv[video.indices].astype(np.float64)[..., :3]
     fates = FrameFates.at(track.lost, track.repaired, video.indices)
-    found = Landmarks(torch.from_numpy(image), torch.from_numpy(world), source, fates)
+    found = Landmarks(
+        torch.from_numpy(image), torch.from_numpy(world), source, fates, track.to_hips
+    )
     count, frames = int(found.found.sum()), len(image)
     if count < RARE * frames:
         why = "; ".join(f"{text} in {len(rows)}" for text, rows in fates.lost.items())

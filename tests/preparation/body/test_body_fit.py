@@ -420,3 +420,20 @@ def test_a_bent_elbow_may_twist() -> None:
     turns = torch.zeros(1, 21, 3)
     turns[:, 17] = quats_to_axis_angle(quats)
     assert turns[0, 17, 2].abs() > 0.3 and limit_penalty(turns) == 0
+
+
+def test_landmarks_of_a_network_that_looks_at_the_hips_are_turned_to_the_camera() -> None:
+    pose = truth()
+    cameras, aside = [camera()] * FRAMES, pose.transl.clone()
+    aside[:, 0] -= 1.2  # 22 degrees off the camera's axis
+    seen = seen_by(cameras, pose.replace(transl=aside))
+    ray = torch.tensor([-0.4, 0.0, 1.0])
+    angle = torch.atan2(ray[0], ray[2])
+    turned = seen.world @ axis_angle_to_matrices(torch.stack((angle * 0, angle, angle * 0)))
+    K = torch.stack([c.K for c in cameras])
+    middle = torch.tensor([FOCAL * -0.4 + WIDTH / 2, HEIGHT / 2])
+    image = seen.image.clone()
+    image[:, [23, 24], :2] = middle
+    given = Landmarks(image, turned, to_hips=True)
+    assert torch.allclose(given.in_cameras(K).world, seen.world, atol=1e-5)
+    assert torch.equal(seen.in_cameras(K).world, seen.world), "they are the camera's already"

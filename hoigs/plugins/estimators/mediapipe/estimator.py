@@ -206,8 +206,9 @@ class MediapipeEstimator(Estimator):
             world = self._spread(found["world_xyzv"][k], given, video)
             fate = self._fate(found["fate"][k], given)
             landmarks[name] = Landmarks(
-                image, world, text, lost=_frames_by(fate, LOST), repaired=_frames_by(fate, REPAIRED)
-            )
+                image, world, text, lost=_frames_by(fate, LOST),
+                repaired=_frames_by(fate, REPAIRED), to_hips=True,
+            )  # fmt: skip
         if not self.config.masks:
             return Estimates(landmarks=landmarks)
         frames = _frames(video, given, progress, "masks")
