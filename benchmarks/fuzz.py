@@ -185,7 +185,7 @@ def _read_specs(folder: Path) -> None:
 
 
 def _read_options(folder: Path) -> None:
-    from hoigs.preparation.options import load_options
+    from hoigs.preparation.estimates.installed import load_options
 
     for path in sorted(folder.iterdir()):
         load_options(path)

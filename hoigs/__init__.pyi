@@ -26,6 +26,7 @@ from hoigs.core.model.scene import SceneModel as SceneModel
 from hoigs.core.model.scene import SceneModel as _SceneModel
 from hoigs.core.registry.component import Component as Component
 from hoigs.core.registry.component import hookimpl as hookimpl
+from hoigs.core.spec.schema import ComponentSpec as _ComponentSpec
 from hoigs.core.spec.schema import Spec as Spec
 from hoigs.core.spec.schema import Spec as _Spec
 from hoigs.core.spec.train_schema import TrainSpec as TrainSpec
@@ -67,8 +68,8 @@ from hoigs.plugins.features.embedding import EmbeddingFeatures as _EmbeddingFeat
 from hoigs.plugins.features.spline_motion import SplineMotionFeatures as _SplineMotionFeatures
 from hoigs.plugins.interaction.cross_attention import CrossAttention as _CrossAttention
 from hoigs.preparation.options import PrepareOptions as PrepareOptions
-from hoigs.preparation.prepare import prepare as prepare
-from hoigs.preparation.prepare import prepare_until as prepare_until
+from hoigs.preparation.options import PrepareOptions as _PrepareOptions
+from hoigs.preparation.report.report import PrepareReport as _PrepareReport
 from hoigs.rasterizers.gsplat import GsplatRasterizer as GsplatRasterizer
 from hoigs.rasterizers.oracle import OracleRasterizer as _OracleRasterizer
 from hoigs.rasterizers.torch_tiles import TorchRasterizer as _TorchRasterizer
@@ -76,14 +77,15 @@ from hoigs.rasterizers.warp import WarpRasterizer as _WarpRasterizer
 from hoigs.runs.clip_source import read_clip as read_clip
 from hoigs.runs.loaded_run import LoadedRun as LoadedRun
 from hoigs.runs.loaded_run import open_run as open_run
-from hoigs.studies.batch.batch import batch as batch
-from hoigs.studies.batch.batch import work as work
+from hoigs.studies.batch.batch import Batch as _Batch
 from hoigs.studies.doctor import bug_report as bug_report
 from hoigs.studies.doctor import doctor as doctor
 from hoigs.studies.needs.auto import AutoRun as _AutoRun
 from hoigs.studies.needs.compress import compress as compress
 from hoigs.studies.needs.options import NeedsOptions as _NeedsOptions
 from hoigs.studies.needs.result import Needs as _Needs
+from hoigs.studies.options import BatchOptions as _BatchOptions
+from hoigs.studies.options import WorkOptions as _WorkOptions
 from hoigs.synthesis import builtin_clip as builtin_clip
 from hoigs.training.options import DemoOptions as _DemoOptions
 from hoigs.training.options import RefineOptions as _RefineOptions
@@ -106,6 +108,7 @@ from hoigs.viewing.playback import Playback as Playback
 from hoigs.viewing.player.page import Page as _Page
 from pathlib import Path as _Path
 from torch import Tensor
+from typing import Any as _Any
 from typing import Any, Literal
 
 __version__: str
@@ -383,6 +386,28 @@ def auto(
     options: _TrainOptions | None = ...,
 ) -> _AutoRun: ...
 
+def batch(
+    manifest: _Path | str,
+    out: _Path | str,
+    *,
+    spec: str | None = ...,
+    auto: bool = ...,
+    overrides: Sequence[str] = ...,
+    export: Sequence[str] = ...,
+    device: str | None = ...,
+    limit: int | None = ...,
+    only: str | None = ...,
+    dry_run: bool = ...,
+    jobs: int = ...,
+    threads: int | None = ...,
+    executor: str | _Any = ...,
+    address: str | None = ...,
+    retries: int = ...,
+    report: Any = ...,
+    tick: Any = ...,
+    options: _BatchOptions | None = ...,
+) -> _Batch: ...
+
 def demo(
     *,
     out: _Path | str = ...,
@@ -454,6 +479,77 @@ def needs(
     report: Any = ...,
     options: _NeedsOptions | None = ...,
 ) -> _Needs: ...
+
+def prepare(
+    source: str | _Path,
+    out: str | _Path,
+    *,
+    object: Sequence[str] = ...,
+    person: Sequence[str] = ...,
+    preset: Literal['auto', 'offline', 'hub', 'files'] = ...,
+    yes: bool = ...,
+    width: int | None = ...,
+    camera: Literal['auto', 'static', 'turning', 'moving', 'sfm'] = ...,
+    max_frames: int | None = ...,
+    every: int = ...,
+    fps: float | None = ...,
+    start: str | float | None = ...,
+    end: str | float | None = ...,
+    focal: float | None = ...,
+    intrinsics: Sequence[float] | None = ...,
+    calibration: str | None = ...,
+    person_height: float | None = ...,
+    chunk: int | None = ...,
+    overlap: int | None = ...,
+    keep_black: bool = ...,
+    overwrite: bool = ...,
+    overrides: Sequence[str] = ...,
+    file: _Path | None = ...,
+    allow_commands: bool = ...,
+    redo: Sequence[str] = ...,
+    body: str = ...,
+    estimators: dict[Literal['masks', 'landmarks', 'depth'] | Literal['object'], _ComponentSpec] = ...,
+    consent: Any | None = ...,
+    announce: Any | None = ...,
+    progress: Any | None = ...,
+    options: _PrepareOptions | None = ...,
+) -> _PrepareReport: ...
+
+def prepare_until(
+    stage: str,
+    source: str | _Path,
+    out: str | _Path,
+    *,
+    object: Sequence[str] = ...,
+    person: Sequence[str] = ...,
+    preset: Literal['auto', 'offline', 'hub', 'files'] = ...,
+    yes: bool = ...,
+    width: int | None = ...,
+    camera: Literal['auto', 'static', 'turning', 'moving', 'sfm'] = ...,
+    max_frames: int | None = ...,
+    every: int = ...,
+    fps: float | None = ...,
+    start: str | float | None = ...,
+    end: str | float | None = ...,
+    focal: float | None = ...,
+    intrinsics: Sequence[float] | None = ...,
+    calibration: str | None = ...,
+    person_height: float | None = ...,
+    chunk: int | None = ...,
+    overlap: int | None = ...,
+    keep_black: bool = ...,
+    overwrite: bool = ...,
+    overrides: Sequence[str] = ...,
+    file: _Path | None = ...,
+    allow_commands: bool = ...,
+    redo: Sequence[str] = ...,
+    body: str = ...,
+    estimators: dict[Literal['masks', 'landmarks', 'depth'] | Literal['object'], _ComponentSpec] = ...,
+    consent: Any | None = ...,
+    announce: Any | None = ...,
+    progress: Any | None = ...,
+    options: _PrepareOptions | None = ...,
+) -> dict[str, float]: ...
 
 def refine_poses(
     clip: _Path | str,
@@ -539,6 +635,19 @@ def view(
     started: Any | None = ...,
     options: _ViewOptions | None = ...,
 ) -> _Page | None: ...
+
+def work(
+    out: _Path | str,
+    *,
+    retries: int = ...,
+    jobs: int = ...,
+    threads: int | None = ...,
+    executor: str | _Any = ...,
+    address: str | None = ...,
+    report: Any = ...,
+    tick: Any = ...,
+    options: _WorkOptions | None = ...,
+) -> _Batch: ...
 
 def score(
     model: _SceneModel,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import SpecError
@@ -261,6 +261,8 @@ class PrepareOptions(Options):
         description="Run this stage again, and those that depend on it.",
     )
 
+    _document: Document = PrivateAttr(default_factory=lambda: Document("options"))
+
     shown: ClassVar = (
         "object", "person", "preset", "yes", "width", "camera", "max_frames", "every", "fps",
         "start", "end", "focal", "intrinsics", "calibration", "person_height", "chunk", "overlap",
@@ -288,7 +290,9 @@ class PrepareOptions(Options):
             document = read_document(Path(options))
             _refuse_callers(document)
         elif options is None or isinstance(options, cls):
-            document = Document("options", {} if options is None else options.given())
+            known = Document("options") if options is None else options.document
+            data = {} if options is None else options.given()
+            document = Document(known.source, data, known.keys, known.values)
         else:
             raise SpecError(f"{verb}: options must be {cls.__name__} or a file, got {options!r}")
         names = {name: (places or {}).get(name, _flag_of(cls, name)) for name in given}
@@ -302,11 +306,13 @@ class PrepareOptions(Options):
             made = cls.model_validate(document.data)
         except ValidationError as error:
             raise SpecError("\n".join(explain(error, cls, document, ()))) from error
-        if made.estimators:  # so that errors in them are reported at once, too
-            from hoigs.preparation.estimates.installed import installed_estimators
-
-            installed_estimators(made.estimators, document)
+        made._document = document
         return made
+
+    @property
+    def document(self) -> Document:
+        """Where the options came from, for messages."""
+        return self._document
 
     @property
     def own_cameras(self) -> bool:
@@ -412,13 +418,3 @@ def _flag_of(options: type[Options], name: str) -> str:
     marks = () if field is None else field.metadata
     names = Flag.names_of(name, next((m for m in marks if isinstance(m, Flag)), None))
     return names[0].partition("/")[0]
-
-
-def load_options(
-    file: PrepareOptions | Path | str | None = None,
-    settings: Sequence[str] = (),
-    flags: Mapping[str, Any] | None = None,
-) -> PrepareOptions:
-    """`PrepareOptions.of`, with flags of which None leaves an option alone."""
-    given = {name: value for name, value in (flags or {}).items() if value is not None}
-    return PrepareOptions.of(file, {**given, "overrides": tuple(settings)})

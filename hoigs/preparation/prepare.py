@@ -150,7 +150,7 @@ def _run(
         check_stage(name)
     _check_paths(source, out, options.overwrite or bool(options.redo) or until is not None)
     options, stored = with_stored(options, find_video(source))
-    named = installed_estimators(options.estimators)
+    named = installed_estimators(options.estimators, options.document)
     if not options.allow_commands:
         refuse_commands(named)  # `estimators` are the caller's own code
     own = {} if isinstance(estimators, str) else (estimators or {})

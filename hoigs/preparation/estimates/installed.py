@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -14,8 +15,7 @@ from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.errors import explain
 from hoigs.core.spec.loader import Document
 from hoigs.core.spec.schema import ComponentSpec
-
-Place = EstimateKind | Literal["object"]  # "object": masks of the object alone
+from hoigs.preparation.options import Place, PrepareOptions
 
 
 def installed_estimators(
@@ -91,3 +91,19 @@ def _givers(registry: Registry, kind: EstimateKind) -> list[str]:
         if issubclass(component, Estimator) and kind in component.provides:
             found.append(key)
     return found
+
+
+def load_options(
+    file: PrepareOptions | Path | str | None = None,
+    settings: Sequence[str] = (),
+    flags: Mapping[str, Any] | None = None,
+) -> PrepareOptions:
+    """`PrepareOptions.of`, whose estimators are installed; a flag that is None changes nothing.
+
+    Raises:
+        SpecError: everything that is wrong with the options, or with their estimators.
+    """
+    given = {name: value for name, value in (flags or {}).items() if value is not None}
+    options = PrepareOptions.of(file, {**given, "overrides": tuple(settings)})
+    installed_estimators(options.estimators, options.document)
+    return options

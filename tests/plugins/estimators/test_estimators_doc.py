@@ -24,8 +24,7 @@ from hoigs.core.reporting import no_progress
 from hoigs.core.spec.schema import Spec
 from hoigs.plugins.estimators.command import CommandEstimator
 from hoigs.plugins.estimators.masks_files import MasksFilesEstimator
-from hoigs.preparation.estimates.installed import installed_estimators
-from hoigs.preparation.options import load_options
+from hoigs.preparation.estimates.installed import installed_estimators, load_options
 
 DOC = (Path(__file__).parents[3] / "docs/reference/estimators.md").read_text()
 BLOCKS = re.findall(r"```yaml\n(.*?)```", DOC, re.S)

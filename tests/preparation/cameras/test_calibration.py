@@ -15,9 +15,10 @@ from hoigs.core.values.lens import Lens
 from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
 from hoigs.preparation.cameras.choose import choose_cameras
+from hoigs.preparation.estimates.installed import load_options
 from hoigs.preparation.estimates.reader import GivenMasks
 from hoigs.preparation.mask_stack import MaskStack
-from hoigs.preparation.options import PrepareOptions, load_options
+from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import VideoFrames
 from hoigs.preparation.video.source import SourceError
 

@@ -14,7 +14,7 @@ from hoigs.core.errors import HoigsError, SpecError
 from hoigs.core.interfaces.estimator import Estimates, Estimator, Landmarks
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.preparation.options import load_options
+from hoigs.preparation.estimates.installed import load_options
 from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until, work_folder
 from hoigs.preparation.video.frames import FolderFrames, VideoFrames, open_frames
 from hoigs.preparation.video.source import SourceError, find_source, numbered_frames

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hoigs.core.errors import SpecError
-from hoigs.preparation.options import load_options
+from hoigs.preparation.estimates.installed import load_options
 
 
 def test_a_former_key_names_the_present_one(tmp_path) -> None:
