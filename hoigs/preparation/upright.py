@@ -54,7 +54,7 @@ def world_of(draft: Draft, focal_range: tuple[float, float] | None) -> World:
         return World.guessed(draft.cameras)
     lines = lines_up(draft, focal_range)
     if stood is None:
-        trunk, most, clear = np.concatenate([t.numpy() for t in trunks]).mean(0), LEAN, CLEAR
+        trunk, most, clear = np.concatenate([t.numpy() for t in trunks]).mean(0), LEAN, LEAN / 2
     else:  # lines have to be surer by far, and agree
         body = stood.within or 0.0
         trunk, most, clear = np.array(stood.up), 1.5 * body, body / 2
