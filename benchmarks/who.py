@@ -4,9 +4,10 @@
 
 The man of the recorded clip `juggle`, cut out by the supplied mask without the ball and made
 smaller, walks through his own background beside a blue post that is twice as tall; or nobody does;
-or hands alone lay letter blocks (the recorded clip `blocks`). `hoigs prepare` is run up to its estimators of
-people, with nothing given. For each share of the picture's height: frames with landmarks, and
-intersection over union with the true mask, mean and worst; or the error that says nobody is there.
+or hands alone lay letter blocks (the recorded clip `blocks`). `hoigs prepare` is run up to its
+estimators of people, with nothing given. For each share of the picture's height: frames with
+landmarks, and intersection over union with the true mask, mean and worst; or the error that says
+nobody is there.
 """
 
 from __future__ import annotations
