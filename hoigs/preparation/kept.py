@@ -74,7 +74,9 @@ PLAN = {
         version=2,
     ),
     "masks": Stage(10, ("people", "object_masks"), ("keep_black",), slow=True),
-    "objects": Stage(40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True),
+    "objects": Stage(
+        40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True, version=2
+    ),
     "scene": Stage(10, ("masks",), ("prompts", "scene_points", "backdrop"), slow=True),
     "write": Stage(40, ("objects", "scene")),
 }

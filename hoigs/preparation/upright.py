@@ -16,7 +16,7 @@ from hoigs.core.values.world import World
 from hoigs.preparation.draft import Draft
 from hoigs.preparation.video.pictures import shrink, shrink_mask
 
-WIDTH = 640  # pixels, at which lines are looked for
+WIDTH, LEAST = 640, 320  # pixels, at which lines are looked for, and below which they are not
 SIGMA, COHERENT = 1.2, 0.85  # pixels, of gradients; of their directions nearby, for a straight line
 EDGES = 4000  # pixels; more change nothing
 STEEP, STRONG = 0.5, 0.85  # x of an edge's normal; quantile of gradients
@@ -28,7 +28,6 @@ DISTINCT = 3.0  # times as many edges as point to where most tilts and rolls hav
 CLEAR = 6.0  # degrees: a wider interval tells nothing
 FRAMES = 3
 LEAN = 30.0  # degrees that somebody's trunk may lean, on average: beyond, lines are not vertical
-STOOD = 15.0  # and those who stand
 
 
 @dataclass(frozen=True)
@@ -54,11 +53,12 @@ def world_of(draft: Draft, focal_range: tuple[float, float] | None) -> World:
     if not trunks:  # the lines of a mat that is seen from above look vertical, too
         return World.guessed(draft.cameras)
     lines = lines_up(draft, focal_range)
-    if stood is not None:
-        trunk, most = np.array(stood.up), STOOD
-    else:
-        trunk, most = np.concatenate([t.numpy() for t in trunks]).mean(0), LEAN
-    if lines is None or _degrees(lines.up, trunk) > most:
+    if stood is None:
+        trunk, most, clear = np.concatenate([t.numpy() for t in trunks]).mean(0), LEAN, LEAN / 2
+    else:  # lines have to be surer by far, and agree
+        body = stood.within or 0.0
+        trunk, most, clear = np.array(stood.up), 1.5 * body, body / 2
+    if lines is None or lines.within > clear or _degrees(lines.up, trunk) > most:
         return World.guessed(draft.cameras) if stood is None else stood
     x, y, z = lines.up.tolist()
     found = World((x, y, z), None, True, "lines", round(lines.within, 1))
@@ -104,6 +104,8 @@ def room_up(
     Returns:
         None if no direction is clear.
     """
+    if image.shape[1] < LEAST:
+        return None
     size = (WIDTH, max(1, round(image.shape[0] * WIDTH / image.shape[1])))
     grey = shrink(image, *size).astype(float).mean(-1)
     places, normals, weights = _edges(grey, shrink_mask(hidden, *size))

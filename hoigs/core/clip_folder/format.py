@@ -105,9 +105,11 @@ class ClipHeader(_Strict):
     )
     world: WorldHeader | None = Field(
         default=None,
-        description='`{"up": [0, 1, 0], "floor": 0, "metres": true, "known": "given"}`: up in the '
-        "world's axes, height of the floor along it or null, whether lengths are metres, and who "
-        'knows: "given", "floor" (feet at rest), "body" (people who stand), "cameras (guess)". '
+        description='`{"up": [0, 1, 0], "floor": 0, "metres": true, "known": "given", "within": '
+        "null}`: up in the world's axes, height of the floor along it or null, whether lengths are "
+        'metres, and who knows: "given", "floor" (feet at rest), "lines" (vertical lines of the '
+        'room), "body" (people who stand), "cameras (guess)"; `within`: degrees within which up '
+        "is, in nine of ten cases, null where not known. "
         "Folders without it are read: up then comes from the bodies, else from the cameras",
     )
     provenance: dict[str, Any] = Field(

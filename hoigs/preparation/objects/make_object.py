@@ -34,16 +34,20 @@ from hoigs.preparation.options import ObjectWay
 
 OFTEN = 0.25  # of the frames: from this on it is said
 SECOND = 0.5  # of the largest part: a part that may be another object
+BESIDE = 0.5  # of the object's area: with so much of a person beside it, it is not the person
 ALIEN = 0.5  # of a person's landmarks on the object, median: the estimator took it for the person
 VISIBLE = 0.5  # landmarks that are surer than this
 
 
-def doubts(masks: MaskStack, landmarks: Float[Tensor, "F 33 3"] | None) -> list[str]:
+def doubts(
+    masks: MaskStack, landmarks: Float[Tensor, "F 33 3"] | None, humans: MaskStack | None = None
+) -> list[str]:
     """Sentences for the report: the border cuts the object often, its mask has several large
-    parts, or most of the person's landmarks lie on it.
+    parts, or most of the person's landmarks lie on it, and little of the person is beside it.
 
     Args:
         landmarks: x, y in pixels and visibility, NaN where unknown; None: of nobody.
+        humans: of people, without the object; None: not known.
     """
     outlines = outlines_of(masks)
     seen = np.flatnonzero(outlines.observed)
@@ -61,7 +65,9 @@ def doubts(masks: MaskStack, landmarks: Float[Tensor, "F 33 3"] | None) -> list[
             "are two objects, both are tracked as one; point at one of them (--object X,Y)"
         )
     shares = [] if landmarks is None else list(_on_object(masks, landmarks, seen.tolist()))
-    if shares and float(np.median(shares)) > ALIEN:
+    areas = [] if humans is None else [humans[i].sum() / masks[i].sum() for i in seen.tolist()]
+    beside = bool(areas) and float(np.median(areas)) > BESIDE  # it is held before the person
+    if shares and not beside and float(np.median(shares)) > ALIEN:
         found.append(
             f"{100 * float(np.median(shares)):.0f} % of the person's landmarks lie on the object "
             f"(median of {len(shares)} frames): it may have been taken for the person; look at "

@@ -33,6 +33,15 @@ def test_a_clear_object_raises_no_doubt() -> None:
     assert doubts(boxes((20, 20)), marks(60)) == []
 
 
+def test_a_plate_before_somebody_is_not_taken_for_them() -> None:
+    """Most landmarks lie on it, and about as much of the person is seen around it."""
+    plate, around, hair = boxes((20, 20)), boxes((8, 20)), MaskStack()
+    for mask in boxes((8, 20)):
+        hair.append(mask & (np.arange(HEIGHT) < 24)[:, None])
+    assert doubts(plate, marks(26), around) == []
+    assert len(doubts(plate, marks(26), hair)) == 1
+
+
 @pytest.mark.parametrize(
     ("corners", "x", "said"),
     [

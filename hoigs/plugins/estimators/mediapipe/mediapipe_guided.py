@@ -94,7 +94,7 @@ class GuidedPose:
 
         Shoulders just above the picture are not seen, and others that are seen may be the edge of a
         sleeve: how well they are seen does not tell the right square."""
-        near: list[tuple[float, int, list]] = []
+        near: list[tuple] = []
         for found in [f for f in tried if not f[5] and f[0] >= FAIR][:TRIED]:
             off = self.check.difference(image, found[1], found[4])
             if off < (self.check.most if found[0] >= SURE else CLOSE):
