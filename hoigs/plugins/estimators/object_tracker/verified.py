@@ -30,8 +30,8 @@ from hoigs.plugins.estimators.object_tracker.scene import Scene, carried
 
 PROVEN = 0.5  # agreement from which a mask is proven by itself
 CARRIED = 0.3  # and from which it is by the frames beside it, from which it does not differ much
-SIZES = (0.25, 3.0)  # of its usual area about then: an object that is farther away, or half hidden
-AROUND = 12  # proven frames before and after a frame that say what is usual
+SIZES = (0.3, 1.5)  # of its usual area about then: half hidden, and not with a thing beside it
+AROUND = 6  # proven frames before and after a frame that say what is usual
 STEP = 1.5  # diameters a frame beside what the motion foretells: farther is a jump
 BESIDE, ALONE = 0.6, (0.6, 1.4)  # of an object that has twins: its breadth, and its area before
 SAME = 6.0  # units of colour within which a place looks as it did
@@ -90,8 +90,8 @@ def proof_of(
     ])  # fmt: skip
     agreement[strays] = 0.0
     area = masks.sum((1, 2)).astype(float)
+    agreement[~_usual_size(area, agreement >= PROVEN, given)] = 0.0
     proven = agreement >= PROVEN
-    proven &= _usual_size(area, proven, given)
     follow = _followed if known.twins else _continued
     return Proof(agreement, follow(masks, agreement, proven, given))
 
@@ -164,10 +164,9 @@ def _usual_size(
     """Frames in which the mask is about as large as in the proven ones around, or as prompted."""
     rows = np.flatnonzero(proven)
     fits = np.zeros(len(area), bool)
-    for i in rows.tolist():
+    for i in np.flatnonzero(area).tolist() if len(rows) else ():
         place = int(np.searchsorted(rows, i))
-        near = rows[max(0, place - AROUND) : place + AROUND + 1]
-        usual = float(np.median(area[near]))
+        usual = float(np.median(area[rows[max(0, place - AROUND) : place + AROUND + 1]]))
         fits[i] = SIZES[0] * usual <= area[i] <= SIZES[1] * usual
     fits[given] = True
     return fits

@@ -11,7 +11,7 @@ from test_behind import footage_of
 
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.states import LOST, OUT, PERSON, SEEN, states_of
-from hoigs.plugins.estimators.object_tracker.verified import _continued, _followed
+from hoigs.plugins.estimators.object_tracker.verified import _continued, _followed, _usual_size
 
 Y, X = np.mgrid[:H, :W] + 0.5
 
@@ -81,3 +81,10 @@ def test_of_equal_things_one_that_was_lost_or_grew_is_not_believed_again() -> No
     assert _followed(masks, hidden, hidden > 0.5, [1]).tolist() == [True] * 4 + [False] * 4
     masks[5] |= disc(55, 40)  # takes in its neighbour
     assert _followed(masks, sure, sure > 0.5, [1]).tolist() == [True] * 5 + [False] * 3
+
+
+def test_a_mask_that_takes_in_the_thing_beside_it_is_not_of_the_usual_size() -> None:
+    area = np.array([100.0] * 8 + [190.0] * 2 + [100.0] * 8)  # a ball, and the shoe that kicks it
+    fits = _usual_size(area, area > 0, [0])
+    assert not fits[8:10].any() and fits[[*range(8), *range(10, 18)]].all()
+    assert _usual_size(np.linspace(100, 400, 18), np.ones(18, bool), [0]).all()  # it comes nearer
