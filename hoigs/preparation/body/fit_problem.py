@@ -235,7 +235,8 @@ REWEIGHTINGS = 3  # for the 3D landmarks' origin
 AT_ONCE = 256  # frames whose derivatives are in memory
 ALL = slice(None)
 OF_FRAMES = ("visible", "pixels", "K", "viewmats", "in_space", "space")
-LEAST_IMAGE = 0.015  # metres on the person: no landmark is known better in the image
+# metres on the person: no landmark is known better in the image (benchmarks/landmark_errors.py)
+LEAST_IMAGE = 0.015
 SPACE_LASTS = 0.5  # seconds in which the error of a 3D landmark stays what it is
 
 

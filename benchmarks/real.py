@@ -1,0 +1,77 @@
+"""The body of real recordings with truth, from one camera each: what it is off from other sides.
+
+    python benchmarks/real.py --json benchmarks/results/real.json
+
+Needs the recordings that do not ship with the package (`HOIGS_SHARED`). Each camera of `fourviews`
+is prepared by itself, with its lens, and scored by the recording's own `score.py`; lengths are
+millimetres, sizes are the clip's in parts of the truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+SHARED = Path(os.environ.get("HOIGS_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+CAMERAS = ("cam02", "cam03", "cam04")  # cam01 sees no elbows
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=SHARED / "data/fourviews")
+    parser.add_argument("--cameras", nargs="+", choices=CAMERAS, default=CAMERAS)
+    parser.add_argument("--keep", type=Path, help="folder in which clips and their work stay")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    if not args.data.is_dir():
+        print(f"there is no {args.data}: set HOIGS_SHARED to the folder that holds data/")
+        return 1
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = (args.keep or Path(temporary)).absolute()
+        folder.mkdir(parents=True, exist_ok=True)
+        rows = {camera: measured(args.data, camera, folder) for camera in args.cameras}
+    print(table(rows))
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=1) + "\n")
+    return 0
+
+
+def measured(data: Path, camera: str, folder: Path) -> dict[str, Any]:
+    """What `score.py` makes of the clip of one camera."""
+    import hoigs
+
+    out, scores = folder / camera, folder / f"{camera}.json"
+    hoigs.prepare(
+        data / f"{camera}.mp4", out, object="none", calibration=data / f"{camera}.yml", yes=True,
+        overwrite=True,
+    )  # fmt: skip
+    argv = [sys.executable, str(data / "score.py"), str(out), "--camera", camera]
+    subprocess.run([*argv, "--json", str(scores)], check=True, stdout=subprocess.DEVNULL)
+    found = json.loads(scores.read_text())
+    row = {
+        "root_aligned": found["root_aligned"],
+        "procrustes": found["procrustes"],
+        "size": 1 / found["procrustes_scale"],
+        "neck_depth": 1 + found["neck_depth_bias"] / found["neck_depth_true"],
+        "acceleration_error": found["acceleration_error"],
+        "image_px": found["image_px_median"],
+    }
+    return {name: round(value, 3) for name, value in row.items()}
+
+
+def table(rows: dict[str, dict[str, Any]]) -> str:
+    """Markdown, one line a camera."""
+    names = list(next(iter(rows.values())))
+    lines = [["camera", *names], ["---"] * (len(names) + 1)]
+    lines += [[camera, *(f"{row[name]:g}" for name in names)] for camera, row in rows.items()]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
