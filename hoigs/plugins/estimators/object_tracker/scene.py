@@ -15,7 +15,6 @@ from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
 # How the picture of the scene moves between frames: homographies, from matched blocks.
 
 STILL = 0.35  # pixels between frames below which a camera counts as static
-QUITE_STILL = 0.1  # and in a video with black edges
 BLOCK = 48
 
 
@@ -39,9 +38,7 @@ def is_static(footage: Footage, samples: int = 16) -> bool:
             order = np.hypot(*shift.T).argsort()
             share = weight[order].cumsum() / weight.sum()
             moved.append(np.hypot(*shift.T)[order][np.searchsorted(share, 0.5)])
-    # black edges are those of a stabilised video, or a dark room's that nothing stabilised
-    most = QUITE_STILL if footage.blank.any() else 2 * STILL
-    return bool(moved) and float(np.median(moved)) < most
+    return bool(moved) and float(np.median(moved)) < 2 * STILL and not footage.blank.any()
 
 
 def chained(steps: Float[np.ndarray, "F 3 3"], a: int, b: int) -> Float[np.ndarray, "3 3"]:

@@ -118,7 +118,19 @@ def followed(
     better = tracked_again(
         footage, behind, prompts, looks, found, lambda x: progress(0.7 + 0.3 * x)
     )
-    return without_unproven(better, proof_of(footage, scene, prompts, better, looks, known))
+    better = without_unproven(better, proof_of(footage, scene, prompts, better, looks, known))
+    return _mended(found, better)
+
+
+def _mended(found: Track, better: Track) -> Track:
+    """The better masks, but where they are of something else: what is behind a thing that hides a
+    person is known badly where they move, and such a mask leaks onto their arm."""
+    pairs = zip(found.soft > 127, better.soft > 127, strict=True)
+    same = np.array([bool(b.any()) and overlap(a, b) > SAME for a, b in pairs])
+    return Track(
+        np.where(same[:, None, None], better.soft, found.soft),
+        np.where(same, better.confidence, found.confidence),
+    )
 
 
 def _learnt(footage: Footage, known: Sequence[PromptedMask]) -> tuple[Appearance, Known]:
