@@ -45,7 +45,7 @@ from hoigs.preparation.prepare import PrepareOptions, prepare, work_folder
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/preparation"))
 from tiny import FRAMES, landmarks, make_source, picture
-from tiny_mediapipe import FAKE, FAKE_CV2, FAKE_LOOK
+from tiny_mediapipe import FAKE, FAKE_CV2, FAKE_LOOK, FAKE_MODEL
 
 NUMBERS = "report.json"  # compared without the seconds that stages took
 TIMED = {"report.md", "report.html"}  # the same numbers, seconds among them
@@ -228,6 +228,7 @@ def use_local_mediapipe(folder: Path) -> Path:
             "mediapipe/__init__.py": FAKE.replace("KNOWN", str(known)),
             "cv2.py": FAKE_CV2,
             "mediapipe_look.py": FAKE_LOOK.replace("PEOPLE", "[(0.9, 48.0, 32.0, 40.0)]"),
+            **{f"{name}.py": text for name, text in FAKE_MODEL.items()},
             "numpy.pth": f"{Path(np.__file__).parents[1]}\n",  # the running one
         },
     )

@@ -10,19 +10,19 @@ from pydantic import Field, PrivateAttr, ValidationError, field_validator, model
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import SpecError
-from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.options import Flag, Options
 from hoigs.core.spec.errors import explain
 from hoigs.core.spec.loader import Document, load_overrides, read_document
 from hoigs.core.spec.schema import ComponentSpec
-from hoigs.preparation.video.container import Pick, Span
+from hoigs.preparation.video.span import Pick, Span
 
 if TYPE_CHECKING:
     from hoigs.core.maths.frame_times import Chunking
 
 ObjectWay = Literal["auto", "ball", "texture", "outline"]
 FIT_STEPS = 40  # of the body fit, at most
-Place = EstimateKind | Literal["object"]  # "object": masks of the object alone
+# an EstimateKind, or "object": masks of the object alone (that interface loads numpy)
+Place = Literal["masks", "landmarks", "depth", "object"]
 Preset = Literal["auto", "offline", "hub", "files"]
 
 
@@ -282,7 +282,7 @@ class PrepareOptions(Options):
         Raises:
             SpecError: everything that is wrong, a line each, with its position.
         """
-        given = dict(settings or {})
+        given = {name: value for name, value in (settings or {}).items() if value is not None}
         file, overrides = given.pop("file", None), tuple(given.pop("overrides", ()))
         if file is not None:
             options = file

@@ -41,9 +41,10 @@ from hoigs.preparation.people import (
 )
 from hoigs.preparation.prompts import check_prompts, placed_prompts
 from hoigs.preparation.scene_points import camera_scene, static_scene
-from hoigs.preparation.video.container import Span, missing_frames
+from hoigs.preparation.video.container import missing_frames
 from hoigs.preparation.video.frames import FrameList, Frames, open_frames
 from hoigs.preparation.video.source import NobodyFoundError, SourceError
+from hoigs.preparation.video.span import Span
 from hoigs.preparation.work_folder import fingerprint
 
 Advance = Callable[[float], None]  # called with the done fraction of a stage

@@ -61,10 +61,13 @@ class GuidedPose:
 """,
     "mediapipe_check": """
 class Check:
+    most, since = 1.0, 0
     def __init__(self, graph, rect):
         pass
-    def agrees(self, image, points):
+    def agrees(self, image, points, square=None, *, known=False):
         return True
+    def difference(self, image, points, square=None):
+        return 0.0
     def lose(self):
         pass
 """,

@@ -24,7 +24,7 @@ SMALL = {  # smaller, but the same code
     "density:budget": {"count": 300},
 }
 # rasterizers are in tests/rasterizers/test_conformance.py; these need a user's file
-ELSEWHERE = {"body:smplx", "body:smpl", "body:smplh"}
+ELSEWHERE = {"body:smplx", "body:smpl", "body:smplh", "objective:tracks"}
 KEYS = [
     key
     for key in sorted(REGISTRY.keys())

@@ -15,8 +15,9 @@ from hoigs.core.system import downloads as hub
 from hoigs.core.system.npz import holds
 from hoigs.preparation.body.body_files import BodyFileEstimator, FileBody
 from hoigs.preparation.options import Place, PrepareOptions
-from hoigs.preparation.video.container import Span, video_header
+from hoigs.preparation.video.container import video_header
 from hoigs.preparation.video.source import MEGASAM, VGGT, Source, numbered_frames
+from hoigs.preparation.video.span import Span
 
 # seconds of a processor a frame of 1280x720, about, as benchmarks/prepare_alone.py measures them;
 # those of networks are guesses

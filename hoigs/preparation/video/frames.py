@@ -14,16 +14,10 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import UInt8
 
-from hoigs.preparation.video.container import (
-    PacketIndex,
-    Pick,
-    Span,
-    open_video,
-    packet_index,
-    unreadable,
-)
+from hoigs.preparation.video.container import PacketIndex, open_video, packet_index, unreadable
 from hoigs.preparation.video.pictures import FilePicture, Picture, VideoPicture, sharpness
 from hoigs.preparation.video.source import IMAGE_SUFFIXES, SourceError, numbered_frames
+from hoigs.preparation.video.span import Pick, Span
 
 UNEVEN = 0.1  # of the gap between frames: times that are so far from even ones are kept
 FAR = 30  # frames ahead, from which on decoding begins anew at a keyframe

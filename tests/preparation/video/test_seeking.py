@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from hoigs.preparation.video import frames as frames_module
-from hoigs.preparation.video.container import Span
 from hoigs.preparation.video.frames import open_frames
+from hoigs.preparation.video.span import Span
 
 COUNT, WIDTH, HEIGHT = 60, 64, 48
 

@@ -12,9 +12,10 @@ from tiny import FRAMES, picture
 
 from hoigs.core.errors import SpecError
 from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.video.container import Place, Span, missing_frames, parse_place
+from hoigs.preparation.video.container import missing_frames
 from hoigs.preparation.video.frames import VideoFrames
 from hoigs.preparation.video.source import SourceError
+from hoigs.preparation.video.span import Place, Span, parse_place
 
 
 def write(path: Path, ticks: list[int], turned: float = 0.0) -> Path:
