@@ -61,7 +61,7 @@ PLAN = {
         slow=True,
     ),
     "object_masks": Stage(
-        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=2
+        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=3
     ),
     "cameras": Stage(
         3, ("frames", "estimates"), ("camera", "focal", "intrinsics", "calibration"), version=2

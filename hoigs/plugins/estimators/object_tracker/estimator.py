@@ -104,7 +104,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 11  # of what is kept in `work`; raised when masks change
+VERSION = 12  # of what is kept in `work`; raised when masks change
 SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
 
 
@@ -185,7 +185,10 @@ class ObjectTrackerEstimator(Estimator):
                 )
             prompts[entity.name] = masks
             part = _part(progress, start, share)
-            tracks[entity.name] = followed(footage, scene, masks, part) if masks else None
+            marked = bool(entity.prompts)
+            tracks[entity.name] = (
+                followed(footage, scene, masks, part, marked=marked) if masks else None
+            )
         tracks, alike = told_apart(footage, scene, prompts, tracks)
         notes += [*alike, *doubts(tracks, footage)]
         write_tracks(file, video, footage, tracks, Said(chosen, notes, states_of(footage, tracks)))
