@@ -227,7 +227,7 @@ def use_local_mediapipe(folder: Path) -> Path:
         {
             "mediapipe/__init__.py": FAKE.replace("KNOWN", str(known)),
             "cv2.py": FAKE_CV2,
-            "mediapipe_look.py": FAKE_LOOK.replace("PEOPLE", "[(0.9, 48.0, 32.0, 40.0)]"),
+            "mediapipe_look.py": FAKE_LOOK.replace("PEOPLE", "[]"),
             **{f"{name}.py": text for name, text in FAKE_MODEL.items()},
             "numpy.pth": f"{Path(np.__file__).parents[1]}\n",  # the running one
         },
