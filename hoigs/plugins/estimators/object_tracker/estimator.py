@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -185,10 +186,7 @@ class ObjectTrackerEstimator(Estimator):
                 )
             prompts[entity.name] = masks
             part = _part(progress, start, share)
-            marked = bool(entity.prompts)
-            tracks[entity.name] = (
-                followed(footage, scene, masks, part, marked=marked) if masks else None
-            )
+            tracks[entity.name] = followed(footage, scene, masks, part) if masks else None
         tracks, alike = told_apart(footage, scene, prompts, tracks)
         notes += [*alike, *doubts(tracks, footage)]
         write_tracks(file, video, footage, tracks, Said(chosen, notes, states_of(footage, tracks)))
@@ -242,7 +240,7 @@ def _proposed(
             f"{best.frame} was taken; if it is something else, click on it, such as --object "
             "640,402@0"
         )
-    return [p.mask for p in found], [p.prompt for p in found]
+    return [replace(p.mask, proposed=True) for p in found], [p.prompt for p in found]
 
 
 def _part(progress: Progress, start: float, share: float) -> Callable[[float], None]:

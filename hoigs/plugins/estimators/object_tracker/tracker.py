@@ -87,27 +87,23 @@ def followed(
     scene: Scene,
     prompts: Sequence[PromptedMask],
     progress: Callable[[float], None] = lambda share: None,
-    *,
-    marked: bool = True,
 ) -> Track:
     """Masks of the frames that are proven to show the object; those of the others are empty.
 
     In up to three passes: the second knows what the object looks like in the frames in which the
     first found it best, the third what is behind an object that hides a person who keeps still.
 
-    Args:
-        marked: the user marked the object. Of equal things they mean one, and one break in its way
-            ends what is known of it; of what was found without a mark any is as good, and white
-            shoes would end the way of a kicked ball.
+    Of equal things a user who marked one means that one, and one break in its way ends what is
+    known of it. Of what was only proposed any is as good: white shoes do not end the way of a ball.
     """
-    looks, known = _learnt(footage, prompts, marked)
+    looks, known = _learnt(footage, prompts)
     first = tracked(footage, scene, prompts, looks=looks, progress=lambda x: progress(0.4 * x))
     proof = proof_of(footage, scene, prompts, first, looks, known)
     found = without_unproven(first, proof)
     best = anchors(footage, found, prompts)
     enough = proof.proven.mean() >= NEARLY_ALL and isinstance(scene, StaticScene)
     if best and not enough and not known.twins:  # which no looks tell apart
-        looks, known = _learnt(footage, [*prompts, *best], marked)
+        looks, known = _learnt(footage, [*prompts, *best])
         again = tracked(
             footage, scene, prompts, best, looks, lambda x: progress(0.4 + 0.3 * x)
         )  # fmt: skip
@@ -140,13 +136,11 @@ def _mended(found: Track, better: Track) -> Track:
     )
 
 
-def _learnt(
-    footage: Footage, known: Sequence[PromptedMask], marked: bool = True
-) -> tuple[Appearance, Known]:
+def _learnt(footage: Footage, known: Sequence[PromptedMask]) -> tuple[Appearance, Known]:
     """What the object looks like in known frames, and these without others that look like it."""
     masks = {p.frame: p.soft > 0.5 for p in known}
     looks = Appearance.learnt(footage, masks)
-    twins = twins_of(looks, masks) if marked else {}
+    twins = {} if any(p.proposed for p in known) else twins_of(looks, masks)
     return Appearance.learnt(footage, masks, twins) if twins else looks, Known(masks, twins)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,10 @@ import pytest
 from disc_world import COUNT, RADIUS, H, W, click, masks_of, overlaps, request, texture, world
 from test_behind import footage_of
 
+from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.states import LOST, OUT, PERSON, SEEN, states_of
+from hoigs.plugins.estimators.object_tracker.tracker import _learnt
 from hoigs.plugins.estimators.object_tracker.verified import _continued, _followed, _usual_size
 
 Y, X = np.mgrid[:H, :W] + 0.5
@@ -88,3 +91,14 @@ def test_a_mask_that_takes_in_the_thing_beside_it_is_not_of_the_usual_size() -> 
     fits = _usual_size(area, area > 0, [0])
     assert not fits[8:10].any() and fits[[*range(8), *range(10, 18)]].all()
     assert _usual_size(np.linspace(100, 400, 18), np.ones(18, bool), [0]).all()  # it comes nearer
+
+
+def test_twins_count_only_for_what_somebody_marked() -> None:
+    """White shoes look like a kicked ball, and end the way of one that nobody chose among them."""
+    image, nobody = np.uint8(texture(0, (120, 130, 90))[:, :W]), np.zeros((H, W), bool)
+    mask, other = disc(30, 40), disc(90, 40)
+    image[mask | other] = 250, 250, 250
+    footage = footage_of([image] * 3, [nobody] * 3)
+    marked = PromptedMask(0, mask.astype(np.float32), 1.0, False, nobody)
+    assert _learnt(footage, [marked])[1].twins
+    assert not _learnt(footage, [replace(marked, proposed=True)])[1].twins
