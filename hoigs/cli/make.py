@@ -47,7 +47,7 @@ def _compare(runs: dict[str, TrainedRun]) -> None:
             found = [run.evaluated.evaluation.score(r, "psnr", view.name) for r in regions]
             scores = (f"{s:.2f}" if isinstance(s, float) else str(s) for s in found)
             rows.append((name, view.name, *scores))
-        given = run.evaluated.evaluation.views[0].protocol.given() or given
+        given = given or run.evaluated.evaluation.views[0].protocol.given()
     title = "; ".join(("PSNR, dB", *filter(None, [given])))
     print_table(title, ("spec", "on", *regions), rows)
 
