@@ -42,7 +42,7 @@ from hoigs.preparation.people import (
 from hoigs.preparation.prompts import check_prompts, placed_prompts
 from hoigs.preparation.scene_points import camera_scene, static_scene
 from hoigs.preparation.video.container import missing_frames
-from hoigs.preparation.video.frames import FrameList, Frames, open_frames
+from hoigs.preparation.video.frames import Choice, FrameList, Frames, open_frames
 from hoigs.preparation.video.source import NobodyFoundError, SourceError
 from hoigs.preparation.video.span import Span
 from hoigs.preparation.work_folder import fingerprint
@@ -128,11 +128,11 @@ def choose_frames(path: Path, options: PrepareOptions) -> tuple[FrameList, list[
     Raises:
         SourceError: fewer than three are left, or they have nothing in them.
     """
-    span = Span.of(options.start, options.end)
-    frames = open_frames(
-        path, options.width, options.every, options.max_frames, fps=options.fps,
-        pick=options.pick, rate=options.folder_fps, span=span,
+    choice = Choice(
+        options.every, options.max_frames, options.fps, options.pick,
+        Span.of(options.start, options.end), options.folder_fps,
     )  # fmt: skip
+    frames = open_frames(path, options.width, choice)
     if len(frames) < FEWEST:
         raise SourceError(
             f"{path}: {len(frames)} of its frames would be used, as the options are; a "
@@ -140,7 +140,7 @@ def choose_frames(path: Path, options: PrepareOptions) -> tuple[FrameList, list[
         )
     require_pictures(frames)
     notes = []
-    if path.is_file() and span.end is None and options.max_frames is None:
+    if path.is_file() and choice.span.end is None and options.max_frames is None:
         notes += missing_frames(path, frames.total)
     if frames.variable:
         notes.append(

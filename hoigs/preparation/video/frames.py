@@ -50,17 +50,33 @@ class FrameList:
     first: int = 0
 
 
+@dataclass(frozen=True)
+class Choice:
+    """Which frames of a source are chosen.
+
+    Attributes:
+        every: one frame of each window of so many. max_frames: stop after so many; None takes all.
+        fps: frames a second to choose, in place of `every`.
+        pick: which frame of a window: its first, or its sharpest.
+        span: the part of the source to choose from.
+        folder_fps: frames a second of a source that has no rate of its own.
+    """
+
+    every: int = 1
+    max_frames: int | None = None
+    fps: float | None = None
+    pick: Pick = "first"
+    span: Span = field(default_factory=Span)
+    folder_fps: float = 30.0
+
+
 class Frames(ABC):
     """The chosen frames of a source, read anew on every iteration.
 
     Args:
         path: the source.
         width: of the frames given out, pixels; None keeps the source's. Height follows.
-        every: one frame of each window of so many. max_frames: stop after so many; None takes all.
-        fps: frames a second to choose, in place of `every`.
-        pick: which frame of a window: its first, or its sharpest.
-        rate: of a source that has none of its own.
-        span: the part of the source to choose from.
+        choice: which frames.
         known: what an earlier survey found; the source is then not looked at again.
 
     Attributes:
@@ -83,19 +99,13 @@ class Frames(ABC):
         self,
         path: Path,
         width: int | None = None,
-        every: int = 1,
-        max_frames: int | None = None,
+        choice: Choice = Choice(),
         *,
-        fps: float | None = None,
-        pick: Pick = "first",
-        rate: float = 30.0,
-        span: Span | None = None,
         known: FrameList | None = None,
     ) -> None:
-        self.path, self._rate = Path(path), rate
+        self.path, self._rate = Path(path), choice.folder_fps
         self.notes: list[str] = []
-        windows = _Windows(every, fps, max_frames, pick)
-        self.list = known or self._survey(windows, span or Span())
+        self.list = known or self._survey(_Windows(choice), choice.span)
         if width and width > self.native_width:
             raise SourceError(
                 f"width {width} is larger than the video's {self.native_width}; "
@@ -235,8 +245,9 @@ class _Windows:
     """Cuts a stream of frames into windows, the first of which begins with the first frame, and
     keeps one frame of each."""
 
-    def __init__(self, every: int, fps: float | None, max_frames: int | None, pick: Pick) -> None:
-        self.every, self.wanted_fps, self.max_frames, self.pick = every, fps, max_frames, pick
+    def __init__(self, choice: Choice) -> None:
+        self.every, self.wanted_fps = choice.every, choice.fps
+        self.max_frames, self.pick = choice.max_frames, choice.pick
         self.rate = 0.0
         self.indices: list[int] = []
         self.sharpnesses: list[float] = []
@@ -375,17 +386,10 @@ class FolderFrames(Frames):
 def open_frames(
     path: Path,
     width: int | None = None,
-    every: int = 1,
-    max_frames: int | None = None,
+    choice: Choice = Choice(),
     *,
-    fps: float | None = None,
-    pick: Pick = "first",
-    rate: float = 30.0,
-    span: Span | None = None,
     known: FrameList | None = None,
 ) -> Frames:
     """A video file's or a folder's frames; see `Frames`."""
     kind = FolderFrames if Path(path).is_dir() else VideoFrames
-    return kind(
-        path, width, every, max_frames, fps=fps, pick=pick, rate=rate, span=span, known=known
-    )
+    return kind(path, width, choice, known=known)

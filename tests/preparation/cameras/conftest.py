@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from hoigs.preparation.video.frames import Frames, open_frames
+from hoigs.preparation.video.frames import Choice, Frames, open_frames
 from tests.preparation.tiny import FRAMES, WIDTH, picture
 
 
@@ -16,4 +16,4 @@ def video(tmp_path: Path) -> Frames:
     (tmp_path / "frames").mkdir()
     for i in range(FRAMES):
         Image.fromarray(picture(i)).save(tmp_path / f"frames/{i:05d}.png")
-    return open_frames(tmp_path / "frames", WIDTH // 2, every=2)
+    return open_frames(tmp_path / "frames", WIDTH // 2, choice=Choice(every=2))

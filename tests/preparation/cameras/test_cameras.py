@@ -16,7 +16,7 @@ from hoigs.preparation.cameras.camera_track import (
     pinhole,
     static_cameras,
 )
-from hoigs.preparation.video.frames import VideoFrames
+from hoigs.preparation.video.frames import Choice, VideoFrames
 from hoigs.preparation.video.source import SourceError
 
 FOCAL, K1 = 90.0, -0.3
@@ -75,7 +75,7 @@ def test_distortion_is_removed_from_images_masks_and_points(
 
 def test_poses_points_and_width(tiny_video: Path, tmp_path: Path) -> None:
     model = colmap_model(tmp_path / "sparse")
-    track = colmap_cameras(VideoFrames(tiny_video, width=WIDTH // 2, every=4), model)
+    track = colmap_cameras(VideoFrames(tiny_video, WIDTH // 2, Choice(every=4)), model)
     assert len(track.cameras) == 3 and not track.metric
     assert float(track.cameras[1].K[0, 0]) == FOCAL / 2
     torch.testing.assert_close(track.cameras[1].center, torch.tensor([0.4, 0, 0]))
@@ -104,7 +104,10 @@ def test_camera_count_unlike_frame_count(tiny_video: Path, tmp_path: Path) -> No
     model = colmap_model(tmp_path / "sparse", range(9))
     with pytest.raises(SourceError, match=r"9 .*12 "):
         colmap_cameras(VideoFrames(tiny_video), model)
-    assert len(colmap_cameras(VideoFrames(tiny_video, max_frames=9), model).cameras) == 9
+    assert (
+        len(colmap_cameras(VideoFrames(tiny_video, choice=Choice(max_frames=9)), model).cameras)
+        == 9
+    )
 
 
 def test_a_damaged_model(tiny_video: Path, tmp_path: Path) -> None:

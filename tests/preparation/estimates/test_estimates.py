@@ -16,7 +16,7 @@ from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.preparation.estimates.installed import load_options
 from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until, work_folder
-from hoigs.preparation.video.frames import FolderFrames, VideoFrames, open_frames
+from hoigs.preparation.video.frames import Choice, FolderFrames, VideoFrames, open_frames
 from hoigs.preparation.video.source import SourceError, find_source, numbered_frames
 
 QUICK = ["fit_steps=3", "overlay_width=0"]
@@ -65,7 +65,7 @@ def test_frames_alone_with_priors_by_options(bare_frames: Path, tmp_path: Path) 
 def test_frames_are_ordered_by_number(bare_frames: Path) -> None:
     names = [p.name for p in numbered_frames(bare_frames)]
     assert names[:3] == ["frame_0.png", "frame_1.png", "frame_2.png"] and len(names) == FRAMES
-    frames = open_frames(bare_frames, every=4, rate=12)
+    frames = open_frames(bare_frames, choice=Choice(every=4, folder_fps=12))
     assert isinstance(frames, FolderFrames) and frames.fps == 3 and frames.indices == [0, 4, 8]
     for i, image in zip(frames.indices, frames, strict=True):
         np.testing.assert_array_equal(image, picture(i))
@@ -94,16 +94,18 @@ def test_the_sharpest_of_each_window(tmp_path: Path) -> None:
     for i in range(9):
         image = sharp if i in best else ndimage.gaussian_filter(sharp, (2, 2, 0))
         Image.fromarray(image).save(folder / f"{i}.png")
-    assert open_frames(folder, every=3, pick="sharpest").indices == [1, 3, 8]
-    assert open_frames(folder, every=3).indices == [0, 3, 6]
-    at_ten = open_frames(folder, fps=10, rate=30, pick="sharpest", max_frames=2)
+    assert open_frames(folder, choice=Choice(every=3, pick="sharpest")).indices == [1, 3, 8]
+    assert open_frames(folder, choice=Choice(every=3)).indices == [0, 3, 6]
+    at_ten = open_frames(
+        folder, choice=Choice(fps=10, folder_fps=30, pick="sharpest", max_frames=2)
+    )
     assert at_ten.indices == [1, 3] and at_ten.fps == 10
     with pytest.raises(SourceError, match="video's 30"):
-        open_frames(folder, fps=31, rate=30)
+        open_frames(folder, choice=Choice(fps=31, folder_fps=30))
 
 
 def test_a_video_reads_any_frame(tiny_video: Path) -> None:
-    video = VideoFrames(tiny_video, width=48, max_frames=2)
+    video = VideoFrames(tiny_video, choice=Choice(max_frames=2), width=48)
     assert video.count() == FRAMES
     for number in (3, 7, 2):
         image = video.read(number)

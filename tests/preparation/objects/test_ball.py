@@ -13,7 +13,7 @@ from hoigs.core.maths.frame_times import smooth
 from hoigs.core.values.lens import Undistortion
 from hoigs.preparation.cameras.camera_track import pinhole, static_cameras
 from hoigs.preparation.objects.ball import ball_centers, load_ball, outline_rays, refine_ball
-from hoigs.preparation.video.frames import VideoFrames
+from hoigs.preparation.video.frames import Choice, VideoFrames
 from hoigs.preparation.video.source import SourceError
 
 
@@ -33,7 +33,7 @@ def test_gaps_are_filled_and_marked(tiny_source: Path) -> None:
 
 
 def test_half_width_halves_the_disc(tiny_source: Path) -> None:
-    video = VideoFrames(tiny_source / "video.mp4", width=WIDTH // 2, every=2)
+    video = VideoFrames(tiny_source / "video.mp4", WIDTH // 2, Choice(every=2))
     ball = load_ball(tiny_source / "ball_track.npz", video, Undistortion())
     np.testing.assert_allclose(ball.centers, truth()[::2, :2] / 2, atol=1e-4)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tiny import FRAMES, HEIGHT, WIDTH, picture
 
-from hoigs.preparation.video.frames import VideoFrames
+from hoigs.preparation.video.frames import Choice, VideoFrames
 from hoigs.preparation.video.source import SourceError
 
 
@@ -24,7 +24,7 @@ def test_all_frames(tiny_video: Path) -> None:
 
 
 def test_every_and_max_frames(tiny_video: Path) -> None:
-    video = VideoFrames(tiny_video, every=3, max_frames=3)
+    video = VideoFrames(tiny_video, choice=Choice(every=3, max_frames=3))
     assert video.indices == [0, 3, 6] and video.fps == 4
     for i, frame in zip(video.indices, video, strict=True):
         assert np.abs(frame.astype(int) - picture(i)).mean() < 6

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hoigs.preparation.video import frames as frames_module
-from hoigs.preparation.video.frames import open_frames
+from hoigs.preparation.video.frames import Choice, open_frames
 from hoigs.preparation.video.span import Span
 
 COUNT, WIDTH, HEIGHT = 60, 64, 48
@@ -46,12 +46,12 @@ def test_frames_are_the_same(
     path = tmp_path / f"video.{suffix}"
     write(path, bframes=bframes, uneven=uneven)
     spans = [Span.of("27f", "40f"), Span.of(1.01, None), Span.of("1f", "3f"), Span.of("59f", None)]
-    sought = [open_frames(path, every=2, span=span) for span in spans]
+    sought = [open_frames(path, choice=Choice(every=2, span=span)) for span in spans]
     images = [list(frames) for frames in sought]
     with monkeypatch.context() as patch:  # every pass from the first frame
         patch.setattr(frames_module, "packet_index", lambda *_: None)
         for span, found, given in zip(spans, sought, images, strict=True):
-            plain = open_frames(path, every=2, span=span)
+            plain = open_frames(path, choice=Choice(every=2, span=span))
             assert plain.list == found.list and len(plain) > 0
             assert all((a == b).all() for a, b in zip(plain, given, strict=True))
             assert plain.count() == found.count() == COUNT
@@ -67,7 +67,7 @@ def test_nothing_before_the_keyframe_is_decoded(
     write(path, bframes=2, uneven=False)
     decoded = []
     monkeypatch.setattr(frames_module, "VideoPicture", _counted(decoded))
-    frames = open_frames(path, span=Span.of("42f", "45f"))
+    frames = open_frames(path, choice=Choice(span=Span.of("42f", "45f")))
     list(frames)
     assert frames.indices == [42, 43, 44] and len(decoded) <= 8
 
@@ -85,7 +85,7 @@ def _counted(decoded: list[int]):
 def test_an_index_that_is_wrong_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "video.mp4"
     write(path, bframes=0, uneven=False)
-    right = list(open_frames(path, span=Span.of("27f", "40f")))
+    right = list(open_frames(path, choice=Choice(span=Span.of("27f", "40f"))))
     index = frames_module.packet_index
 
     def shifted(*arguments: object) -> object:
@@ -93,6 +93,6 @@ def test_an_index_that_is_wrong_is_noted(tmp_path: Path, monkeypatch: pytest.Mon
         return found and replace(found, times=[time + 7 for time in found.times])
 
     monkeypatch.setattr(frames_module, "packet_index", shifted)
-    frames = open_frames(path, span=Span.of("27f", "40f"))
+    frames = open_frames(path, choice=Choice(span=Span.of("27f", "40f")))
     assert all((a == b).all() for a, b in zip(right, frames, strict=True))
     assert len(frames.notes) == 1 and "decoded from the start" in frames.notes[0]

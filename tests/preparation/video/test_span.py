@@ -13,7 +13,7 @@ from tiny import FRAMES, picture
 from hoigs.core.errors import SpecError
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.container import missing_frames
-from hoigs.preparation.video.frames import VideoFrames
+from hoigs.preparation.video.frames import Choice, VideoFrames
 from hoigs.preparation.video.source import SourceError
 from hoigs.preparation.video.span import Place, Span, parse_place
 
@@ -54,14 +54,18 @@ def test_no_places(text: str) -> None:
 
 
 def test_a_part_keeps_the_videos_numbers_and_times(tiny_video: Path) -> None:
-    part = VideoFrames(tiny_video, span=Span.of(0.25, "10f"))  # 12 frames a second
+    part = VideoFrames(tiny_video, choice=Choice(span=Span.of(0.25, "10f")))  # 12 frames a second
     assert part.indices == [3, 4, 5, 6, 7, 8, 9]
     assert part.times == pytest.approx([i / 12 for i in part.indices], abs=1e-3)
     assert np.abs(next(iter(part)).astype(int) - picture(3)).mean() < 6
-    both = VideoFrames(tiny_video, every=2, max_frames=3, span=Span.of("3f", None))
+    both = VideoFrames(tiny_video, choice=Choice(every=2, max_frames=3, span=Span.of("3f", None)))
     assert both.indices == [3, 5, 7] and both.fps == 6 and both.list.first == 3
-    assert VideoFrames(tiny_video, fps=4, span=Span.of(0.25, None)).indices == [3, 6, 9]
-    assert VideoFrames(tiny_video, span=Span.of(None, 99)).total == FRAMES
+    assert VideoFrames(tiny_video, choice=Choice(fps=4, span=Span.of(0.25, None))).indices == [
+        3,
+        6,
+        9,
+    ]
+    assert VideoFrames(tiny_video, choice=Choice(span=Span.of(None, 99))).total == FRAMES
 
 
 def test_parts_that_are_none(tiny_video: Path) -> None:
@@ -69,9 +73,9 @@ def test_parts_that_are_none(tiny_video: Path) -> None:
         with pytest.raises(ValueError, match=r"--end .*--start"):
             PrepareOptions(start=start, end=end)
     with pytest.raises(SourceError, match=r"--start 7 s.* 0 to 11, .* 0\.92 s"):
-        VideoFrames(tiny_video, span=Span.of(7, None))
+        VideoFrames(tiny_video, choice=Choice(span=Span.of(7, None)))
     with pytest.raises(SourceError, match="--start"):
-        VideoFrames(tiny_video, span=Span.of("6f", 0.1))
+        VideoFrames(tiny_video, choice=Choice(span=Span.of("6f", 0.1)))
 
 
 def test_frames_of_a_variable_rate_keep_their_times(tmp_path: Path) -> None:
@@ -79,7 +83,7 @@ def test_frames_of_a_variable_rate_keep_their_times(tmp_path: Path) -> None:
     video = VideoFrames(write(tmp_path / "uneven.mp4", ticks))
     assert video.times == pytest.approx([(t - 600) / 300 for t in ticks])
     assert video.uneven and video.fps == pytest.approx(11 / video.times[-1])
-    assert VideoFrames(video.path, span=Span.of(0.2, None)).indices[0] == 4
+    assert VideoFrames(video.path, choice=Choice(span=Span.of(0.2, None))).indices[0] == 4
     even = VideoFrames(write(tmp_path / "even.mp4", [10 * i for i in range(12)]))
     some = even.subset([0, 1, 2, 7])
     assert not even.uneven and some.uneven and video.variable and not some.variable
