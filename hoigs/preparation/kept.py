@@ -77,7 +77,7 @@ PLAN = {
     "objects": Stage(
         40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True, version=2
     ),
-    "scene": Stage(10, ("masks",), ("prompts", "scene_points", "backdrop"), slow=True),
+    "scene": Stage(11, ("masks",), ("prompts", "scene_points", "backdrop"), slow=True),
     "write": Stage(40, ("objects", "scene")),
 }
 

@@ -14,6 +14,7 @@ from scipy.spatial import Delaunay, QhullError
 from torch import Tensor
 
 from hoigs.core.values.camera import Camera, pinhole_rays
+from hoigs.preparation.completion import completed
 from hoigs.preparation.depth import median_depth
 from hoigs.preparation.final_masks import EntityMasks
 from hoigs.preparation.mask_stack import Images
@@ -30,7 +31,7 @@ class Plate:
     """The background without what moves.
 
     Attributes:
-        image: RGB, 0..255; pixels never seen are copied from the nearest seen.
+        image: RGB, 0..255; what is never seen is made from patches of the rest.
         seen: pixels that some frame shows.
     """
 
@@ -57,12 +58,7 @@ def background_plate(
     middle = np.maximum(visible - 1, 0) // 2
     median = np.take_along_axis(stack, middle[None, ..., None].astype(np.int64), axis=0)[0]
     seen = visible > 0
-    if not seen.all() and seen.any():
-        rows, columns = ndimage.distance_transform_edt(
-            ~seen, return_distances=False, return_indices=True
-        )
-        median = median[rows, columns]
-    return Plate(median, seen)
+    return Plate(completed(median, seen), seen)
 
 
 def supposed_depth(
@@ -473,5 +469,8 @@ def static_scene(
         share = 100 * float((measured[within] > 0).mean())
         text = f"the median of the depth maps over unmasked pixels, {share:.0f} % of the image "
         text += f"(else {floor}); "
-    text += f"{100 * (1 - plate.seen[within].mean()):.1f} % of it is never seen"
+    text += (
+        f"{100 * (1 - plate.seen[within].mean()):.1f} % of it is never seen: patches of the rest "
+    )
+    text += "stand there"
     return ScenePoints(points, colors, text)

@@ -7,7 +7,7 @@ image on a body: the solution of a screened Laplace equation over the graph of n
 gradient-domain inpainting, Perez et al. 2003), which keeps what was seen. Patterns do not continue
 that way: far from all that was seen, stripes become their mean. So a person's back may take the
 colours of the front at the same height, as avatars from one picture do (e.g. Natsume et al. 2019,
-SiCloPe).
+SiCloPe), and the hidden part of a scene those of the clip's own points there.
 """
 
 from __future__ import annotations
@@ -115,8 +115,8 @@ def spread(
 #
 # Nothing says what is there, and the little that shines through whatever is in front of it pulls
 # its Gaussians about by full steps of Adam, however weak the pull: from the side they are stripes
-# of all colours. Here they become an opaque surface with the colours of the scene around, and are
-# not trained on: whoever is in front of them has to explain the images.
+# of all colours. Here they become an opaque surface with the colours of the clip's points, or of
+# the scene around, and are not trained on: whoever is in front of them has to explain the images.
 
 HIDDEN, SHOWN = 0.05, 0.15  # shares of the weight without anything in front; 0 and 1 of it kept
 MOST = 20_000  # Gaussians whose colours are solved for together; others take their neighbour's
@@ -133,6 +133,7 @@ def fill_hidden(
     alone: Float[Tensor, " N"],
     centers: Sequence[Float[Tensor, " 3"]],
     shapes: bool = True,
+    points: tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]] | None = None,
 ) -> Float[Tensor, " N"] | None:
     """Fill in, in place, what is hidden in all pictures though it would be in some.
 
@@ -140,6 +141,8 @@ def fill_hidden(
         shown: blending weights over the training frames. alone: those without people and objects.
         centers: of the cameras, from which colours are meant. shapes: also opacity and size, but at
             the rim; else colours alone.
+        points: in the world, metres, and their RGB in [0, 1], of which the nearest colour each; by
+            default colours are continued from the Gaussians beside.
 
     Returns:
         How much of each Gaussian is kept, in [0, 1]; None where all of it is.
@@ -155,7 +158,12 @@ def fill_hidden(
         return None
     gaussians = scene.canonical
     target = {"sh": torch.zeros_like(gaussians.sh[hidden])}
-    target["sh"][:, 0] = _colors(scene, hidden, known, kept, centers)
+    if points is None:
+        target["sh"][:, 0] = _colors(scene, hidden, known, kept, centers)
+    else:
+        places, colors = (p.to(gaussians.means) for p in points)
+        beside = nearest(gaussians.means[hidden], 1, places)[0][:, 0]
+        target["sh"][:, 0] = (colors[beside] - 0.5) / SH_C0
     if shapes:
         beside, apart = nearest(gaussians.means[hidden], NEIGHBOURS + 1, gaussians.means)
         within = (kept[beside] < 1).all(1)  # at the rim they reach into what is seen
@@ -361,9 +369,10 @@ def fill_unseen(
         if seen is not None:
             _fill(model.entity(name), seen, shapes, opposite)
     centers = [clip.cameras[p].center for p in training_frames(clip)]
+    points = (clip.points, clip.point_colors) if len(clip.points) else None
     kept = {}
     for name in model.names("scene") if scenes else ():
-        share = fill_hidden(model.entity(name), *weights[name], centers, shapes)
+        share = fill_hidden(model.entity(name), *weights[name], centers, shapes, points)
         if share is not None:
             kept[name] = share
     model.train(training)

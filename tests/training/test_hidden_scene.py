@@ -46,6 +46,16 @@ def test_the_hidden_part_is_opaque_and_between_its_surroundings() -> None:
     torch.testing.assert_close(scene.means, before["means"])
 
 
+def test_the_hidden_part_takes_the_colours_of_the_clips_own_points() -> None:
+    scene, hidden = wall()
+    red = torch.tensor([0.9, 0.1, 0.1]).expand(len(scene), 3)
+    weights = torch.where(hidden, 0.01, 1.0), torch.ones(len(scene))
+    before = scene.canonical.colors.detach().clone()
+    fill_hidden(scene, *weights, CAMERA, points=(scene.means.detach() + 0.001, red))
+    torch.testing.assert_close(scene.canonical.colors[hidden], red[hidden])
+    torch.testing.assert_close(scene.canonical.colors[~hidden], before[~hidden])
+
+
 def test_one_that_stands_alone_before_the_others_stays_off_what_is_seen() -> None:
     scene, hidden = wall()
     alone = Gaussians.from_points(torch.tensor([[0.1, 0.0, 1.5]]), torch.zeros(1, 3), sh_degree=1)
