@@ -23,7 +23,6 @@ from hoigs.core.system.video_files import SUFFIXES, WITH_ALPHA, write_video
 from hoigs.core.values.between import frame_numbers
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
-from hoigs.core.values.moment import Moment
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.options import RenderOptions
 from hoigs.viewing.paths import OLDER, View, film_path, frames_shown, rate_of
@@ -268,12 +267,6 @@ def _with_alpha(output: RenderOutput) -> Float[Tensor, "H W 4"]:
     """Straight colours and opacity of a picture over black."""
     alpha = output.alpha.clamp(0, 1)[..., None]
     return torch.cat((output.color / alpha.clamp_min(1e-3), alpha), -1)
-
-
-def film_views(model: SceneModel, clip: Clip, path: str) -> list[tuple[Moment, Camera]]:
-    """The moment and camera of every frame of a film over the whole clip."""
-    numbers, fps = frame_numbers(clip)
-    return film_path(model, clip, path, numbers, fps)
 
 
 def playback_of(

@@ -8,7 +8,9 @@ import pytest
 import torch
 
 import hoigs as h
-from hoigs.viewing.films import film_views, playback_of
+from hoigs.core.values.between import frame_numbers
+from hoigs.viewing.films import playback_of
+from hoigs.viewing.paths import film_path
 
 SMALL = ("--set", "train.steps=60", "--set", "train.preview_every=30")
 # a render of the default numbers takes 0.4 s, and an evaluation with its report makes 200 of them
@@ -41,7 +43,7 @@ def test_train_evaluate_and_render_from_python(hoigs, tiny_clip, tmp_path):
 
     loaded = h.open_run(run, device="cpu")
     for path in ("video", "orbit"):
-        views = film_views(loaded.model, loaded.clip, path)
+        views = film_path(loaded.model, loaded.clip, path, *frame_numbers(loaded.clip))
         play = playback_of(loaded.model, views)
         for moment, camera in views[::3]:
             with torch.no_grad():

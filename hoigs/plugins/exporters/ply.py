@@ -58,20 +58,12 @@ def ply_bytes(gaussians: Gaussians, *, pad_sh: bool = False) -> bytes:
     return "\n".join(header).encode("ascii") + table.tobytes()
 
 
-def read_ply(path: Path | str) -> Gaussians:
-    """The Gaussians of a PLY in the layout of 3DGS, raw.
+def parse_ply(data: bytes, name: str = "PLY") -> Gaussians:
+    """The raw Gaussians of a binary PLY in the layout of 3DGS.
 
     Raises:
-        HoigsError: the file is absent, damaged, or no PLY of Gaussians.
+        HoigsError: the bytes are damaged, or no PLY of Gaussians.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise HoigsError(f"{path}: no such file")
-    return parse_ply(path.read_bytes(), str(path))
-
-
-def parse_ply(data: bytes, name: str = "PLY") -> Gaussians:
-    """The Gaussians in the bytes of a binary PLY; errors as `read_ply`."""
     head, end, body = data.partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     fields = [(line[2], SIZES.get(line[1], "")) for line in lines if line[:1] == ["property"]]

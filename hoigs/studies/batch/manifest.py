@@ -153,11 +153,6 @@ class Row(BaseModel):
         return value
 
 
-def read_manifest(path: Path, defaults: Mapping[str, Any] | None = None) -> list[Row]:
-    """The rows of a manifest; arguments and errors as `each_row`."""
-    return list(each_row(path, defaults))
-
-
 def each_row(path: Path, defaults: Mapping[str, Any] | None = None) -> Iterator[Row]:
     """The rows of a YAML file (`rows:`, and `defaults:` for all of them) or of a CSV file.
 
