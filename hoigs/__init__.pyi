@@ -466,7 +466,6 @@ def needs(
     spec: str | _Path = ...,
     *,
     out: _Path | str | None = ...,
-    criterion: str = ...,
     least: float = ...,
     share: float = ...,
     search_spaces: _Path | str | None = ...,

@@ -236,7 +236,7 @@ def load_chart(path: Path) -> tuple[list[Cell], dict[str, Any]]:
 
 def _plain_point(point: Point) -> dict[str, Any]:
     values = {
-        name: {"not_computed": v.reason}
+        name: to_json(v)
         if isinstance(v, NotComputed)
         else {"mean": v.mean, "std": v.std, "n": len(v.values)}
         for name, v in point.values.items()

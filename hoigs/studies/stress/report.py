@@ -1,13 +1,11 @@
-"""A study's files: stress.md, stress.csv, stress.json, and the figures of matrix and curves."""
+"""A study's files: stress.md, stress.json, and the figures of matrix and curves."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from hoigs.core.system.files import write_whole
-from hoigs.evaluation.protocol import NotComputed
-from hoigs.studies.plots import INK, MARKERS, PALETTE, QUIET, STYLE, short_number
+from hoigs.studies.plots import DPI, INK, MARKERS, PALETTE, QUIET, STYLE, framed, short_number
 from hoigs.studies.stress.capabilities import MEANING as HAS
 from hoigs.studies.stress.case import Case
 from hoigs.studies.stress.verdict import (
@@ -44,7 +41,6 @@ def write_stress(table: Table, out: Path) -> list[Path]:
     out.mkdir(parents=True, exist_ok=True)
     files: dict[str, bytes] = {
         "stress.json": as_json(table).encode(),
-        "stress.csv": as_csv(table).encode(),
         "stress.md": as_markdown(table).encode(),
     }
     drawn = {"stress-matrix": matrix(table, "Where methods break"),
@@ -70,48 +66,6 @@ def as_json(table: Table) -> str:
         "verdicts": [v.to_dict() for v in table.verdicts.values()],
     }
     return json.dumps(data, indent=1, allow_nan=False)
-
-
-def as_csv(table: Table) -> str:
-    """One number a line; a verdict without numbers is a line too."""
-    columns = ("case", "title", "kind", "spec", "definition", "status", "rate", "breaks_at",
-               "unit", "seed", "value", "stands", "measure", "number", "not_computed", "measured",
-               "run", "machine", "protocol", *table.about)  # fmt: skip
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    for case in table.cases:
-        for spec in table.specs:
-            verdict = table.at(case, spec)
-            base = {
-                "case": case.id, "title": case.title, "kind": "sweep", "spec": spec,
-                "definition": table.definitions[spec], "status": verdict.status,
-                "rate": "" if verdict.rate is None else f"{verdict.rate:.3f}",
-                "breaks_at": "" if verdict.breaks_at is None else f"{verdict.breaks_at:g}",
-                "unit": case.sweep.unit,
-                "machine": " and ".join(verdict.machines),
-                "protocol": " ".join(verdict.protocol), **table.about,
-            }  # fmt: skip
-            numbers = list(_numbers(verdict))
-            for row in numbers or [{"measured": verdict.measured}]:
-                writer.writerow(base | row)
-    return text.getvalue()
-
-
-def _numbers(verdict: Verdict) -> Iterator[dict[str, Any]]:
-    for seed in verdict.seeds:
-        for level in seed.levels:
-            place = {"seed": seed.seed, "value": f"{level.value:g}", "stands": level.stands,
-                     "measured": level.why, "run": level.run}  # fmt: skip
-            if not level.values:
-                yield place
-            for name, value in level.values.items():
-                absent = isinstance(value, NotComputed)
-                yield place | {
-                    "measure": name,
-                    "number": "" if absent else repr(value),
-                    "not_computed": value.reason if isinstance(value, NotComputed) else "",
-                }
 
 
 def as_markdown(table: Table) -> str:
@@ -161,43 +115,30 @@ def _section(table: Table, case: Case) -> list[str]:
 
 # Breakdown curves: a score against the value of a sweep, for each method.
 
-DPI = 160
-PANEL = (3.9, 3.1)  # inches
+PANEL, LEGEND = (3.9, 3.3), 2.2  # inches
 MOST_COLUMNS = 4
-CURVES_HEAD, CURVES_LINE = 1.05, 0.19
 
 
 def breakdown(table: Table, title: str) -> Figure | None:
     """A panel for each case with a sweep that has been run; None where none has."""
-    cases = [c for c in table.cases if _drawn(table, c)]
+    cases = [c for c in table.cases if any(table.curve(c, spec) for spec in table.specs)]
     if not cases:
         return None
     columns = min(MOST_COLUMNS, len(cases))
     rows = math.ceil(len(cases) / columns)
-    width = PANEL[0] * max(2, columns)
-    notes = [line for note in [HOW, *table.notes] for line in textwrap.wrap(note, int(width * 15))]
-    legend = math.ceil(len(table.specs) / max(1, int(width / 1.9)))
-    foot = 0.5 + CURVES_LINE * len(notes)
-    head = CURVES_HEAD + 0.24 * (legend - 1)
-    height = head + PANEL[1] * rows + foot
+    width = PANEL[0] * max(2, columns) + LEGEND
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(width, height), dpi=DPI)
-        FigureCanvasAgg(figure)
+        figure = framed(title, [HOW, *table.notes], width, PANEL[1] * rows)
         grid: Any = figure.subplots(rows, columns, squeeze=False)
-        figure.subplots_adjust(
-            left=0.62 / width, right=1 - 0.2 / width, top=1 - (head + 0.25) / height,
-            bottom=(foot + 0.5) / height, wspace=0.24, hspace=0.52,
-        )  # fmt: skip
-        for i, case in enumerate(cases):
-            _panel(grid[i // columns][i % columns], table, case)
-        for i in range(len(cases), rows * columns):
-            grid[i // columns][i % columns].axis("off")
-        figure.text(0.3 / width, 1 - 0.34 / height, title, size=15, weight="bold", va="center")
-        _legend(figure, table.specs, width, height)
-        for i, line in enumerate(notes):
-            figure.text(0.3 / width, (foot - 0.3 - CURVES_LINE * i) / height, line, size=8,
-                    color=QUIET,
-                        va="center")  # fmt: skip
+        for axes, case in zip_longest(grid.flat, cases):
+            if case is None:
+                axes.axis("off")
+            else:
+                _panel(axes, table, case)
+        looks = [
+            Line2D([], [], color=_color(i), marker=_marker(i)) for i in range(len(table.specs))
+        ]
+        figure.legend(looks, table.specs, loc="outside right upper")
     return figure
 
 
@@ -205,24 +146,6 @@ HOW = (
     "Bars: one standard deviation over seeds. A cross: half of the seeds or more fail that "
     "value; a seed that fails a value runs none harder. Grey line: the required value."
 )
-
-
-def _drawn(table: Table, case: Case) -> bool:
-    return any(table.curve(case, spec) for spec in table.specs)
-
-
-def _legend(figure: Figure, specs: Sequence[str], width: float, height: float) -> None:
-    x, y = 0.36, 0.68
-    for i, spec in enumerate(specs):
-        step = 0.42 + 0.078 * len(spec)
-        if x + step > width - 0.2:
-            x, y = 0.36, y + 0.24
-        artist = Line2D([x / width, (x + 0.22) / width], [1 - y / height] * 2, color=_color(i),
-                        marker=_marker(i), markersize=5, linewidth=1.4,
-                        transform=figure.transFigure)  # fmt: skip
-        figure.add_artist(artist)
-        figure.text((x + 0.3) / width, 1 - y / height, spec, size=9, color=INK, va="center")
-        x += step + 0.1
 
 
 def _panel(axes: Any, table: Table, case: Case) -> None:
@@ -234,15 +157,15 @@ def _panel(axes: Any, table: Table, case: Case) -> None:
         if not points:
             continue
         shift = 0.05 * (i - (len(table.specs) - 1) / 2)  # so that bars do not hide each other
-        x = [places[p.value] + shift for p in points]
+        x, spreads = [places[value] + shift for value in points], points.values()
         axes.errorbar(
-            x, [p.mean for p in points], yerr=[p.std or 0 for p in points], color=_color(i),
+            x, [s.mean for s in spreads], yerr=[s.std or 0 for s in spreads], color=_color(i),
             marker=_marker(i), markersize=4.5, linewidth=1.4, elinewidth=0.9, capsize=0, zorder=3,
         )  # fmt: skip
         broken = table.at(case, spec).breaks_at
-        at = [(a, p.mean) for a, p in zip(x, points, strict=True) if p.value == broken]
-        axes.plot([a for a, _ in at], [b for _, b in at], "x", color=INK, markersize=9,
-                  markeredgewidth=1.6, zorder=4)  # fmt: skip
+        if broken in points:
+            axes.plot(places[broken] + shift, points[broken].mean, "x", color=INK, markersize=9,
+                      markeredgewidth=1.6, zorder=4)  # fmt: skip
     axes.set_xticks(list(places.values()), [short_number(v) for v in sweep.values])
     axes.set_xlim(-0.4, len(places) - 0.6)
     axes.tick_params(length=0, labelsize=8.5)

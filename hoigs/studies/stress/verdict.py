@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from statistics import mean, stdev
 from typing import Any, Literal
 
-from hoigs.evaluation.protocol import NotComputed, Value
+from hoigs.evaluation.protocol import NotComputed, Value, to_json
+from hoigs.studies.jobs.results import Spread
 from hoigs.studies.plots import short_number
 from hoigs.studies.stress.case import Case, Criterion, Sweep, load_cases
 from hoigs.studies.stress.measures import MEASURES
@@ -93,10 +93,7 @@ class Verdict:
         for seed, plain in zip(self.seeds, data["seeds"], strict=True):
             plain["broke_at"] = seed.broke_at
             for level, shown in zip(seed.levels, plain["levels"], strict=True):
-                shown["values"] = {
-                    name: {"not_computed": v.reason} if isinstance(v, NotComputed) else v
-                    for name, v in level.values.items()
-                }
+                shown["values"] = {name: to_json(v) for name, v in level.values.items()}
         return data
 
 
@@ -177,16 +174,6 @@ def middle_of(seeds: Sequence[Seed], value: float, measure: str) -> list[float]:
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Numbers of several seeds at one value of a sweep; std is None with one seed."""
-
-    value: float
-    mean: float
-    std: float | None
-    seeds: int
-
-
-@dataclass(frozen=True)
 class Table:
     """Cases down, specs across.
 
@@ -214,16 +201,11 @@ class Table:
         }
         return {family: cases for family, cases in found.items() if cases}
 
-    def curve(self, case: Case, spec: str) -> list[Spread]:
-        """The drawn measure at every value that has been run."""
-        sweep = case.sweep
-        points = []
-        for value in sweep.values:
-            numbers = middle_of(self.at(case, spec).seeds, value, sweep.drawn)
-            if numbers:
-                std = stdev(numbers) if len(numbers) > 1 else None
-                points.append(Spread(value, mean(numbers), std, len(numbers)))
-        return points
+    def curve(self, case: Case, spec: str) -> dict[float, Spread]:
+        """The drawn measure over seeds at every value that has been run."""
+        seeds = self.at(case, spec).seeds
+        found = {v: middle_of(seeds, v, case.sweep.drawn) for v in case.sweep.values}
+        return {value: Spread.of(numbers) for value, numbers in found.items() if numbers}
 
     @property
     def machines(self) -> list[str]:
