@@ -142,8 +142,6 @@ PARTS = (
      "Gaussians of one moment by KHR_gaussian_splatting, which is new"),
     ("exporter:mesh-sequence", "hoigs.plugins.exporters.mesh_sequence", "MeshSequenceExporter",
      "MeshSequenceConfig", "meshes of people and objects at every moment: ply, obj or glb"),
-    ("exporter:rgba", "hoigs.plugins.exporters.rgba", "RgbaExporter", "RgbaConfig",
-     "entities with transparency, from the camera of the video: ProRes 4444, VP9 or PNG"),
     ("exporter:spz", "hoigs.plugins.exporters.gaussforge", "SpzExporter", "GaussForgeConfig",
      "Gaussians of one moment in a spz, Niantic's, about a tenth of the PLY"),
     ("exporter:splat", "hoigs.plugins.exporters.gaussforge", "SplatExporter", "GaussForgeConfig",
