@@ -50,7 +50,7 @@ def test_train_evaluate_and_render_from_python(hoigs, tiny_clip, tmp_path):
                 wanted = loaded.model.render(moment, camera).color
             torch.testing.assert_close(play(moment, camera).color, wanted, atol=1e-5, rtol=0)
 
-    film = h.render(run, only=["human", "scene"], device="cpu")
+    film = h.render(run, entities=["human", "scene"], device="cpu")
     assert film.path == run / "renders" / "video.mp4" and film.frames == 12
     assert film.fps > 0 and film.mode == "cached" and "CUDA" in film.reason
 
@@ -63,7 +63,7 @@ def test_train_evaluate_and_render_from_python(hoigs, tiny_clip, tmp_path):
     assert f"video: {run / 'renders' / 'video-compare.mp4'}\n" in beside.out
     again = hoigs("render", run, "--compare", "--to", 1, "--device", "cpu")
     assert "an earlier video of this name was replaced" in again.out
-    wrong = hoigs("render", run, "--only", "humn")
+    wrong = hoigs("render", run, "--entities", "humn")
     assert wrong.code == 2 and '"human"' in wrong.err
 
 
