@@ -5,10 +5,10 @@ from __future__ import annotations
 import io
 import textwrap
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
-from matplotlib.axis import Axis
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
@@ -68,10 +68,11 @@ def framed(title: str, notes: Sequence[str], width: float, height: float) -> Fig
     return figure
 
 
-def scale(axis: Axis, values: Sequence[float]) -> None:
+def scale(axes: Axes, which: Literal["x", "y"], values: Sequence[float]) -> None:
     """One axis of a panel: logarithmic where that is easier to read, with short numbers."""
+    axis = axes.xaxis if which == "x" else axes.yaxis
     if is_log(values):
-        axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+        axes.set(**{f"{which}scale": "log"})
         decades = max(values) / min(values)
         subs = (1, 2, 5) if decades < 60 else (1, 3) if decades < 600 else (1,)
         axis.set_major_locator(LogLocator(subs=subs))

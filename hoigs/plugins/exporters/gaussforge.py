@@ -37,16 +37,13 @@ class GaussForgeConfig(ComponentConfig):
 class GaussForgeExporter(Exporter):
     """One file that GaussForge makes of the PLY; it is read back and compared with it."""
 
-    Config: ClassVar[type[ComponentConfig]] = GaussForgeConfig
+    Config: ClassVar = GaussForgeConfig
+    config: GaussForgeConfig
     moving: ClassVar = False
     file_format: ClassVar[str]  # GaussForge's name
     keeps: ClassVar = {"Gaussians": "quantised; the loss is under `lost`"}
 
-    def __init__(self, config: GaussForgeConfig | None = None) -> None:
-        self.config = config or GaussForgeConfig()
-
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
-        """See `Exporter.write`."""
         progress(0.0, "gaussians")
         ours = request.scene(request.moments[0], request.entities).joined()
         data, read = self.packed(self.prepared(ours, request.clip))

@@ -59,7 +59,7 @@ def accuracy_chart(
             grid[i][0].yaxis.set_major_locator(MaxNLocator(5))
             grid[i][0].set_ylabel(row.title + (", reversed" if row.better == "lower" else ""))
         for axes, column in zip(grid[-1], columns, strict=True):
-            scale(axes.xaxis, [v for p in points if (v := p.number(column)) is not None])
+            scale(axes, "x", [v for p in points if (v := p.number(column)) is not None])
             axes.set_xlabel(column.title)
         handles, names = grid[0][0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside right upper")
@@ -155,7 +155,7 @@ def curve_chart(
                 curve = one.points[0].curve
                 axes.plot([c[which] for c in curve], [c[2] for c in curve], one.marker + "-",
                           color=one.color, linewidth=1.6, markersize=4, label=one.name)  # fmt: skip
-            scale(axes.xaxis, [s.points[0].curve[-1][which] for s in series])
+            scale(axes, "x", [s.points[0].curve[-1][which] for s in series])
             axes.set_xlabel(name)
             axes.tick_params(length=0)
         grid[0].set_ylabel("PSNR, full frame (dB)")

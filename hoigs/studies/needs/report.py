@@ -165,8 +165,8 @@ def _panel(axes: Axes, answer: Answer) -> None:
     axes.set_ylabel("RMSE, grey levels of 255", size=8)
     axes.tick_params(labelsize=8, which="both")
     axes.margins(0.15)
-    scale(axes.xaxis, [_point(s)[0] for s in shown])
-    scale(axes.yaxis, [_point(s)[1] for s in shown])
+    scale(axes, "x", [_point(s)[0] for s in shown])
+    scale(axes, "y", [_point(s)[1] for s in shown])
 
 
 def _shown(answer: Answer) -> list[Step]:
