@@ -152,7 +152,7 @@ def test_wrong_input_gets_a_sentence(tiny_run: Path, tmp_path: Path) -> None:
         hoigs.view(tiny_run, clip)
     with pytest.raises(HoigsError, match="writes one run"):
         hoigs.view(clip, html=tmp_path / "a.html")
-    for option in ({"port": 0}, {"host": "::1"}, {"width": 640}, {"client": True}):
+    for option in ({"port": 0}, {"host": "::1"}, {"width": 640}):
         with pytest.raises(HoigsError, match="--html writes a file: leave them out"):
             hoigs.view(tiny_run, html=tmp_path / "a.html", **option)
     with pytest.raises(HoigsError, match="65535"):
