@@ -5,18 +5,21 @@ from __future__ import annotations
 import json
 import math
 import textwrap
+from collections import Counter
+from collections.abc import Sequence
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import matplotlib
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+import numpy as np
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Patch
 
 from hoigs.core.system.files import write_whole
-from hoigs.studies.plots import DPI, INK, MARKERS, PALETTE, QUIET, STYLE, framed, short_number
+from hoigs.studies.plots import INK, MARKERS, PALETTE, QUIET, STYLE, framed, short_number
 from hoigs.studies.stress.capabilities import MEANING as HAS
 from hoigs.studies.stress.case import Case
 from hoigs.studies.stress.verdict import (
@@ -186,9 +189,8 @@ def _marker(index: int) -> str:
 # The matrix: cases down, specs across, a colour for each verdict.
 
 ROW, COLUMN = 0.25, 1.22  # inches of a cell
-LEFT, RIGHT, MATRIX_LINE = 4.5, 0.3, 0.19  # inches of the titles, the margin, a line of notes
-NARROWEST = 9.6  # inches at which the legend has two lines
-MATRIX_HEAD, GAP = 1.2, 0.36  # inches above the first row, and above each family
+TITLES, HEAD, GAP = 4.5, 1.0, 0.42  # inches of titles, of specs and legend, above each family
+NARROWEST = 9.6  # inches at which the legend has two columns
 
 # fill and ink, dark enough to be read on it (WCAG AA)
 COLORS: dict[Status, tuple[str, str]] = {
@@ -203,61 +205,42 @@ COLORS: dict[Status, tuple[str, str]] = {
 def matrix(table: Table, title: str) -> Figure:
     """One row for each case, by family, and a verdict in each cell."""
     families = table.families()
-    width = max(NARROWEST, LEFT + COLUMN * len(table.specs) + RIGHT)
-    notes = [line for note in table.notes for line in textwrap.wrap(note, int(width * 15))]
-    body = sum(GAP + ROW * len(cases) for cases in families.values())
-    height = MATRIX_HEAD + body + 0.45 + MATRIX_LINE * len(notes)
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(width, height), dpi=DPI)
-        FigureCanvasAgg(figure)
-        axes: Any = figure.add_axes((0, 0, 1, 1))
-        axes.set(xlim=(0, width), ylim=(height, 0))
-        axes.axis("off")
-        _head(axes, table, title, width)
-        y = MATRIX_HEAD
-        for family, cases in families.items():
-            y += GAP
-            axes.text(0.3, y - 0.1, family.capitalize(), size=10.5, weight="bold", va="center")
-            for case in cases:
-                _row(axes, table, case, y)
-                y += ROW
-        for i, line in enumerate(notes):
-            axes.text(0.3, y + 0.35 + MATRIX_LINE * i, line, size=8, color=QUIET, va="center")
+    rows = [len(cases) for cases in families.values()]
+    width = max(NARROWEST, TITLES + COLUMN * len(table.specs))
+    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+        figure = framed(title, table.notes, width, HEAD + ROW * sum(rows) + GAP * len(rows))
+        grid: Any = figure.subplots(len(rows), squeeze=False, height_ratios=rows)[:, 0]
+        for axes, (family, cases) in zip(grid, families.items(), strict=True):
+            _family(axes, table, family, cases)
+        specs = ["\n".join(textwrap.wrap(spec.replace("@", " @"), 12)) for spec in table.specs]
+        grid[0].tick_params(labeltop=True)
+        grid[0].set_xticks(range(len(specs)), specs, weight="bold", color=INK)
+        counts = Counter(verdict.status for verdict in table.verdicts.values())
+        keys = [
+            Patch(facecolor=fill, edgecolor="#9aa0a8", label=f"{s}: {MEANING[s]} ({counts[s]})")
+            for s, (fill, _) in COLORS.items()
+        ]
+        at = (1, 0)  # below the last row
+        grid[-1].legend(handles=keys, loc="upper right", bbox_to_anchor=at, ncols=2)
     return figure
 
 
-def _head(axes: Any, table: Table, title: str, width: float) -> None:
-    axes.text(0.3, 0.38, title, size=15, weight="bold", va="center")
-    counts = {s: sum(v.status == s for v in table.verdicts.values()) for s in COLORS}
-    x, y = 0.3, 0.76
-    for status, (fill, _) in COLORS.items():
-        words = f"{status}: {MEANING[status]} ({counts[status]})"
-        if x > 0.3 and x + 0.3 + 0.066 * len(words) > width:
-            x, y = 0.3, y + 0.21
-        axes.add_patch(Rectangle((x, y - 0.07), 0.16, 0.14, facecolor=fill, edgecolor="#9aa0a8",
-                                 linewidth=0.5))  # fmt: skip
-        axes.text(x + 0.23, y, words, size=8.5, color=QUIET, va="center")
-        x += 0.45 + 0.066 * len(words)
-    for i, spec in enumerate(table.specs):
-        lines = textwrap.wrap(spec.replace("@", " @"), 12)
-        axes.text(LEFT + COLUMN * (i + 0.5), MATRIX_HEAD + 0.22, "\n".join(lines), size=9,
-                  weight="bold",
-                  ha="center", va="bottom")  # fmt: skip
-
-
-def _row(axes: Any, table: Table, case: Any, y: float) -> None:
-    middle = y + ROW / 2
-    axes.text(0.3, middle, case.id, size=8.5, color=QUIET, va="center")
-    shown = textwrap.shorten(case.title, 56, placeholder=" …")
-    axes.text(0.72, middle, shown, size=9, color=INK, va="center")
-    for i, spec in enumerate(table.specs):
-        verdict = table.at(case, spec)
-        fill, ink = COLORS[verdict.status]
-        box = (LEFT + COLUMN * i + 0.02, y + 0.015)
-        hatch = "////" if verdict.status == "not run" else None
-        axes.add_patch(Rectangle(box, COLUMN - 0.04, ROW - 0.03, facecolor=fill, hatch=hatch,
-                                 edgecolor="#d5d8dc", linewidth=0.5))  # fmt: skip
-        rate = rate_of(verdict)
-        words = in_short(case, verdict) + (f" · {rate}" if rate else "")
-        axes.text(LEFT + COLUMN * (i + 0.5), middle, words, size=7.6, color=ink, ha="center",
-                  va="center")  # fmt: skip
+def _family(axes: Any, table: Table, family: str, cases: Sequence[Case]) -> None:
+    verdicts = [[table.at(case, spec) for spec in table.specs] for case in cases]
+    fills = [[to_rgb(COLORS[verdict.status][0]) for verdict in row] for row in verdicts]
+    axes.imshow(fills, aspect="auto")
+    titles = [f"{case.id}  {textwrap.shorten(case.title, 56, placeholder=' …')}" for case in cases]
+    axes.set_yticks(range(len(cases)), titles, color=INK)
+    axes.set_xticks([])
+    axes.set_xticks(np.arange(0.5, len(table.specs)), minor=True)
+    axes.set_yticks(np.arange(0.5, len(cases)), minor=True)
+    axes.grid(which="minor", color="white", linewidth=2)
+    axes.tick_params(which="both", length=0, labelbottom=False)
+    axes.spines[:].set_visible(False)
+    axes.set_title(family.capitalize(), loc="right", x=-0.01, size=10.5, weight="bold")
+    for y, (case, row) in enumerate(zip(cases, verdicts, strict=True)):
+        for x, verdict in enumerate(row):
+            rate = rate_of(verdict)
+            words = in_short(case, verdict) + (f" · {rate}" if rate else "")
+            ink = COLORS[verdict.status][1]
+            axes.text(x, y, words, size=7.6, color=ink, ha="center", va="center")
