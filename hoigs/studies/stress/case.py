@@ -105,7 +105,7 @@ class Case(ComponentConfig):
         title: what fails. trigger: what causes it. criterion: what passes, in words.
         concerns: capabilities of the models that the case applies to; () is every model.
         sweep: the setting that is varied, with short trainings.
-        nature: failing is inherent in the method of a model with one of these capabilities (or
+        limitation: failing is inherent in the method of a model with one of these capabilities (or
             without: "no keyed opacity").
         advice: what to do about it.
     """
@@ -116,13 +116,13 @@ class Case(ComponentConfig):
     criterion: str
     concerns: tuple[Capability, ...] = ()
     sweep: Sweep
-    nature: tuple[Capability | Literal["no keyed opacity"], ...] = ()
+    limitation: tuple[Capability | Literal["no keyed opacity"], ...] = ()
     advice: str = ""
 
-    def is_nature(self, has: frozenset[Capability]) -> bool:
+    def is_limitation(self, has: frozenset[Capability]) -> bool:
         """Whether failing is inherent in a method with these capabilities."""
         flat = "keyed opacity" not in has
-        return any(flat if word == "no keyed opacity" else word in has for word in self.nature)
+        return any(flat if word == "no keyed opacity" else word in has for word in self.limitation)
 
 
 class _File(ComponentConfig):

@@ -34,7 +34,7 @@ from hoigs.studies.stress.verdict import (
 )
 
 FORMAT, VERSION = "hoigs-stress", 1
-MARKS = {"pass": "✓", "fail": "✗", "nature": "◐", "not applicable": "–", "not run": "?"}
+MARKS = {"pass": "✓", "fail": "✗", "limitation": "◐", "not applicable": "–", "not run": "?"}
 
 
 def write_stress(table: Table, out: Path) -> list[Path]:
@@ -110,7 +110,7 @@ def _section(table: Table, case: Case) -> list[str]:
         if verdict.measured:
             results.setdefault(f"{verdict.status}: {verdict.measured}", []).append(spec)
     lines += ["", *(f"- {', '.join(specs)}: {words}" for words, specs in results.items())]
-    failed = {"fail", "nature"} & {table.at(case, spec).status for spec in table.specs}
+    failed = {"fail", "limitation"} & {table.at(case, spec).status for spec in table.specs}
     if failed and case.advice:
         lines += ["", f"What to do: {case.advice}."]
     return lines
@@ -196,7 +196,7 @@ NARROWEST = 9.6  # inches at which the legend has two columns
 COLORS: dict[Status, tuple[str, str]] = {
     "pass": ("#bfe5d6", "#0b4a36"),
     "fail": ("#f3b79a", "#6b2400"),
-    "nature": ("#fbe3b0", "#5a4300"),
+    "limitation": ("#fbe3b0", "#5a4300"),
     "not applicable": ("#f3f4f5", "#686f78"),
     "not run": ("#ffffff", "#686f78"),
 }

@@ -12,11 +12,11 @@ from hoigs.studies.plots import short_number
 from hoigs.studies.stress.case import Case, Criterion, Sweep, load_cases
 from hoigs.studies.stress.measures import MEASURES
 
-Status = Literal["pass", "fail", "nature", "not applicable", "not run"]
+Status = Literal["pass", "fail", "limitation", "not applicable", "not run"]
 MEANING: Mapping[Status, str] = {
     "pass": "passes what the case requires",
     "fail": "does not pass what the case requires",
-    "nature": "fails, which is inherent in the method; see the advice",
+    "limitation": "fails, as expected of the method; see the advice",
     "not applicable": "the model lacks what the case is about",
     "not run": "no verdict yet",
 }
@@ -122,18 +122,20 @@ def _broken(
     return f"{criterion.words}: {value:.4g} of {start:.4g}"
 
 
-def verdict_of(case: Case, spec: str, nature: bool, seeds: Sequence[Seed], **more: Any) -> Verdict:
+def verdict_of(
+    case: Case, spec: str, limitation: bool, seeds: Sequence[Seed], **more: Any
+) -> Verdict:
     """Verdict over seeds: pass if most of them pass the required value.
 
     Args:
-        nature: whether failing is inherent in the method.
+        limitation: whether failing is inherent in the method.
     """
     sweep = case.sweep
     known = [s for seed in seeds if (s := seed.stands(sweep.required_value)) is not None]
     rate = sum(known) / len(known) if known else None
     status: Status = "not run"
     if rate is not None and len(known) == len(seeds):
-        status = "pass" if rate > 0.5 else "nature" if nature else "fail"
+        status = "pass" if rate > 0.5 else "limitation" if limitation else "fail"
     return Verdict(
         case.id, spec, status, in_words(seeds), rate, tuple(seeds), breaking(sweep, seeds), **more
     )

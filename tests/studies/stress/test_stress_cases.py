@@ -20,7 +20,9 @@ def test_every_case_is_complete():
     assert len({case.id for case in CASES}) == len(CASES) > 10
     for case in CASES:
         assert case.title and case.trigger and case.criterion
-        assert not case.nature or case.advice, f"{case.id}: what to do about a method's nature?"
+        assert not case.limitation or case.advice, (
+            f"{case.id}: no advice on a limitation of the method"
+        )
 
 
 def test_every_sweep_varies_something_and_measures_it():
