@@ -14,7 +14,6 @@ from typing import ClassVar
 import gaussforge
 import torch
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.maths.spherical_harmonics import mean_colors
@@ -30,15 +29,9 @@ FLAGS, ANTIALIASED = 14, 1  # the byte of an SPZ header, and its bit
 EYES = 8  # cameras of the video, of which a colour is the mean
 
 
-class GaussForgeConfig(ComponentConfig):
-    """These exporters have no settings."""
-
-
 class GaussForgeExporter(Exporter):
     """One file that GaussForge makes of the PLY; it is read back and compared with it."""
 
-    Config: ClassVar = GaussForgeConfig
-    config: GaussForgeConfig
     moving: ClassVar = False
     file_format: ClassVar[str]  # GaussForge's name
     keeps: ClassVar = {"Gaussians": "quantised; the loss is under `lost`"}

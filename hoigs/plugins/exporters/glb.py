@@ -100,10 +100,6 @@ class Glb:
 NAME = "KHR_gaussian_splatting"
 
 
-class GltfSplatConfig(ComponentConfig):
-    """`exporter:gltf-splat` has no settings."""
-
-
 class GltfSplatExporter(Exporter):
     """`splats.glb`: one point primitive for each entity.
 
@@ -111,8 +107,6 @@ class GltfSplatExporter(Exporter):
     scales in metres; drafts before had their logarithms. Few programs read it yet.
     """
 
-    Config: ClassVar = GltfSplatConfig
-    config: GltfSplatConfig
     suffixes = (".glb",)
     moving: ClassVar = False
     up = "y"
