@@ -142,11 +142,16 @@ def check(
     return candidate.report(expected_failures)
 
 
-def check_plugin(name: str, *, registry: Registry | None = None, **how: Any) -> list[Report]:
+def check_plugin(
+    name: str,
+    *,
+    expected_failures: Mapping[str, str] | None = None,
+    settings: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+    folder: str | Path | None = None,
+    registry: Registry | None = None,
+) -> list[Report]:
     """`check` for a key, or for every component of a distribution or entry point of that name.
-
-    Args:
-        how: `expected_failures`, `settings`, `device` and `folder`, as `check` has them.
 
     Raises:
         PluginError: there is no such key or plugin, or it offers nothing.
@@ -155,7 +160,17 @@ def check_plugin(name: str, *, registry: Registry | None = None, **how: Any) -> 
 
     registry = registry or default_registry()
     keys = [name] if ":" in name else keys_of(name, registry)
-    return [check(key, registry=registry, **how) for key in keys]
+    return [
+        check(
+            key,
+            expected_failures=expected_failures,
+            settings=settings,
+            device=device,
+            folder=folder,
+            registry=registry,
+        )
+        for key in keys
+    ]
 
 
 def keys_of(name: str, registry: Registry) -> list[str]:
