@@ -65,7 +65,7 @@ class Sweep(ComponentConfig):
     Attributes:
         clip: built-in clip with any settings of its own: "carry?camera.arc_degrees=20".
         sets: settings in the clip's name, with `{}` for the value: "object.cycles={}".
-        blocks: settings of every model block that has them, likewise:
+        blocks: settings of every model block that has them, with `{}` for the value:
             "deformation.keyframe_step".
         values: easiest first; the others are compared with the first.
         required: the hardest value that a method must pass; None is the last.
