@@ -56,7 +56,7 @@ charts: $(INSTALLED)
 	mkdir -p docs/results/chart
 	cp $(addprefix $(CHART_OUT)/,chart.md chart.json chart-*.png) docs/results/chart/
 
-# where methods break, into docs/results/stress; likewise
+# where methods break, into docs/results/stress; the same command continues after a kill
 STRESS_CASES ?= all
 STRESS_SPECS ?= hoigs,4dgs@matched,d3dgs@matched,e-d3dgs@matched,ex4dgs@matched,exavatar@matched,static-3dgs@matched
 STRESS_SEEDS ?= 3

@@ -29,8 +29,6 @@ LAYOUTS: dict[str, dict[str, Any]] = {
     "colmap": {},
     "colmap-binary": {},
     "nerfstudio": {"points": 50},
-    "davis": {"points": 50},
-    "davis-folders": {"points": 50},
     "hold": {},
     "arctic": {},
     "behave": {},
@@ -76,12 +74,10 @@ def write_layouts(root: Path, clip: Path) -> list[tuple[str, Path, tuple[str, ..
 
 def _write(name: str, clip: Clip, folder: Path) -> Path:
     """The folder that the reader is given."""
-    from layouts import colmap, davis, dnerf, hold, hypernerf, nerfstudio
+    from layouts import colmap, dnerf, hold, hypernerf, nerfstudio
 
     if name in ("arctic", "behave", "exavatar", "hosnerf", "neuman"):
         return _write_with_body(name, clip, folder)
-    if name.startswith("davis"):
-        return davis.write(clip, folder, folders=name == "davis-folders")
     if name == "hold":
         return hold.write(clip, folder)
     if name.startswith("colmap"):

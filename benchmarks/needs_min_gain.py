@@ -103,7 +103,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--cells", type=Path, help="JSON of all cells, to read or to write")
     parser.add_argument("--cell", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    return argparse.Namespace(**vars(options), all=False, criterion="one-se")
+    return argparse.Namespace(**vars(options), all=False)
 
 
 def main() -> int:

@@ -71,7 +71,7 @@ def search_of(case: Case, seed: int, options: argparse.Namespace, kind: type[Any
     spaces = [s for s in load_search_spaces() if options.all or s.name in wanted]
     given = (f"train.steps={options.steps}", f"train.seed={seed}",
              "model.human.points=2000", "model.human.deformation.resolution=32")  # fmt: skip
-    return kind(clip, "hoigs", spaces, given, Settings(options.criterion, share=options.share))
+    return kind(clip, "hoigs", spaces, given, Settings(share=options.share))
 
 
 def run(case: Case, seed: int, options: argparse.Namespace) -> dict[str, Any]:
@@ -97,7 +97,7 @@ def run(case: Case, seed: int, options: argparse.Namespace) -> dict[str, Any]:
 
 def settings_of(options: argparse.Namespace) -> dict[str, Any]:
     """What a cell's result depends on."""
-    names = ("steps", "frames", "size", "share", "criterion", "all")
+    names = ("steps", "frames", "size", "share", "all")
     return {name: getattr(options, name) for name in names}
 
 
@@ -155,7 +155,6 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--frames", type=int, default=48)
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--share", type=float, default=0.15, help="of training frames, held back")
-    parser.add_argument("--criterion", choices=["one-se", "bic"], default="one-se")
     parser.add_argument("--all", action="store_true", help="search every search space")
     parser.add_argument("--jobs", type=int, default=1, help="searches at a time")
     parser.add_argument("--threads", type=int, default=1, help="of each")

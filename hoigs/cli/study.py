@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hoigs.cli.common import print_table
 from hoigs.cli.options import flags
 from hoigs.core.system.files import printable
 from hoigs.studies.options import (
@@ -23,7 +22,6 @@ from hoigs.studies.options import (
 
 if TYPE_CHECKING:
     from hoigs.studies.batch.batch import Batch, Work
-    from hoigs.studies.execution.local import Executor
     from hoigs.studies.jobs.results import Row
 
 
@@ -35,17 +33,12 @@ def compare(
 ) -> None:
     """Compare accuracy and cost of methods. The same command continues an interrupted study.
 
-    Writes chart.html (interactive, needs plotly: pip install 'hoigs[charts]'), chart.md,
-    chart.csv, chart.json, and chart-CLIP.png and .svg with training curves beside them. With
-    --rerun, the exit code is 1 if a PSNR differs by more than 0.05 dB on the same machine.
+    Writes chart.md, chart.csv, chart.json, and chart-CLIP.png and .svg with training curves beside
+    them.
     """
     where = options.place()
-    if options.rerun is not None:
-        _rerun(options.out, options.rerun, where)
-        return
     from hoigs.core.errors import HoigsError
     from hoigs.studies.compare.data import load_chart, merged_about
-    from hoigs.studies.compare.interactive import require_plotly
     from hoigs.studies.compare.paper import choose_tables
     from hoigs.studies.compare.run import Comparison, run_comparison
     from hoigs.studies.compare.write import write_chart
@@ -54,7 +47,6 @@ def compare(
 
     if not clips and not options.add:
         raise HoigsError("name a clip: `hoigs study compare builtin:carry --specs hoigs,static`")
-    require_plotly()
     loaded = {path: load_chart(path) for path in options.add}
     others = [cell for added, _ in loaded.values() for cell in added]
     rows: dict[str, Sequence[Row]] = dict(choose_tables(options.table))
@@ -113,29 +105,6 @@ def _about_chart(
     }
 
 
-def _rerun(out: Path, cell: str, executor: Executor) -> None:
-    from hoigs.evaluation.protocol import NotComputed
-    from hoigs.studies.compare.data import AXES
-    from hoigs.studies.compare.run import TOLERANCE_DB
-    from hoigs.studies.compare.run import rerun as run_again
-
-    found = run_again(out.resolve(), cell, executor)
-    rows = []
-    for name, axis in AXES.items():
-        pair = (found.first[name], found.again[name])
-        shown = [str(v) if isinstance(v, NotComputed) else f"{v:.4f}" for v in pair]
-        difference = found.difference(name)
-        rows.append((axis.title, *shown, "" if difference is None else f"{difference:+.4f}"))
-    print_table(cell, ("measure", "first", "again", "difference"), rows, [f"run: {found.run}"])
-    if not found.same_machine:
-        typer.echo(f"two machines, so not compared: {found.machines[0]} | {found.machines[1]}")
-        return
-    word = "reproduced" if found.reproduced else "NOT reproduced"
-    typer.echo(f"{word}: PSNR to {TOLERANCE_DB} dB on the same machine")
-    if not found.reproduced:
-        raise typer.Exit(1)
-
-
 # `hoigs study stress`: named failure cases, for every spec that they concern.
 
 
@@ -143,7 +112,7 @@ def _rerun(out: Path, cell: str, executor: Executor) -> None:
 def stress(*, options: StressOptions) -> None:
     """Find out where methods break. The same command continues an interrupted study.
 
-    Each case trains on clips that get harder until a spec breaks. Writes stress.md, .csv and .json,
+    Each case trains on clips that get harder until a spec breaks. Writes stress.md and .json,
     stress-matrix.png and .svg, and stress-curves.png and .svg.
     """
     from hoigs.studies.jobs.job import Job

@@ -186,8 +186,8 @@ FIT_DSSIM = 0.2  # weight of D-SSIM in the image loss
 
 
 def source_of_poses(clip: Clip, setting: TestPoseSetting) -> TestPose:
-    """What "auto" stands for: poses that were estimated are trusted as far as training frames bear
-    out."""
+    """The protocol of test poses. "auto" is "blended" for a clip whose poses were estimated, and
+    "given" for any other."""
     if setting != "auto":
         return setting
     return "blended" if clip.provenance.get(POSES_ESTIMATED) else "given"
@@ -204,9 +204,9 @@ def posed_clip(
     """The clip with the poses and cameras of a protocol for the frames of a split.
 
     "given" changes nothing. "interpolated" takes them from the two neighbouring training frames,
-    rotations by SLERP, positions linearly; the model then adds its learned corrections, which it
-    interpolates likewise. "blended" goes from these poses a share of the way to the frame's own;
-    `share` is it, or None to find it in training frames (`blending.own_share`). "fitted" optimises
+    rotations by SLERP, positions linearly; the model adds its learned corrections, interpolated in
+    the same way. "blended" interpolates between these poses and the frame's own by `share`, 0 to 1;
+    None estimates it from training frames (`blending.own_share`). "fitted" optimises
     them on the *image that is scored*, with the model frozen, starting from the given ones.
     Training frames and intrinsics never change.
 

@@ -93,13 +93,13 @@ class Protocol:
         return replace(self, region=region)
 
     def given(self) -> str:
-        """What a model was told of the frames that are scored: "cameras, body and object poses
-        given"; "" if that is nothing."""
+        """The inputs that a model gets for the scored frames, as "cameras, body and object poses
+        given"; "" where it gets none."""
         sources = {"body": self.test_pose, "object": self.object_poses}
         poses = " and ".join(what for what, how in sources.items() if how == "given")
-        told = ["cameras"] if self.test_camera == "given" else []
-        told += [f"{poses} poses"] if poses else []
-        return f"{', '.join(told)} given" if told else ""
+        inputs = ["cameras"] if self.test_camera == "given" else []
+        inputs += [f"{poses} poses"] if poses else []
+        return f"{', '.join(inputs)} given" if inputs else ""
 
     def _cameras(self) -> str:
         moved = ", moved by the corrections that training learned" if self.cameras_refined else ""

@@ -124,7 +124,7 @@ def clip_folder(clip: str | Path, registry: Registry | None = None) -> Path:
 
     Args:
         clip: a folder, or "builtin:NAME" (`hoigs.synthesis.named`), or a URL, of which there is a
-            local copy then (`hoigs.core.storage`).
+            local copy then (`hoigs.core.system.urls`).
 
     Raises:
         ClipError: there is no built-in clip of that name, or the argument is empty. Whether a

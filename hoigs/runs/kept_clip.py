@@ -28,7 +28,7 @@ ADVICE = "remove it and name the clip, or train again"
 
 
 class NoPixels(FrameStore):
-    """The frames of a clip that is gone: whoever asks for pixels is told."""
+    """Stands in for the frames of a deleted clip; reading pixels raises ClipError."""
 
     def __init__(self, run: Path) -> None:
         self.run = run

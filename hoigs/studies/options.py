@@ -92,8 +92,6 @@ class CompareOptions(StudyOptions):
     """Also draw the results of this chart.json; without CLIPS, only those."""
     mix_machines: bool = False
     """Draw times that were measured on different machines."""
-    rerun: str | None = None
-    """Train CLIP/RUN again and print the differences."""
     lpips_weights: Path | None = None
     """File of LPIPS weights; default: $HOIGS_LPIPS_WEIGHTS, or else AlexNet's, shipped."""
 

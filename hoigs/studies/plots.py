@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 INK, QUIET, FAINT, FRONT = "#1d2126", "#5b626b", "#e4e6e9", "#8a9099"
 DPI = 160
@@ -53,7 +57,29 @@ def is_log(values: Sequence[float]) -> bool:
     return bool(values) and min(values) > 0 and max(values) >= 4 * min(values)
 
 
-# Figures as files.
+def framed(title: str, notes: Sequence[str], width: float, height: float) -> Figure:
+    """A figure with a title above and notes below `width` x `height` inches of panels."""
+    lines = [line for note in notes for line in textwrap.wrap(note, int(width * 15))]
+    size = (width, height + 0.9 + 0.16 * len(lines))
+    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, x=0.01, ha="left", size=14, weight="bold")
+    figure.supxlabel("\n".join(lines), x=0.01, ha="left", size=8.5, color=QUIET)
+    return figure
+
+
+def scale(axes: Axes, which: Literal["x", "y"], values: Sequence[float]) -> None:
+    """One axis of a panel: logarithmic where that is easier to read, with short numbers."""
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    if is_log(values):
+        axes.set(**{f"{which}scale": "log"})
+        decades = max(values) / min(values)
+        subs = (1, 2, 5) if decades < 60 else (1, 3) if decades < 600 else (1,)
+        axis.set_major_locator(LogLocator(subs=subs))
+        axis.set_minor_locator(NullLocator())
+    else:
+        axis.set_major_locator(MaxNLocator(5))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: short_number(value)))
 
 
 # nothing that differs between two runs of the same study

@@ -23,7 +23,7 @@ from hoigs.synthesis.textures import hex_color, to_linear
 
 Array = np.ndarray
 SKIN, SHIRT, TROUSERS, SHOES, CAP, HAIR = range(6)
-HEAD_PART, HAND_PARTS, FOOT_PARTS = 3, (8, 9), (14, 15)
+HEAD_PART, FOOT_PARTS = 3, (14, 15)
 LEG_PARTS = (0, 10, 11, 12, 13, 14, 15)
 
 

@@ -50,6 +50,7 @@ from hoigs.testing.modules import (
     plain_state,
     require_finite_gradients,
     require_gradients,
+    require_penalties,
     require_true_gradients,
     seeded,
     trained,
@@ -325,15 +326,11 @@ def penalties_are_finite(subject: DeformationSubject) -> None:
         entity = subject.entity(count, perturbed=perturbed).train()
         for time in (0.0, 0.4):
             subject.draw(entity, time)
-            for name, value in entity.regularizers().items():
-                require(value.dim() == 0, f'penalty "{name}" has shape {list(value.shape)}')
-                require_finite(f'penalty "{name}"', value)
+            require_penalties(entity.regularizers(), subject.cls.regularizer_weights)
             subject.draw(entity, time)
             penalties = entity.regularizers()
             if penalties:
                 require_finite_gradients(entity, weighted_sum(penalties))
-    for name, weight in subject.cls.regularizer_weights.items():
-        require(weight >= 0, f'the weight of penalty "{name}" is {weight}')
 
 
 @CHECKS.check("D26")

@@ -14,7 +14,7 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.topology import TopologyChange
 from hoigs.testing.checks import CheckList, require, require_close, require_finite, require_zero
 from hoigs.testing.material import OBJECT, tiny_clip
-from hoigs.testing.modules import DeviceSubject, unchanged
+from hoigs.testing.modules import DeviceSubject, require_penalties, unchanged
 
 if TYPE_CHECKING:
     from hoigs.testing.runner import Options
@@ -317,11 +317,8 @@ def penalties_are_finite(subject: DensitySubject) -> None:
     """Penalties are finite scalars for many, one and no Gaussians; weights are >= 0."""
     control = subject.control()
     for count in (0, 1, COUNT):
-        for name, value in control.regularizers(subject.cloud(count)).items():
-            require(value.dim() == 0, f'penalty "{name}" has shape {list(value.shape)}')
-            require_finite(f'penalty "{name}" of {count}', value)
-    for name, weight in control.regularizer_weights.items():
-        require(weight >= 0, f'the weight of penalty "{name}" is {weight}')
+        found = control.regularizers(subject.cloud(count))
+        require_penalties(found, control.regularizer_weights)
 
 
 @CHECKS.check("N13", changes_rows)

@@ -17,11 +17,14 @@ from hoigs.core.interfaces.body import BODY_JOINT_PARTS, BodyModel, BodyOutput, 
 from hoigs.core.interfaces.deformation import DeformationModel
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.maths.skinning import joint_transforms, skin, transform_points
+from hoigs.core.model.entity import Entity
+from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
-from hoigs.core.values.tokens import Residual
+from hoigs.core.values.tokens import EntityKind, Residual
+from hoigs.rasterizers.torch_tiles import TorchRasterizer
 
 HUMAN, OBJECT = "human", "object"
 FRAMES = 9
@@ -296,3 +299,21 @@ class TinyMotion(DeformationModel):
 
     def field_parts(self) -> Int[Tensor, " V"]:
         return self._body[0].vertex_parts
+
+
+# A scene of both entities, as objectives and exporters get it.
+
+COUNT = 12  # Gaussians of each entity
+
+
+def tiny_scene(*names: str) -> SceneModel:
+    """A human and an object that move, or only these, with colours of degree 1."""
+    kinds: dict[str, EntityKind] = {HUMAN: "human", OBJECT: "object"}
+    entities = {}
+    for seed, (name, kind) in enumerate(kinds.items()):
+        generator = torch.Generator().manual_seed(seed)
+        points = torch.randn(COUNT, 3, generator=generator) * 0.2 + torch.tensor((0.0, 0.0, 3.0))
+        canonical = Gaussians.from_points(points, opacity=0.5, sh_degree=1)
+        if name in (names or kinds):
+            entities[name] = Entity(canonical, TinyMotion(), kind=kind)
+    return SceneModel(entities, rasterizer=TorchRasterizer())

@@ -139,6 +139,15 @@ def require_finite_gradients(module: nn.Module, loss: Tensor) -> None:
     module.zero_grad()
 
 
+def require_penalties(found: Mapping[str, Tensor], weights: Mapping[str, float]) -> None:
+    """Penalties are finite scalars, and their weights are not negative."""
+    for name, value in found.items():
+        require(value.dim() == 0, f'penalty "{name}" has shape {list(value.shape)}')
+        require_finite(f'penalty "{name}"', value)
+    for name, weight in weights.items():
+        require(weight >= 0, f'the weight of penalty "{name}" is {weight}')
+
+
 def require_true_gradients(
     leaves: Mapping[str, Tensor], loss: Callable[[], Tensor], cut: Sequence[str] = ()
 ) -> None:
@@ -257,11 +266,16 @@ def require_same_state(what: str, a: nn.Module, b: nn.Module) -> None:
 
 
 @contextmanager
-def unchanged(what: str, tensors: Mapping[str, Tensor]) -> Any:
-    """Raise CheckError when any of these tensors is written to in this block."""
-    before = {name: x.detach().clone() for name, x in tensors.items()}
+def unchanged(what: str, tensors: Mapping[str, Tensor] | Callable[[], Mapping[str, Tensor]]) -> Any:
+    """Raise CheckError when any of these tensors is written to in this block.
+
+    Args:
+        tensors: or what gives them, before and after.
+    """
+    read = tensors if callable(tensors) else lambda: tensors
+    before = {name: x.detach().clone() for name, x in read().items()}
     yield
-    for name, x in tensors.items():
+    for name, x in read().items():
         if not torch.equal(x.detach().nan_to_num(math.pi), before[name].nan_to_num(math.pi)):
             raise CheckError(f"{what}{name} was changed in place")
 

@@ -21,7 +21,7 @@ from hoigs.core.registry.component import API, INTERFACES, Component
 from hoigs.core.registry.manager import HOOK, Offer, Status, normal_name
 from hoigs.core.registry.registry import Registry
 from hoigs.core.system.environments import PYTHON
-from hoigs.testing.checks import CheckError, CheckList
+from hoigs.testing.checks import CheckError, CheckList, require
 from hoigs.testing.runner import KINDS
 
 if TYPE_CHECKING:
@@ -143,6 +143,14 @@ def _target(subject: PluginSubject) -> dict[str, Any]:
     return found
 
 
+def _require_silent(what: str, found: dict[str, Any]) -> None:
+    require(not found["printed"], f"importing {what} prints {found['printed'][:200]!r}")
+
+
+def _require_no_threads(what: str, found: dict[str, Any]) -> None:
+    require(not found["threads"], f"importing {what} starts {', '.join(found['threads'])}")
+
+
 @CHECKS.check("P01")
 def listing_imports_nothing_heavy(subject: PluginSubject) -> None:
     """Listing the plugin imports neither torch nor another heavy package."""
@@ -157,25 +165,20 @@ def listing_imports_nothing_heavy(subject: PluginSubject) -> None:
 @CHECKS.check("P02")
 def listing_prints_nothing(subject: PluginSubject) -> None:
     """Listing the plugin prints nothing."""
-    printed = _listing(subject)["printed"]
-    if printed:
-        raise CheckError(f"importing {subject.offer.plugin.module} prints {printed[:200]!r}")
+    _require_silent(subject.offer.plugin.module, _listing(subject))
 
 
 @CHECKS.check("P03")
 def listing_starts_no_threads(subject: PluginSubject) -> None:
     """Listing the plugin starts no threads."""
-    threads = _listing(subject)["threads"]
-    if threads:
-        raise CheckError(f"importing {subject.offer.plugin.module} starts {', '.join(threads)}")
+    _require_no_threads(subject.offer.plugin.module, _listing(subject))
 
 
 @CHECKS.check("P04")
 def listing_is_quick(subject: PluginSubject) -> str:
     """Listing the plugin takes less than a second."""
-    seconds = _listing(subject)["seconds"]
-    if seconds > SLOW:
-        raise CheckError(f"importing {subject.offer.plugin.module} takes {seconds:.1f} s")
+    seconds, module = _listing(subject)["seconds"], subject.offer.plugin.module
+    require(seconds <= SLOW, f"importing {module} takes {seconds:.1f} s")
     return f"its module is imported in {1000 * seconds:.0f} ms"
 
 
@@ -195,17 +198,14 @@ def target_implements_its_interface(subject: PluginSubject) -> None:
 def target_prints_nothing(subject: PluginSubject) -> str:
     """Importing the component prints nothing; the time is reported."""
     found = _target(subject)
-    if found["printed"]:
-        raise CheckError(f"importing {subject.component.target} prints {found['printed'][:200]!r}")
+    _require_silent(subject.component.target, found)
     return f"its component is imported in {1000 * found['seconds']:.0f} ms, torch not counted"
 
 
 @CHECKS.check("P07")
 def target_starts_no_threads(subject: PluginSubject) -> None:
     """Importing the component starts no threads."""
-    threads = _target(subject)["threads"]
-    if threads:
-        raise CheckError(f"importing {subject.component.target} starts {', '.join(threads)}")
+    _require_no_threads(subject.component.target, _target(subject))
 
 
 # P08, P09 and P11: how a plugin declares a component.
@@ -217,21 +217,18 @@ LONGEST = 100  # characters of a summary, which has one line in the listing
 def it_can_be_used_by_its_key(subject: PluginSubject) -> None:
     """The component is usable: a valid key, this API version, no conflict, nothing missing."""
     api, offer = subject.component.api, subject.offer
-    if api != API:
-        raise CheckError(f"api is {api}, this hoigs has {API}")
+    require(api == API, f"api is {api}, this hoigs has {API}")
     subject.registry.check(offer)
-    if offer.status is not Status.OK:
-        raise CheckError(f"{offer.status}: {offer.error}")
+    require(offer.status is Status.OK, f"{offer.status}: {offer.error}")
 
 
 @CHECKS.check("P09")
 def summary_is_one_line(subject: PluginSubject) -> None:
     """The summary is one line."""
     summary = subject.component.summary
-    if not summary.strip():
-        raise CheckError("summary is empty; `hoigs plugins` shows it beside the key")
-    if len(summary.splitlines()) > 1 or len(summary) > LONGEST:
-        raise CheckError(f"summary is not one line of at most {LONGEST} characters: {summary!r}")
+    require(summary.strip(), "summary is empty; `hoigs plugins` shows it beside the key")
+    short = len(summary.splitlines()) == 1 and len(summary) <= LONGEST
+    require(short, f"summary is not one line of at most {LONGEST} characters: {summary!r}")
 
 
 @CHECKS.check("P11", has_extra, installed)
@@ -239,8 +236,8 @@ def extra_exists_in_the_distribution(subject: PluginSubject) -> None:
     """The extra that it declares is one that its distribution offers."""
     dist, extra = subject.offer.plugin.dist, subject.component.extra
     offered = metadata.metadata(dist).get_all("Provides-Extra") or []
-    if extra not in offered:
-        raise CheckError(f'"{extra}" is not an extra of {dist}, which has {offered or "none"}')
+    known = extra in offered
+    require(known, f'"{extra}" is not an extra of {dist}, which has {offered or "none"}')
 
 
 # P10, P12 and P13: the component's settings, and building it from them.
@@ -289,5 +286,4 @@ def settings_survive_json(subject: PluginSubject) -> None:
     config = subject.config()
     json.dumps(type(config).model_json_schema())
     again = type(config).model_validate(json.loads(config.model_dump_json()))
-    if again != config:
-        raise CheckError(f"after a round trip through JSON, {config!r} is {again!r}")
+    require(again == config, f"after a round trip through JSON, {config!r} is {again!r}")

@@ -129,8 +129,8 @@ class GroupedAdam:
                     f"{did_you_mean(named, known)} (has: {', '.join(sorted(set(known)))})"
                 )
         self.names: dict[str, nn.Parameter] = {}
-        self.roles: list[str] = []  # name of the rate of each, in the same order
-        self.schedules: list[Schedule] = []  # of each, likewise
+        self.roles: list[str] = []  # the rate's name for each parameter, in the order of `names`
+        self.schedules: list[Schedule] = []  # one for each parameter, in the same order
         views = [] if cameras is None else cameras.named_parameters(prefix="cameras")
         trained = chain(named_rates(model), ((name, p, "camera", None) for name, p in views))
         for name, parameter, rate, entity in trained:

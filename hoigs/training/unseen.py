@@ -113,10 +113,10 @@ def spread(
 
 # The part of a scene that people and objects hide in every training frame.
 #
-# Nothing says what is there, and the little that shines through whatever is in front of it pulls
-# its Gaussians about by full steps of Adam, however weak the pull: from the side they are stripes
-# of all colours. Here they become an opaque surface with the colours of the clip's points, or of
-# the scene around, and are not trained on: whoever is in front of them has to explain the images.
+# No pixel constrains its Gaussians except through half-transparent people and objects in front, and
+# Adam takes full steps however small such a gradient is: seen from the side, these Gaussians become
+# stripes of arbitrary colours. Here they become an opaque surface in the colours of the clip's
+# points, or of the scene around, and get no gradients, so that people and objects explain the images.
 
 HIDDEN, SHOWN = 0.05, 0.15  # shares of the weight without anything in front; 0 and 1 of it kept
 MOST = 20_000  # Gaussians whose colours are solved for together; others take their neighbour's

@@ -23,10 +23,9 @@ from hoigs.core.system.video_files import SUFFIXES, WITH_ALPHA, write_video
 from hoigs.core.values.between import frame_numbers
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
-from hoigs.core.values.moment import Moment
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.options import RenderOptions
-from hoigs.viewing.paths import OLDER, View, film_path, frames_shown, rate_of
+from hoigs.viewing.paths import View, film_path, frames_shown, rate_of
 from hoigs.viewing.playback import Mode, Playback
 from hoigs.viewing.viewer.panes import placed
 
@@ -179,11 +178,11 @@ def render(run: Path | str, *, options: RenderOptions, progress: Progress | None
         HoigsError: this is no run, its clip is not there, or an entity, a path, a background, a
             size or a kind of file is unknown.
     """
-    name = OLDER.get(options.path, options.path)
+    name = options.path
     target = _target(Path(run), name, options)
     loaded = options.open(run, pixels=options.compare)
     names = list(loaded.model.entities)
-    for entity in (*options.entities, *options.only):
+    for entity in options.entities:
         if entity not in names:
             raise HoigsError(
                 f"--entities {entity}: this run has {', '.join(names)}{did_you_mean(entity, names)}"
@@ -229,8 +228,7 @@ def _draw(
     behind = (
         None if clear or options.background is None else read_background(options.background, camera)
     )
-    only = (*options.entities, *options.only)
-    play = playback_of(loaded.model, film, only, behind, copied=False)
+    play = playback_of(loaded.model, film, options.entities, behind, copied=False)
     shown = frames_shown(loaded.clip, film) if options.compare else []
     drawn, draw_s = 0, 0.0
 
@@ -268,12 +266,6 @@ def _with_alpha(output: RenderOutput) -> Float[Tensor, "H W 4"]:
     """Straight colours and opacity of a picture over black."""
     alpha = output.alpha.clamp(0, 1)[..., None]
     return torch.cat((output.color / alpha.clamp_min(1e-3), alpha), -1)
-
-
-def film_views(model: SceneModel, clip: Clip, path: str) -> list[tuple[Moment, Camera]]:
-    """The moment and camera of every frame of a film over the whole clip."""
-    numbers, fps = frame_numbers(clip)
-    return film_path(model, clip, path, numbers, fps)
 
 
 def playback_of(

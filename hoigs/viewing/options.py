@@ -27,8 +27,6 @@ class ViewOptions(RunOptions):
     """Write only this entity with --html."""
     width: Annotated[int, Field(ge=64)] = 1280
     """Pixels of a still picture at most."""
-    client: bool = False
-    """Send the Gaussians to the browser, which draws them."""
 
 
 class PlayedOptions(RunOptions):
@@ -56,8 +54,6 @@ class RenderOptions(PlayedOptions):
     file of keyed cameras, also nerfstudio's camera_path.json."""
     entities: tuple[str, ...] = ()
     """Draw only this entity."""
-    only: Annotated[tuple[str, ...], Flag("--only", hidden=True)] = ()
-    """An older name of --entities."""
     compare: bool = False
     """Draw beside the frame of the video."""
     background: str | None = None

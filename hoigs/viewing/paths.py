@@ -173,7 +173,6 @@ def _opengl(entry: dict[str, Any], width: int, height: int) -> Camera:
 
 
 View = tuple[Moment, Camera]
-OLDER = {"playback": "video"}
 BULLET_DEGREES = 25.0  # to each side: what a single video has seen of the far side is little
 BULLET_SECONDS = 4.0
 SMOOTHING = 0.25  # seconds over which the place of what is followed is averaged
@@ -199,7 +198,7 @@ def film_path(
     Raises:
         HoigsError: no such path or entity, or a camera file that cannot be read.
     """
-    path, clip = OLDER.get(path, path), _of_one_size(clip)
+    clip = _of_one_size(clip)
     if path.lower().endswith(".json"):
         return read_camera_path(Path(path), clip, frames)
     name, _, target = path.partition(" ")

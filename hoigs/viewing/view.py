@@ -20,7 +20,6 @@ from hoigs.runs.clip_source import clip_folder, read_clip
 from hoigs.runs.options import ModelOptions
 from hoigs.viewing.options import ViewOptions
 from hoigs.viewing.player.page import Page, write_page
-from hoigs.viewing.splats import ClientScene
 from hoigs.viewing.viewer.access import is_loopback
 from hoigs.viewing.viewer.clip_drawing import ClipDrawing
 from hoigs.viewing.viewer.following import FollowedRun, wait_for_checkpoint
@@ -30,7 +29,7 @@ from hoigs.viewing.viewer.server import free_port, open_server, require_viser, s
 from hoigs.viewing.viewer.viewer import Viewer
 
 Report = Callable[[str], None]
-SERVED = ("host", "port", "width", "client")  # options of a page that is served
+SERVED = ("host", "port", "width")  # options of a page that is served
 
 
 @verb(ViewOptions)
@@ -78,8 +77,6 @@ def view(
         )  # fmt: skip
     if options.max_mb is not None or options.entities:
         raise HoigsError("max_mb and entities are of the file that `html` names")
-    if options.client and not runs:
-        raise HoigsError(f"--client shows the Gaussians of a run, and {what} is none")
     report(f"starting the viewer of {' and '.join([str(run) for run in runs] or [str(what)])}")
     registry = default_registry(plugin_files=options.plugins)
     followed = []
@@ -109,7 +106,6 @@ def view(
         viewer = Viewer(
             server, drawings, bodies, overlays, widest=options.width,
             refresh=partial(_newer, followed, drawings, report),
-            splats=ClientScene(server.scene) if options.client else None,
         )  # fmt: skip
         if not is_loopback(host):
             report(

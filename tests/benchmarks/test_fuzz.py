@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 # what takes a tenth of a second or more gets fewer here; benchmarks/fuzz.py runs 10,000
 CASES = {"specs": 200, "options": 200, "shapes": 200, "clips": 200, "runs": 100, "checkpoints": 60}
 CASES |= {f"layout {name}": 40 for name in (
-    "dnerf", "hypernerf", "colmap", "colmap-binary", "nerfstudio", "davis", "davis-folders", "hold",
+    "dnerf", "hypernerf", "colmap", "colmap-binary", "nerfstudio", "hold",
     "arctic", "behave", "exavatar", "hosnerf", "neuman",
 )}  # fmt: skip
 CASES["bodies"] = 100

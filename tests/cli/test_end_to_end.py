@@ -8,7 +8,9 @@ import pytest
 import torch
 
 import hoigs as h
-from hoigs.viewing.films import film_views, playback_of
+from hoigs.core.values.between import frame_numbers
+from hoigs.viewing.films import playback_of
+from hoigs.viewing.paths import film_path
 
 SMALL = ("--set", "train.steps=60", "--set", "train.preview_every=30")
 # a render of the default numbers takes 0.4 s, and an evaluation with its report makes 200 of them
@@ -41,14 +43,14 @@ def test_train_evaluate_and_render_from_python(hoigs, tiny_clip, tmp_path):
 
     loaded = h.open_run(run, device="cpu")
     for path in ("video", "orbit"):
-        views = film_views(loaded.model, loaded.clip, path)
+        views = film_path(loaded.model, loaded.clip, path, *frame_numbers(loaded.clip))
         play = playback_of(loaded.model, views)
         for moment, camera in views[::3]:
             with torch.no_grad():
                 wanted = loaded.model.render(moment, camera).color
             torch.testing.assert_close(play(moment, camera).color, wanted, atol=1e-5, rtol=0)
 
-    film = h.render(run, only=["human", "scene"], device="cpu")
+    film = h.render(run, entities=["human", "scene"], device="cpu")
     assert film.path == run / "renders" / "video.mp4" and film.frames == 12
     assert film.fps > 0 and film.mode == "cached" and "CUDA" in film.reason
 
@@ -61,7 +63,7 @@ def test_train_evaluate_and_render_from_python(hoigs, tiny_clip, tmp_path):
     assert f"video: {run / 'renders' / 'video-compare.mp4'}\n" in beside.out
     again = hoigs("render", run, "--compare", "--to", 1, "--device", "cpu")
     assert "an earlier video of this name was replaced" in again.out
-    wrong = hoigs("render", run, "--only", "humn")
+    wrong = hoigs("render", run, "--entities", "humn")
     assert wrong.code == 2 and '"human"' in wrong.err
 
 

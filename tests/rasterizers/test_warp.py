@@ -198,13 +198,6 @@ def test_copies_carry_the_settings() -> None:
         assert torch.equal(copied.render(random_scene(20), a_camera()).color, before.color)
 
 
-def test_a_batch_is_its_views() -> None:
-    rasterizer, scene = WarpRasterizer(), random_scene(50)
-    cameras = [a_camera(), a_camera(33, 20)]
-    for camera, output in zip(cameras, rasterizer.render_batch(scene, cameras), strict=True):
-        assert torch.equal(output.color, rasterizer.render(scene, camera).color)
-
-
 def test_capture_needs_cuda() -> None:
     with pytest.raises(RenderError, match="are on cpu, expected a CUDA device"):
         WarpRasterizer().capture(random_scene(5), a_camera())

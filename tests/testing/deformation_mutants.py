@@ -13,7 +13,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.deformation import DeformationModel
 from hoigs.core.values.topology import reindex
 from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning, HexPlaneSkinningConfig
-from hoigs.plugins.deformation.lbs import Lbs, LbsConfig
+from hoigs.plugins.deformation.lbs import Lbs
 
 # a counter instead of random numbers: two instances in a row always differ, deterministically
 BUILT = itertools.count()
@@ -284,7 +284,7 @@ class OtherWithoutGradients(Right):
 
 
 SMALL = HexPlaneSkinningConfig(resolution=8, channels=2, width=8, field_points=64)
-CONFIGS: dict[str, Any] = {"D28": SMALL, "D29": LbsConfig(), "D30": LbsConfig()}
+CONFIGS: dict[str, Any] = {"D28": SMALL, "D29": Lbs.Config(), "D30": Lbs.Config()}
 MUTANTS: dict[str, type[DeformationModel]] = {
     "D01": GrowsItsSettings,
     "D02": NeedsOneRow,

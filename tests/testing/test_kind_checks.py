@@ -13,7 +13,7 @@ import objective_mutants
 import pytest
 import reader_mutants
 
-from hoigs.plugins.readers.clip import ClipFolderReader, ClipFolderReaderConfig
+from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.testing import body, density, exporter, features, interaction, objective, reader
 from hoigs.testing.checks import run_checks
 from hoigs.testing.material import TinyBody
@@ -29,7 +29,7 @@ KINDS: dict[str, tuple[Any, ...]] = {
     ),
     "reader": (
         reader.CHECKS, reader.ReaderSubject, reader_mutants.MUTANTS, ClipFolderReader,
-        ClipFolderReaderConfig(),
+        ClipFolderReader.Config(),
     ),
     "exporter": (
         exporter.CHECKS, exporter.ExporterSubject, exporter_mutants.MUTANTS,

@@ -34,7 +34,6 @@ def views(run, path, **settings):
 def test_the_video_is_the_clip(run):
     for i, (moment, camera) in enumerate(views(run, "video")):
         assert moment.poses is run.clip.moments[i].poses and camera is run.clip.cameras[i]
-    assert len(views(run, "playback")) == len(run.clip)  # its older name
 
 
 @pytest.fixture

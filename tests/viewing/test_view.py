@@ -152,7 +152,7 @@ def test_wrong_input_gets_a_sentence(tiny_run: Path, tmp_path: Path) -> None:
         hoigs.view(tiny_run, clip)
     with pytest.raises(HoigsError, match="writes one run"):
         hoigs.view(clip, html=tmp_path / "a.html")
-    for option in ({"port": 0}, {"host": "::1"}, {"width": 640}, {"client": True}):
+    for option in ({"port": 0}, {"host": "::1"}, {"width": 640}):
         with pytest.raises(HoigsError, match="--html writes a file: leave them out"):
             hoigs.view(tiny_run, html=tmp_path / "a.html", **option)
     with pytest.raises(HoigsError, match="65535"):
@@ -225,32 +225,3 @@ def answers(address: str, seconds: float) -> bool:
             if time.monotonic() > end:
                 return False
             time.sleep(0.3)
-
-
-def test_the_browser_draws_with_client(tiny_run: Path, window: Any) -> None:
-    """Its picture agrees with ours, moves with time, and only what changes is sent."""
-    with served(tiny_run, client=True) as (viewer, address, _):
-        opened = window()
-        page = opened.page
-        page.goto(address)
-        until(lambda: "drawn by the browser" in viewer.controls.status.content, page, "Gaussians")
-        until(lambda: bool(viewer._eyes), page, "the browser")
-        eye = next(iter(viewer._eyes.values()))
-
-        def alike() -> bool:  # below the browser's notice, left of the panel
-            ours = viewer.picture(eye.canvas, viewer.settings, 0.0, eye.view).image
-            theirs, own = (p[170:, :280].mean(-1).ravel() for p in (opened.pixels(), ours))
-            return bool(np.corrcoef(theirs, own)[0, 1] > 0.8)
-
-        until(alike, page, "our picture in the browser")
-        first = opened.pixels()[:, :280]
-        viewer.clock.seek(6.0, 0.0)
-        sent = viewer._splats._sent
-        until(lambda: "1,500 Gaussians" in viewer.controls.status.content, page, "the person alone")
-        assert not np.allclose(sent["object"].node.position, 0)  # moved by its pose
-        page.wait_for_timeout(3000)
-        assert np.abs(opened.pixels()[:, :280] - first).max() > 30
-        page.get_by_label("scene", exact=True).click()
-        until(lambda: not sent["scene"].node.visible, page, "no scene")
-        # three.js logs this of viser's own mesh of splats; nothing of it is seen
-        assert [e for e in opened.errors if "computeBoundingSphere" not in e] == []

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.reporting import Progress, no_progress
@@ -366,11 +366,6 @@ def _checked(frames: Frames, video: VideoRequest, dtype: type, what: str) -> Laz
     return LazyFrames(len(frames), read)
 
 
-COCO_17 = (
-    "nose", "left eye", "right eye", "left ear", "right ear", "left shoulder", "right shoulder",
-    "left elbow", "right elbow", "left wrist", "right wrist", "left hip", "right hip", "left knee",
-    "right knee", "left ankle", "right ankle",
-)  # fmt: skip
 # landmark of MediaPipe's 33 for each of COCO's 17 keypoints
 COCO_17_LANDMARKS = (0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)
 # and for OpenPose's BODY_25; -1 (neck, middle of the hips, small toes) has no counterpart
@@ -402,13 +397,3 @@ def landmarks_from_keypoints(
             image[found, target, :2] = keypoints[found, source, :2]
             image[found, target, 3] = keypoints[found, source, 2]
     return Landmarks(image, None, provenance)
-
-
-def found_landmarks(
-    track: Landmarks,
-) -> tuple[Bool[np.ndarray, "F 33"], Bool[np.ndarray, "F 33"]]:
-    """Which landmarks are known in the image, and which in space."""
-    image = np.isfinite(track.image_xyzv[..., [0, 1, 3]]).all(-1)
-    if track.world_xyzv is None:
-        return image, np.zeros_like(image)
-    return image, np.isfinite(track.world_xyzv[..., :3]).all(-1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -127,21 +127,6 @@ class Rasterizer(Configurable, ABC):
         Raises:
             RenderError: shapes, dtypes, devices or limits that this backend cannot draw.
         """
-
-    def render_batch(
-        self,
-        gaussians: Gaussians,
-        cameras: Sequence[Camera],
-        request: RenderRequest | None = None,
-    ) -> list[RenderOutput]:
-        """Draw several views of the same Gaussians; their sizes may differ.
-
-        A background that is an image must have the size of every view.
-
-        Raises:
-            RenderError: as `render`.
-        """
-        return [self.render(gaussians, camera, request) for camera in cameras]
 
     def check_inputs(self, gaussians: Gaussians, camera: Camera, request: RenderRequest) -> None:
         """The checks that every backend shares; call first in `render`."""

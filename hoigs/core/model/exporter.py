@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 
@@ -119,6 +119,10 @@ class Exporter(Configurable, ABC):
     axes: str = "the world of the clip; cameras are OpenCV's (x right, y down, z forward)"
     units: str = "metres"
     keeps: ClassVar[Mapping[str, str]] = {}
+    config: Any
+
+    def __init__(self, config: Any = None) -> None:
+        self.config = config or self.Config()
 
     @abstractmethod
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:

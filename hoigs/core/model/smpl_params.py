@@ -23,7 +23,6 @@ from hoigs.core.values.moment import BodyPose, HandConvention
 # SMPL turns a hand as one block at its knuckles; thumbs stand elsewhere and are part of the block.
 KNUCKLES = (0, 3, 6, 9, 12)
 ANOTHER_PERSON = 3.0  # in standard deviations of people, which betas count
-CLEARLY = 2.0  # a convention is chosen when the other one's error is this many times larger
 
 
 def pose_from_smplx(
@@ -84,11 +83,6 @@ def pose_from_smplh(
     return BodyPose(orient.squeeze(-2), body, left, right, transl, betas, hands)
 
 
-def smplh_from_pose(pose: BodyPose) -> Float[Tensor, "*batch 156"]:
-    """The pose vector of SMPL+H; the inverse of `pose_from_smplh`, in the same convention."""
-    return pose.rotations.flatten(-2)
-
-
 def pose_from_smpl(
     pose: Float[Tensor, "*batch 72"],
     transl: Float[Tensor, "*batch 3"],
@@ -107,31 +101,6 @@ def pose_from_smpl(
     return BodyPose(orient.squeeze(-2), body, left, right, transl, betas, "flat")
 
 
-def smpl_from_pose(pose: BodyPose, tolerance: float = 1e-6) -> Float[Tensor, "*batch 72"]:
-    """The pose vector of SMPL, where it can hold the pose.
-
-    Raises:
-        ClipError: fingers bend, or hands are in the "mean" convention: SMPL has one joint a hand.
-    """
-    if pose.hand_pose_convention != "flat":
-        raise ClipError(
-            'SMPL has no mean hand: expected hand_pose_convention="flat", got "mean"; convert with '
-            "the model that the pose comes from"
-        )
-    ends = []
-    for side, hand in (("left", pose.left_hand), ("right", pose.right_hand)):
-        block = hand[..., KNUCKLES[1], :]
-        worst = float((hand - _block(block)).abs().max()) if hand.numel() else 0.0
-        if worst > tolerance:
-            raise ClipError(
-                f"SMPL cannot hold this pose: fingers of the {side} hand bend by up to {worst:.3g} "
-                "rad, and it has one joint a hand; use SMPL+H or SMPL-X"
-            )
-        ends.append(block)
-    first = torch.cat((pose.global_orient[..., None, :], pose.body), -2)
-    return torch.cat((first, torch.stack(ends, -2)), -2).flatten(-2)
-
-
 def moved_pose(
     pose: BodyPose,
     pelvis: Float[Tensor, " 3"],
@@ -147,43 +116,6 @@ def moved_pose(
     orient = matrices_to_axis_angle(rotation @ axis_angle_to_matrices(pose.global_orient))
     place = (rotation @ (pelvis + pose.transl)[..., None])[..., 0] + translation
     return pose.replace(global_orient=orient, transl=place - pelvis)
-
-
-@torch.no_grad()
-def hand_convention(
-    body: BodyModel, pose: BodyPose, observed: Float[Tensor, "*batch N 3"]
-) -> HandConvention:
-    """Which hand convention a pose is written in, from the points that it should give.
-
-    Both conventions are tried; flat and mean hands differ by centimetres at the fingertips.
-
-    Args:
-        body: the model of the pose, with a mean hand. pose: its own convention is ignored.
-        observed: all vertices or all joints of the posed body, in the model's order, metres (a
-            fitted mesh of the data set, for example).
-
-    Raises:
-        ClipError: neither is clearly better (twice as close), or the number of points is neither.
-    """
-    errors: dict[HandConvention, float] = {}
-    conventions: tuple[HandConvention, ...] = ("flat", "mean")
-    for convention in conventions:
-        out = body(pose.replace(hand_pose_convention=convention))
-        choices = [p for p in (out.vertices, out.joints) if p.shape == observed.shape]
-        if not choices:
-            raise ClipError(
-                f"points have shape {list(observed.shape)}; the body has vertices "
-                f"{list(out.vertices.shape)} and joints {list(out.joints.shape)}"
-            )
-        errors[convention] = float((choices[0] - observed).norm(dim=-1).mean())
-    best = min(conventions, key=errors.__getitem__)
-    if max(errors.values()) < CLEARLY * errors[best] or errors["flat"] == errors["mean"]:
-        distances = ", ".join(f"{c}: {1000 * e:.2f} mm" for c, e in errors.items())
-        raise ClipError(
-            f"hand convention unclear, mean distance to the given points is {distances}; is this "
-            "the model (and gender, and template) that they were made with?"
-        )
-    return best
 
 
 @torch.no_grad()

@@ -3,5 +3,4 @@
 - `schema.Spec`: reads, checks and resolves a spec. `train_schema.TrainSpec`: its training settings.
 - `files`: built-in specs, what a spec extends, and its profiles.
 - `loader`: YAML and TOML with the position of every value. `errors`: messages of invalid values.
-- `older`: names that specs of version 0.1 used.
 """

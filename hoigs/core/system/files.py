@@ -77,7 +77,7 @@ class NotRegularError(OSError):
 
 
 def regular_file(path: AnyPath) -> AnyPath:
-    """`path` itself, if reading it ends; a folder is left to whoever opens it.
+    """`path`, unless it is a FIFO, a socket or a device, which could block a reader forever.
 
     Raises:
         FileNotFoundError: there is nothing.

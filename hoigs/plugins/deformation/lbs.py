@@ -12,14 +12,10 @@ from hoigs.plugins.deformation.skinned_body import SkinnedBodyConfig
 from hoigs.plugins.deformation.surface_body import SurfaceBody
 
 
-class LbsConfig(SkinnedBodyConfig):
-    """Linear blend skinning with the skinning weights of the body model."""
-
-
 class Lbs(SurfaceBody):
     """G(t) = LBS(P_c, theta(t), W) with the body's own W; every canonical field is trained."""
 
-    Config: ClassVar = LbsConfig
+    Config: ClassVar = SkinnedBodyConfig
     cuda_graph_safe = True
 
     def forward(

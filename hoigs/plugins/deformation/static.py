@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.deformation import DeformationModel
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual, displaced
-
-
-class StaticConfig(ComponentConfig):
-    """No settings."""
 
 
 class Static(DeformationModel):

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.density import DensityControl, DensityStatistics, Refinement
 from hoigs.core.values.gaussians import Gaussians
-
-
-class NoDensityConfig(ComponentConfig):
-    """No settings."""
 
 
 class NoDensity(DensityControl):

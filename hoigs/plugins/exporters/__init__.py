@@ -2,5 +2,5 @@
 
 - `ply`, `ply_sequence`, `gaussforge`, `gltf_splat`: Gaussians.
 - `bvh`, `smpl_npz`, `gltf_body`: the body. `tracks`: objects, cameras and contacts.
-- `mesh_sequence`, `rgba`: surfaces and pictures. `usd`: all of these in one stage.
+- `mesh_sequence`: surfaces. `usd`: all of these in one stage.
 """

@@ -9,9 +9,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.model.exporter import Exporter, ExportRequest
+from hoigs.core.model.exporter import ExportRequest
 from hoigs.core.reporting import Progress
-from hoigs.plugins.exporters.posed import AXES, BodyMotion, Up, body_motions, world_move
+from hoigs.plugins.exporters.posed import BodyMotion, TurnedExporter, Up, body_motions, world_move
 
 
 class BvhConfig(ComponentConfig):
@@ -23,10 +23,11 @@ class BvhConfig(ComponentConfig):
     """unit of lengths"""
 
 
-class BvhExporter(Exporter):
+class BvhExporter(TurnedExporter):
     """`NAME.bvh` for each person: bones of the body's shape, rotations in the order Z X Y."""
 
-    Config: ClassVar[type[ComponentConfig]] = BvhConfig
+    Config: ClassVar = BvhConfig
+    config: BvhConfig
     suffixes = (".bvh",)
     kinds: ClassVar = frozenset({"human"})
     reads_gaussians: ClassVar = False
@@ -36,13 +37,10 @@ class BvhExporter(Exporter):
     }
 
     def __init__(self, config: BvhConfig | None = None) -> None:
-        self.config = config or BvhConfig()
-        self.up = self.config.up
-        self.axes = AXES[self.up]
+        super().__init__(config)
         self.units = {"m": "metres", "cm": "centimetres"}[self.config.unit]
 
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
-        """See `Exporter.write`."""
         progress(0.0, "poses")
         move = world_move(request.clip, self.config.up)
         for motion in body_motions(request):

@@ -14,7 +14,6 @@ from typing import ClassVar
 import gaussforge
 import torch
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.maths.spherical_harmonics import mean_colors
@@ -30,23 +29,14 @@ FLAGS, ANTIALIASED = 14, 1  # the byte of an SPZ header, and its bit
 EYES = 8  # cameras of the video, of which a colour is the mean
 
 
-class GaussForgeConfig(ComponentConfig):
-    """These exporters have no settings."""
-
-
 class GaussForgeExporter(Exporter):
     """One file that GaussForge makes of the PLY; it is read back and compared with it."""
 
-    Config: ClassVar[type[ComponentConfig]] = GaussForgeConfig
     moving: ClassVar = False
     file_format: ClassVar[str]  # GaussForge's name
     keeps: ClassVar = {"Gaussians": "quantised; the loss is under `lost`"}
 
-    def __init__(self, config: GaussForgeConfig | None = None) -> None:
-        self.config = config or GaussForgeConfig()
-
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
-        """See `Exporter.write`."""
         progress(0.0, "gaussians")
         ours = request.scene(request.moments[0], request.entities).joined()
         data, read = self.packed(self.prepared(ours, request.clip))

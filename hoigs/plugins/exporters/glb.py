@@ -100,10 +100,6 @@ class Glb:
 NAME = "KHR_gaussian_splatting"
 
 
-class GltfSplatConfig(ComponentConfig):
-    """`exporter:gltf-splat` has no settings."""
-
-
 class GltfSplatExporter(Exporter):
     """`splats.glb`: one point primitive for each entity.
 
@@ -111,7 +107,6 @@ class GltfSplatExporter(Exporter):
     scales in metres; drafts before had their logarithms. Few programs read it yet.
     """
 
-    Config: ClassVar[type[ComponentConfig]] = GltfSplatConfig
     suffixes = (".glb",)
     moving: ClassVar = False
     up = "y"
@@ -121,11 +116,7 @@ class GltfSplatExporter(Exporter):
         "scales": "standard deviations", "colours": "all SH bands, srgb_rec709_display",
     }  # fmt: skip
 
-    def __init__(self, config: GltfSplatConfig | None = None) -> None:
-        self.config = config or GltfSplatConfig()
-
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
-        """See `Exporter.write`."""
         progress(0.0, "gaussians")
         move = world_move(request.clip, "y")
         state = request.scene(request.moments[0], request.entities)
@@ -189,7 +180,8 @@ class GltfBodyExporter(Exporter):
     on an animated node.
     """
 
-    Config: ClassVar[type[ComponentConfig]] = GltfBodyConfig
+    Config: ClassVar = GltfBodyConfig
+    config: GltfBodyConfig
     suffixes = (".glb",)
     kinds: ClassVar = frozenset({"human", "object"})
     up = "y"
@@ -200,11 +192,7 @@ class GltfBodyExporter(Exporter):
         "camera": "of the video, with its vertical field of view at the first moment",
     }
 
-    def __init__(self, config: GltfBodyConfig | None = None) -> None:
-        self.config = config or GltfBodyConfig()
-
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
-        """See `Exporter.write`."""
         glb = Glb()
         seconds = np.arange(len(request.moments), dtype=np.float32) / np.float32(request.fps)
         clock = _Clock(glb, glb.accessor(seconds))

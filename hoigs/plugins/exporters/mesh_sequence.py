@@ -15,10 +15,10 @@ from torch import Tensor
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.maths.nearest import nearest
-from hoigs.core.model.exporter import Exporter, ExportRequest
+from hoigs.core.model.exporter import ExportRequest
 from hoigs.core.reporting import Progress
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.plugins.exporters.posed import AXES, Up, body_motion, world_move
+from hoigs.plugins.exporters.posed import TurnedExporter, Up, body_motion, world_move
 
 
 class MeshSequenceConfig(ComponentConfig):
@@ -34,7 +34,7 @@ class MeshSequenceConfig(ComponentConfig):
     """size of the gaps that an object's surface closes, in distances of neighbouring Gaussians"""
 
 
-class MeshSequenceExporter(Exporter):
+class MeshSequenceExporter(TurnedExporter):
     """`NAME/frame_0000.ply` …, the same triangles at every moment.
 
     A person is the body model's mesh; an object is the alpha shape (Edelsbrunner & Mücke 1994) of
@@ -42,7 +42,8 @@ class MeshSequenceExporter(Exporter):
     nearest Gaussians.
     """
 
-    Config: ClassVar[type[ComponentConfig]] = MeshSequenceConfig
+    Config: ClassVar = MeshSequenceConfig
+    config: MeshSequenceConfig
     kinds: ClassVar = frozenset({"human", "object"})
     keeps: ClassVar = {
         "people": "the body model's mesh", "objects": "the alpha shape of their Gaussians",
@@ -50,13 +51,7 @@ class MeshSequenceExporter(Exporter):
         "triangles": "the same at every moment",
     }  # fmt: skip
 
-    def __init__(self, config: MeshSequenceConfig | None = None) -> None:
-        self.config = config or MeshSequenceConfig()
-        self.up = self.config.up
-        self.axes = AXES[self.up]
-
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
-        """See `Exporter.write`."""
         lost = {"looks": "a mesh has one colour a vertex, from all sides; ply-sequence holds them"}
         move = world_move(request.clip, self.config.up)
         for done, name in enumerate(request.entities):

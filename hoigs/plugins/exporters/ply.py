@@ -13,10 +13,10 @@ from torch import Tensor
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import HoigsError
-from hoigs.core.model.exporter import Exporter, ExportRequest
+from hoigs.core.model.exporter import ExportRequest
 from hoigs.core.reporting import Progress
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.plugins.exporters.posed import AXES, Up, world_move
+from hoigs.plugins.exporters.posed import TurnedExporter, Up, world_move
 
 # PLY files of Gaussians in the layout of 3DGS (Kerbl et al. 2023): written and read back.
 
@@ -58,20 +58,12 @@ def ply_bytes(gaussians: Gaussians, *, pad_sh: bool = False) -> bytes:
     return "\n".join(header).encode("ascii") + table.tobytes()
 
 
-def read_ply(path: Path | str) -> Gaussians:
-    """The Gaussians of a PLY in the layout of 3DGS, raw.
+def parse_ply(data: bytes, name: str = "PLY") -> Gaussians:
+    """The raw Gaussians of a binary PLY in the layout of 3DGS.
 
     Raises:
-        HoigsError: the file is absent, damaged, or no PLY of Gaussians.
+        HoigsError: the bytes are damaged, or no PLY of Gaussians.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise HoigsError(f"{path}: no such file")
-    return parse_ply(path.read_bytes(), str(path))
-
-
-def parse_ply(data: bytes, name: str = "PLY") -> Gaussians:
-    """The Gaussians in the bytes of a binary PLY; errors as `read_ply`."""
     head, end, body = data.partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     fields = [(line[2], SIZES.get(line[1], "")) for line in lines if line[:1] == ["property"]]
@@ -114,10 +106,11 @@ class PlyConfig(ComponentConfig):
     open nothing else; false leaves out the zeros"""
 
 
-class PlyExporter(Exporter):
+class PlyExporter(TurnedExporter):
     """`scene.ply`: all entities that are exported, joined, at the first moment."""
 
-    Config: ClassVar[type[ComponentConfig]] = PlyConfig
+    Config: ClassVar = PlyConfig
+    config: PlyConfig
     suffixes = (".ply",)
     moving: ClassVar = False
     keeps: ClassVar = {
@@ -125,13 +118,7 @@ class PlyExporter(Exporter):
         "scales": "natural logarithms", "opacities": "logits", "colours": "all SH bands",
     }  # fmt: skip
 
-    def __init__(self, config: PlyConfig | None = None) -> None:
-        self.config = config or PlyConfig()
-        self.up = self.config.up
-        self.axes = AXES[self.up]
-
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
-        """See `Exporter.write`."""
         progress(0.0, "gaussians")
         state = request.scene(request.moments[0].to(request.scene.device), request.entities)
         move = world_move(request.clip, self.config.up)
@@ -160,26 +147,21 @@ class PlySequenceConfig(ComponentConfig):
     """one file a moment; false makes a folder for each entity"""
 
 
-class PlySequenceExporter(Exporter):
+class PlySequenceExporter(TurnedExporter):
     """`frame_0000.ply`, `frame_0001.ply` …, or these in a folder for each entity.
 
     A Gaussian is at the same row of every file.
     """
 
-    Config: ClassVar[type[ComponentConfig]] = PlySequenceConfig
+    Config: ClassVar = PlySequenceConfig
+    config: PlySequenceConfig
     keeps: ClassVar = {
         "means": "float32, world", "rotations": "unit quaternions wxyz",
         "scales": "natural logarithms", "opacities": "logits", "colours": "all SH bands",
         "rows": "a Gaussian is at the same row of every file",
     }  # fmt: skip
 
-    def __init__(self, config: PlySequenceConfig | None = None) -> None:
-        self.config = config or PlySequenceConfig()
-        self.up = self.config.up
-        self.axes = AXES[self.up]
-
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
-        """See `Exporter.write`."""
         move = world_move(request.clip, self.config.up)
         for i, moment in enumerate(request.moments):
             progress(i / len(request.moments), f"moment {i + 1} of {len(request.moments)}")

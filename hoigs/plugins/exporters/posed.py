@@ -23,7 +23,7 @@ from hoigs.core.maths.rotations import (
     slerp,
 )
 from hoigs.core.maths.spherical_harmonics import rotate_sh
-from hoigs.core.model.exporter import ExportRequest
+from hoigs.core.model.exporter import Exporter, ExportRequest
 from hoigs.core.values.between import frame_of
 from hoigs.core.values.clip import Clip, ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
@@ -39,6 +39,15 @@ AXES: dict[Up, str] = {
     "z": "right-handed, z up: the world of the clip, turned so that its up is +z and moved along "
     "it so that its floor is z = 0",
 }
+
+
+class TurnedExporter(Exporter):
+    """An exporter with a setting `up`: how the world of the clip is turned."""
+
+    def __init__(self, config: Any = None) -> None:
+        super().__init__(config)
+        up: Up = self.config.up
+        self.up, self.axes = up, AXES[up]
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.model.exporter import Exporter, ExportRequest
+from hoigs.core.model.exporter import ExportRequest
 from hoigs.core.reporting import Progress
-from hoigs.plugins.exporters.posed import AXES, BodyMotion, Up, body_motions, world_move
+from hoigs.plugins.exporters.posed import BodyMotion, TurnedExporter, Up, body_motions, world_move
 
 
 class SmplxNpzConfig(ComponentConfig):
@@ -30,7 +30,7 @@ class AmassConfig(ComponentConfig):
     """the axis that points upward, z in AMASS; "clip" keeps the world of the cameras"""
 
 
-class _ParametersExporter(Exporter):
+class _ParametersExporter(TurnedExporter):
     """One npz for each person."""
 
     suffixes = (".npz",)
@@ -40,13 +40,7 @@ class _ParametersExporter(Exporter):
     Config: ClassVar[type[SmplxNpzConfig | AmassConfig]]
     config: SmplxNpzConfig | AmassConfig
 
-    def __init__(self, config: SmplxNpzConfig | AmassConfig | None = None) -> None:
-        self.config = config or self.Config()
-        self.up = self.config.up
-        self.axes = AXES[self.up]
-
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
-        """See `Exporter.write`."""
         progress(0.0, "poses")
         move = world_move(request.clip, self.config.up)
         lost = {"surface details and looks": "the files hold parameters of a body"}
@@ -75,7 +69,6 @@ class SmplxExporter(_ParametersExporter):
     }
 
     def arrays(self, motion: BodyMotion, request: ExportRequest) -> dict[str, np.ndarray]:
-        """See the class."""
         turns = motion.rotations.numpy()
         return {
             "global_orient": turns[:, 0],
@@ -105,7 +98,6 @@ class AmassExporter(_ParametersExporter):
     }
 
     def arrays(self, motion: BodyMotion, request: ExportRequest) -> dict[str, np.ndarray]:
-        """See the class."""
         turns = torch.cat((motion.rotations[:, :22], motion.rotations[:, -30:]), 1)
         return {
             "poses": turns.reshape(len(motion), 156).double().numpy(),

@@ -45,7 +45,8 @@ class TracksExporter(Exporter):
     `colmap/` with the cameras as COLMAP's text model.
     """
 
-    Config: ClassVar[type[ComponentConfig]] = TracksConfig
+    Config: ClassVar = TracksConfig
+    config: TracksConfig
     keeps: ClassVar = {
         "objects": "object to world, quaternion wxyz and metres: the rigid motion that fits the "
         "Gaussians best, in the frame of the clip's track",
@@ -55,11 +56,7 @@ class TracksExporter(Exporter):
         "of each object, metres",
     }
 
-    def __init__(self, config: TracksConfig | None = None) -> None:
-        self.config = config or TracksConfig()
-
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
-        """See `Exporter.write`."""
         frames = [frame_of(request.clip, moment) for moment in request.moments]
         stamps = [(f"{f:.4f}", f"{i / request.fps:.6f}") for i, f in enumerate(frames)]
         cameras = [camera_between(request.clip, frame).to("cpu") for frame in frames]

@@ -48,7 +48,8 @@ class UsdExporter(Exporter):
     Attributes that change have a time sample a moment; the others have one value.
     """
 
-    Config: ClassVar[type[ComponentConfig]] = UsdConfig
+    Config: ClassVar = UsdConfig
+    config: UsdConfig
     suffixes = (".usd", ".usdc")
     up = "y"
     axes = AXES["y"]
@@ -59,11 +60,7 @@ class UsdExporter(Exporter):
         "camera": "of the video, with time samples",
     }
 
-    def __init__(self, config: UsdConfig | None = None) -> None:
-        self.config = config or UsdConfig()
-
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
-        """See `Exporter.write`."""
         move = world_move(request.clip, "y")
         stage = _stage(request)
         lost: dict[str, str] = {}

@@ -6,17 +6,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.body import PART_NAMES
 from hoigs.core.interfaces.deformation import DeformationModel, ProvidesField
 from hoigs.core.interfaces.features import FeatureExtractor
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Tokens
-
-
-class BodyPartConfig(ComponentConfig):
-    """No settings: the width is that of the deformation's field (96 in the paper)."""
 
 
 def part_averages(parts: Int[Tensor, " V"]) -> Float[Tensor, "16 V"]:

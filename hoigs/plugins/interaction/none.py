@@ -4,13 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.interaction import InteractionModule
 from hoigs.core.values.tokens import Residual, Role, Tokens
-
-
-class NoInteractionConfig(ComponentConfig):
-    """No settings."""
 
 
 class NoInteraction(InteractionModule):

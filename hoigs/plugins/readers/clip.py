@@ -40,10 +40,6 @@ from hoigs.plugins.readers.checked_files import ReaderConfig
 LEAST_BRIGHT = 16  # of a mask's brightest pixel, unless it is empty
 
 
-class ClipFolderReaderConfig(ReaderConfig):
-    """Settings of reader:clip."""
-
-
 class ClipFolderReader(ClipReader):
     """Reads a checked clip folder; pixels are decoded on access.
 
@@ -51,8 +47,8 @@ class ClipFolderReader(ClipReader):
         cache_mb: decoded pixels kept in memory, MiB, for the frames and again for held-out views.
     """
 
-    Config: ClassVar = ClipFolderReaderConfig
-    config: ClipFolderReaderConfig
+    Config: ClassVar = ReaderConfig
+    config: ReaderConfig
 
     def matches(self, folder: Path) -> bool:
         return (Path(folder) / HEADER).is_file()

@@ -84,7 +84,7 @@ def drive(
         retries: further attempts at a stage that failed.
         report: called with a row and "done before", "taken by another driver", "STAGE", "STAGE
             done", "waits: why", "retry: why", "done" or "failed: why".
-        tick: called at every look at the running rows.
+        tick: called at every poll of the running rows.
     """
     new = (Work(row, out.of(row), stages_of(row, out.of(row))) for row in rows)
     driver = _Driver(Queue(executor), retries, report)

@@ -248,7 +248,7 @@ class State:
 
     @classmethod
     def read(cls, folder: Path) -> State:
-        """Of a row that was not started yet: empty.
+        """The state of a row; an empty one if the row was not started yet.
 
         Raises:
             HoigsError: the file is damaged.

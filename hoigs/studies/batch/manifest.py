@@ -25,8 +25,8 @@ from hoigs.core.system.urls import as_url
 from hoigs.runs.choices import parse_settings
 from hoigs.training.options import TrainOptions
 
-NAMES = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")  # of rows, as they name folders
-FORMATS = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:@-]{0,79}")  # likewise, with kind: and @distribution
+NAMES = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")  # rows, whose names become folders
+FORMATS = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:@-]{0,79}")  # formats, with kind: and @distribution
 ONE_SOURCE = "a row has either a video or a clip"
 # options of a training that a row has under another name, or that the batch sets; plugin files run
 # code, and the batch's folder may be writable for others
@@ -151,11 +151,6 @@ class Row(BaseModel):
                 f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in value.items()
             )
         return value
-
-
-def read_manifest(path: Path, defaults: Mapping[str, Any] | None = None) -> list[Row]:
-    """The rows of a manifest; arguments and errors as `each_row`."""
-    return list(each_row(path, defaults))
 
 
 def each_row(path: Path, defaults: Mapping[str, Any] | None = None) -> Iterator[Row]:

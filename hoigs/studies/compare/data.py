@@ -60,11 +60,11 @@ class Cell:
     """One training of one spec on one clip.
 
     Attributes:
-        spec: its label. definition: what it is: a name or file, and what is laid over it.
+        spec: its label. definition: the spec's name or file, and its overrides.
         rasterizer: name. steps: the budget. clip: label. seed: of the training.
         run: its folder, relative to the chart's. machine: fingerprint in words, "" if never run.
         values: by axis name; every further number of the evaluation as "VIEW/REGION/METRIC".
-        protocol: how they came about, sentences.
+        protocol: how the values were measured, in sentences.
         curve: PSNR of a few test frames as training went.
         missing: why there are no values; "" when there are.
         table: of the paper, that the spec is a row of; "" for specs that were chosen freely.
@@ -236,7 +236,7 @@ def load_chart(path: Path) -> tuple[list[Cell], dict[str, Any]]:
 
 def _plain_point(point: Point) -> dict[str, Any]:
     values = {
-        name: {"not_computed": v.reason}
+        name: to_json(v)
         if isinstance(v, NotComputed)
         else {"mean": v.mean, "std": v.std, "n": len(v.values)}
         for name, v in point.values.items()

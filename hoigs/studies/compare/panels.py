@@ -9,9 +9,8 @@ from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 
 from hoigs.studies.compare.data import (
     ACCURACY,
@@ -26,9 +25,9 @@ from hoigs.studies.compare.data import (
     series_of,
     usable_axes,
 )
-from hoigs.studies.plots import DPI, FRONT, QUIET, STYLE, is_log, short_number
+from hoigs.studies.plots import FRONT, STYLE, framed, scale
 
-PANEL = (2.6, 2.2)  # inches
+PANEL, LEGEND = (2.6, 2.2), 2.2  # inches
 MARKER = 7.0  # points
 
 
@@ -48,7 +47,8 @@ def accuracy_chart(
     series = series_of(points)
     notes = foot_notes(points, no_rows | no_columns)
     with matplotlib.rc_context(STYLE):
-        figure = framed(title, points, notes, PANEL[0] * max(2, len(columns)), PANEL[1] * len(rows))
+        width = PANEL[0] * max(2, len(columns)) + LEGEND
+        figure = framed(_titled(title, points), notes, width, PANEL[1] * len(rows))
         grid: Any = figure.subplots(len(rows), len(columns), squeeze=False, sharex="col",
                                     sharey="row")  # fmt: skip
         for i, row in enumerate(rows):
@@ -59,7 +59,7 @@ def accuracy_chart(
             grid[i][0].yaxis.set_major_locator(MaxNLocator(5))
             grid[i][0].set_ylabel(row.title + (", reversed" if row.better == "lower" else ""))
         for axes, column in zip(grid[-1], columns, strict=True):
-            scale(axes, [v for p in points if (v := p.number(column)) is not None])
+            scale(axes, "x", [v for p in points if (v := p.number(column)) is not None])
             axes.set_xlabel(column.title)
         handles, names = grid[0][0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside right upper")
@@ -67,20 +67,9 @@ def accuracy_chart(
     return figure
 
 
-def framed(
-    title: str, points: Sequence[Point], notes: Sequence[str], width: float, height: float
-) -> Figure:
-    """A figure with title and notes, and `width` x `height` inches for its panels."""
-    several = len(machines(points)) > 1
-    text = f"{title}: points of {len(machines(points))} machines" if several else title
-    width += 2.2  # of the legend
-    lines = [line for note in notes for line in textwrap.wrap(note, int(width * 15))]
-    size = (width, height + 0.9 + 0.16 * len(lines))
-    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(text, x=0.01, ha="left", size=14, weight="bold")
-    figure.supxlabel("\n".join(lines), x=0.01, ha="left", size=8.5, color=QUIET)
-    return figure
+def _titled(title: str, points: Sequence[Point]) -> str:
+    count = len(machines(points))
+    return f"{title}: points of {count} machines" if count > 1 else title
 
 
 def foot_notes(points: Sequence[Point], absent: Mapping[str, str]) -> list[str]:
@@ -135,19 +124,6 @@ def _at(point: Point, axis: Axis) -> float:
     return value
 
 
-def scale(axes: Axes, values: Sequence[float]) -> None:
-    """The horizontal axis: logarithmic where that is easier to read, with short numbers."""
-    if is_log(values):
-        axes.set_xscale("log")
-        decades = max(values) / min(values)
-        subs = (1, 2, 5) if decades < 60 else (1, 3) if decades < 600 else (1,)
-        axes.xaxis.set_major_locator(LogLocator(subs=subs))
-        axes.xaxis.set_minor_locator(NullLocator())
-    else:
-        axes.xaxis.set_major_locator(MaxNLocator(5))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short_number(value)))
-
-
 # Quality during training: PSNR of test frames over seconds and over steps, one line a series.
 
 
@@ -172,14 +148,14 @@ def curve_chart(
     if not timed:
         notes.append("Seconds are not drawn: several machines; --mix-machines draws them.")
     with matplotlib.rc_context(STYLE):
-        figure = framed(title, points, notes, 5.2 * len(axes_of), 3.6)
+        figure = framed(_titled(title, points), notes, 5.2 * len(axes_of) + LEGEND, 3.6)
         grid = figure.subplots(1, len(axes_of), squeeze=False, sharey=True)[0]
         for axes, (which, name) in zip(grid, axes_of, strict=True):
             for one in series:
                 curve = one.points[0].curve
                 axes.plot([c[which] for c in curve], [c[2] for c in curve], one.marker + "-",
                           color=one.color, linewidth=1.6, markersize=4, label=one.name)  # fmt: skip
-            scale(axes, [s.points[0].curve[-1][which] for s in series])
+            scale(axes, "x", [s.points[0].curve[-1][which] for s in series])
             axes.set_xlabel(name)
             axes.tick_params(length=0)
         grid[0].set_ylabel("PSNR, full frame (dB)")

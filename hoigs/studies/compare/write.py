@@ -1,4 +1,4 @@
-"""A chart's files: chart.json, chart.csv, chart.md, chart.html, and figures of every clip."""
+"""A chart's files: chart.json, chart.csv, chart.md, and figures of every clip."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ from hoigs.studies.compare.data import (
     dominances,
     dump_cells,
     front,
-    letter,
-    machines,
+    machine_sentences,
     name_of,
     points_of,
     usable_axes,
@@ -54,15 +53,12 @@ def write_chart(
         about: how the study was made, JSON values.
         mix_machines: draw times of several machines in one panel.
     """
-    from hoigs.studies.compare.interactive import page
-
     out.mkdir(parents=True, exist_ok=True)
     sheets = by_clip(cells)
     files: dict[str, bytes] = {
         "chart.json": dump_cells(cells, about).encode(),
         "chart.csv": as_csv(cells).encode(),
         "chart.md": markdown(cells, sheets, about, mix_machines).encode(),
-        "chart.html": page(cells, sheets, about, mix_machines).encode(),
     }
     for clip, points in sheets.items():
         files |= _figures(clip, points, mix_machines)
@@ -118,13 +114,9 @@ def markdown(
     """Numbers and dominances, a section a clip."""
     lines = ["# Accuracy against cost", "", *(f"- {k}: {v}" for k, v in about.items()), ""]
     for clip, points in sheets.items():
-        lines += [f"## {clip}", "", *machine_lines(points), ""]
-        lines += [
-            *_grid([*ACCURACY, *COST], points),
-            "",
-            *dominance_table(points, mix_machines),
-            "",
-        ]
+        lines += [f"## {clip}", "", *(f"- {said}" for said in machine_sentences(points)), ""]
+        lines += [*_grid([*ACCURACY, *COST], points), ""]
+        lines += [*dominance_table(points, mix_machines), ""]
         if points[0].table:
             for title, axes in paper.columns(points):
                 lines += [f"{title}:", "", *_grid(axes, points), ""]
@@ -137,16 +129,6 @@ def markdown(
             f"- {c.spec}, {c.clip}, {c.steps} steps, seed {c.seed}: {c.missing}" for c in lost
         ]
     return "\n".join(lines).rstrip() + "\n"
-
-
-def machine_lines(points: Sequence[Point]) -> list[str]:
-    """The sentence on machines that every table has."""
-    found = machines(points)
-    if len(found) == 1:
-        return [f"Measured on {found[0]}."]
-    each = [f"- machine {letter(i)}: {words}" for i, words in enumerate(found)]
-    differ = "whose times, joules and memory cannot be compared"
-    return [f"**Points of {len(found)} machines**, {differ}:", "", *each]
 
 
 def _grid(axes: Sequence[Axis], points: Sequence[Point]) -> list[str]:

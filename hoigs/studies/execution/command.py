@@ -16,7 +16,7 @@ from pathlib import Path
 from hoigs.core.system.folder_lock import is_held
 
 PARENT_POLL_S = 0.25
-LEASE_POLLS = 4  # looks at the parent for one at the lease, which may lie on a slow disk
+LEASE_POLLS = 4  # the lease, perhaps on a slow disk, is read at every fourth poll of the parent
 
 
 def end_with(parent: int, lease: str = "") -> None:
@@ -24,10 +24,10 @@ def end_with(parent: int, lease: str = "") -> None:
 
     Args:
         parent: its number; it is gone once this process has another parent.
-        lease: `FolderLock.lease` of the driver's lock. Where two looks find it gone or another's,
-            another driver has taken the work over; one look may fall into a take-over that fails.
-            It also ends with a driver on this machine, which on a cluster is not the parent: where
-            the head is gone too, a Ray worker goes on for a minute.
+        lease: `FolderLock.lease` of the driver's lock. If it is absent or another driver's in two
+            polls, that driver has taken over the work (in one poll, the take-over may still fail).
+            On a cluster, where the driver is not the parent, this also ends the process with the
+            driver; a Ray worker would continue for a minute without the cluster's head.
     """
     path, _, token = lease.rpartition(":")
 

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from hoigs.core.registry.registry import default_registry
+from hoigs.core.system.files import write_whole
 from hoigs.runs.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from hoigs.runs.options import RunOptions
 from hoigs.runs.run_folder import RunFolder
@@ -181,9 +182,9 @@ def add_to_answer(after: After, folder: Path) -> None:
     lines += ["| " + " | ".join(row) + " |" for row in rows]
     lines += ["", *(f"- {sentence}" for sentence in sentences(after))]
     text = page.read_text(encoding="utf-8").partition(HEADING)[0].rstrip()
-    _write(page, "\n".join([text, "", HEADING, "", *lines, ""]))
+    write_whole(page, "\n".join([text, "", HEADING, "", *lines, ""]))
     record = json.loads(data.read_text(encoding="utf-8"))
-    _write(data, json.dumps(record | {"after": as_data(after)}, indent=1))
+    write_whole(data, json.dumps(record | {"after": as_data(after)}, indent=1))
 
 
 def as_data(after: After) -> dict[str, Any]:
@@ -203,9 +204,3 @@ def as_data(after: After) -> dict[str, Any]:
         "full_trainings": after.whole_cost,
         "threads": torch.get_num_threads(),
     }  # fmt: skip
-
-
-def _write(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)

@@ -60,7 +60,7 @@ def auto(
     """Find how much of a spec a clip needs, train that, prune it, and compress it.
 
     The answer of `needs` is written to OUT-needs, the compressed copy to OUT-compact; OUT is by
-    default runs/CLIP-SPEC-auto. With `resume` the training in OUT goes on with the answer that it
+    default runs/CLIP-SPEC-auto. With `resume` the training in OUT continues with the answer that it
     was started with. The reader is the one that recognises the clip, and there is no budget of
     time.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hoigs.core.errors import HoigsError, did_you_mean
+from hoigs.core.errors import HoigsError
 from hoigs.core.options import verb
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import Spec
@@ -15,7 +15,7 @@ from hoigs.studies.needs.options import NeedsOptions
 from hoigs.studies.needs.report import require_new, write_needs
 from hoigs.studies.needs.result import Needs, Settings
 from hoigs.studies.needs.search import Search
-from hoigs.studies.needs.search_space import CRITERIA, load_search_spaces
+from hoigs.studies.needs.search_space import load_search_spaces
 from hoigs.training.train import Report, silent
 
 
@@ -38,11 +38,7 @@ def needs(clip: Path | str, *, options: NeedsOptions, report: Report = silent) -
     Raises:
         HoigsError: anything wrong with the input.
     """
-    criterion, share, search_spaces = options.criterion, options.share, options.search_spaces
-    rule = next((c for c in CRITERIA if c == criterion), None)
-    if rule is None:
-        near = did_you_mean(criterion, CRITERIA)
-        raise HoigsError(f"criterion {criterion}: expected {' or '.join(CRITERIA)}{near}")
+    share, search_spaces = options.share, options.search_spaces
     if not 0 <= share < 0.5:
         raise HoigsError(f"share {share}: expected a share of the training frames below 0.5")
     spec, given = options.spec, options.spec_settings()
@@ -59,7 +55,7 @@ def needs(clip: Path | str, *, options: NeedsOptions, report: Report = silent) -
         str(spec),
         load_search_spaces(None if search_spaces is None else Path(search_spaces)),
         given,
-        Settings(rule, options.least, share),
+        Settings(options.least, share),
         registry,
         device,
         lambda line: report(f"  {line}"),

@@ -17,8 +17,6 @@ class NeedsOptions(FitOptions):
     """The spec to reduce: a name or a file."""
     out: Path | str | None = None
     """Folder of the answer; default: runs/needs-CLIP."""
-    criterion: str = "one-se"
-    """one-se: the cheapest candidate within one standard error of the best; or bic."""
     least: Annotated[float, Field(ge=0)] = 0.1
     """Ignore gains below this, dB."""
     share: float = 0.05

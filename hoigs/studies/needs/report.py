@@ -14,9 +14,7 @@ from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.registry.registry import Registry
@@ -26,7 +24,7 @@ from hoigs.core.spec.schema import Spec
 from hoigs.core.system.files import name_from
 from hoigs.core.system.safe_replace import Layout, one_of, require_replaceable
 from hoigs.studies.needs.result import SETTLES, UNSEEN, Answer, Needs, Step, summary_line
-from hoigs.studies.plots import MARKERS, PALETTE, QUIET, STYLE, is_log, short_number
+from hoigs.studies.plots import DPI, MARKERS, PALETTE, STYLE, framed, scale
 
 # The answer as a readable spec: what it extends, and each changed key with a reason.
 
@@ -126,7 +124,7 @@ def _flow(value: Any) -> str:
 # Error against parameters: a panel for each search space, its candidates as points.
 
 WIDTH, HEIGHT = 4.8, 3.0  # inches of a panel
-COLUMNS, DPI = 3, 130
+COLUMNS = 3
 
 
 def draw(needs: Needs, *paths: Path) -> None:
@@ -141,18 +139,11 @@ def _figure(needs: Needs) -> Figure:
     answers = [a for a in needs.answers if any(s.score for s in a.steps)]
     columns = max(1, min(COLUMNS, len(answers)))
     rows = max(1, math.ceil(len(answers) / columns))
-    figure = Figure(figsize=(columns * WIDTH, rows * HEIGHT), layout="constrained", dpi=DPI)
-    FigureCanvasAgg(figure)
-    figure.suptitle(
-        f"What {needs.clip} needs: error on training frames held back, by trained parameters",
-        weight="bold",
-    )
+    title = f"What {needs.clip} needs: error on training frames held back, by trained parameters"
+    note = "trained parameters of the trial (star: chosen; pale: rejected early, after fewer steps)"
+    figure = framed(title, [note], columns * WIDTH, rows * HEIGHT)
     for number, answer in enumerate(answers, 1):
         _panel(figure.add_subplot(rows, columns, number), answer)
-    figure.supxlabel(
-        "trained parameters of the trial (star: chosen; pale: rejected early, after fewer steps)",
-        size=8.5, color=QUIET,
-    )  # fmt: skip
     return figure
 
 
@@ -174,22 +165,8 @@ def _panel(axes: Axes, answer: Answer) -> None:
     axes.set_ylabel("RMSE, grey levels of 255", size=8)
     axes.tick_params(labelsize=8, which="both")
     axes.margins(0.15)
-    _scale(axes, [_point(s)[0] for s in shown], [_point(s)[1] for s in shown])
-
-
-def _scale(axes: Axes, parameters: list[int], errors: list[float]) -> None:
-    """Logarithmic axes where values spread widely, with short numbers."""
-    for axis, scale, values in (
-        (axes.xaxis, axes.set_xscale, parameters),
-        (axes.yaxis, axes.set_yscale, errors),
-    ):
-        if is_log(values):
-            scale("log")
-            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
-            axis.set_minor_locator(NullLocator())
-        else:
-            axis.set_major_locator(MaxNLocator(5))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: short_number(value)))
+    scale(axes, "x", [_point(s)[0] for s in shown])
+    scale(axes, "y", [_point(s)[1] for s in shown])
 
 
 def _shown(answer: Answer) -> list[Step]:
@@ -211,7 +188,7 @@ ANSWER = Layout(
     what="answer of `hoigs study needs`",
     maker="`hoigs study needs`",
     required=FILES,
-    files=one_of(*map(re.escape, FILES), r"\.needs\.(md|json)\.\d+\.part"),
+    files=one_of(*map(re.escape, FILES), r"\.needs\.(md|json)(\.\d+)?\.part"),
     folders=one_of(),
 )
 
@@ -301,8 +278,6 @@ def method(needs: Needs) -> list[str]:
     rule = (
         f"the cheapest candidate within one standard error of the best, or within "
         f"{chosen.least:g} dB{_tolerances(needs)}"
-        if chosen.criterion == "one-se"
-        else "the candidate of the least BIC"
     )
     total = needs.full * chosen.budget
     frames = ", ".join(map(str, needs.frames))

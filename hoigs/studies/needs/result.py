@@ -16,7 +16,6 @@ from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.studies.needs.search_space import (
     Candidate,
-    Criterion,
     Gain,
     Overrides,
     Score,
@@ -95,12 +94,11 @@ class Settings:
     """How to search.
 
     Attributes:
-        criterion: "one-se" or "bic". least: dB of gain that are ignored (`criterion.near_best`).
+        least: dB of gain that are ignored (`search_space.near_best`).
         share, frames: share of the training frames that is held back, and the least number.
         budget: full trainings that everything may cost, including the final training.
     """
 
-    criterion: Criterion = "one-se"
     least: float = 0.1
     share: float = 0.05
     frames: int = 3

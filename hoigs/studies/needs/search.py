@@ -183,7 +183,6 @@ class Search:
                 lambda k, until: trials[tried[k].name].advance(until),
                 self.budget,
                 rule=Rule(
-                    self.settings.criterion,
                     self.settings.least if space.least is None else space.least,
                     space.min_gain,
                 ),

@@ -191,13 +191,8 @@ def as_settings(overrides: Mapping[str, Any]) -> list[str]:
     return [f"{key}={json.dumps(value)}" for key, value in overrides.items()]
 
 
-# Choosing a candidate: the cheapest within one standard error of the best, or the least BIC.
+# Choosing a candidate: the cheapest within one standard error of the best.
 
-Criterion = Literal["one-se", "bic"]
-CRITERIA: tuple[Criterion, ...] = ("one-se", "bic")
-# pixels that count as one observation: a square of twice the radius of a small splat's blur
-CORRELATED = (2 * 1.5) ** 2
-MSE_FLOOR = 1e-10
 PATIENCE = 1.5  # standard errors within which a candidate is kept before the last round
 
 
@@ -251,12 +246,6 @@ def gain(of: Score, over: Score) -> Gain:
     return Gain(mean(differences), stdev(differences) / math.sqrt(len(differences)))
 
 
-def bic(score: Score) -> float:
-    """n log(MSE) + p log(n), with n the roughly independent pixels (Schwarz 1978)."""
-    count = max(2.0, sum(score.pixels) / CORRELATED)
-    return count * math.log(max(score.mse, MSE_FLOOR)) + score.parameters * math.log(count)
-
-
 def near_best(
     scores: Sequence[Score], least: float = 0.0, min_gain: float = 0.0, errors: float = 1.0
 ) -> list[bool]:
@@ -280,20 +269,15 @@ class Rule:
     """How one of several candidates is chosen.
 
     Attributes:
-        criterion: the cheapest within one standard error of the best, or the least BIC.
-        least, min_gain: as `near_best` has them, for the former.
+        least, min_gain: as `near_best` has them.
     """
 
-    criterion: Criterion = "one-se"
     least: float = 0.0
     min_gain: float = 0.0
 
 
 def choose(scores: Sequence[Score], rule: Rule) -> int:
     """Index of the candidate to keep; scores are in order of cost."""
-    if rule.criterion == "bic":
-        values = [bic(score) for score in scores]
-        return values.index(min(values))
     return near_best(scores, rule.least, rule.min_gain).index(True)
 
 
@@ -307,8 +291,6 @@ def ranked(scores: Sequence[Score], rule: Rule) -> list[int]:
     exclude the one that they have to be compared with.
     """
     places = range(len(scores))
-    if rule.criterion == "bic":
-        return sorted(places, key=lambda k: (bic(scores[k]), k))
     near = near_best(scores, rule.least, rule.min_gain, PATIENCE)
     order = sorted(places, key=lambda k: (not near[k], k if near[k] else -scores[k].mean))
     best = max(places, key=lambda k: scores[k].mean)

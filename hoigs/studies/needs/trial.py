@@ -399,8 +399,3 @@ def overridden(spec: Spec, overrides: Mapping[str, Any], registry: Registry) -> 
 def state_prefix(entity: str) -> str:
     """How an entity's tensors are named in the model's state."""
     return f"entities.{entity}."
-
-
-def cloned(tensor: Tensor) -> Tensor:
-    with torch.no_grad():
-        return tensor.detach().clone()

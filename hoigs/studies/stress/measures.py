@@ -15,7 +15,7 @@ from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.clip import Clip, Frame
 from hoigs.evaluation.geometry import read_truth
-from hoigs.evaluation.protocol import NotComputed, Value, from_json
+from hoigs.evaluation.protocol import NotComputed, Value, from_json, to_json
 from hoigs.studies.jobs.results import Measure, measures_of
 
 STRESS = "stress"  # in evaluation.json, beside the evaluation's own
@@ -95,10 +95,7 @@ def observe(
         "scene_over_human": _covered(model, clip, frames, shares),
         "drift_of_path": _drift(clip, geometry["object_translation"]),
     }
-    return {
-        name: {"not_computed": v.reason} if isinstance(v, NotComputed) else round(v, 6)
-        for name, v in found.items()
-    }
+    return {n: to_json(v if isinstance(v, NotComputed) else round(v, 6)) for n, v in found.items()}
 
 
 def _shares(model: SceneModel, frame: Frame) -> Float[Tensor, "H W 3"]:

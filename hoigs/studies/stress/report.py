@@ -1,25 +1,25 @@
-"""A study's files: stress.md, stress.csv, stress.json, and the figures of matrix and curves."""
+"""A study's files: stress.md, stress.json, and the figures of matrix and curves."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import matplotlib
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+import numpy as np
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Patch
 
 from hoigs.core.system.files import write_whole
-from hoigs.evaluation.protocol import NotComputed
-from hoigs.studies.plots import INK, MARKERS, PALETTE, QUIET, STYLE, short_number
+from hoigs.studies.plots import INK, MARKERS, PALETTE, QUIET, STYLE, framed, short_number
 from hoigs.studies.stress.capabilities import MEANING as HAS
 from hoigs.studies.stress.case import Case
 from hoigs.studies.stress.verdict import (
@@ -34,7 +34,7 @@ from hoigs.studies.stress.verdict import (
 )
 
 FORMAT, VERSION = "hoigs-stress", 1
-MARKS = {"pass": "✓", "fail": "✗", "nature": "◐", "not applicable": "–", "not run": "?"}
+MARKS = {"pass": "✓", "fail": "✗", "limitation": "◐", "not applicable": "–", "not run": "?"}
 
 
 def write_stress(table: Table, out: Path) -> list[Path]:
@@ -44,7 +44,6 @@ def write_stress(table: Table, out: Path) -> list[Path]:
     out.mkdir(parents=True, exist_ok=True)
     files: dict[str, bytes] = {
         "stress.json": as_json(table).encode(),
-        "stress.csv": as_csv(table).encode(),
         "stress.md": as_markdown(table).encode(),
     }
     drawn = {"stress-matrix": matrix(table, "Where methods break"),
@@ -70,48 +69,6 @@ def as_json(table: Table) -> str:
         "verdicts": [v.to_dict() for v in table.verdicts.values()],
     }
     return json.dumps(data, indent=1, allow_nan=False)
-
-
-def as_csv(table: Table) -> str:
-    """One number a line; a verdict without numbers is a line too."""
-    columns = ("case", "title", "kind", "spec", "definition", "status", "rate", "breaks_at",
-               "unit", "seed", "value", "stands", "measure", "number", "not_computed", "measured",
-               "run", "machine", "protocol", *table.about)  # fmt: skip
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    for case in table.cases:
-        for spec in table.specs:
-            verdict = table.at(case, spec)
-            base = {
-                "case": case.id, "title": case.title, "kind": "sweep", "spec": spec,
-                "definition": table.definitions[spec], "status": verdict.status,
-                "rate": "" if verdict.rate is None else f"{verdict.rate:.3f}",
-                "breaks_at": "" if verdict.breaks_at is None else f"{verdict.breaks_at:g}",
-                "unit": case.sweep.unit,
-                "machine": " and ".join(verdict.machines),
-                "protocol": " ".join(verdict.protocol), **table.about,
-            }  # fmt: skip
-            numbers = list(_numbers(verdict))
-            for row in numbers or [{"measured": verdict.measured}]:
-                writer.writerow(base | row)
-    return text.getvalue()
-
-
-def _numbers(verdict: Verdict) -> Iterator[dict[str, Any]]:
-    for seed in verdict.seeds:
-        for level in seed.levels:
-            place = {"seed": seed.seed, "value": f"{level.value:g}", "stands": level.stands,
-                     "measured": level.why, "run": level.run}  # fmt: skip
-            if not level.values:
-                yield place
-            for name, value in level.values.items():
-                absent = isinstance(value, NotComputed)
-                yield place | {
-                    "measure": name,
-                    "number": "" if absent else repr(value),
-                    "not_computed": value.reason if isinstance(value, NotComputed) else "",
-                }
 
 
 def as_markdown(table: Table) -> str:
@@ -153,7 +110,7 @@ def _section(table: Table, case: Case) -> list[str]:
         if verdict.measured:
             results.setdefault(f"{verdict.status}: {verdict.measured}", []).append(spec)
     lines += ["", *(f"- {', '.join(specs)}: {words}" for words, specs in results.items())]
-    failed = {"fail", "nature"} & {table.at(case, spec).status for spec in table.specs}
+    failed = {"fail", "limitation"} & {table.at(case, spec).status for spec in table.specs}
     if failed and case.advice:
         lines += ["", f"What to do: {case.advice}."]
     return lines
@@ -161,43 +118,30 @@ def _section(table: Table, case: Case) -> list[str]:
 
 # Breakdown curves: a score against the value of a sweep, for each method.
 
-DPI = 160
-PANEL = (3.9, 3.1)  # inches
+PANEL, LEGEND = (3.9, 3.3), 2.2  # inches
 MOST_COLUMNS = 4
-CURVES_HEAD, CURVES_LINE = 1.05, 0.19
 
 
 def breakdown(table: Table, title: str) -> Figure | None:
     """A panel for each case with a sweep that has been run; None where none has."""
-    cases = [c for c in table.cases if _drawn(table, c)]
+    cases = [c for c in table.cases if any(table.curve(c, spec) for spec in table.specs)]
     if not cases:
         return None
     columns = min(MOST_COLUMNS, len(cases))
     rows = math.ceil(len(cases) / columns)
-    width = PANEL[0] * max(2, columns)
-    notes = [line for note in [HOW, *table.notes] for line in textwrap.wrap(note, int(width * 15))]
-    legend = math.ceil(len(table.specs) / max(1, int(width / 1.9)))
-    foot = 0.5 + CURVES_LINE * len(notes)
-    head = CURVES_HEAD + 0.24 * (legend - 1)
-    height = head + PANEL[1] * rows + foot
+    width = PANEL[0] * max(2, columns) + LEGEND
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(width, height), dpi=DPI)
-        FigureCanvasAgg(figure)
+        figure = framed(title, [HOW, *table.notes], width, PANEL[1] * rows)
         grid: Any = figure.subplots(rows, columns, squeeze=False)
-        figure.subplots_adjust(
-            left=0.62 / width, right=1 - 0.2 / width, top=1 - (head + 0.25) / height,
-            bottom=(foot + 0.5) / height, wspace=0.24, hspace=0.52,
-        )  # fmt: skip
-        for i, case in enumerate(cases):
-            _panel(grid[i // columns][i % columns], table, case)
-        for i in range(len(cases), rows * columns):
-            grid[i // columns][i % columns].axis("off")
-        figure.text(0.3 / width, 1 - 0.34 / height, title, size=15, weight="bold", va="center")
-        _legend(figure, table.specs, width, height)
-        for i, line in enumerate(notes):
-            figure.text(0.3 / width, (foot - 0.3 - CURVES_LINE * i) / height, line, size=8,
-                    color=QUIET,
-                        va="center")  # fmt: skip
+        for axes, case in zip_longest(grid.flat, cases):
+            if case is None:
+                axes.axis("off")
+            else:
+                _panel(axes, table, case)
+        looks = [
+            Line2D([], [], color=_color(i), marker=_marker(i)) for i in range(len(table.specs))
+        ]
+        figure.legend(looks, table.specs, loc="outside right upper")
     return figure
 
 
@@ -205,24 +149,6 @@ HOW = (
     "Bars: one standard deviation over seeds. A cross: half of the seeds or more fail that "
     "value; a seed that fails a value runs none harder. Grey line: the required value."
 )
-
-
-def _drawn(table: Table, case: Case) -> bool:
-    return any(table.curve(case, spec) for spec in table.specs)
-
-
-def _legend(figure: Figure, specs: Sequence[str], width: float, height: float) -> None:
-    x, y = 0.36, 0.68
-    for i, spec in enumerate(specs):
-        step = 0.42 + 0.078 * len(spec)
-        if x + step > width - 0.2:
-            x, y = 0.36, y + 0.24
-        artist = Line2D([x / width, (x + 0.22) / width], [1 - y / height] * 2, color=_color(i),
-                        marker=_marker(i), markersize=5, linewidth=1.4,
-                        transform=figure.transFigure)  # fmt: skip
-        figure.add_artist(artist)
-        figure.text((x + 0.3) / width, 1 - y / height, spec, size=9, color=INK, va="center")
-        x += step + 0.1
 
 
 def _panel(axes: Any, table: Table, case: Case) -> None:
@@ -234,15 +160,15 @@ def _panel(axes: Any, table: Table, case: Case) -> None:
         if not points:
             continue
         shift = 0.05 * (i - (len(table.specs) - 1) / 2)  # so that bars do not hide each other
-        x = [places[p.value] + shift for p in points]
+        x, spreads = [places[value] + shift for value in points], points.values()
         axes.errorbar(
-            x, [p.mean for p in points], yerr=[p.std or 0 for p in points], color=_color(i),
+            x, [s.mean for s in spreads], yerr=[s.std or 0 for s in spreads], color=_color(i),
             marker=_marker(i), markersize=4.5, linewidth=1.4, elinewidth=0.9, capsize=0, zorder=3,
         )  # fmt: skip
         broken = table.at(case, spec).breaks_at
-        at = [(a, p.mean) for a, p in zip(x, points, strict=True) if p.value == broken]
-        axes.plot([a for a, _ in at], [b for _, b in at], "x", color=INK, markersize=9,
-                  markeredgewidth=1.6, zorder=4)  # fmt: skip
+        if broken in points:
+            axes.plot(places[broken] + shift, points[broken].mean, "x", color=INK, markersize=9,
+                      markeredgewidth=1.6, zorder=4)  # fmt: skip
     axes.set_xticks(list(places.values()), [short_number(v) for v in sweep.values])
     axes.set_xlim(-0.4, len(places) - 0.6)
     axes.tick_params(length=0, labelsize=8.5)
@@ -263,15 +189,14 @@ def _marker(index: int) -> str:
 # The matrix: cases down, specs across, a colour for each verdict.
 
 ROW, COLUMN = 0.25, 1.22  # inches of a cell
-LEFT, RIGHT, MATRIX_LINE = 4.5, 0.3, 0.19  # inches of the titles, the margin, a line of notes
-NARROWEST = 9.6  # inches at which the legend has two lines
-MATRIX_HEAD, GAP = 1.2, 0.36  # inches above the first row, and above each family
+TITLES, HEAD, GAP = 4.5, 1.0, 0.42  # inches of titles, of specs and legend, above each family
+NARROWEST = 9.6  # inches at which the legend has two columns
 
 # fill and ink, dark enough to be read on it (WCAG AA)
 COLORS: dict[Status, tuple[str, str]] = {
     "pass": ("#bfe5d6", "#0b4a36"),
     "fail": ("#f3b79a", "#6b2400"),
-    "nature": ("#fbe3b0", "#5a4300"),
+    "limitation": ("#fbe3b0", "#5a4300"),
     "not applicable": ("#f3f4f5", "#686f78"),
     "not run": ("#ffffff", "#686f78"),
 }
@@ -280,61 +205,42 @@ COLORS: dict[Status, tuple[str, str]] = {
 def matrix(table: Table, title: str) -> Figure:
     """One row for each case, by family, and a verdict in each cell."""
     families = table.families()
-    width = max(NARROWEST, LEFT + COLUMN * len(table.specs) + RIGHT)
-    notes = [line for note in table.notes for line in textwrap.wrap(note, int(width * 15))]
-    body = sum(GAP + ROW * len(cases) for cases in families.values())
-    height = MATRIX_HEAD + body + 0.45 + MATRIX_LINE * len(notes)
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(width, height), dpi=DPI)
-        FigureCanvasAgg(figure)
-        axes: Any = figure.add_axes((0, 0, 1, 1))
-        axes.set(xlim=(0, width), ylim=(height, 0))
-        axes.axis("off")
-        _head(axes, table, title, width)
-        y = MATRIX_HEAD
-        for family, cases in families.items():
-            y += GAP
-            axes.text(0.3, y - 0.1, family.capitalize(), size=10.5, weight="bold", va="center")
-            for case in cases:
-                _row(axes, table, case, y)
-                y += ROW
-        for i, line in enumerate(notes):
-            axes.text(0.3, y + 0.35 + MATRIX_LINE * i, line, size=8, color=QUIET, va="center")
+    rows = [len(cases) for cases in families.values()]
+    width = max(NARROWEST, TITLES + COLUMN * len(table.specs))
+    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+        figure = framed(title, table.notes, width, HEAD + ROW * sum(rows) + GAP * len(rows))
+        grid: Any = figure.subplots(len(rows), squeeze=False, height_ratios=rows)[:, 0]
+        for axes, (family, cases) in zip(grid, families.items(), strict=True):
+            _family(axes, table, family, cases)
+        specs = ["\n".join(textwrap.wrap(spec.replace("@", " @"), 12)) for spec in table.specs]
+        grid[0].tick_params(labeltop=True)
+        grid[0].set_xticks(range(len(specs)), specs, weight="bold", color=INK)
+        counts = Counter(verdict.status for verdict in table.verdicts.values())
+        keys = [
+            Patch(facecolor=fill, edgecolor="#9aa0a8", label=f"{s}: {MEANING[s]} ({counts[s]})")
+            for s, (fill, _) in COLORS.items()
+        ]
+        at = (1, 0)  # below the last row
+        grid[-1].legend(handles=keys, loc="upper right", bbox_to_anchor=at, ncols=2)
     return figure
 
 
-def _head(axes: Any, table: Table, title: str, width: float) -> None:
-    axes.text(0.3, 0.38, title, size=15, weight="bold", va="center")
-    counts = {s: sum(v.status == s for v in table.verdicts.values()) for s in COLORS}
-    x, y = 0.3, 0.76
-    for status, (fill, _) in COLORS.items():
-        words = f"{status}: {MEANING[status]} ({counts[status]})"
-        if x > 0.3 and x + 0.3 + 0.066 * len(words) > width:
-            x, y = 0.3, y + 0.21
-        axes.add_patch(Rectangle((x, y - 0.07), 0.16, 0.14, facecolor=fill, edgecolor="#9aa0a8",
-                                 linewidth=0.5))  # fmt: skip
-        axes.text(x + 0.23, y, words, size=8.5, color=QUIET, va="center")
-        x += 0.45 + 0.066 * len(words)
-    for i, spec in enumerate(table.specs):
-        lines = textwrap.wrap(spec.replace("@", " @"), 12)
-        axes.text(LEFT + COLUMN * (i + 0.5), MATRIX_HEAD + 0.22, "\n".join(lines), size=9,
-                  weight="bold",
-                  ha="center", va="bottom")  # fmt: skip
-
-
-def _row(axes: Any, table: Table, case: Any, y: float) -> None:
-    middle = y + ROW / 2
-    axes.text(0.3, middle, case.id, size=8.5, color=QUIET, va="center")
-    shown = textwrap.shorten(case.title, 56, placeholder=" …")
-    axes.text(0.72, middle, shown, size=9, color=INK, va="center")
-    for i, spec in enumerate(table.specs):
-        verdict = table.at(case, spec)
-        fill, ink = COLORS[verdict.status]
-        box = (LEFT + COLUMN * i + 0.02, y + 0.015)
-        hatch = "////" if verdict.status == "not run" else None
-        axes.add_patch(Rectangle(box, COLUMN - 0.04, ROW - 0.03, facecolor=fill, hatch=hatch,
-                                 edgecolor="#d5d8dc", linewidth=0.5))  # fmt: skip
-        rate = rate_of(verdict)
-        words = in_short(case, verdict) + (f" · {rate}" if rate else "")
-        axes.text(LEFT + COLUMN * (i + 0.5), middle, words, size=7.6, color=ink, ha="center",
-                  va="center")  # fmt: skip
+def _family(axes: Any, table: Table, family: str, cases: Sequence[Case]) -> None:
+    verdicts = [[table.at(case, spec) for spec in table.specs] for case in cases]
+    fills = [[to_rgb(COLORS[verdict.status][0]) for verdict in row] for row in verdicts]
+    axes.imshow(fills, aspect="auto")
+    titles = [f"{case.id}  {textwrap.shorten(case.title, 56, placeholder=' …')}" for case in cases]
+    axes.set_yticks(range(len(cases)), titles, color=INK)
+    axes.set_xticks([])
+    axes.set_xticks(np.arange(0.5, len(table.specs)), minor=True)
+    axes.set_yticks(np.arange(0.5, len(cases)), minor=True)
+    axes.grid(which="minor", color="white", linewidth=2)
+    axes.tick_params(which="both", length=0, labelbottom=False)
+    axes.spines[:].set_visible(False)
+    axes.set_title(family.capitalize(), loc="right", x=-0.01, size=10.5, weight="bold")
+    for y, (case, row) in enumerate(zip(cases, verdicts, strict=True)):
+        for x, verdict in enumerate(row):
+            rate = rate_of(verdict)
+            words = in_short(case, verdict) + (f" · {rate}" if rate else "")
+            ink = COLORS[verdict.status][1]
+            axes.text(x, y, words, size=7.6, color=ink, ha="center", va="center")

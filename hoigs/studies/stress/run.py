@@ -321,5 +321,5 @@ def _verdict(
     machines = tuple(dict.fromkeys(word for cost in costs for word in cost.machines))
     protocol = protocol_of(done[0].scores(), costs[0]) if done else ()
     return verdict_of(
-        case, label, case.is_nature(has), seeds, machines=machines, protocol=tuple(protocol)
+        case, label, case.is_limitation(has), seeds, machines=machines, protocol=tuple(protocol)
     )

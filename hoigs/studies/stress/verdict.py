@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from statistics import mean, stdev
 from typing import Any, Literal
 
-from hoigs.evaluation.protocol import NotComputed, Value
+from hoigs.evaluation.protocol import NotComputed, Value, to_json
+from hoigs.studies.jobs.results import Spread
 from hoigs.studies.plots import short_number
 from hoigs.studies.stress.case import Case, Criterion, Sweep, load_cases
 from hoigs.studies.stress.measures import MEASURES
 
-Status = Literal["pass", "fail", "nature", "not applicable", "not run"]
+Status = Literal["pass", "fail", "limitation", "not applicable", "not run"]
 MEANING: Mapping[Status, str] = {
     "pass": "passes what the case requires",
     "fail": "does not pass what the case requires",
-    "nature": "fails, which is inherent in the method; see the advice",
+    "limitation": "fails, as expected of the method; see the advice",
     "not applicable": "the model lacks what the case is about",
     "not run": "no verdict yet",
 }
@@ -93,10 +93,7 @@ class Verdict:
         for seed, plain in zip(self.seeds, data["seeds"], strict=True):
             plain["broke_at"] = seed.broke_at
             for level, shown in zip(seed.levels, plain["levels"], strict=True):
-                shown["values"] = {
-                    name: {"not_computed": v.reason} if isinstance(v, NotComputed) else v
-                    for name, v in level.values.items()
-                }
+                shown["values"] = {name: to_json(v) for name, v in level.values.items()}
         return data
 
 
@@ -125,18 +122,20 @@ def _broken(
     return f"{criterion.words}: {value:.4g} of {start:.4g}"
 
 
-def verdict_of(case: Case, spec: str, nature: bool, seeds: Sequence[Seed], **more: Any) -> Verdict:
+def verdict_of(
+    case: Case, spec: str, limitation: bool, seeds: Sequence[Seed], **more: Any
+) -> Verdict:
     """Verdict over seeds: pass if most of them pass the required value.
 
     Args:
-        nature: whether failing is inherent in the method.
+        limitation: whether failing is inherent in the method.
     """
     sweep = case.sweep
     known = [s for seed in seeds if (s := seed.stands(sweep.required_value)) is not None]
     rate = sum(known) / len(known) if known else None
     status: Status = "not run"
     if rate is not None and len(known) == len(seeds):
-        status = "pass" if rate > 0.5 else "nature" if nature else "fail"
+        status = "pass" if rate > 0.5 else "limitation" if limitation else "fail"
     return Verdict(
         case.id, spec, status, in_words(seeds), rate, tuple(seeds), breaking(sweep, seeds), **more
     )
@@ -177,16 +176,6 @@ def middle_of(seeds: Sequence[Seed], value: float, measure: str) -> list[float]:
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Numbers of several seeds at one value of a sweep; std is None with one seed."""
-
-    value: float
-    mean: float
-    std: float | None
-    seeds: int
-
-
-@dataclass(frozen=True)
 class Table:
     """Cases down, specs across.
 
@@ -214,16 +203,11 @@ class Table:
         }
         return {family: cases for family, cases in found.items() if cases}
 
-    def curve(self, case: Case, spec: str) -> list[Spread]:
-        """The drawn measure at every value that has been run."""
-        sweep = case.sweep
-        points = []
-        for value in sweep.values:
-            numbers = middle_of(self.at(case, spec).seeds, value, sweep.drawn)
-            if numbers:
-                std = stdev(numbers) if len(numbers) > 1 else None
-                points.append(Spread(value, mean(numbers), std, len(numbers)))
-        return points
+    def curve(self, case: Case, spec: str) -> dict[float, Spread]:
+        """The drawn measure over seeds at every value that has been run."""
+        seeds = self.at(case, spec).seeds
+        found = {v: middle_of(seeds, v, case.sweep.drawn) for v in case.sweep.values}
+        return {value: Spread.of(numbers) for value, numbers in found.items() if numbers}
 
     @property
     def machines(self) -> list[str]:

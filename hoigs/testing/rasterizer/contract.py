@@ -31,6 +31,7 @@ from hoigs.testing.rasterizer.subject import (
     one_gaussian,
     random_gaussians,
     random_scene,
+    received,
 )
 
 
@@ -41,10 +42,9 @@ def two_runs_agree_bit_for_bit(subject: RasterizerSubject) -> None:
     (first, a), (second, b) = (subject.drawn(scene, squares) for _ in range(2))
     for name, image in images(first).items():
         require(torch.equal(image, images(second)[name]), f"{name} differs from run to run")
-    for name, gradient in a.items():
-        again = b[name]
-        assert gradient is not None and again is not None
-        require(torch.equal(gradient, again), f"gradient of {name} differs from run to run")
+    for name in a:
+        same = torch.equal(received(a, name), received(b, name))
+        require(same, f"gradient of {name} differs from run to run")
 
 
 @CHECKS.check("R81")
@@ -209,12 +209,9 @@ def require_only_good_rows(subject: RasterizerSubject, scene: Scene, good: Tenso
     for name, image in images(clean).items():
         require_finite(name, image.detach())
         require_close(name, images(mixed)[name], image, atol=2e-6, rtol=1e-5)
-    for name, gradient in gradients.items():
-        wanted = clean_gradients[name]
+    for name in gradients:
+        gradient, wanted = received(gradients, name), received(clean_gradients, name)
         what = f"gradient of {name}"
-        require(gradient is not None and wanted is not None, f"no {what}")
-        assert gradient is not None and wanted is not None
-        require_finite(what, gradient)
         if name not in ROWS:
             scale = float(wanted.abs().max())
             require_close(what, gradient, wanted, atol=1e-4 * scale)
@@ -311,10 +308,8 @@ def denormal_numbers_draw_as_zero(subject: RasterizerSubject) -> None:
     wanted = subject.render(zero, a_camera())
     for name, image in images(wanted).items():
         require_close(name, images(output)[name], image, atol=1e-6, rtol=1e-6)
-    for name, gradient in gradients.items():
-        require(gradient is not None, f"no gradient reached {name}")
-        assert gradient is not None
-        require_finite(f"gradient of {name}", gradient)
+    for name in gradients:
+        received(gradients, name)
 
 
 @CHECKS.check("R63")
@@ -351,8 +346,7 @@ def large_values_change_only_their_pixels(subject: RasterizerSubject) -> None:
         )
     others = ~alone
     for name in ROWS:
-        actual, want = gradients[name], wanted_gradients[name]
-        assert actual is not None and want is not None
+        actual, want = received(gradients, name), received(wanted_gradients, name)
         what = f"gradient of {name} in other rows"
         require_close(what, actual[others], want[others], atol=1e-5, rtol=1e-4)
     for logit, opacity in ((1e30, 1.0), (-1e30, 0.0)):
@@ -384,10 +378,7 @@ def a_broken_camera_is_drawn_or_refused(subject: RasterizerSubject) -> None:
             for name, image in images(output).items():
                 require_finite(f"{name} {what}", image.detach())
             for name in RAW:
-                gradient = gradients[name]
-                require(gradient is not None, f"no gradient reached {name} {what}")
-                assert gradient is not None
-                require_finite(f"gradient of {name} {what}", gradient)
+                received(gradients, name, what)
 
 
 @CHECKS.check("R65")
@@ -427,10 +418,8 @@ def infinite_logits_are_opaque_or_nothing(subject: RasterizerSubject) -> None:
         )
         for name, image in images(wanted).items():
             require_close(name, images(output)[name], image, atol=2e-6, rtol=1e-5)
-        for name, gradient in gradients.items():
-            want = wanted_gradients[name]
-            require(gradient is not None, f"no gradient reached {name}")
-            assert gradient is not None and want is not None
+        for name in gradients:
+            gradient, want = received(gradients, name), received(wanted_gradients, name)
             size = float(want.abs().max())
             require_close(f"gradient of {name}", gradient, want, atol=1e-4 * size)
             if name == "opacity_logits":

@@ -11,7 +11,7 @@ from torch.autograd.gradcheck import GradcheckError
 from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import SH_C0, Gaussians
-from hoigs.testing.checks import CheckError, require, require_close, require_finite, require_zero
+from hoigs.testing.checks import CheckError, require, require_close, require_zero
 from hoigs.testing.rasterizer.subject import (
     CHECKS,
     ORACLE,
@@ -30,6 +30,7 @@ from hoigs.testing.rasterizer.subject import (
     one_gaussian,
     random_gaussians,
     random_scene,
+    received,
     reference,
     require_reference_gradients,
     require_reference_picture,
@@ -90,9 +91,7 @@ def background_colour_takes_its_gradient(subject: RasterizerSubject) -> None:
     scene = Scene(random_gaussians(50, degree=0), a_camera(), request)
     output, gradients = subject.drawn(scene, lambda output: output.color.sum())
     left = float((1 - output.alpha.detach()).sum())
-    slope = gradients["background"]
-    require(slope is not None, "no gradient reached background")
-    assert slope is not None
+    slope = received(gradients, "background")
     require_close("gradient of background", slope, torch.full((3,), left), atol=0.0, rtol=1e-5)
 
 
@@ -102,9 +101,7 @@ def screen_offsets_get_the_screen_space_gradient(subject: RasterizerSubject) -> 
     request = RenderRequest(screen_offsets=torch.zeros(50, 2))
     scene = Scene(random_gaussians(50, degree=0), a_camera(), request)
     _, gradients = subject.drawn(scene, lambda output: output.color.square().sum())
-    slopes = gradients["screen_offsets"]
-    if slopes is None:
-        raise CheckError("no gradient reached screen_offsets")
+    slopes = received(gradients, "screen_offsets")
     seen = int(slopes.norm(dim=-1).argmax())
     losses = []
     for step in (1e-4, -1e-4):
@@ -136,9 +133,7 @@ def no_gradient_to_colours_clamped_at_zero(subject: RasterizerSubject) -> None:
     scene = Scene(one_gaussian(color=(-0.5, 0.5, 0.5)), front_camera())
     output, gradients = subject.drawn(scene, lambda output: output.color.sum())
     require_zero("the red image", output.color[..., 0].detach())
-    slopes = gradients["sh"]
-    require(slopes is not None, "no gradient reached sh")
-    assert slopes is not None
+    slopes = received(gradients, "sh")
     require_zero("gradient of the red coefficient", slopes[0, 0, 0])
     require(slopes[0, 0, 1] > 0, f"gradient of the green coefficient is {float(slopes[0, 0, 1])}")
 
@@ -155,13 +150,10 @@ def culled_rows_get_zero_gradients(subject: RasterizerSubject) -> None:
     shown = output.info["radii"].gt(0).tolist()
     require(shown == [False, True, False, False], f"info['radii'] > 0 is {shown}")
     for name in RAW:
-        gradient = gradients[name]
-        require(gradient is not None, f"no gradient reached {name}")
-        assert gradient is not None
-        require_finite(f"gradient of {name}", gradient)
+        gradient = received(gradients, name)
         require_zero(f"gradient of {name} in culled rows", gradient[[0, 2, 3]])
-    slope = gradients["opacity_logits"]
-    require(slope is not None and slope[1] != 0, "the one that is seen got no gradient")
+    slope = received(gradients, "opacity_logits")
+    require(slope[1] != 0, "the one that is seen got no gradient")
 
 
 @CHECKS.check("R49", float64, free("min_alpha", "min_transmittance"))
@@ -220,9 +212,8 @@ def float64_is_the_oracle(subject: RasterizerSubject) -> None:
     output, gradients = subject.drawn(exact, weighing(PARTS, everywhere))
     for name, image in images(output).items():
         require_close(name, image, images(wanted)[name], atol=1e-9)
-    for name, gradient in gradients.items():
-        want = wanted_gradients[name]
-        assert gradient is not None and want is not None
+    for name in gradients:
+        gradient, want = received(gradients, name), received(wanted_gradients, name)
         require_close(f"gradient of {name}", gradient, want, atol=1e-9, rtol=1e-9)
 
 
@@ -255,9 +246,7 @@ def black_learns(subject: RasterizerSubject) -> None:
         sh[8:, 0] = black * (1 + 1e-7)
         scene = Scene(gaussians.replace(sh=sh), a_camera())
         _, gradients = subject.drawn(scene, lambda output: output.color.sum())
-        slopes = gradients["sh"]
-        require(slopes is not None, "no gradient reached sh")
-        assert slopes is not None
+        slopes = received(gradients, "sh")
         least = float(slopes[:, 0].min())
         require(least > 0, f"of the coefficients of colours at 0 one has the gradient {least:g}")
         require_reference_gradients(subject, scene, ("color",), ("sh",))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -17,11 +17,13 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.oracle import OracleConfig, OracleRasterizer
 from hoigs.testing.checks import (
+    CheckError,
     CheckList,
     Need,
     require,
     require_close,
     require_close_gradient,
+    require_finite,
     require_zero,
 )
 
@@ -196,6 +198,15 @@ class RasterizerSubject:
         """Those values, or the only one that the backend declares for this option of a request."""
         fixed = self.rasterizer.capabilities.fixed
         return [fixed[option]] if option in fixed else values
+
+
+def received(gradients: Mapping[str, Tensor | None], name: str, where: str = "") -> Tensor:
+    """The gradient of an input, which has to be there and finite."""
+    gradient = gradients[name]
+    if gradient is None:
+        raise CheckError(f"no gradient reached {name} {where}")
+    require_finite(f"gradient of {name} {where}", gradient)
+    return gradient
 
 
 CHECKS: CheckList[RasterizerSubject] = CheckList("R")

@@ -125,7 +125,7 @@ class ClickMasks:
             self._made_before.clear()
 
     def look_at(self, frame: int) -> None:
-        """Makes ready for clicks in a frame."""
+        """Compute what masks from clicks need in this frame, before the first click."""
         with self._lock:
             self._survey()
             self._still(frame)

@@ -87,7 +87,7 @@ class Eye:
 
     @contextmanager
     def apart(self) -> Iterator[None]:
-        """What fails in here is told to this browser, and ends nothing but its own work."""
+        """An exception in this block is shown in this browser, and does not stop the others."""
         try:
             yield
         except Exception as error:

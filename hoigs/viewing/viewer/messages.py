@@ -1,9 +1,9 @@
 """What a browser may send to the viewer: its camera, and values of the panel's controls.
 
-viser takes whatever a client sends into its camera and its controls, where numbers that are not
-finite, words that are no option or a canvas of any size would reach whoever reads them, and other
-browsers. So every message is read by a schema before viser sees it: numbers are brought into the
-bounds of their control, and what has no place here is left out.
+viser applies every message of a client to its camera and controls without checks. A number that is
+not finite, an unknown option or a huge canvas size would reach the viewer and other browsers. So
+each message is validated by a schema before viser gets it: numbers are clamped to the bounds of
+their control, and unknown messages are dropped.
 """
 
 from __future__ import annotations

@@ -140,10 +140,6 @@ class RunDrawing:
             self._top_speed = float(torch.quantile(some, 0.99)) if len(some) else 1.0
         return self._top_speed
 
-    def restart_depth(self) -> None:
-        """Measure the range of depths again, as when the mode is chosen."""
-        self._span = None
-
     def _render(self, frame: float, camera: Camera, look: Look) -> RenderOutput:
         colors = None
         if look.mode == "velocity":  # before the Gaussians, which it overwrites

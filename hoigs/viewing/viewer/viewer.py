@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -27,14 +27,6 @@ DEPTH_WIDTH = 400  # pixels of the depth that is sent, which hides overlays behi
 JPEG = {True: 80, False: 93}  # quality of a moving and of a still picture
 
 
-class Splats(Protocol):
-    """What sends Gaussians to the browsers (`hoigs.viewing.splats`)."""
-
-    def draws(self, settings: Settings) -> bool: ...
-
-    def update(self, drawing: RunDrawing, frame: float, settings: Settings) -> int: ...
-
-
 class Viewer:
     """One server, its panel, and the thread that draws (the one that calls `serve`).
 
@@ -43,7 +35,6 @@ class Viewer:
         bodies: for overlays. overlays: their names.
         widest: pixels of width of a still picture at most.
         refresh: called now and then; may return drawings to go on with.
-        splats: shows the first drawing where the browser can draw it.
     """
 
     def __init__(
@@ -55,7 +46,6 @@ class Viewer:
         *,
         widest: int = 1280,
         refresh: Callable[[], Sequence[Drawing] | None] | None = None,
-        splats: Splats | None = None,
     ) -> None:
         self.server, self.drawings = server, list(drawings)
         first, clip = drawings[0], drawings[0].clip
@@ -67,8 +57,6 @@ class Viewer:
         self._wake, self._jobs = threading.Event(), queue.SimpleQueue[tuple[Eye, str]]()
         self._stopped, self._widest = False, widest
         self._refresh, self._refreshed = refresh, 0.0
-        self._splats = splats
-        self._splatted: object = None  # what was last sent
         self._eyes: dict[int, Eye] = {}
         self._films: dict[Eye, takes.Film] = {}  # in the making
         self._version, self._told = 0, 0.0
@@ -120,34 +108,17 @@ class Viewer:
             frame = self.clock.frame(now)
             self.controls.show_time(frame, now)
         self.overlays.update(settings.overlays, frame)
-        browser = self._splats is not None and self._splats.draws(settings)
-        if self._splats is not None:
-            self._send(settings, frame)
         drew = False
         for eye in list(self._eyes.values()):
             if eye.ready(now):
                 with eye.apart():
                     self._follow(eye, settings, frame)
-                    drew |= (
-                        self._clear(eye) if browser else self._draw_for(eye, settings, frame, now)
-                    )
+                    drew |= self._draw_for(eye, settings, frame, now)
         for eye in list(self._films):
             with eye.apart():
                 drew |= self._go_on(eye)
         self._anchor = (settings.follow, frame)
         return drew
-
-    def _send(self, settings: Settings, frame: float) -> None:
-        """Bring the browsers' Gaussians up to date, if anything has changed."""
-        key = (frame, settings.key(), self._version)
-        first = self.drawings[0]
-        if self._splats is None or key == self._splatted or not isinstance(first, RunDrawing):
-            return
-        self._splatted = key
-        sent = self._splats.update(first, frame, settings)
-        if self._splats.draws(settings):
-            text = f"{first.title}  \ndrawn by the browser, {sent:,} Gaussians sent"
-            self.controls.status.content = text
 
     def _connect(self, client: Any) -> None:
         eye = Eye(client, self._widest, self._dragged)

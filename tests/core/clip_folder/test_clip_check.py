@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,10 @@ from PIL import Image
 from test_clip_folder import HEIGHT, WIDTH, write
 
 from hoigs.core.clip_folder.check import check_clip, require_clip, summarize, wrong
-from hoigs.core.clip_folder.format import with_tables
 from hoigs.core.errors import ClipError
 from hoigs.core.system.npz import load_arrays
 
-PAGE = Path(__file__).parents[3] / "docs/reference/clip.md"
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture
@@ -219,7 +219,6 @@ def test_summary_keeps_different_messages_apart() -> None:
 
 
 def test_the_page_agrees_with_the_constants() -> None:
-    text = PAGE.read_text(encoding="utf-8")
-    assert with_tables(text) == text, (
-        "run: python -m hoigs.core.clip_folder.format docs/reference/clip.md"
-    )
+    script = runpy.run_path(str(ROOT / "scripts" / "clip_tables.py"))
+    text = script["PAGE"].read_text(encoding="utf-8")
+    assert script["with_tables"](text) == text, "run scripts/clip_tables.py"

@@ -11,12 +11,12 @@ from hoigs.core.interfaces.body import LEFT_WRIST, PART_NAMES, RIGHT_WRIST
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.values.moment import BodyPose
-from hoigs.plugins.bodies.anny import ASSET, AnnyBody, AnnyConfig
+from hoigs.plugins.bodies.anny import ASSET, AnnyBody
 
 
 @pytest.fixture(scope="module")
 def body() -> AnnyBody:
-    return AnnyBody.from_config(AnnyConfig(), BuildContext())
+    return AnnyBody.from_config(AnnyBody.Config(), BuildContext())
 
 
 def joint(body: AnnyBody, name: str) -> int:

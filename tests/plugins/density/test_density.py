@@ -15,7 +15,7 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.plugins.deformation.chs import CubicHermite
 from hoigs.plugins.density.adc import AdaptiveDensity, AdaptiveDensityConfig
-from hoigs.plugins.density.none import NoDensity, NoDensityConfig
+from hoigs.plugins.density.none import NoDensity
 
 
 def adaptive_density(**settings: Any) -> AdaptiveDensity:
@@ -184,5 +184,5 @@ def _axes(gaussians: Gaussians) -> torch.Tensor:
 
 
 def test_none_never_refines():
-    control = NoDensity.from_config(NoDensityConfig(), BuildContext())
+    control = NoDensity.from_config(NoDensity.Config(), BuildContext())
     assert refine(control, cloud([0.5] * 4), statistics([9.0] * 4)) is None

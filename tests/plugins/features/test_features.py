@@ -15,7 +15,7 @@ from hoigs.plugins.deformation.chs import CubicHermite
 from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning
 from hoigs.plugins.deformation.mlp import MlpDeformation
 from hoigs.plugins.deformation.static import Static
-from hoigs.plugins.features.body_parts import BodyPartConfig, BodyPartFeatures, part_averages
+from hoigs.plugins.features.body_parts import BodyPartFeatures, part_averages
 from hoigs.plugins.features.embedding import EmbeddingConfig, EmbeddingFeatures
 from hoigs.plugins.features.spline_motion import SplineMotionConfig, SplineMotionFeatures
 
@@ -42,7 +42,9 @@ def thing(features, count: int = 12, **settings) -> Entity:
 
 
 def test_body_parts_are_means_over_each_part(toy_body, toy_pose):
-    entity = human(toy_body, BodyPartFeatures.from_config(BodyPartConfig(), BuildContext()))
+    entity = human(
+        toy_body, BodyPartFeatures.from_config(BodyPartFeatures.Config(), BuildContext())
+    )
     moment = Moment(0.3, poses={"human": toy_pose(0)})
     with torch.no_grad():
         entity.deformation.planes.time.normal_()

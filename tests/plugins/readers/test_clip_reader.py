@@ -15,7 +15,7 @@ from hoigs.core.errors import ClipError
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
-from hoigs.plugins.readers.clip import ClipFolderReader, ClipFolderReaderConfig, FolderStore
+from hoigs.plugins.readers.clip import ClipFolderReader, FolderStore
 
 FRAMES, SIZE = 5, 16
 
@@ -37,11 +37,11 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_config_and_matches(folder: Path) -> None:
-    reader = ClipFolderReader.from_config(ClipFolderReaderConfig(cache_mb=3), BuildContext())
+    reader = ClipFolderReader.from_config(ClipFolderReader.Config(cache_mb=3), BuildContext())
     assert reader.config.cache_mb == 3
     assert reader.matches(folder) and not reader.matches(folder.parent)
     with pytest.raises(ValidationError):
-        ClipFolderReaderConfig(cache_gb=1)  # type: ignore[call-arg]
+        ClipFolderReader.Config(cache_gb=1)  # type: ignore[call-arg]
 
 
 def test_nothing_is_decoded_before_it_is_asked_for(folder: Path) -> None:

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from layouts import behave, davis, hosnerf
+from layouts import behave, colmap, hosnerf
 from layouts.anny_models import write_model
 from layouts.changed import without_fingers
 from typer.testing import CliRunner
@@ -58,7 +58,8 @@ def test_the_scene_alone_of_hosnerf_and_its_settings(builtin: Clip, tmp_path: Pa
 
 
 def test_a_reader_that_does_not_fit_says_what_is_absent(builtin: Clip, tmp_path: Path) -> None:
-    folder = davis.write(builtin, tmp_path)
+    folder = tmp_path / "scene"
+    colmap.write(builtin, folder)
     args = ["train", str(folder), "--out", str(tmp_path / "run"), *SMALL, "--reader", "hosnerf"]
     refused = CliRunner().invoke(app, args)
     assert not (tmp_path / "run").exists()

@@ -13,7 +13,7 @@ import pytest
 from hoigs.core.errors import HoigsError
 from hoigs.studies.batch import manifest
 from hoigs.studies.batch.folder import BATCH, BatchFolder, stages_of
-from hoigs.studies.batch.manifest import ManifestError, each_row, read_manifest
+from hoigs.studies.batch.manifest import ManifestError, each_row
 from hoigs.studies.batch.summary import write_summary
 
 
@@ -27,12 +27,12 @@ def test_yaml_and_csv_give_the_same_rows(tmp_path):
     (tmp_path / "m.csv").write_text(
         "video,name,spec,set\none.mp4,,static,train.steps=5\ntwo.mp4,zwei,static,train.steps=7\n"
     )
-    rows = read_manifest(tmp_path / "m.yaml", {"spec": "hoigs", "device": "cpu"})
+    rows = list(each_row(tmp_path / "m.yaml", {"spec": "hoigs", "device": "cpu"}))
     assert [(r.name, r.spec, r.set, r.device) for r in rows] == [
         ("one", "static", ("train.steps=5",), "cpu"),
         ("zwei", "static", ("train.steps=7",), "cpu"),
     ]
-    assert read_manifest(tmp_path / "m.csv", {"device": "cpu"}) == rows
+    assert list(each_row(tmp_path / "m.csv", {"device": "cpu"})) == rows
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_mistakes_are_found_where_they_are(tmp_path, text, message):
     (tmp_path / "one.mp4").touch()
     (tmp_path / "m.yaml").write_text(text)
     with pytest.raises(ManifestError, match=message):
-        read_manifest(tmp_path / "m.yaml")
+        list(each_row(tmp_path / "m.yaml"))
 
 
 def test_a_row_has_the_options_of_a_training(tmp_path):
@@ -66,7 +66,7 @@ def test_a_row_has_the_options_of_a_training(tmp_path):
         "rows:\n  - clip: builtin:carry\n    auto: true\n    set: {train.steps: 5}\n"
         "    train: {chunk: 16, allow_faults: true}\n"
     )
-    (row,) = read_manifest(tmp_path / "m.yaml")
+    (row,) = list(each_row(tmp_path / "m.yaml"))
     stage = next(s for s in stages_of(row, tmp_path) if s.name == "train")
     options = [*stage.command]
     for words in (["--chunk", "16"], ["--allow-faults"], ["--set", "train.steps=5"], ["--no-eval"],
@@ -137,7 +137,7 @@ def test_names_that_leave_the_batch_are_refused_when_read_and_when_read_back(tmp
     if row["name"]:  # without one, a manifest's row is named after its clip
         (tmp_path / "m.yaml").write_text(json.dumps({"rows": [row]}))
         with pytest.raises(ManifestError, match=rf"m\.yaml:1:\d+: {key}: ") as caught:
-            read_manifest(tmp_path / "m.yaml")
+            list(each_row(tmp_path / "m.yaml"))
         assert repr(value) in str(caught.value)
     (made.path / BATCH).write_text(f'{{"fan_out": false}}\n{json.dumps(row)}\n')
     with pytest.raises(HoigsError, match=f"{BATCH}:2"):
@@ -147,10 +147,10 @@ def test_names_that_leave_the_batch_are_refused_when_read_and_when_read_back(tmp
 def test_what_is_no_csv_and_no_file_is_named(tmp_path):
     (tmp_path / "m.csv").write_text(f"clip,spec\nbuiltin:carry,a\nbuiltin:carry,{'s' * 200_000}\n")
     with pytest.raises(ManifestError, match=r"m\.csv:3: .*131072"):
-        read_manifest(tmp_path / "m.csv")
+        list(each_row(tmp_path / "m.csv"))
     os.mkfifo(tmp_path / "m.yaml")
     with pytest.raises(ManifestError, match=r"m\.yaml: .*FIFO"):
-        read_manifest(tmp_path / "m.yaml")
+        list(each_row(tmp_path / "m.yaml"))
 
 
 @pytest.mark.parametrize(
@@ -221,7 +221,7 @@ def _as(form, row, rng, folder):
             table.writerow(
                 [";".join(map(str, v)) if isinstance(v, list) else v for v in row.values()]
             )
-        return read_manifest(file)
+        return list(each_row(file))
     file = folder / "m.yaml"
     data = bytearray(text.encode())
     for _ in range(rng.randint(1, 4) if form == "bytes" else 0):
@@ -230,4 +230,4 @@ def _as(form, row, rng, folder):
             (b"", b"\0", b"\xff", b"{", b"]", b"\n", b": ", b"!!int ", b"&a ", b"*a", b"- " * 2000)
         )
     file.write_bytes(data)
-    return read_manifest(file)
+    return list(each_row(file))

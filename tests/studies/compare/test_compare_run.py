@@ -1,4 +1,4 @@
-"""A chart of two specs is killed, goes on, and is drawn; a cell is run again."""
+"""A chart of two specs is killed, goes on, and is drawn."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from hoigs.core.errors import HoigsError
-from hoigs.studies.compare.run import Comparison, find_cell, plan
+from hoigs.studies.compare.run import Comparison, plan
 from hoigs.studies.jobs.results import parse_variants
 
 CLIP = "builtin:carry?frames=8&width=32&samples=1&edge_samples=1&held_out_views=0&test_frames=2"
@@ -48,7 +48,7 @@ def _alive(text: str) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at processes through /proc")
-def test_a_killed_chart_goes_on_and_a_cell_is_reproduced(tmp_path: Path) -> None:
+def test_a_killed_chart_goes_on(tmp_path: Path) -> None:
     out = tmp_path / "chart"
     first = _start(out)
     assert first.stdout is not None
@@ -68,7 +68,7 @@ def test_a_killed_chart_goes_on_and_a_cell_is_reproduced(tmp_path: Path) -> None
     second = _start(out)
     told, _ = second.communicate()
     assert second.returncode == 0, told
-    assert told.count("done before") >= 1 and told.count("wrote") >= 4 + 2
+    assert told.count("done before") >= 1 and told.count("wrote") >= 3 + 2
 
     data = json.loads((out / "chart.json").read_text())
     cells = data["cells"]
@@ -88,17 +88,6 @@ def test_a_killed_chart_goes_on_and_a_cell_is_reproduced(tmp_path: Path) -> None
     assert len(rows) > 2 * 10 and all(row["protocol"] for row in rows)
     figures = sorted(p.suffix for p in out.glob("chart-carry*"))
     assert figures == [".png", ".png", ".svg", ".svg"]
-
-    run = cells[0]["run"].removeprefix("runs/")
-    again = subprocess.run(
-        [sys.executable, "-m", "hoigs", "study", "compare", "--out", str(out), "--rerun", run,
-         "--threads", "1"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert again.returncode == 0, again.stdout + again.stderr
-    assert "reproduced: PSNR to 0.05 dB on the same machine" in again.stdout
-    with pytest.raises(HoigsError, match=run.rpartition("/")[2]):
-        find_cell(out, run[:-1])
 
 
 def test_the_plan_is_the_product_and_every_cell_a_job(tmp_path: Path) -> None:

@@ -1,22 +1,16 @@
-"""Figures, page and tables of made-up results: legends apart, machines named, pages whole."""
+"""Figures and tables of made-up results: legends apart, machines named."""
 
 from __future__ import annotations
 
-import json
-import re
-from html.parser import HTMLParser
 from itertools import combinations
 from pathlib import Path
 
-import plotly.graph_objects as go
 import pytest
 from made_up_cells import METHODS, A, B, cell, study
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from hoigs.core.errors import HoigsError
-from hoigs.studies.compare.data import load_chart, machine_sentences, points_of, series_of
-from hoigs.studies.compare.interactive import details, page
+from hoigs.studies.compare.data import machine_sentences, points_of, series_of
 from hoigs.studies.compare.panels import accuracy_chart, curve_chart
 from hoigs.studies.compare.write import by_clip, write_chart
 from hoigs.studies.plots import is_log, short_number
@@ -102,97 +96,6 @@ def test_every_clip_and_their_mean_have_figures(written: Path) -> None:
     assert stems == {p.stem for p in written.glob("*.png")} and not list(written.glob(".*"))
     svg = (written / "chart-carry.svg").read_text()
     assert ">hoigs</text>" in svg, "text stays text"
-
-
-class Tags(HTMLParser):
-    """Checks that tags are closed in order, and collects attributes and scripts."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.attributes: set[str] = set()
-        self.scripts: list[str] = []
-        self.words: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.attributes |= {name for name, _ in attrs}
-        if tag != "meta":
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        (self.scripts if self.open[-1:] == ["script"] else self.words).append(data)
-
-
-def test_the_page_opens_offline_and_has_every_point(written: Path) -> None:
-    tags = Tags((written / "chart.html").read_text())
-    assert not tags.open and not tags.attributes & {"src", "href"}
-    assert "@import" not in "".join(tags.words)
-    library, figures = tags.scripts[1], _figures(tags)
-    assert len(library) > 1e6 and "plotly.js v" in library
-    sheets = by_clip(load_chart(written / "chart.json")[0])
-    assert len(figures) == len(sheets) == 3
-    for (figure, config), points in zip(figures, sheets.values(), strict=True):
-        assert config["showSendToCloud"] is False
-        shown = [text for trace in figure.data if trace.xaxis == "x"
-                 for text in trace.hovertext or ()]  # fmt: skip
-        assert sorted(shown) == sorted(details(p) for p in points)
-    words = " ".join(tags.words)
-    assert "it fell </script>" in words and "throw?x=<1>" in words
-    assert "training (J): not computed: this machine does not tell" in words
-
-
-def _figures(tags: Tags) -> list[tuple[go.Figure, dict[str, object]]]:
-    """The arguments of each call of Plotly.newPlot: figure and config."""
-    decoder, found = json.JSONDecoder(), []
-    for script in tags.scripts:
-        call = re.search(r"Plotly\.newPlot\(\s*\"chart-\d+\",\s*", script)
-        if call is not None:
-            position, parts = call.end(), []
-            for _ in range(3):
-                part, position = decoder.raw_decode(script, position)
-                parts.append(part)
-                position += len(re.match(r"[\s,]*", script[position:])[0])  # type: ignore[index]
-            found.append((go.Figure(parts[0], parts[1]), parts[2]))
-    return found
-
-
-def test_every_menu_entry_draws_what_it_names(written: Path) -> None:
-    (figure, _), *_ = _figures(Tags((written / "chart.html").read_text()))
-    axes, scale, curves = figure.layout.updatemenus
-    assert len(axes.buttons) == 2 * 5 and len(scale.buttons) == len(curves.buttons) == 2
-    points = by_clip(load_chart(written / "chart.json")[0])["carry"]
-    best, *others = (next(p for p in points if (p.spec, p.steps) == ("hoigs", s))
-                     for s in (1000, 200))  # fmt: skip
-    for button in (*axes.buttons, *scale.buttons, *curves.buttons):
-        figure.plotly_update(*button.args)  # what a click does; plotly checks names and values
-    figure.plotly_update(*next(b for b in axes.buttons if b.label ==
-                               "PSNR, human + object (dB) against parameters").args)  # fmt: skip
-    assert figure.layout.xaxis.title.text == "parameters"
-    front, hoigs = figure.data[0], figure.data[1]
-    assert hoigs.name == "hoigs"
-    assert list(hoigs.x) == [p.values["parameters"].mean for p in (*others, best)]
-    assert list(hoigs.error_y.array) == [p.values["psnr_human_object"].std for p in (*others, best)]
-    assert list(hoigs.marker.symbol) == ["circle-open", "circle"], "1000 steps are on the front"
-    assert best.values["psnr_human_object"].mean in front.y
-
-
-def test_times_of_two_machines_are_in_no_menu() -> None:
-    cells = study(FEW, machines=(A, B), seeds=1)
-    for mixed, expected in ((False, False), (True, True)):
-        ((figure, _),) = _figures(Tags(page(cells, by_clip(cells), {}, mixed)))
-        labels = [b.label for menu in figure.layout.updatemenus for b in menu.buttons]
-        assert any("training (s)" in label for label in labels) is expected
-        assert ("curves over seconds of training" in labels) is expected
-
-
-def test_without_plotly_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hoigs.studies.compare.interactive.find_spec", lambda name: None)
-    with pytest.raises(HoigsError, match=r"hoigs\[charts\]"):
-        page([], {}, {}, False)
 
 
 def test_the_table_says_who_dominates(written: Path) -> None:

@@ -40,7 +40,6 @@ def test_auto_searches_trains_prunes_and_compresses(tmp_path, monkeypatch):
 
 def test_needs_refuses_what_it_does_not_know(tmp_path):
     for wrong, words in (
-        ({"criterion": "one-s"}, '"one-se"'),
         ({"share": 0.5}, "share.*0.5"),
         ({"least": -1.0}, "least.*-1"),
     ):

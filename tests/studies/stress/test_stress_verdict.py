@@ -27,19 +27,19 @@ def test_a_seed_that_broke_stands_nothing_harder():
 
 
 @pytest.mark.parametrize(
-    ("stood", "nature", "status", "rate", "breaks_at"),
+    ("stood", "limitation", "status", "rate", "breaks_at"),
     [
         ((5, 5, 5), False, "pass", 1.0, None),
         ((4, 4, 2), False, "pass", 2 / 3, 6),
         ((3, 4, 2), False, "fail", 1 / 3, 4),
-        ((3, 4, 2), True, "nature", 1 / 3, 4),
+        ((3, 4, 2), True, "limitation", 1 / 3, 4),
         ((0, 0, 5), False, "fail", 1 / 3, 1),
         ((4, 0), False, "fail", 0.5, 1),
     ],
 )
-def test_most_seeds_decide(stood, nature, status, rate, breaks_at):
+def test_most_seeds_decide(stood, limitation, status, rate, breaks_at):
     seeds = [seed(i, *([True] * n + [False])[: len(VALUES)]) for i, n in enumerate(stood)]
-    verdict = verdict_of(CASE, "hoigs", nature, seeds)
+    verdict = verdict_of(CASE, "hoigs", limitation, seeds)
     assert (verdict.status, verdict.breaks_at) == (status, breaks_at)
     assert verdict.rate == pytest.approx(rate)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -12,14 +10,14 @@ from made_up import MACHINE, PROTOCOL, SPECS, table
 from PIL import Image
 
 from hoigs.studies.stress.case import all_cases, choose_cases
-from hoigs.studies.stress.report import as_csv, as_json, as_markdown, write_stress
+from hoigs.studies.stress.report import as_json, as_markdown, write_stress
 from hoigs.studies.stress.verdict import Verdict, in_short, rate_of
 
 
 def test_all_files_are_written_whole(tmp_path: Path) -> None:
     paths = write_stress(table(), tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(p.name for p in paths)
-    assert {p.suffix for p in paths} == {".json", ".csv", ".md", ".png", ".svg"}
+    assert {p.suffix for p in paths} == {".json", ".md", ".png", ".svg"}
     for path in tmp_path.glob("*.png"):
         with Image.open(path) as image:
             assert min(image.size) > 1000
@@ -38,17 +36,12 @@ def test_before_any_training_there_are_no_curves(tmp_path: Path) -> None:
 
 def test_every_number_has_its_machine_and_protocol() -> None:
     made = table()
-    rows = list(csv.DictReader(io.StringIO(as_csv(made))))
-    assert {row["case"] for row in rows} == {case.id for case in all_cases()}
-    numbers = [row for row in rows if row["number"]]
-    assert numbers and all(
-        row["machine"] == MACHINE and row["protocol"] == " ".join(PROTOCOL) and row["date"]
-        for row in numbers
-    )
-    absent = [row for row in rows if row["not_computed"]]
-    assert absent and all(row["number"] == "" for row in absent)
     data = json.loads(as_json(made))
     assert len(data["cases"]) == len(all_cases())
+    measured = [v for v in data["verdicts"] if v["seeds"]]
+    assert measured and all(
+        v["machines"] == [MACHINE] and v["protocol"] == list(PROTOCOL) for v in measured
+    )
     assert len(data["verdicts"]) == len(all_cases()) * len(SPECS)
     one = next(v for v in data["verdicts"] if v["case"] == "F01" and v["spec"] == "d3dgs@matched")
     levels = one["seeds"][0]["levels"]

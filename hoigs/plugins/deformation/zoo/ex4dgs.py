@@ -33,10 +33,6 @@ from hoigs.core.values.topology import AxisChange, TopologyChange
 # deformation:linear-displacement: each Gaussian moves along a line, as Ex4DGS's static ones.
 
 
-class LinearDisplacementConfig(ComponentConfig):
-    """No settings."""
-
-
 class LinearDisplacement(DeformationModel):
     """x(t) = x + d t, with d a parameter `displacement` [N, 3], metres over the clip, 0 at first.
 

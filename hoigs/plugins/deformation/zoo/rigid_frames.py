@@ -20,10 +20,6 @@ from hoigs.plugins.deformation.rigid_track import RigidTrack
 from hoigs.plugins.deformation.skinned_body import FrameCorrections, clip_settings
 
 
-class RigidFramesConfig(ComponentConfig):
-    """No settings."""
-
-
 class RigidFrames(DeformationModel):
     """x(t) = R(t) p + T(t), with (R, T) the object's track times a learned correction a frame.
 
@@ -35,33 +31,26 @@ class RigidFrames(DeformationModel):
         trained_frames: frames that are trained on; all when absent.
     """
 
-    Config: ClassVar = RigidFramesConfig
     kinds = frozenset({"object"})
     rates: ClassVar[Mapping[str, str]] = {
         "corrections.turns": "pose",
         "corrections.shifts": "pose",
     }
 
-    def __init__(
-        self,
-        config: RigidFramesConfig | None = None,
-        *,
-        track: ObjectTrack,
-        trained_frames: Sequence[int] | None = None,
-    ) -> None:
+    def __init__(self, *, track: ObjectTrack, trained_frames: Sequence[int] | None = None) -> None:
         super().__init__()
-        self.config = config or RigidFramesConfig()
         self.track = RigidTrack(track)
         self.corrections = FrameCorrections(len(track.rotations), trained_frames, track.times)
 
     @classmethod
-    def from_config(cls, config: RigidFramesConfig, context: BuildContext) -> Self:
+    def from_config(cls, config: ComponentConfig, context: BuildContext) -> Self:
+        del config
         if context.object_track is None:
             raise ValueError(
                 "deformation:rigid-frames needs a track; it suits entities of kind object"
             )
         trained = clip_settings(context.clip)["trained_frames"] if context.clip else None
-        return cls(config, track=context.object_track, trained_frames=trained)
+        return cls(track=context.object_track, trained_frames=trained)
 
     def pose(self, time: float) -> tuple[Tensor, Tensor]:
         """Rotation (wxyz) [4] and translation [3], metres, object to world."""

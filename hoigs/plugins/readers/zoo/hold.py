@@ -42,10 +42,6 @@ NO_POSES = (
 Array = np.ndarray
 
 
-class HoldConfig(VideoPointsConfig):
-    """Settings of reader:hold."""
-
-
 class HoldReader(ClipReader):
     """Frames, masks by value, cameras and the object's poses, in metres.
 
@@ -54,8 +50,8 @@ class HoldReader(ClipReader):
     could not place were filled by HOLD's slerp; the data does not mark which ones.
     """
 
-    Config: ClassVar = HoldConfig
-    config: HoldConfig
+    Config: ClassVar = VideoPointsConfig
+    config: VideoPointsConfig
 
     def matches(self, folder: Path) -> bool:
         build = _build(Path(folder))

@@ -14,7 +14,7 @@ from hoigs.core.model.entity import Entity
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
-from hoigs.plugins.deformation.lbs import Lbs, LbsConfig
+from hoigs.plugins.deformation.lbs import Lbs
 from hoigs.plugins.deformation.zoo.triplane_avatar import (
     TriplaneAvatar,
     TriplaneAvatarConfig,
@@ -237,7 +237,7 @@ def test_mistakes_are_told(toy_body):
     with pytest.raises(ValueError, match="from the surface"):
         config = TriplaneAvatarConfig(**SMALL, refine_poses=False)
         Entity(toy_body.canonical(COUNT, seed=4), TriplaneAvatar(config, body=toy_body))
-    for part, config in ((TriplaneAvatar, TriplaneAvatarConfig()), (Lbs, LbsConfig())):
+    for part, config in ((TriplaneAvatar, TriplaneAvatarConfig()), (Lbs, Lbs.Config())):
         with pytest.raises(ValueError, match="needs a body"):
             part.from_config(config, BuildContext())
 

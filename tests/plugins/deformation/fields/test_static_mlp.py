@@ -16,7 +16,7 @@ from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual
 from hoigs.plugins.deformation.mlp import MlpConfig, MlpDeformation, positional_encoding
 from hoigs.plugins.deformation.rigid_track import RigidTrack
-from hoigs.plugins.deformation.static import Static, StaticConfig
+from hoigs.plugins.deformation.static import Static
 
 
 def cloud(count: int = 12, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
@@ -39,7 +39,7 @@ def turning_track(frames: int = 9, turn: float = math.pi / 2) -> ObjectTrack:
 
 def test_static_stays_and_follows_residual():
     canonical = cloud()
-    model = Static.from_config(StaticConfig(), BuildContext())
+    model = Static.from_config(Static.Config(), BuildContext())
     assert model(canonical, Moment(0.3)) is canonical
     shift = torch.randn(12, 3)
     moved = model(canonical, Moment(0.3), Residual(means=shift))

@@ -25,7 +25,7 @@ from hoigs.plugins.deformation.zoo.object_bone import (
     rest_transitions,
     state_of,
 )
-from hoigs.plugins.deformation.zoo.rigid_frames import RigidFrames, RigidFramesConfig
+from hoigs.plugins.deformation.zoo.rigid_frames import RigidFrames
 
 FRAMES = 12
 
@@ -224,4 +224,4 @@ def test_mistakes_are_told(toy_body):
     with pytest.raises(ValueError, match="a clip and a track"):
         ObjectBone.from_config(ObjectBoneConfig(), BuildContext())
     with pytest.raises(ValueError, match="needs a track"):
-        RigidFrames.from_config(RigidFramesConfig(), BuildContext())
+        RigidFrames.from_config(RigidFrames.Config(), BuildContext())

@@ -14,7 +14,6 @@ from layouts.changed import in_camera_world
 from layouts.common import save_image, save_json, save_mask
 
 from hoigs.core.maths.rotations import matrices_to_axis_angle
-from hoigs.core.model.smpl_params import smplh_from_pose
 from hoigs.core.values.clip import Clip
 
 NAME = "Date03_Sub04_boxmedium"
@@ -105,7 +104,7 @@ def _fits(clip: Clip, offset: np.ndarray) -> dict[str, np.ndarray]:
     turns = track.rotations.double()
     places = track.translations.double() + turns @ torch.from_numpy(offset)
     return {
-        "poses": smplh_from_pose(poses).numpy(),
+        "poses": poses.rotations.flatten(-2).numpy(),
         "trans": poses.transl.numpy(),
         "betas": poses.betas.expand(len(clip), -1).numpy(),
         "angles": matrices_to_axis_angle(turns).numpy(),

@@ -10,7 +10,9 @@ import numpy as np
 import torch
 from PIL import Image
 
+from hoigs.core.model.smpl_params import KNUCKLES
 from hoigs.core.values.camera import Camera
+from hoigs.core.values.moment import BodyPose
 
 
 def save_image(path: Path, pixels: Any) -> None:
@@ -46,3 +48,10 @@ def save_ply(path: Path, points: torch.Tensor, colors: torch.Tensor, floats: boo
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     header += [f"property {named[rows.dtype[n].str[1:]]} {n}" for n in rows.dtype.names or ()]
     path.write_bytes(("\n".join([*header, "end_header"]) + "\n").encode() + rows.tobytes())
+
+
+def smpl_pose(pose: BodyPose) -> torch.Tensor:
+    """The 72 numbers of SMPL for a pose whose fingers are straight: one joint a hand."""
+    hands = torch.stack((pose.left_hand, pose.right_hand), -3)[..., KNUCKLES[1], :]
+    first = torch.cat((pose.global_orient[..., None, :], pose.body), -2)
+    return torch.cat((first, hands), -2).flatten(-2)

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from layouts.common import save_image, save_mask
+from layouts.common import save_image, save_mask, smpl_pose
 
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.maths.rotations import axis_angle_to_matrices
-from hoigs.core.model.smpl_params import smpl_from_pose
 from hoigs.core.values.clip import Clip
 
 
@@ -37,7 +36,7 @@ def write(
     """
     names = [f"{i:06d}" for i in range(len(clip))]
     pose = clip.bodies["human"].poses.to(torch.float64)
-    vectors = smpl_from_pose(pose)
+    vectors = smpl_pose(pose)
     rest = body.shaped(pose.betas)[1].detach().double()
     joints = rest[[*range(22), 25, 40]].numpy()
     cameras, meshes, rows = {}, {}, []

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 from layouts.colmap_text import write_model
-from layouts.common import save_image, save_mask
+from layouts.common import save_image, save_mask, smpl_pose
 
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
-from hoigs.core.model.smpl_params import smpl_from_pose
 from hoigs.core.values.clip import Clip
 
 
@@ -60,7 +59,7 @@ def save_smpl(clip: Clip, body: BodyModel, units: float, scales: list[float], na
         torch.randn(len(clip), 3, generator=torch.Generator().manual_seed(0)).double()
     )
     orient = matrices_to_axis_angle(turns.mT @ axis_angle_to_matrices(pose.global_orient))
-    vectors = smpl_from_pose(pose.replace(global_orient=orient)).float().numpy()
+    vectors = smpl_pose(pose.replace(global_orient=orient)).float().numpy()
     betas = pose.betas[:10].float().numpy()
     people = {"pose": list(vectors), "betas": [betas for _ in names]}
     dump({1: people}, folder / "smpl_output_optimized.pkl")
