@@ -82,6 +82,7 @@ def _improved(
 # The body fit of a long clip, window by window: one shape, and poses that follow on.
 
 STRETCHES, SHORTEST = 10, 8  # in which frames that stand for all are taken; frames of one, at least
+STAND_FOR_ALL = 2  # windows that have as many frames as stand for all
 
 
 def fit_in_windows(
@@ -96,17 +97,17 @@ def fit_in_windows(
     chunking: Chunking,
     progress: Callable[[float], None] | None,
 ) -> BodyFit:
-    """As `fit_body`, with memory for one window.
+    """As `fit_body`, with memory for two windows.
 
     What all frames share (shape, places of the landmarks, noise, ordinary motion, the world's
-    scale) is fitted to as many frames as a window has, in stretches from all over the clip, and
-    then kept. Each window keeps the first poses of its overlap as the window before has found them,
-    so that accelerations are priced across the joint, and replaces the later ones, of which that
-    had not seen what follows (a fixed-lag smoother).
+    scale) is fitted to as many frames as two windows have, in stretches from all over the clip,
+    and then kept. Each window keeps the first poses of its overlap as the window before has found
+    them, so that accelerations are priced across the joint, and replaces the later ones, of which
+    that had not seen what follows (a fixed-lag smoother).
     """
     windows = chunking.windows(len(cameras))
     share = partial(_share, progress, len(windows) + 1)
-    rows = spread(landmarks.found.nonzero()[:, 0], chunking.chunk)
+    rows = spread(landmarks.found.nonzero()[:, 0], STAND_FOR_ALL * chunking.chunk)
     some = landmarks.rows(rows)
     known = FitProblem(
         body, some, [cameras[i] for i in rows.tolist()], times[rows], options,
