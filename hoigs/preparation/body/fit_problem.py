@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hoigs.core.interfaces.body import BodyModel
@@ -67,6 +67,43 @@ class FitOptions:
     masks: float = 10.0
     mask_spread: float = 0.03
     scale: bool = False
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What a body is fitted to.
+
+    Attributes:
+        cameras: one a frame, as `landmarks` has them.
+        times: of the frames, seconds; by default 30 frames a second.
+        turns: axis-angle of joints 1..21 as another program has found them: the fit starts there,
+            and `PosePrior` holds it near.
+        points: of the scene, in the cameras' own unit; only used to find the scale.
+        masks: one a frame, of the person or of all that moves.
+    """
+
+    landmarks: Landmarks
+    cameras: Sequence[Camera]
+    times: Float[Tensor, " F"] | None = None
+    turns: Float[Tensor, "F 21 3"] | None = None
+    points: Float[Tensor, "S 3"] | None = None
+    masks: Masks | None = None
+
+    @property
+    def seconds(self) -> Float[Tensor, " F"]:
+        return torch.arange(len(self.cameras)) / 30.0 if self.times is None else self.times
+
+    def rows(self, frames: slice | Int[Tensor, " T"]) -> Observations:
+        """Of some frames alone, without their masks."""
+        numbers = torch.arange(len(self.cameras))[frames].tolist()
+        return replace(
+            self,
+            landmarks=self.landmarks.rows(frames),
+            cameras=[self.cameras[i] for i in numbers],
+            times=self.seconds[frames],
+            turns=None if self.turns is None else self.turns[frames],
+            masks=None,
+        )
 
 
 @dataclass(frozen=True)
@@ -244,8 +281,7 @@ class FitProblem:
     """The energy and what it needs, precomputed.
 
     Args:
-        times: of the frames, seconds.
-        turns: axis-angle of joints 1..21 where they are known, about.
+        seen: its masks are looked at after `show`, its points as `ground`.
         start: where the fit begins, in place of `first_guess`.
         found: what another fit has found, and this one keeps.
     """
@@ -253,15 +289,13 @@ class FitProblem:
     def __init__(
         self,
         body: BodyModel,
-        landmarks: Landmarks,
-        cameras: Sequence[Camera],
-        times: Float[Tensor, " F"],
+        seen: Observations,
         options: FitOptions,
-        turns: Float[Tensor, "F 21 3"] | None = None,
         start: Start | None = None,
         found: Found | None = None,
     ) -> None:
         self.body, self.options, self.found = body, options, found
+        landmarks, cameras, times, turns = seen.landmarks, seen.cameras, seen.seconds, seen.turns
         self.points: LandmarkPoints = points_of(body)
         self.kinematics = Kinematics(body, self.points.joints, self.points.vertices)
         rows = list(self.points.landmarks)
