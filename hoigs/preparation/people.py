@@ -194,7 +194,8 @@ def fit_person(
         provenance=(
             f"fitted to {landmarks.source} landmarks{'' if solid else ' in the image only'} of "
             f"{found} of {len(cameras)} frames{'' if seen.masks is None else ' and to masks'}, "
-            f"{residual:.1f} px off (median of frames); hands are not fitted"
+            f"{residual:.1f} px off (median of frames); {_size(fit.report, stature(body))}; hands "
+            "are not fitted"
             f"{'' if chunking is None else _windows(fit.joints, chunking)}"
         ),
         report=fit.report,
@@ -205,6 +206,19 @@ def fit_person(
             *_open_joints(fit.joints),
         ],
         fates=fates,
+    )
+
+
+def _size(report: Mapping[str, Any], mean: float) -> str:
+    """What is said of a body's size.
+
+    Args:
+        mean: height of the mean body, metres.
+    """
+    size, error = report["size"], 200 * report["size_spread"]
+    return (
+        f"its size, that of {mean * size:.2f} m of height, is {report['size_from']}, and right to "
+        f"{error:.0f} % in 19 of 20 cases, as is the distance that follows from it"
     )
 
 
@@ -273,7 +287,7 @@ def _unseen(landmarks: Landmarks) -> list[str]:
         return []
     said = [
         f"the person's {' and '.join(parts)} are out of view or hidden: their pose is not known "
-        "and is held relaxed, and the body's height is a guess"
+        "and is held relaxed"
     ]
     if "head" in parts and landmarks.found.float().mean() < DOUBTFUL:
         said.insert(

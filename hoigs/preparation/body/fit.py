@@ -45,6 +45,7 @@ def solve(problem: FitProblem, steps: int, progress: Callable[[float], None] | N
         widen = max(1.0, 5.0 - step)
         if step in RESCALED:
             unknowns = problem.rescale(unknowns)
+            problem.measure(unknowns)
         if step in ESTIMATED:
             problem.estimate_noise(unknowns)
         unknowns = problem.carry(unknowns, step / min(steps, SETTLED))

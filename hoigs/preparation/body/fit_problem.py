@@ -15,6 +15,7 @@ from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.maths.rotations import axis_angle_to_quats, multiply_quats, quats_to_axis_angle
 from hoigs.core.values.camera import Camera, pinhole_pixels
 from hoigs.core.values.moment import BodyPose
+from hoigs.preparation.body.face import Size, faces_of
 from hoigs.preparation.body.kinematics import (
     REACH,
     Kinematics,
@@ -43,11 +44,12 @@ class FitOptions:
             ones cost less than their square (a throw is no error).
         shape: standard deviation of the shape coefficients, in those of the body model.
         size: standard deviation of the body's size about `mean_size`, in parts of the model's mean.
-            Adults differ by 4 %, but 3D landmarks by a network do not measure size, and one still
-            camera shows none: the mean is the best guess, which only plain evidence may move
+            3D landmarks by a network do not measure size, and one still camera shows none but the
+            face's: what that makes of it is the best guess, which only plain evidence may move
             (cameras in metres that move, see the body from several sides).
-        mean_size: of the body, in parts of the model's mean; other than 1 where the person's height
-            is known. 3D landmarks, of a person of average height, are taken in that unit.
+        mean_size: of the body, in parts of the model's mean, where the person's height is known;
+            None: as the face shows, and adults are (`Size`). 3D landmarks, of a person of average
+            height, are taken in that unit.
         offset: standard deviation of the distance from a landmark to the body's own point that
             stands for it, metres on a body of the mean size.
         masks: number of landmarks that a mask weighs as much as. mask_spread: residual at which a
@@ -58,11 +60,11 @@ class FitOptions:
     steps: int = FIT_STEPS
     spread: float = 0.006
     space: float = 0.1
-    unit: float = 0.015
+    unit: float = 0.1
     smooth: float = 6.0
     shape: float = 0.3
     size: float = 0.005
-    mean_size: float = 1.0
+    mean_size: float | None = None
     offset: float = 0.003
     masks: float = 10.0
     mask_spread: float = 0.03
@@ -265,6 +267,7 @@ def _mean_of_upper_half(values: Float[Tensor, " N"]) -> Float[Tensor, ""]:
     return values.sort(descending=True).values[: (len(values) + 1) // 2].mean()
 
 
+NOSE = 0  # landmark
 GAP = 12  # frames between landmarks that smoothness carries a pose across
 CARRIED = 0.6  # of the steps, in which frames farther off begin one after another
 SURFACE = 1.7  # of a landmark on the skin against one at a joint: how uncertain its place is
@@ -300,6 +303,9 @@ class FitProblem:
         self.kinematics = Kinematics(body, self.points.joints, self.points.vertices)
         rows = list(self.points.landmarks)
         self.seen: Bool[Tensor, " F"] = landmarks.found
+        given = options.mean_size
+        self.size = Size() if given is None else Size(given, options.size, "as given")
+        self.faces = faces_of(landmarks.image, torch.stack([c.K for c in cameras]))
         self.solid = int(landmarks.solid.sum())
         image = landmarks.image[:, rows].double()
         counted = self.seen[:, None] & landmarks.known[:, rows]
@@ -423,6 +429,15 @@ class FitProblem:
         return Unknowns(
             unknowns.pose.replace(transl=transl), unknowns.offsets, unknowns.unit, scale
         )
+
+    def measure(self, unknowns: Unknowns) -> None:
+        """The size of the body, by the face's."""
+        if self.found is not None or self.options.mean_size is not None:
+            return
+        points = self.posed(unknowns, derivatives=False).points
+        _, cam = self.in_cameras(points, unknowns.scale)
+        size, _ = self.kinematics.size(unknowns.pose.betas)
+        self.size = Size.by_face(size, cam[:, self.points.index(NOSE), 2], self.faces)
 
     def estimate_noise(self, unknowns: Unknowns) -> None:
         """Of the landmarks; and how strongly what they stand for accelerates."""
@@ -567,7 +582,7 @@ class FitProblem:
         Offsets count in parts of the body's size. In metres, those that landmarks have by
         definition would be cheaper on a smaller body closer by.
         """
-        mean = self.options.mean_size
+        mean = self.size.mean
         betas = unknowns.pose.betas
         unit = self.offset_spread.new_tensor([unknowns.unit - (1 / mean - 1)])
         size, by_betas = self.kinematics.size(betas)
@@ -604,6 +619,9 @@ class FitProblem:
             "landmark_noise_px": round(float(self.noise.pixels.median()), 2),
             "landmark_noise_m": round(float(self.noise.space.median()), 3),
             "landmark_unit": round(1 + unknowns.unit, 3),
+            "size": round(self.size.mean, 3),
+            "size_spread": round(self.size.spread, 3),
+            "size_from": self.size.source,
             "landmark_offset_m_largest": round(float(unknowns.offsets.norm(dim=-1).max()), 3),
             "frames_with_landmarks": int(self.seen.sum()),
             "frames_with_landmarks_in_space": self.solid,
