@@ -24,7 +24,7 @@ from hoigs.core.maths.frame_times import Chunking
 from hoigs.core.values.camera import Camera
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_problem import BodyFit
+from hoigs.preparation.body.fit_problem import BodyFit, Observations
 from hoigs.preparation.body.landmarks import Landmarks
 
 WIDTH, HEIGHT, FOCAL, FPS = 1280, 720, 1536.0, 24
@@ -45,7 +45,7 @@ def main() -> int:
     whole: BodyFit | None = None
     for chunking in [None, *map(_chunking, arguments.chunks.split(","))]:
         began = time.perf_counter()
-        fit = fit_body(body, marks, cameras, times=times, chunking=chunking)
+        fit = fit_body(body, Observations(marks, cameras, times), chunking=chunking)
         row = {
             "chunk": chunking and chunking.chunk, "overlap": chunking and chunking.overlap,
             "seconds": round(time.perf_counter() - began, 1),

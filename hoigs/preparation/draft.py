@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import UInt8
 
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.estimator import FramePrompt
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.body.body_files import FileBody
+from hoigs.preparation.body.fit_problem import Observations
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.depth import DepthFit
 from hoigs.preparation.estimates.reader import FoundObject, FrameEstimates, GivenMasks
@@ -116,6 +118,25 @@ class Draft:
     def cameras(self) -> list[Camera]:
         """Of each frame, in metres."""
         return [camera.scaled(self.unit.metres) for camera in self.track.cameras]
+
+    def observations(self) -> dict[str, Observations]:
+        """What each person's body is fitted to, the first one's first."""
+        track, times = self.track, torch.tensor(self.video.times)
+        found = {
+            name: Observations(
+                landmarks, track.cameras, times, points=None if track.metric else track.points,
+                masks=self.undistorted.further.get(name),
+            )
+            for name, landmarks in self.undistorted.landmarks.items()
+        }  # fmt: skip
+        first = next(iter(found))
+        file = self.body_file
+        found[first] = replace(
+            found[first],
+            masks=self.undistorted.masks.persons(self.ball),
+            turns=None if file is None else file.rotations(self.video.indices),
+        )
+        return found
 
     def images(self) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
         """The frames anew, undistorted."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.reporting import Progress, ranges
 from hoigs.preparation.body.mask_fit import silhouette
 from hoigs.preparation.cameras.calibration import calibration_file
-from hoigs.preparation.cameras.choose import choose_cameras, known_lens
+from hoigs.preparation.cameras.choose import BesideVideo, choose_cameras, known_lens
 from hoigs.preparation.clip_writing import write_clip_folder
 from hoigs.preparation.depth import POOR, DepthSource, fit_depth, seen_points, seen_surface
 from hoigs.preparation.draft import Draft
@@ -270,8 +271,8 @@ def cameras(
 
     def make() -> Draft:
         chosen = choose_cameras(
-            draft.video, draft.estimates.person, draft.estimates.masks, source.colmap, options,
-            folder, progress, source.cameras, draft.body_file,
+            draft.video, draft.estimates.person, draft.estimates.masks,
+            BesideVideo(source.colmap, source.cameras, draft.body_file), options, folder, progress,
         )  # fmt: skip
         return draft.noting(
             chosen.warnings, {"cameras": chosen.track.provenance}, track=chosen.track
@@ -306,9 +307,11 @@ def people(
             ball = refine_ball(load_ball(source.ball, draft.video, track.undistort), draft.images())
         found = draft.noting(undistorted=undistorted, ball=ball)
         if draft.people:
-            bodies, unit = fit_people(
-                undistorted, ball, track, body, options, draft.video, draft.body_file, progress
-            )
+            bodies, unit = fit_people(found.observations(), track, body, options, progress)
+            if draft.body_file is not None:
+                name, first = next(iter(bodies.items()))
+                text = f"{first.provenance}; {draft.body_file.used(draft.video.indices)}"
+                bodies[name] = replace(first, provenance=text)
             texts = {
                 f"body {name}" if k else "body": person.provenance
                 for k, (name, person) in enumerate(bodies.items())

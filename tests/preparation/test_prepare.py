@@ -249,7 +249,7 @@ def test_real_videos(
 def test_a_body_fitted_in_windows_says_so(
     tiny_source: Path, tmp_path: Path, body: AnnyBody
 ) -> None:
-    _, report = prepared(tiny_source, tmp_path / "clip", body, chunk=8, overlap=4, fit_steps=6)
+    _, report = prepared(tiny_source, tmp_path / "clip", body, chunk=8, overlap=4, fit_steps=3)
     assert report.body["windows"] == 2
     ((frame, metres, degrees),) = report.body["joints"]
     assert (frame, metres, degrees) == (6, pytest.approx(0, abs=0.01), pytest.approx(0, abs=2))

@@ -8,13 +8,12 @@ from dataclasses import replace
 from functools import partial
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.maths.frame_times import Chunking
-from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit_problem import (
     BodyFit,
@@ -22,11 +21,11 @@ from hoigs.preparation.body.fit_problem import (
     FitProblem,
     Found,
     Joint,
+    Observations,
     Unknowns,
 )
 from hoigs.preparation.body.kinematics import PER_FRAME, REACH, NormalEquations, nearest_turn
-from hoigs.preparation.body.landmarks import ENOUGH, Landmarks
-from hoigs.preparation.body.mask_fit import Masks
+from hoigs.preparation.body.landmarks import ENOUGH
 from hoigs.preparation.body.start import first_guess
 
 # Gauss-Newton on the energy of the body fit.
@@ -46,6 +45,7 @@ def solve(problem: FitProblem, steps: int, progress: Callable[[float], None] | N
         widen = max(1.0, 5.0 - step)
         if step in RESCALED:
             unknowns = problem.rescale(unknowns)
+            problem.measure(unknowns)
         if step in ESTIMATED:
             problem.estimate_noise(unknowns)
         unknowns = problem.carry(unknowns, step / min(steps, SETTLED))
@@ -82,55 +82,46 @@ def _improved(
 # The body fit of a long clip, window by window: one shape, and poses that follow on.
 
 STRETCHES, SHORTEST = 10, 8  # in which frames that stand for all are taken; frames of one, at least
+STAND_FOR_ALL = 2  # windows that have as many frames as stand for all
 
 
 def fit_in_windows(
     body: BodyModel,
-    landmarks: Landmarks,
-    cameras: Sequence[Camera],
-    times: Float[Tensor, " F"],
+    seen: Observations,
     options: FitOptions,
-    points: Float[Tensor, "S 3"] | None,
-    masks: Masks | None,
-    turns: Float[Tensor, "F 21 3"] | None,
     chunking: Chunking,
     progress: Callable[[float], None] | None,
 ) -> BodyFit:
-    """As `fit_body`, with memory for one window.
+    """As `fit_body`, with memory for two windows.
 
     What all frames share (shape, places of the landmarks, noise, ordinary motion, the world's
-    scale) is fitted to as many frames as a window has, in stretches from all over the clip, and
-    then kept. Each window keeps the first poses of its overlap as the window before has found them,
-    so that accelerations are priced across the joint, and replaces the later ones, of which that
-    had not seen what follows (a fixed-lag smoother).
+    scale) is fitted to as many frames as two windows have, in stretches from all over the clip,
+    and then kept. Each window keeps the first poses of its overlap as the window before has found
+    them, so that accelerations are priced across the joint, and replaces the later ones, of which
+    that had not seen what follows (a fixed-lag smoother).
     """
-    windows = chunking.windows(len(cameras))
+    landmarks = seen.landmarks
+    windows = chunking.windows(len(seen.cameras))
     share = partial(_share, progress, len(windows) + 1)
-    rows = spread(landmarks.found.nonzero()[:, 0], chunking.chunk)
-    some = landmarks.rows(rows)
-    known = FitProblem(
-        body, some, [cameras[i] for i in rows.tolist()], times[rows], options,
-        None if turns is None else turns[rows],
-    )  # fmt: skip
-    if points is not None:
-        known.ground = points
+    rows = spread(landmarks.found.nonzero()[:, 0], STAND_FOR_ALL * chunking.chunk)
+    known = FitProblem(body, seen.rows(rows), options)
+    if seen.points is not None:
+        known.ground = seen.points
     shared = solve(known, options.steps, partial(share, 0))
     found = Found(
         known.noise, known.motion.ordinary, shared.pose.betas, shared.offsets, shared.unit
     )
-    metric, cameras = replace(options, scale=False), [c.scaled(shared.scale) for c in cameras]
-    start = first_guess(body, landmarks, cameras, False)
+    metric = replace(options, scale=False)
+    scaled = replace(seen, cameras=[c.scaled(shared.scale) for c in seen.cameras])
+    start = first_guess(body, landmarks, scaled.cameras, False)
     parts: list[BodyPose] = []
     misses: list[Tensor] = []
     joints: list[Joint] = []
     before: BodyPose | None = None  # of the next window's first own frame, by the last one
     for number, window in enumerate(windows):
-        problem = FitProblem(
-            body, landmarks.rows(window), cameras[window], times[window], metric,
-            None if turns is None else turns[window], start.part(window), found,
-        )  # fmt: skip
-        if masks is not None:
-            problem.show(masks, window.start)
+        problem = FitProblem(body, scaled.rows(window), metric, start.part(window), found)
+        if seen.masks is not None:
+            problem.show(seen.masks, window.start)
         solved = solve(problem, options.steps, partial(share, number + 1))
         own, last = found.frames, window == windows[-1]
         if before is not None:
@@ -187,14 +178,8 @@ def _share(progress: Callable[[float], None] | None, count: int, number: int, do
 
 def fit_body(
     body: BodyModel,
-    landmarks: Landmarks,
-    cameras: Sequence[Camera],
-    *,
+    seen: Observations,
     options: FitOptions | None = None,
-    points: Float[Tensor, "S 3"] | None = None,
-    masks: Masks | None = None,
-    times: Float[Tensor, " F"] | None = None,
-    turns: Float[Tensor, "F 21 3"] | None = None,
     chunking: Chunking | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> BodyFit:
@@ -211,11 +196,6 @@ def fit_body(
     or, without them, from feet that stand still and from smoothness (poor if the person walks).
 
     Args:
-        points: of the scene, in the cameras' own unit; only used to find the scale.
-        masks: one a frame, of the person or of all that moves.
-        times: of the frames, seconds; by default 30 frames a second.
-        turns: axis-angle of joints 1..21 as another program has found them: the fit starts there,
-            and `PosePrior` holds it near.
         chunking: fit window by window (`fit_in_windows`); None: all frames at once.
         progress: called with 0..1.
 
@@ -223,27 +203,26 @@ def fit_body(
         HoigsError: cameras and landmarks differ in number, or there are hardly any landmarks.
     """
     options = options or FitOptions()
-    seen = landmarks.found
-    if len(cameras) != len(seen):
-        raise HoigsError(f"{len(cameras)} cameras but landmarks of {len(seen)} frames")
-    if int(seen.sum()) < 2:
+    found, cameras = seen.landmarks.found, seen.cameras
+    if len(cameras) != len(found):
+        raise HoigsError(f"{len(cameras)} cameras but landmarks of {len(found)} frames")
+    if int(found.sum()) < 2:
         raise HoigsError(
-            f"{ENOUGH} landmarks or more were found in {int(seen.sum())} of {len(seen)} frames; a "
-            "body fit needs at least 2: is the person in view?"
+            f"{ENOUGH} landmarks or more were found in {int(found.sum())} of {len(found)} frames; "
+            "a body fit needs at least 2: is the person in view?"
         )
-    landmarks = landmarks.in_cameras(torch.stack([c.K for c in cameras]))
-    times = torch.arange(len(seen)) / 30.0 if times is None else times
-    if not options.scale:
-        points = None
+    seen = replace(
+        seen,
+        landmarks=seen.landmarks.in_cameras(torch.stack([c.K for c in cameras])),
+        points=seen.points if options.scale else None,
+    )
     with torch.no_grad():
-        if chunking is not None and len(chunking.windows(len(seen))) > 1:
-            return fit_in_windows(
-                body, landmarks, cameras, times, options, points, masks, turns, chunking, progress
-            )
-        problem = FitProblem(body, landmarks, cameras, times, options, turns)
-        if points is not None:
-            problem.ground = points
-        if masks is not None:
-            problem.show(masks)
+        if chunking is not None and len(chunking.windows(len(found))) > 1:
+            return fit_in_windows(body, seen, options, chunking, progress)
+        problem = FitProblem(body, seen, options)
+        if seen.points is not None:
+            problem.ground = seen.points
+        if seen.masks is not None:
+            problem.show(seen.masks)
         unknowns = solve(problem, options.steps, progress)
         return problem.result(unknowns, problem.misses(unknowns))

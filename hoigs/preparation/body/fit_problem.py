@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.maths.rotations import axis_angle_to_quats, multiply_quats, quats_to_axis_angle
 from hoigs.core.values.camera import Camera, pinhole_pixels
 from hoigs.core.values.moment import BodyPose
+from hoigs.preparation.body.face import Size, faces_of
 from hoigs.preparation.body.kinematics import (
     REACH,
     Kinematics,
@@ -43,11 +44,12 @@ class FitOptions:
             ones cost less than their square (a throw is no error).
         shape: standard deviation of the shape coefficients, in those of the body model.
         size: standard deviation of the body's size about `mean_size`, in parts of the model's mean.
-            Adults differ by 4 %, but 3D landmarks by a network do not measure size, and one still
-            camera shows none: the mean is the best guess, which only plain evidence may move
+            3D landmarks by a network do not measure size, and one still camera shows none but the
+            face's: what that makes of it is the best guess, which only plain evidence may move
             (cameras in metres that move, see the body from several sides).
-        mean_size: of the body, in parts of the model's mean; other than 1 where the person's height
-            is known. 3D landmarks, of a person of average height, are taken in that unit.
+        mean_size: of the body, in parts of the model's mean, where the person's height is known;
+            None: as the face shows, and adults are (`Size`). 3D landmarks, of a person of average
+            height, are taken in that unit.
         offset: standard deviation of the distance from a landmark to the body's own point that
             stands for it, metres on a body of the mean size.
         masks: number of landmarks that a mask weighs as much as. mask_spread: residual at which a
@@ -58,15 +60,52 @@ class FitOptions:
     steps: int = FIT_STEPS
     spread: float = 0.006
     space: float = 0.1
-    unit: float = 0.015
+    unit: float = 0.1
     smooth: float = 6.0
     shape: float = 0.3
     size: float = 0.005
-    mean_size: float = 1.0
+    mean_size: float | None = None
     offset: float = 0.003
     masks: float = 10.0
     mask_spread: float = 0.03
     scale: bool = False
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What a body is fitted to.
+
+    Attributes:
+        cameras: one a frame, as `landmarks` has them.
+        times: of the frames, seconds; by default 30 frames a second.
+        turns: axis-angle of joints 1..21 as another program has found them: the fit starts there,
+            and `PosePrior` holds it near.
+        points: of the scene, in the cameras' own unit; only used to find the scale.
+        masks: one a frame, of the person or of all that moves.
+    """
+
+    landmarks: Landmarks
+    cameras: Sequence[Camera]
+    times: Float[Tensor, " F"] | None = None
+    turns: Float[Tensor, "F 21 3"] | None = None
+    points: Float[Tensor, "S 3"] | None = None
+    masks: Masks | None = None
+
+    @property
+    def seconds(self) -> Float[Tensor, " F"]:
+        return torch.arange(len(self.cameras)) / 30.0 if self.times is None else self.times
+
+    def rows(self, frames: slice | Int[Tensor, " T"]) -> Observations:
+        """Of some frames alone, without their masks."""
+        numbers = torch.arange(len(self.cameras))[frames].tolist()
+        return replace(
+            self,
+            landmarks=self.landmarks.rows(frames),
+            cameras=[self.cameras[i] for i in numbers],
+            times=self.seconds[frames],
+            turns=None if self.turns is None else self.turns[frames],
+            masks=None,
+        )
 
 
 @dataclass(frozen=True)
@@ -228,6 +267,7 @@ def _mean_of_upper_half(values: Float[Tensor, " N"]) -> Float[Tensor, ""]:
     return values.sort(descending=True).values[: (len(values) + 1) // 2].mean()
 
 
+NOSE = 0  # landmark
 GAP = 12  # frames between landmarks that smoothness carries a pose across
 CARRIED = 0.6  # of the steps, in which frames farther off begin one after another
 SURFACE = 1.7  # of a landmark on the skin against one at a joint: how uncertain its place is
@@ -244,8 +284,7 @@ class FitProblem:
     """The energy and what it needs, precomputed.
 
     Args:
-        times: of the frames, seconds.
-        turns: axis-angle of joints 1..21 where they are known, about.
+        seen: its masks are looked at after `show`, its points as `ground`.
         start: where the fit begins, in place of `first_guess`.
         found: what another fit has found, and this one keeps.
     """
@@ -253,19 +292,20 @@ class FitProblem:
     def __init__(
         self,
         body: BodyModel,
-        landmarks: Landmarks,
-        cameras: Sequence[Camera],
-        times: Float[Tensor, " F"],
+        seen: Observations,
         options: FitOptions,
-        turns: Float[Tensor, "F 21 3"] | None = None,
         start: Start | None = None,
         found: Found | None = None,
     ) -> None:
         self.body, self.options, self.found = body, options, found
+        landmarks, cameras, times, turns = seen.landmarks, seen.cameras, seen.seconds, seen.turns
         self.points: LandmarkPoints = points_of(body)
         self.kinematics = Kinematics(body, self.points.joints, self.points.vertices)
         rows = list(self.points.landmarks)
         self.seen: Bool[Tensor, " F"] = landmarks.found
+        given = options.mean_size
+        self.size = Size() if given is None else Size(given, options.size, "as given")
+        self.faces = faces_of(landmarks.image, torch.stack([c.K for c in cameras]))
         self.solid = int(landmarks.solid.sum())
         image = landmarks.image[:, rows].double()
         counted = self.seen[:, None] & landmarks.known[:, rows]
@@ -389,6 +429,15 @@ class FitProblem:
         return Unknowns(
             unknowns.pose.replace(transl=transl), unknowns.offsets, unknowns.unit, scale
         )
+
+    def measure(self, unknowns: Unknowns) -> None:
+        """The size of the body, by the face's."""
+        if self.found is not None or self.options.mean_size is not None:
+            return
+        points = self.posed(unknowns, derivatives=False).points
+        _, cam = self.in_cameras(points, unknowns.scale)
+        size, _ = self.kinematics.size(unknowns.pose.betas)
+        self.size = Size.by_face(size, cam[:, self.points.index(NOSE), 2], self.faces)
 
     def estimate_noise(self, unknowns: Unknowns) -> None:
         """Of the landmarks; and how strongly what they stand for accelerates."""
@@ -533,7 +582,7 @@ class FitProblem:
         Offsets count in parts of the body's size. In metres, those that landmarks have by
         definition would be cheaper on a smaller body closer by.
         """
-        mean = self.options.mean_size
+        mean = self.size.mean
         betas = unknowns.pose.betas
         unit = self.offset_spread.new_tensor([unknowns.unit - (1 / mean - 1)])
         size, by_betas = self.kinematics.size(betas)
@@ -570,6 +619,9 @@ class FitProblem:
             "landmark_noise_px": round(float(self.noise.pixels.median()), 2),
             "landmark_noise_m": round(float(self.noise.space.median()), 3),
             "landmark_unit": round(1 + unknowns.unit, 3),
+            "size": round(self.size.mean, 3),
+            "size_spread": round(self.size.spread, 3),
+            "size_from": self.size.source,
             "landmark_offset_m_largest": round(float(unknowns.offsets.norm(dim=-1).max()), 3),
             "frames_with_landmarks": int(self.seen.sum()),
             "frames_with_landmarks_in_space": self.solid,

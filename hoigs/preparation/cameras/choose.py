@@ -44,34 +44,44 @@ class ChosenCameras:
     warnings: list[str] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class BesideVideo:
+    """What lies beside a video and says something of its cameras.
+
+    Attributes:
+        model: a COLMAP model. cameras: cameras.npz, or MegaSaM's or VGGT's npz.
+        bodies: whose lens a still camera has, unless another is given.
+    """
+
+    model: Path | None = None
+    cameras: Path | None = None
+    bodies: FileBody | None = None
+
+
 def choose_cameras(
     video: Frames,
     landmarks: Landmarks | None,
     masks: GivenMasks,
-    model: Path | None,
+    beside: BesideVideo,
     options: PrepareOptions,
     folder: Path,
     progress: Callable[[float], None],
-    given: Path | None = None,
-    bodies: FileBody | None = None,
 ) -> ChosenCameras:
     """Cameras as `options.camera` requests them.
 
     Args:
         landmarks, masks: of the raw frames; landmarks None: nobody is looked for.
-        model: a COLMAP model that is there already, or None.
-        given: cameras.npz, or MegaSaM's or VGGT's npz, or None.
-        bodies: whose lens a still camera has, unless another is given.
         folder: to work in; it may be removed when the result has been kept.
 
     Raises:
         SourceError: the model does not fit, or structure from motion fails.
     """
     lens = known_lens(options, video)
-    beside = None if options.own_cameras else given or model
-    if lens is not None and beside is not None:
+    model, given, bodies = beside.model, beside.cameras, beside.bodies
+    made = None if options.own_cameras else given or model
+    if lens is not None and made is not None:
         raise SourceError(
-            f"{beside.name} beside the video has a lens already: leave {lens[1]} out, or use "
+            f"{made.name} beside the video has a lens already: leave {lens[1]} out, or use "
             "--camera sfm, static or turning to make the cameras anew"
         )
     if not options.own_cameras and given is not None:

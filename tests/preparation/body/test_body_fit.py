@@ -26,6 +26,7 @@ from hoigs.preparation.body.fit_problem import (
     BodyFit,
     FitOptions,
     FitProblem,
+    Observations,
     Unknowns,
     ground_scale,
 )
@@ -91,7 +92,7 @@ def seen_by(cameras: list[Camera], pose: BodyPose) -> Landmarks:
 @cache
 def static_fit() -> BodyFit:
     cameras = [camera()] * FRAMES
-    return fit_body(body(), seen_by(cameras, truth()), cameras, options=QUICK)
+    return fit_body(body(), Observations(seen_by(cameras, truth()), cameras), options=QUICK)
 
 
 def joint_errors(found: BodyPose, true: BodyPose) -> Tensor:
@@ -114,7 +115,7 @@ def test_a_known_pose_is_found() -> None:
 
 def test_a_known_height_scales_the_body_and_its_distance() -> None:
     cameras, landmarks = [camera()] * FRAMES, seen_by([camera()] * FRAMES, truth())
-    fit = fit_body(body(), landmarks, cameras, options=replace(QUICK, mean_size=0.92))
+    fit = fit_body(body(), Observations(landmarks, cameras), options=replace(QUICK, mean_size=0.92))
     usual = static_fit()
     assert fit.residual_px.max() < 3.0
     nearer = fit.poses.transl[:, 2] / usual.poses.transl[:, 2]
@@ -181,7 +182,7 @@ def test_frames_without_landmarks_lie_between_their_neighbours() -> None:
     image, world = landmarks.image.clone(), landmarks.world.clone()
     image[4:6] = torch.nan
     world[4:6] = torch.nan
-    fit = fit_body(body(), Landmarks(image, world), cameras, options=QUICK)
+    fit = fit_body(body(), Observations(Landmarks(image, world), cameras), options=QUICK)
     assert torch.isnan(fit.residual_px[4:6]).all()
     assert torch.isfinite(fit.residual_px[[0, 1, 2, 3, 6, 7, 8]]).all()
     assert fit.report["frames_with_landmarks"] == FRAMES - 2
@@ -196,7 +197,7 @@ def test_first_and_last_frames_may_be_unseen() -> None:
     landmarks = seen_by(cameras, truth())
     image = landmarks.image.clone()
     image[[0, 1, FRAMES - 1]] = torch.nan
-    fit = fit_body(body(), replace(landmarks, image=image), cameras, options=QUICK)
+    fit = fit_body(body(), Observations(replace(landmarks, image=image), cameras), options=QUICK)
     assert joint_errors(fit.poses, truth()).mean() < 0.08
 
 
@@ -205,7 +206,7 @@ def test_an_outlier_landmark_is_outvoted() -> None:
     landmarks = seen_by(cameras, truth())
     image = landmarks.image.clone()
     image[4, 15, :2] += torch.tensor([200.0, -150.0])  # one wrist, one frame
-    fit = fit_body(body(), Landmarks(image, landmarks.world), cameras, options=QUICK)
+    fit = fit_body(body(), Observations(Landmarks(image, landmarks.world), cameras), options=QUICK)
     errors = joint_errors(fit.poses, truth())
     assert errors[4, 20] < 0.12
     assert errors.mean() < 0.04  # nor does it pull the body nearer or change its size
@@ -227,8 +228,8 @@ def test_scene_scale_from_the_ground_at_the_feet() -> None:
     x, z = torch.meshgrid(torch.linspace(-1, 1, 41), torch.linspace(2, 5, 61), indexing="xy")
     ground = torch.stack((x, torch.full_like(x, floor), z), -1).reshape(-1, 3)
     fit = fit_body(
-        body(), seen_by(metric, pose), own,
-        options=replace(QUICK, scale=True), points=ground / unit,
+        body(), Observations(seen_by(metric, pose), own, points=ground / unit),
+        options=replace(QUICK, scale=True),
     )  # fmt: skip
     assert fit.scene_scale == pytest.approx(unit, rel=0.06)
     assert "ground" in fit.report["scene_scale_from"]
@@ -244,7 +245,7 @@ def test_scene_scale_without_points_comes_from_still_feet() -> None:
     still = pose.replace(transl=pose.transl[:1].expand(FRAMES, 3), body=pose.body[:1].expand(
         FRAMES, 21, 3))  # fmt: skip
     fit = fit_body(
-        body(), seen_by(metric, still), own, options=replace(QUICK, scale=True), points=None
+        body(), Observations(seen_by(metric, still), own), options=replace(QUICK, scale=True)
     )
     assert fit.scene_scale == pytest.approx(unit, rel=0.1)
     assert "still" in fit.report["scene_scale_from"]
@@ -332,11 +333,11 @@ def test_too_little_to_fit_is_refused() -> None:
     cameras = [camera()] * FRAMES
     landmarks = seen_by(cameras, truth())
     with pytest.raises(HoigsError, match=rf"3 .*{FRAMES} "):
-        fit_body(body(), landmarks, cameras[:3])
+        fit_body(body(), Observations(landmarks, cameras[:3]))
     image = landmarks.image.clone()
     image[1:] = torch.nan
     with pytest.raises(HoigsError, match=r"1 of 9 .* 2"):
-        fit_body(body(), replace(landmarks, image=image), cameras)
+        fit_body(body(), Observations(replace(landmarks, image=image), cameras))
 
 
 def test_overlay_paints_the_mesh_and_nothing_else() -> None:
@@ -366,7 +367,7 @@ def test_real_landmarks_of_a_juggler(shared_data) -> None:
     K = torch.tensor([[1536.0, 0, 640], [0, 1536.0, 360], [0, 0, 1]])
     cameras = [Camera(K, torch.eye(4), 1280, 720)] * len(image)
     landmarks = Landmarks.from_mediapipe(image, world)
-    fit = fit_body(body(), landmarks, cameras, times=torch.arange(len(image)) / 3)
+    fit = fit_body(body(), Observations(landmarks, cameras, torch.arange(len(image)) / 3))
     assert fit.report["landmark_error_px"] < 12
     assert fit.report["landmark_offset_m_largest"] < 0.12  # errors are not explained away
     assert limit_penalty(fit.poses.body) < 0.05
@@ -376,9 +377,11 @@ def test_real_landmarks_of_a_juggler(shared_data) -> None:
 
 def test_offsets_are_as_likely_on_a_small_body_as_on_a_large_one() -> None:
     """And the prior's equations are its derivatives."""
+    cameras = [camera()] * FRAMES
     problem = FitProblem(
-        body(), seen_by([camera()] * FRAMES, truth()), [camera()] * FRAMES,
-        torch.arange(FRAMES) / 24, QUICK,
+        body(),
+        Observations(seen_by(cameras, truth()), cameras, torch.arange(FRAMES) / 24),
+        QUICK,
     )  # fmt: skip
     draw = torch.Generator().manual_seed(0)
     pairs = len(problem.offset_spread)

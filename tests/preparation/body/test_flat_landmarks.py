@@ -18,7 +18,7 @@ from hoigs.core.interfaces.estimator import (
 )
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_problem import BodyFit
+from hoigs.preparation.body.fit_problem import BodyFit, Observations
 from hoigs.preparation.body.landmarks import ENOUGH, SOLID, USED, Landmarks
 from hoigs.preparation.body.start import flat_start, place, relaxed
 
@@ -33,7 +33,9 @@ def flat(targets: tuple[int, ...]) -> Landmarks:
 
 @cache
 def coco_fit() -> BodyFit:
-    return fit_body(body(), flat(COCO_17_LANDMARKS), [camera()] * FRAMES, options=QUICK)
+    return fit_body(
+        body(), Observations(flat(COCO_17_LANDMARKS), [camera()] * FRAMES), options=QUICK
+    )
 
 
 def centred(joints: Tensor) -> Tensor:
@@ -59,7 +61,9 @@ def test_frames_with_a_few_landmarks_count_and_hidden_limbs_are_carried() -> Non
     track = seen_by([camera()] * FRAMES, truth())
     image = track.image.clone()
     image[3:5, [15, 16, 25, 26, 27, 28, 29, 30, 31, 32]] = torch.nan
-    fit = fit_body(body(), replace(track, image=image), [camera()] * FRAMES, options=QUICK)
+    fit = fit_body(
+        body(), Observations(replace(track, image=image), [camera()] * FRAMES), options=QUICK
+    )
     assert fit.report["frames_with_landmarks"] == FRAMES
     assert torch.isfinite(fit.residual_px).all() and fit.residual_px.max() < 4.0
     assert joint_errors(fit.poses, truth()).mean() < 0.06

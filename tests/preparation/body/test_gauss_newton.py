@@ -10,7 +10,7 @@ from torch import Tensor
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body import fit_problem
-from hoigs.preparation.body.fit_problem import FitProblem
+from hoigs.preparation.body.fit_problem import FitProblem, Observations
 from hoigs.preparation.body.kinematics import PER_FRAME, Kinematics, NormalEquations
 from hoigs.preparation.body.landmarks import points_of
 from hoigs.preparation.body.priors import MotionPrior
@@ -119,10 +119,8 @@ def test_derivatives_of_a_few_frames_at_a_time_give_the_same_equations(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Accelerations reach over the borders of such parts."""
-    problem = FitProblem(
-        body(), seen_by([camera()] * FRAMES, truth()), [camera()] * FRAMES,
-        torch.arange(FRAMES) / 30, QUICK,
-    )  # fmt: skip
+    cameras = [camera()] * FRAMES
+    problem = FitProblem(body(), Observations(seen_by(cameras, truth()), cameras), QUICK)
     found = []
     for at_once in (FRAMES, 4, 1):
         monkeypatch.setattr(fit_problem, "AT_ONCE", at_once)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_problem import BodyFit
+from hoigs.preparation.body.fit_problem import BodyFit, Observations
 from hoigs.preparation.body.kinematics import PER_FRAME, NormalEquations
 from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.body.mask_fit import MaskFit, posed, silhouette
@@ -40,9 +40,9 @@ def missed(fit: BodyFit) -> Tensor:
 
 def test_masks_place_limbs_where_there_are_no_landmarks() -> None:
     cameras, landmarks = [camera()] * FRAMES, half_seen()
-    without = missed(fit_body(body(), landmarks, cameras, options=QUICK))
+    without = missed(fit_body(body(), Observations(landmarks, cameras), options=QUICK))
     with_masks = missed(
-        fit_body(body(), landmarks, cameras, options=QUICK, masks=outlines(truth()))
+        fit_body(body(), Observations(landmarks, cameras, masks=outlines(truth())), options=QUICK)
     )
     assert with_masks < 0.6 * without, (with_masks, without)
 

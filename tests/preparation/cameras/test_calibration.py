@@ -14,7 +14,7 @@ from hoigs.core.errors import SpecError
 from hoigs.core.values.lens import Lens
 from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.cameras.calibration import fitting, given_intrinsics, read_calibration
-from hoigs.preparation.cameras.choose import choose_cameras
+from hoigs.preparation.cameras.choose import BesideVideo, choose_cameras
 from hoigs.preparation.estimates.installed import load_options
 from hoigs.preparation.estimates.reader import GivenMasks
 from hoigs.preparation.mask_stack import MaskStack
@@ -144,7 +144,9 @@ def test_a_still_cameras_frames_are_undistorted(tiny_video: Path, tmp_path: Path
     video = VideoFrames(tiny_video, width=WIDTH // 2)
 
     def choose(options: PrepareOptions, model: Path | None = None):
-        return choose_cameras(video, *everything, model, options, tmp_path, lambda _: None)
+        return choose_cameras(
+            video, *everything, BesideVideo(model), options, tmp_path, lambda _: None
+        )
 
     track = choose(options).track
     K = track.cameras[0].K

@@ -13,7 +13,7 @@ from PIL import Image
 from scipy import ndimage
 
 from hoigs.preparation.body.landmarks import Landmarks
-from hoigs.preparation.cameras.choose import choose_cameras
+from hoigs.preparation.cameras.choose import BesideVideo, choose_cameras
 from hoigs.preparation.cameras.sfm import _what_to_do, structure_from_motion
 from hoigs.preparation.cameras.turning_cameras import background_motion
 from hoigs.preparation.estimates.reader import GivenMasks
@@ -77,7 +77,13 @@ def test_a_camera_that_stands_still(tmp_path: Path) -> None:
     motion = background_motion(video, masks)
     assert motion.known and motion.static and motion.largest < 0.5
     chosen = choose_cameras(
-        video, nobody(COUNT), masks, None, PrepareOptions(focal=FOCAL), tmp_path, lambda _: None
+        video,
+        nobody(COUNT),
+        masks,
+        BesideVideo(),
+        PrepareOptions(focal=FOCAL),
+        tmp_path,
+        lambda _: None,
     )
     assert chosen.track.static and "features outside the masks move by" in chosen.track.provenance
     assert chosen.track.figures["displacement_px"] < 0.5
@@ -91,7 +97,7 @@ def test_a_camera_that_moves_and_one_that_shows_nothing(tmp_path: Path) -> None:
     nothing = background_motion(video, hidden)
     assert not nothing.known and nothing.static
     chosen = choose_cameras(
-        video, nobody(COUNT), hidden, None, PrepareOptions(), tmp_path, lambda _: None
+        video, nobody(COUNT), hidden, BesideVideo(), PrepareOptions(), tmp_path, lambda _: None
     )
     assert any("too few to tell" in warning for warning in chosen.warnings)
 
@@ -102,7 +108,7 @@ def test_a_camera_in_a_hand_is_one_that_turns(tmp_path: Path) -> None:
     motion = background_motion(video, masks)
     assert not motion.static and motion.turned is not None and 0.3 < motion.parallax < 3
     chosen = choose_cameras(
-        video, nobody(4), masks, None, PrepareOptions(), tmp_path, lambda _: None
+        video, nobody(4), masks, BesideVideo(), PrepareOptions(), tmp_path, lambda _: None
     )
     assert chosen.track.kind == "turning"
     # so small turns show no focal length, however small their residuals are
@@ -131,7 +137,13 @@ def test_a_camera_that_turns_on_its_spot(tmp_path: Path) -> None:
 
     def choose(**options):
         return choose_cameras(
-            video, nobody(4), nothing, None, PrepareOptions(**options), tmp_path, lambda _: None
+            video,
+            nobody(4),
+            nothing,
+            BesideVideo(),
+            PrepareOptions(**options),
+            tmp_path,
+            lambda _: None,
         )
 
     chosen = choose()
@@ -157,7 +169,9 @@ def test_a_turning_camera_of_which_some_frames_show_no_background(tmp_path: Path
     def choose():
         masks = GivenMasks(together=MaskStack(hidden))
         options = PrepareOptions(camera="turning", focal=FOCAL)
-        return choose_cameras(video, nobody(4), masks, None, options, tmp_path, lambda _: None)
+        return choose_cameras(
+            video, nobody(4), masks, BesideVideo(), options, tmp_path, lambda _: None
+        )
 
     chosen = choose()
     assert any("background of 1 frames (1) was not found" in w for w in chosen.warnings)
@@ -173,7 +187,13 @@ def test_the_way_of_a_moving_camera(tmp_path: Path) -> None:
     steps = [0.1 * i for i in range(COUNT)]
     video, masks = recorded(tmp_path / "moves", steps)
     chosen = choose_cameras(
-        video, nobody(COUNT), masks, None, PrepareOptions(focal=FOCAL), tmp_path, lambda _: None
+        video,
+        nobody(COUNT),
+        masks,
+        BesideVideo(),
+        PrepareOptions(focal=FOCAL),
+        tmp_path,
+        lambda _: None,
     )
     track = chosen.track
     assert track.model is not None and track.positions == tuple(range(COUNT))
@@ -207,7 +227,7 @@ def test_frames_without_features_are_refused_with_advice(tmp_path: Path) -> None
             video,
             nobody(4),
             empty,
-            None,
+            BesideVideo(),
             PrepareOptions(camera="moving"),
             tmp_path,
             lambda _: None,
