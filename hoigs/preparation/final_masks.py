@@ -355,22 +355,29 @@ def without_others(
     return found
 
 
-def entity_masks(
-    given: GivenMasks,
-    ball: BallTrack | None,
-    images: Images,
-    silhouettes: Callable[[], MaskStack],
-    fitted: Bool[np.ndarray, " F"],
-    folder: Path | None = None,
-) -> tuple[MaskStack, MaskStack, str]:
-    """Masks of person and object, disjoint, and what they were made from.
+@dataclass(frozen=True)
+class MaskSources:
+    """What the masks of the first person and object are made from.
 
-    Args:
+    Attributes:
+        ball: the object, if it was tracked as one.
         images: gives the undistorted frames anew on every call.
         silhouettes: gives the fitted body's; called only if masks must be separated.
         fitted: frames whose body was fitted to landmarks.
         folder: for temporary files; None: the system's.
     """
+
+    given: GivenMasks
+    ball: BallTrack | None
+    images: Images
+    silhouettes: Callable[[], MaskStack]
+    fitted: Bool[np.ndarray, " F"]
+    folder: Path | None = None
+
+
+def entity_masks(sources: MaskSources) -> tuple[MaskStack, MaskStack, str]:
+    """Masks of person and object, disjoint, and what they were made from."""
+    given, ball = sources.given, sources.ball
     if given.human is not None and given.object is not None:
         human = MaskStack(h & ~o for h, o in zip(given.human, given.object, strict=True))
         return human, given.object, "given for each entity; the object's win where they overlap"
@@ -381,7 +388,9 @@ def entity_masks(
     if ball is not None:
         human, objects = _disc_masks(together, ball)
         return human, objects, "ball: its disc; person: the given mask without the disc"
-    human, objects = separate(images, together, silhouettes(), fitted, folder=folder)
+    human, objects = separate(
+        sources.images, together, sources.silhouettes(), sources.fitted, folder=sources.folder
+    )
     text = (
         "one given mask of person and object, separated by the fitted body's silhouette, "
         "colour and neighbouring frames: borders between them are weak, more so where the body "
@@ -403,31 +412,21 @@ def _disc_masks(together: MaskStack, ball: BallTrack) -> tuple[MaskStack, MaskSt
 
 
 def final_masks(
-    given: GivenMasks,
-    ball: BallTrack | None,
+    sources: MaskSources,
     others: Mapping[str, MaskStack],
-    fitted: Bool[np.ndarray, " F"] | None,
     found: FoundObject | None,
     track: CameraTrack,
-    images: Images,
-    silhouettes: Callable[[], MaskStack],
     *,
     keep_black: bool,
-    folder: Path,
 ) -> tuple[EntityMasks, str]:
     """The masks, and what they were made from.
 
     Args:
-        given: of the first person and object. ball: the object, if it was tracked as one.
-        others: of further people. fitted: frames whose body was fitted to landmarks; None: nobody.
+        others: of further people.
         found: objects that were followed in the video, the first and further ones.
-        images: gives the undistorted frames anew on every call.
-        silhouettes: gives the fitted body's; called only if masks must be separated.
         keep_black: take flat black patches for a part of the scene.
-        folder: for temporary files.
     """
-    fitted = np.zeros(len(track.positions), bool) if fitted is None else fitted
-    human, object_masks, text = entity_masks(given, ball, images, silhouettes, fitted, folder)
+    human, object_masks, text = entity_masks(sources)
     further: dict[str, MaskStack] = {}
     if found is not None:
         text = f"{text}: {found.provenance}"
@@ -436,7 +435,7 @@ def final_masks(
     things = [object_masks, *further.values()]
     people = without_others(others, human, things)
     shown = [human, *people.values(), *things]
-    blank = _nothing(human) if keep_black else _blank(images, shown)
+    blank = _nothing(human) if keep_black else _blank(sources.images, shown)
     return EntityMasks(human, object_masks, blank, further, people), text
 
 

@@ -27,10 +27,11 @@ from hoigs.preparation.clip_writing import write_clip_folder
 from hoigs.preparation.depth import POOR, DepthSource, fit_depth, seen_points, seen_surface
 from hoigs.preparation.draft import Draft
 from hoigs.preparation.estimates.reader import EstimateReader, Estimators, identity, paths_of
-from hoigs.preparation.final_masks import blank_warning, final_masks
+from hoigs.preparation.final_masks import MaskSources, blank_warning, final_masks
 from hoigs.preparation.kept import PLAN, kept, key_of
 from hoigs.preparation.mask_stack import MaskStack
 from hoigs.preparation.objects.ball import load_ball, refine_ball
+from hoigs.preparation.objects.filmed import Filmed
 from hoigs.preparation.objects.hands import nearest_person
 from hoigs.preparation.objects.make_object import MadeObject, doubts, make_object
 from hoigs.preparation.options import PrepareOptions
@@ -336,10 +337,15 @@ def masks(
         return MaskStack(silhouette(v, draft.body.faces, c) for (v, _), c in pairs)
 
     def make() -> Draft:
+        person = draft.person
+        fitted = np.zeros(len(draft.track.positions), bool) if person is None else person.found
+        sources = MaskSources(
+            draft.given_masks(options), draft.ball, draft.images, silhouettes, fitted,
+            draft.work.root,
+        )  # fmt: skip
         found, text = final_masks(
-            draft.given_masks(options), draft.ball, draft.undistorted.further,
-            None if draft.person is None else draft.person.found, draft.found_object, draft.track,
-            draft.images, silhouettes, keep_black=options.keep_black, folder=draft.work.root,
+            sources, draft.undistorted.further, draft.found_object, draft.track,
+            keep_black=options.keep_black,
         )  # fmt: skip
         return draft.noting(blank_warning(found.blank), {"masks": text}, masks=found)
 
@@ -373,12 +379,14 @@ def place_objects(
             continue
         assert stack is not None
         owner = nearest_person(joints, stack, cameras)
+        filmed = Filmed(
+            stack, humans, masks.other_objects(None if first else name), cameras, draft.images,
+            draft.video.fps, None if owner is None else joints[owner], draft.body.parents,
+            draft.unit.depths,
+        )  # fmt: skip
         made = make_object(
-            disc, stack, humans, masks.other_objects(None if first else name), cameras,
-            None if owner is None else joints[owner], draft.body.parents, draft.images,
-            way=options.object_track, radius=options.ball_radius, count=options.object_points,
-            fps=draft.video.fps, progress=partial(_share, progress, k, count),
-            depths=draft.unit.depths,
+            disc, filmed, way=options.object_track, radius=options.ball_radius,
+            count=options.object_points, progress=partial(_share, progress, k, count),
         )  # fmt: skip
         provenance = {"object" if first else f"object {name}": made.track.provenance}
         if len(draft.bodies) > 1:

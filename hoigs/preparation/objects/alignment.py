@@ -23,8 +23,8 @@ from torch import Tensor
 
 from hoigs.core.maths.frame_times import fill_gaps
 from hoigs.core.maths.rotations import axis_angle_to_matrices
-from hoigs.core.values.camera import Camera
-from hoigs.preparation.mask_stack import Images, MaskStack
+from hoigs.preparation.mask_stack import MaskStack
+from hoigs.preparation.objects.filmed import Filmed
 
 MARGIN = 1.6  # side of a crop over the longer side of the mask's box
 EDGES = 96  # pixels of the outline that a crop keeps
@@ -121,11 +121,7 @@ class Crops:
 
 
 def make_crops(
-    images: Images,
-    masks: MaskStack,
-    humans: MaskStack,
-    others: MaskStack,
-    cameras: Sequence[Camera],
+    filmed: Filmed,
     shown: Bool[np.ndarray, " F"],
     size: int,
     body: Float[Tensor, "F B 3"],
@@ -134,15 +130,15 @@ def make_crops(
     """Crops of the frames in `shown`, `size` pixels wide (an object is 0.6 of that).
 
     Args:
-        others: pixels of other objects, whose depth is unknown: they hide whatever they cover.
         body: points of the person, world, metres. behind: depths from which on the person is
             behind all of the object, and hides nothing of it.
     """
+    masks, humans, others, cameras = filmed.masks, filmed.humans, filmed.others, filmed.cameras
     boxes = _boxes(masks, shown)
     rows: dict[str, list[np.ndarray]] = {
         name: [] for name in ("image", "K", "view", "mask", "hidden", "outside", "edges", "share")
     }
-    for i, image in enumerate(images()):
+    for i, image in enumerate(filmed.images()):
         if not shown[i]:
             continue
         box = boxes[i]
@@ -382,18 +378,26 @@ class Aligned:
     cost: float
 
 
+@dataclass(frozen=True)
+class Effort:
+    """Blur, frames between knots and steps of each level; whether the shape is found, too; and
+    what is told how much is done."""
+
+    levels: Sequence[Level] = LEVELS
+    shape: bool = True
+    progress: Callable[[float], None] = lambda done: None
+
+
 def align(
     crops: Crops,
     surface: Surface,
     start: Poses,
     held: Held,
     fps: float,
-    *,
-    levels: Sequence[Level] = LEVELS,
-    shape: bool = True,
-    progress: Callable[[float], None] | None = None,
+    effort: Effort,
 ) -> Aligned:
     """Poses and shape from a start, coarse to fine: blurred texture and few knots at first."""
+    levels, shape, progress = effort.levels, effort.shape, effort.progress
     problem = _Problem(crops, surface, held, fps)
     poses, vertices = start, surface.rest.clone()
     total, done = sum(steps for _, _, steps in levels), 0

@@ -15,7 +15,7 @@ from torch import Tensor
 from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
-from hoigs.preparation.mask_stack import Images, MaskStack, outlines_of
+from hoigs.preparation.mask_stack import MaskStack, outlines_of
 from hoigs.preparation.objects.ball import (
     BallTrack,
     Cones,
@@ -26,6 +26,7 @@ from hoigs.preparation.objects.ball import (
     contact_radius,
     require_round,
 )
+from hoigs.preparation.objects.filmed import Filmed
 from hoigs.preparation.objects.shape import ColorSampler, held_object, sphere_points
 from hoigs.preparation.objects.tracked import ObjectConfidence, UntrackableError, tracked_object
 from hoigs.preparation.options import ObjectWay
@@ -234,35 +235,26 @@ class MadeObject:
 
 def make_object(
     ball: BallTrack | None,
-    masks: MaskStack,
-    humans: MaskStack,
-    others: MaskStack,
-    cameras: Sequence[Camera],
-    joints: Float[Tensor, "F J 3"] | None,
-    parents: Sequence[int],
-    images: Images,
+    filmed: Filmed,
     *,
     way: ObjectWay,
     radius: float | None,
     count: int,
-    fps: float,
     progress: Callable[[float], None],
-    depths: Float[np.ndarray, " F"] | None = None,
 ) -> MadeObject:
     """A ball's track, or that of something held by its texture; by its outline where that cannot
     be, and the confidence names why.
 
     Args:
-        others: pixels of other objects, which hide this one wherever the person's limbs are.
-        joints: of the body, world, metres; None: nobody is there, and the object is at `depths`
-            along the view. parents: of the joints. way: how; "auto": as a ball
-            where all masks are round, or else by texture, or by outlines where these cover the
-            masks better. radius: of a ball, metres; None: a
-            football's for a tracked ball, and for a round mask that which the limbs at it give.
-            count: of points.
+        way: how; "auto": as a ball where all masks are round, or else by texture, or by outlines
+            where these cover the masks better.
+        radius: of a ball, metres; None: a football's for a tracked ball, and for a round mask that
+            which the limbs at it give.
+        count: of points.
     """
-    hiding = MaskStack(h | o for h, o in zip(humans, others, strict=True))
-    colored = partial(_colored, masks=masks, humans=hiding, cameras=cameras, images=images)
+    masks, cameras, joints = filmed.masks, filmed.cameras, filmed.joints
+    hiding = filmed.hiding()
+    colored = partial(_colored, filmed, hiding)
     if ball is not None:
         track, normals, spread = ball_object(ball, cameras, radius or FOOTBALL, count)
         confidence = ObjectConfidence.none("ball", len(cameras), "a ball's spin is not tracked")
@@ -274,7 +266,7 @@ def make_object(
             if way == "auto":
                 require_round(cones, cameras)
             track, normals, confidence = round_object(
-                cones, masks, cameras, joints, parents, radius, count
+                cones, masks, cameras, joints, filmed.parents, radius, count
             )
             return colored(track, normals, cones.jitter, confidence)
         except NoBallError as reason:
@@ -284,17 +276,14 @@ def make_object(
     try:
         if way == "outline":
             raise UntrackableError("object_track is outline")
-        track, normals, confidence = tracked_object(
-            masks, humans, others, cameras, joints, parents, images, count, fps, progress,
-            depths=depths,
-        )  # fmt: skip
+        track, normals, confidence = tracked_object(filmed, count, progress)
         made = colored(track, normals, _spread(track, confidence), confidence)
         if way == "texture" or np.nanmean(made.ious) >= COVERED:
             return made
     except UntrackableError as reason:
         reasons.append(str(reason))
     wrists = None if joints is None else joints[:, [LEFT_WRIST, RIGHT_WRIST]]
-    track, normals, spread = held_object(masks, list(cameras), wrists, count, depths)
+    track, normals, spread = held_object(masks, list(cameras), wrists, count, filmed.depths)
     confidence = ObjectConfidence.none("outline", len(cameras), "; ".join(reasons))
     rough = colored(track, normals, spread, confidence)
     return rough if made is None else _better_covering(made, rough)
@@ -329,31 +318,26 @@ def _better_covering(made: MadeObject, rough: MadeObject) -> MadeObject:
 
 
 def _colored(
+    filmed: Filmed,
+    hiding: MaskStack,
     track: ObjectTrack,
     normals: Float[Tensor, "P 3"],
     spread: float,
     confidence: ObjectConfidence,
-    masks: MaskStack,
-    humans: MaskStack,
-    cameras: Sequence[Camera],
-    images: Images,
 ) -> MadeObject:
-    track = replace(track, colors=_colors(track, normals, masks, cameras, images))
-    ious = silhouette_ious(track, masks, humans, cameras)
+    track = replace(track, colors=_colors(track, normals, filmed))
+    ious = silhouette_ious(track, filmed.masks, hiding, filmed.cameras)
     return MadeObject(track, spread, confidence, ious)
 
 
 def _colors(
-    track: ObjectTrack,
-    normals: Float[Tensor, "P 3"],
-    masks: MaskStack,
-    cameras: Sequence[Camera],
-    images: Images,
+    track: ObjectTrack, normals: Float[Tensor, "P 3"], filmed: Filmed
 ) -> Float[Tensor, "P 3"]:
     sampler = ColorSampler(track.points, normals)
     seen = np.flatnonzero(track.observed.numpy())
     chosen = set(seen[np.linspace(0, len(seen) - 1, COLOR_FRAMES).round().astype(int)].tolist())
-    for i, image in enumerate(images()):
+    for i, image in enumerate(filmed.images()):
         if i in chosen:
-            sampler.add(image, masks[i], cameras[i], track.rotations[i], track.translations[i])
+            seen_by = filmed.masks[i], filmed.cameras[i]
+            sampler.add(image, *seen_by, track.rotations[i], track.translations[i])
     return sampler.colors()

@@ -13,11 +13,12 @@ from torch import Tensor
 from hoigs.core.maths.rotations import matrices_to_quats, quats_to_matrices, slerp
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
-from hoigs.preparation.mask_stack import Images, MaskStack, Outlines, outlines_of
+from hoigs.preparation.mask_stack import Outlines, outlines_of
 from hoigs.preparation.objects.alignment import (
     LEVELS,
     Aligned,
     Crops,
+    Effort,
     Held,
     Level,
     Poses,
@@ -25,6 +26,7 @@ from hoigs.preparation.objects.alignment import (
     align,
     make_crops,
 )
+from hoigs.preparation.objects.filmed import Filmed
 from hoigs.preparation.objects.hands import HandMotion, along_bones, hand_motion, no_hands
 from hoigs.preparation.objects.search import flights_by_texture, grasps_by_texture
 from hoigs.preparation.objects.shape import completed, hull, with_samples
@@ -72,23 +74,12 @@ class ObjectConfidence:
 
 
 def tracked_object(
-    masks: MaskStack,
-    humans: MaskStack,
-    others: MaskStack,
-    cameras: Sequence[Camera],
-    joints: Float[Tensor, "F J 3"] | None,
-    parents: Sequence[int],
-    images: Images,
+    filmed: Filmed,
     count: int,
-    fps: float,
     progress: Callable[[float], None],
     levels: Sequence[Level] = LEVELS,
-    depths: Float[np.ndarray, " F"] | None = None,
 ) -> tuple[ObjectTrack, Float[Tensor, "P 3"], ObjectConfidence]:
     """Poses and shape by `align`, started from the hands.
-
-    Args:
-        joints: of the body, world, metres; None: nobody is there, and the object is at `depths`.
 
     Returns:
         the track (grey: colours are sampled afterwards), the points' outward normals, and how far
@@ -98,15 +89,16 @@ def tracked_object(
         UntrackableError: too few frames, too small, always cut by the border, or textures that
             do not agree.
     """
-    outlines = outlines_of(masks)
+    cameras = filmed.cameras
+    outlines = outlines_of(filmed.masks)
     _check(outlines)
     bones = torch.zeros(len(cameras), 0, 3)
-    if joints is not None:
-        hands = hand_motion(joints, masks, outlines, cameras, fps)
-        bones = along_bones(joints, parents)
+    if filmed.joints is not None:
+        hands = hand_motion(filmed.joints, filmed.masks, outlines, cameras, filmed.fps)
+        bones = along_bones(filmed.joints, filmed.parents)
     else:
-        assert depths is not None
-        hands = no_hands(outlines, depths, cameras, fps)
+        assert filmed.depths is not None
+        hands = no_hands(outlines, filmed.depths, cameras, filmed.fps)
     shown = outlines.observed
     # metres within which the object lies, from the largest extent of its outlines
     rows = np.flatnonzero(outlines.whole)
@@ -115,7 +107,7 @@ def tracked_object(
     ]
     radius = 0.9 * float(np.quantile(metres, 0.95))
     behind = hands.depths + BEHIND * radius
-    crops = make_crops(images, masks, humans, others, cameras, shown, SIDE, bones, behind)
+    crops = make_crops(filmed, shown, SIDE, bones, behind)
     contrast = crops.contrast(BLUR)
     if contrast < FAINTEST:
         raise UntrackableError(
@@ -131,7 +123,8 @@ def tracked_object(
         torch.from_numpy(grasps[shown]),
         torch.from_numpy(rests[shown]),
     )
-    surface, found = _aligned(crops, start, held, hands, radius, fps, levels, progress)
+    known = _Known(crops, start, held, hands, radius, filmed.fps)
+    surface, found = _aligned(known, levels, progress)
     agreement = _over_frames(found.agreement, shown)
     typical = float(np.nanmedian(found.agreement)) if np.isfinite(found.agreement).any() else 0.0
     if typical < AGREES:
@@ -144,18 +137,24 @@ def tracked_object(
     return _result(found, surface, hands, outlines, agreement, count, depth)
 
 
+@dataclass(frozen=True)
+class _Known:
+    """What the alignment starts from; radius: metres within which the object lies."""
+
+    crops: Crops
+    start: Poses
+    held: Held
+    hands: HandMotion
+    radius: float
+    fps: float
+
+
 def _aligned(
-    crops: Crops,
-    start: Poses,
-    held: Held,
-    hands: HandMotion,
-    radius: float,
-    fps: float,
-    levels: Sequence[Level],
-    progress: Callable[[float], None],
+    known: _Known, levels: Sequence[Level], progress: Callable[[float], None]
 ) -> tuple[Surface, Aligned]:
     """One grasp first, with its rests; the other grasps by what it has shown; flights last, which
     give the shape nothing."""
+    crops, start, hands, radius = known.crops, known.start, known.hands, known.radius
     tied, pieces = ~hands.free[crops.frames], hands.pieces[crops.frames]
     if tied.sum() < FEWEST:  # never held, never at rest: one piece, from no rotation at all
         tied, pieces = np.ones(len(crops), bool), np.zeros(len(crops), int)
@@ -169,8 +168,8 @@ def _aligned(
     def aligned(rows: np.ndarray, poses: Poses, levels: Sequence[Level], shape: bool) -> Aligned:
         step = next(steps)
         return align(
-            crops.rows(rows), surface, poses, held.rows(rows), fps, levels=levels, shape=shape,
-            progress=lambda done: share(done, step),
+            crops.rows(rows), surface, poses, known.held.rows(rows), known.fps,
+            Effort(levels, shape, lambda done: share(done, step)),
         )  # fmt: skip
 
     surface = hull(crops.rows(rows), start.rows(rows), radius, SAMPLES)
@@ -183,7 +182,7 @@ def _aligned(
     if flies:
         rows, flying = np.arange(len(crops)), np.flatnonzero(~tied)
         surface = replace(surface, rest=found.vertices)
-        poses = flights_by_texture(crops, surface, found, start, hands.up, fps)
+        poses = flights_by_texture(crops, surface, found, start, hands.up, known.fps)
         # a flight shows other sides: as many of its frames as of the others shape the hull
         others = np.flatnonzero(tied)[:: max(1, int(tied.sum()) // len(flying))]
         both = np.sort(np.concatenate((flying, others)))

@@ -17,6 +17,7 @@ from hoigs.preparation.objects.ball import (
     fit_cone,
     require_round,
 )
+from hoigs.preparation.objects.filmed import Filmed
 from hoigs.preparation.objects.make_object import make_object
 
 FRAMES, WIDTH, HEIGHT, F, RADIUS = 12, 160, 120, 110.0, 0.11
@@ -111,9 +112,12 @@ def test_limbs_give_the_radius_and_the_rotation_stays_unknown() -> None:
     assert found is not None and found[0] == pytest.approx(RADIUS, rel=0.05)
     assert found[1] == FRAMES and found[2] < 0.05
     images = [np.full((HEIGHT, WIDTH, 3), 90, np.uint8)] * FRAMES
+    parents = (-1, *range(51))
+    shown = Filmed(
+        balls(), NOBODY, NOBODY, CAMERAS, lambda: iter(images), 12.0, joints, parents
+    )  # fmt: skip
     made = make_object(
-        None, balls(), NOBODY, NOBODY, CAMERAS, joints, (-1, *range(51)), lambda: iter(images),
-        way="auto", radius=None, count=200, fps=12.0, progress=lambda _: None,
+        None, shown, way="auto", radius=None, count=200, progress=lambda _: None
     )  # fmt: skip
     assert made.confidence.way == "ball" and "no outline shows" in made.confidence.reason
     assert "rotation is unknown" in made.track.provenance and not made.track.rotation_known

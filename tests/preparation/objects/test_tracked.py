@@ -15,6 +15,7 @@ from hoigs.core.values.clip import ObjectTrack
 from hoigs.preparation.mask_stack import MaskStack, outlines_of
 from hoigs.preparation.objects import make_object as making
 from hoigs.preparation.objects.alignment import Aligned, Poses, make_crops
+from hoigs.preparation.objects.filmed import Filmed
 from hoigs.preparation.objects.hands import hand_motion, upward
 from hoigs.preparation.objects.make_object import ObjectWay, make_object
 from hoigs.preparation.objects.search import ballistic, flights_by_texture
@@ -74,6 +75,14 @@ def filmed(contrast: float = 0.35, *, motion: tuple[torch.Tensor, torch.Tensor] 
     return images, objects, humans, joints
 
 
+def around(
+    images, objects: MaskStack, humans: MaskStack, joints: torch.Tensor | None = None
+) -> Filmed:
+    """As `make_object` needs them."""
+    cameras = [CAMERA] * len(objects)
+    return Filmed(objects, humans, humans, cameras, lambda: iter(images), FPS, joints, PARENTS)
+
+
 def angles(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return torch.rad2deg(torch.acos((((a * b).sum((-1, -2)) - 1) / 2).clamp(-1, 1)))
 
@@ -81,18 +90,9 @@ def angles(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 def test_turning_and_shape_of_a_held_box() -> None:
     images, objects, humans, joints = filmed()
     joints = joints + 0.02 * torch.randn(joints.shape, generator=torch.Generator().manual_seed(1))
+    shown = around(images, objects, humans, joints)
     track, normals, confidence = tracked_object(
-        objects,
-        humans,
-        humans,
-        [CAMERA] * FRAMES,
-        joints,
-        PARENTS,
-        lambda: iter(images),
-        800,
-        FPS,
-        lambda _: None,
-        levels=((5.0, 6, 60), (2.0, 2, 60)),
+        shown, 800, lambda _: None, levels=((5.0, 6, 60), (2.0, 2, 60))
     )
     rotations, places = poses(0.7)
     left, _, right = torch.linalg.svd((track.rotations.mT @ rotations).sum(0))
@@ -111,8 +111,8 @@ def test_what_has_no_texture_is_refused() -> None:
     noisy = np.clip(images + rng.normal(size=images.shape) * 4, 0, 255).astype(np.uint8)
     with pytest.raises(UntrackableError, match="texture"):
         tracked_object(
-            objects, humans, humans, [CAMERA] * FRAMES, joints, PARENTS, lambda: iter(noisy), 99,
-            FPS, lambda _: None, levels=((5.0, 6, 20), (2.0, 2, 20)),
+            around(noisy, objects, humans, joints), 99, lambda _: None,
+            levels=((5.0, 6, 20), (2.0, 2, 20)),
         )  # fmt: skip
 
 
@@ -120,8 +120,8 @@ def test_what_is_seen_briefly_goes_the_old_way_by_name() -> None:
     images, objects, humans, joints = filmed()
     brief = MaskStack(m if i < 5 else np.zeros_like(m) for i, m in enumerate(objects))
     made = make_object(
-        None, brief, humans, humans, [CAMERA] * FRAMES, joints, PARENTS, lambda: iter(images),
-        way="auto", radius=0.1, count=200, fps=FPS, progress=lambda _: None,
+        None, around(images, brief, humans, joints), way="auto", radius=0.1, count=200,
+        progress=lambda _: None,
     )  # fmt: skip
     assert made.confidence.way == "outline" and "5 frames" in made.confidence.reason
     assert "roll" in made.track.provenance
@@ -177,13 +177,13 @@ def test_what_is_hidden_moves_with_the_hands_that_hold_it() -> None:
 
 def test_a_person_behind_the_object_hides_nothing_of_it_but_other_objects_do() -> None:
     images, objects, nothing, _ = filmed()
-    around = MaskStack(~mask for mask in objects)
+    beside = MaskStack(~mask for mask in objects)
     shown = np.ones(FRAMES, bool)
-    cases = ((3.0, around, nothing, 0.0), (1.5, around, nothing, 1.0), (3.0, nothing, around, 1.0))
+    cases = ((3.0, beside, nothing, 0.0), (1.5, beside, nothing, 1.0), (3.0, nothing, beside, 1.0))
     for depth, person, others, share in cases:
         body = torch.tensor([0.0, 0.0, depth]).expand(FRAMES, 1, 3)
         crops = make_crops(
-            lambda: iter(images), objects, person, others, [CAMERA] * FRAMES, shown, 32, body,
+            replace(around(images, objects, person), others=others), shown, 32, body,
             np.full(FRAMES, 2.2),
         )  # fmt: skip
         assert float(crops.hidden[crops.masks == 0].mean()) == share
@@ -195,8 +195,8 @@ def test_a_back_that_no_frame_shows_is_filled(angle: float, one_sided: bool) -> 
     rotations, places = poses(angle)
     images, objects, humans, _ = filmed(motion=(rotations, places))
     crops = make_crops(
-        lambda: iter(images), objects, humans, humans, [CAMERA] * FRAMES, np.ones(FRAMES, bool),
-        96, torch.zeros(FRAMES, 0, 3), np.full(FRAMES, 2.5),
+        around(images, objects, humans), np.ones(FRAMES, bool), 96, torch.zeros(FRAMES, 0, 3),
+        np.full(FRAMES, 2.5),
     )  # fmt: skip
     known = Poses(rotations, places)
     surface = hull(crops, known, 0.35, 800)
@@ -221,8 +221,8 @@ def test_what_is_seen_from_above_does_not_hang_down_at_the_back() -> None:
     rotations = axis_angle_to_matrices(torch.tensor([0.4, 0.0, 0.0])) @ swing
     images, objects, humans, _ = filmed(motion=(rotations, places))
     crops = make_crops(
-        lambda: iter(images), objects, humans, humans, [CAMERA] * FRAMES, np.ones(FRAMES, bool),
-        96, torch.zeros(FRAMES, 0, 3), np.full(FRAMES, 2.5),
+        around(images, objects, humans), np.ones(FRAMES, bool), 96, torch.zeros(FRAMES, 0, 3),
+        np.full(FRAMES, 2.5),
     )  # fmt: skip
     surface = hull(crops, Poses(rotations, places), 0.35, 800)
     found, depth = completed(crops, surface, Poses(rotations, places), surface.rest, 0.35)
@@ -242,10 +242,9 @@ def test_a_spin_in_flight_is_found_by_texture() -> None:
     turns[flight, 0] = torch.linspace(0, 2 * torch.pi, 8)[1:-1]
     rotations = axis_angle_to_matrices(turns)
     images, objects, humans, _ = filmed(motion=(rotations, places))
-    cameras = [CAMERA] * FRAMES
     crops = make_crops(
-        lambda: iter(images), objects, humans, humans, cameras, np.ones(FRAMES, bool), 64,
-        torch.zeros(FRAMES, 0, 3), np.ones(FRAMES),
+        around(images, objects, humans), np.ones(FRAMES, bool), 64, torch.zeros(FRAMES, 0, 3),
+        np.ones(FRAMES),
     )  # fmt: skip
     known = np.array([i for i in range(FRAMES) if not 3 <= i < 9])
     surface = hull(crops, Poses(rotations, places), 0.3, 600)
@@ -301,8 +300,8 @@ def test_a_shape_far_off_its_masks_is_refused(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(making, "tracked_object", collapsed)
     made = make_object(
-        None, objects, humans, humans, [CAMERA] * FRAMES, joints, PARENTS, lambda: iter(images),
-        way="texture", radius=None, count=200, fps=FPS, progress=lambda _: None,
+        None, around(images, objects, humans, joints), way="texture", radius=None, count=200,
+        progress=lambda _: None,
     )  # fmt: skip
     assert made.confidence.way == "outline" and "off its masks" in made.confidence.reason
 
@@ -316,9 +315,9 @@ def test_poses_that_leave_the_masks_lose_to_the_outlines(
 ) -> None:
     """As of something shiny, whose texture is that of what it mirrors."""
     images, objects, humans, joints = filmed()
-    around = (humans, humans, [CAMERA] * FRAMES, joints, PARENTS, lambda: iter(images))
-    settings = {"radius": None, "count": 400, "fps": FPS, "progress": lambda _: None}
-    good = make_object(None, objects, *around, way="outline", **settings)  # type: ignore[arg-type]
+    shown = around(images, objects, humans, joints)
+    settings = {"radius": None, "count": 400, "progress": lambda _: None}
+    good = make_object(None, shown, way="outline", **settings)  # type: ignore[arg-type]
 
     def moved(*arguments: object, **_: object) -> object:
         places = good.track.translations + torch.tensor([beside, 0.0, 0.0])
@@ -328,6 +327,6 @@ def test_poses_that_leave_the_masks_lose_to_the_outlines(
         return replace(good.track, translations=places), good.track.points, confidence
 
     monkeypatch.setattr(making, "tracked_object", moved)
-    made = make_object(None, objects, *around, way=way, **settings)  # type: ignore[arg-type]
+    made = make_object(None, shown, way=way, **settings)  # type: ignore[arg-type]
     assert made.confidence.way == taken
     assert ("cover its masks by" in made.confidence.reason) == (taken == "outline")
