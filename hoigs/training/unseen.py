@@ -116,7 +116,8 @@ def spread(
 # No pixel constrains its Gaussians except through half-transparent people and objects in front, and
 # Adam takes full steps however small such a gradient is: seen from the side, these Gaussians become
 # stripes of arbitrary colours. Here they become an opaque surface in the colours of the clip's
-# points, or of the scene around, and get no gradients, so that people and objects explain the images.
+# points, or of the scene around, and get no gradients, so that people and objects explain the
+# images.
 
 HIDDEN, SHOWN = 0.05, 0.15  # shares of the weight without anything in front; 0 and 1 of it kept
 MOST = 20_000  # Gaussians whose colours are solved for together; others take their neighbour's
