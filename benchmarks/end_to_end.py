@@ -24,7 +24,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from estimates.figures import body_figures, camera_motion, draw_masks, object_figures
+from estimates.figures import (
+    body_figures,
+    camera_motion,
+    contact_figures,
+    draw_masks,
+    object_figures,
+)
 from estimates.source import landmarks, write_video
 from estimates.training import Training, trained
 from object_tracking import click_on
@@ -122,7 +128,8 @@ def figures(made: Any, truth: Any, true_folder: Path, found: Any, body: Any) -> 
     if "object" not in made.objects:
         return row | {"object_iou": "not computed: no object was found"}
     row["object_iou"] = overlaps([f.masks["object"] for f in made], truth, "object")
-    return row | object_figures(made, truth, true_folder, world)
+    row |= object_figures(made, truth, true_folder, world)
+    return row | contact_figures(made, truth, true_folder, body)
 
 
 def overlaps(masks: list[Any], truth: Any, name: str) -> dict[str, Any]:
@@ -172,6 +179,7 @@ def table(found: dict[str, Any]) -> str:
     head = (
         "clip, prompt", "person IoU", "object IoU, worst 5 %", "frames without it", "landmarks px",
         "focal", "scale", "joints mm, root-aligned", "joints mm", "object mm", "object °",
+        "contact F1",
         "PSNR person + object", "all given",
     )  # fmt: skip
     lines = [head, ("---",) * len(head)]
@@ -184,6 +192,7 @@ def table(found: dict[str, Any]) -> str:
             _at(row, "object_iou", "empty"), _at(row, "landmarks_px", "median"),
             row.get("focal_ratio"), row.get("scale_ratio"), row.get("root_aligned_joints_mm"),
             row.get("joints_mm"), _at(row, "place_mm", "mean"), _at(row, "rotation_deg", "median"),
+            _at(row, "contact", "f1"),
             *runs,
         )  # fmt: skip
         cells = ["-" if v is None else "still" if str(v).startswith("not") else v for v in shown]

@@ -74,6 +74,59 @@ def _joints(body: Any, clip: Any) -> np.ndarray:
     return np.stack(joints)[:, :22]
 
 
+TRUE_CONTACT, CONTACT = (
+    0.01,
+    0.03,
+)  # metres from the skin of a hand to the surface, and to its points
+
+
+def contact_figures(made: Any, truth: Any, truth_folder: Path, body: Any) -> dict[str, Any]:
+    """Which hand touches the object in which frame: precision, recall and F1; and, where one truly
+    does, how far apart both are."""
+    from hoigs.core.interfaces.body import LEFT_HAND_PART, RIGHT_HAND_PART
+    from hoigs.core.system.npz import load_arrays
+
+    arrays, track = load_arrays(truth_folder / "truth.npz"), made.objects["object"]
+    true_points = surface(arrays["object_vertices"], arrays["object_faces"])
+    points = track.points.double().numpy()
+    hands = [body.vertex_parts == part for part in (LEFT_HAND_PART, RIGHT_HAND_PART)]
+    found = _hand_distances(
+        made, body, hands, points, track.rotations.double().numpy(),
+        track.translations.double().numpy(),
+    )  # fmt: skip
+    true = _hand_distances(
+        truth, body, hands, true_points, arrays["object_rotations"], arrays["object_translations"]
+    )
+    touching, touched = found < CONTACT, true < TRUE_CONTACT
+    both = int((touching & touched).sum())
+    precision, recall = both / max(1, int(touching.sum())), both / max(1, int(touched.sum()))
+    if not touched.any():
+        return {"contact": "not computed: no hand touches the object"}
+    return {
+        "contact": {
+            "precision": round(precision, 3), "recall": round(recall, 3),
+            "f1": round(2 * both / max(1, int(touching.sum()) + int(touched.sum())), 3),
+            "apart_mm": round(float(1000 * np.median(found[touched])), 1),
+            "hands_in_frames": int(touched.sum()),
+        }
+    }  # fmt: skip
+
+
+def _hand_distances(
+    clip: Any, body: Any, hands: Any, points: np.ndarray, rotations: np.ndarray, places: np.ndarray
+) -> np.ndarray:
+    """Metres from each hand to the object in each frame, [F, 2]."""
+    from scipy.spatial import cKDTree
+
+    from hoigs.preparation.body.mask_fit import posed
+
+    tree, found = cKDTree(points), []
+    for i, (vertices, _) in enumerate(posed(body, clip.bodies["human"].poses)):
+        local = (vertices.double().numpy() - places[i]) @ rotations[i]  # into the object's frame
+        found.append([tree.query(local[hand.numpy()])[0].min() for hand in hands])
+    return np.array(found)
+
+
 def camera_motion(made: Any, truth: Any) -> World:
     """The rigid motion that takes a clip's cameras nearest to the true ones. It has no scale: an
     error of the world's scale stays in the figures."""

@@ -268,7 +268,12 @@ def row(answer: Answer, step: Step) -> list[str]:
     return [
         step.candidate.name,
         *cells,
-        "chosen" if step.candidate is answer.chosen else "rejected",
+        ("chosen" if step.candidate is answer.chosen else "rejected")
+        + (
+            ""
+            if step.useless is None
+            else f"; where it is the truth, the best gains {step.useless}"
+        ),
     ]
 
 
@@ -299,13 +304,13 @@ def method(needs: Needs) -> list[str]:
 
 
 def _tolerances(needs: Needs) -> str:
-    """Tolerances that search spaces declare: "; interaction 0.5 dB; object 0.6 dB for every …"."""
+    """Tolerances that search spaces declare: "; interaction 0.5 dB; object beyond what …"."""
     spaces = {a.space.name: a.space for a in needs.answers if a.steps}.values()
     own = [f"; {space.name} {space.least:g} dB" for space in spaces if space.least is not None]
     own += [
-        f"; {space.name} {space.min_gain:g} dB for every doubling of parameters"
+        f"; {space.name} beyond what the same freedom gains where the cheaper one is the truth"
         for space in spaces
-        if space.min_gain > 0
+        if space.calibrated
     ]
     return "".join(own)
 
@@ -340,6 +345,7 @@ def _answer(answer: Answer) -> dict[str, Any]:
             "seconds": step.seconds,
             "score": None if step.score is None else asdict(step.score),
             "over_chosen": None if step.over_chosen is None else asdict(step.over_chosen),
+            "useless": None if step.useless is None else asdict(step.useless),
             "problem": step.problem,
         }
         for step in answer.steps

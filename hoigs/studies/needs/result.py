@@ -111,13 +111,16 @@ class Step:
 
     Attributes:
         score: at `steps`, the last at which the chosen candidate was scored too. over_chosen: gain
-            over the chosen candidate there. problem: why it could not be built.
+            over the chosen candidate there. useless: what the best one gains over this one where
+            this one is the truth; None where that was not measured. problem: why it could not be
+            built.
     """
 
     candidate: Candidate
     steps: int = 0
     score: Score | None = None
     over_chosen: Gain | None = None
+    useless: Gain | None = None
     seconds: float = 0.0
     problem: str = ""
 

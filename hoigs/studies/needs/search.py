@@ -13,6 +13,7 @@ from hoigs.core.errors import SpecError
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
+from hoigs.studies.needs.calibration import calibrated
 from hoigs.studies.needs.result import (
     AFTER,
     FINAL,
@@ -29,9 +30,9 @@ from hoigs.studies.needs.search_space import (
     SCORING,
     BudgetError,
     Candidate,
+    Gain,
     Halving,
     Overrides,
-    Rule,
     SearchSpace,
     StepBudget,
     as_settings,
@@ -45,6 +46,7 @@ from hoigs.studies.needs.search_space import (
 from hoigs.studies.needs.trial import SELECTION, Trial, isolated, selection_view
 
 Report = Callable[[str], None]
+CALIBRATION = 0.5  # of the budget of a search space that is calibrated
 
 
 @dataclass
@@ -166,7 +168,8 @@ class Search:
             self._overrides(candidate, blocks) for candidate in space.candidates
         ):
             return Answer(space, block, None, skipped="no chosen component has this setting")
-        held = len(self.held)
+        held, apart = len(self.held), CALIBRATION * budget if space.calibrated else 0.0
+        budget -= apart
         try:
             longest = plan([r.cost for r in space.candidates], budget, held, self.most).steps
         except BudgetError as error:
@@ -174,26 +177,37 @@ class Search:
         trials, steps = self._trials(space, block, blocks, longest)
         tried = [candidate for candidate in space.candidates if candidate.name in trials]
         place, refitted = 0, ""
+        useless: Mapping[int, Gain] = {}
         if len(tried) > 1:
             costs = [candidate.cost for candidate in tried]
+            least = self.settings.least if space.least is None else space.least
+            what = f"{space.name} {block}".strip()
+            rounds = plan(costs, budget, held, longest)
             halving = successive_halving(
-                plan(costs, budget, held, longest),
+                rounds,
                 costs,
                 held,
                 lambda k, until: trials[tried[k].name].advance(until),
                 self.budget,
-                rule=Rule(
-                    self.settings.least if space.least is None else space.least,
-                    space.min_gain,
-                ),
-                what=f"{space.name} {block}".strip(),
+                least=least,
+                what=what,
             )
+            if space.calibrated:
+                allowance = StepBudget(min(apart, self.budget.left))
+                found = calibrated(
+                    [trials[candidate.name] for candidate in tried], costs, halving, rounds.steps,
+                    allowance, least=least, what=what,
+                )  # fmt: skip
+                for entry in allowance.entries:
+                    self.budget.spend(*entry)
+                halving, useless = replace(halving, chosen=found.chosen), found.useless
             place = cheapest_refit(tried, halving.chosen, trials, self.clip)
             if place != halving.chosen:
                 refitted = tried[halving.chosen].name
                 halving = replace(halving, chosen=place)
             for k, candidate in enumerate(tried):
-                steps[candidate.name] = _step(candidate, k, halving, trials[candidate.name].seconds)
+                step = _step(candidate, k, halving, trials[candidate.name].seconds)
+                steps[candidate.name] = replace(step, useless=useless.get(k))
         chosen = tried[place]
         rows = tuple(steps.get(candidate.name, Step(candidate)) for candidate in space.candidates)
         why = "" if len(tried) > 1 else "no other of its candidates can be built here"
@@ -260,7 +274,7 @@ class Search:
 def _step(candidate: Candidate, k: int, halving: Halving, seconds: float) -> Step:
     steps, own, chosen = halving.last_common(k, halving.chosen)
     over = None if k == halving.chosen else gain(own, chosen)
-    return Step(candidate, steps, own, over, seconds)
+    return Step(candidate, steps, own, over, seconds=seconds)
 
 
 def _blocks(spec: Spec, clip: Clip) -> tuple[dict[str, list[str]], dict[str, list[str]]]:

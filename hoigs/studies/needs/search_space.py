@@ -61,8 +61,9 @@ class SearchSpace(ComponentConfig):
     """Of the search's budget, relative to the other search spaces."""
     least: float | None = Field(default=None, ge=0)
     """dB within which a cheaper candidate is taken; None takes `Settings.least`."""
-    min_gain: float = Field(default=0.0, ge=0)
-    """dB that a candidate must gain for every doubling of the trial's parameters."""
+    calibrated: bool = False
+    """Whether the gain of a dearer candidate counts only beyond what it gains where the cheaper one
+    is the truth (`calibration`)."""
     during: Overrides = Field(default_factory=dict)
     """Overrides of every trial, below those of its candidate."""
     unless: dict[str, tuple[str, ...]] = Field(default_factory=dict)
@@ -246,42 +247,20 @@ def gain(of: Score, over: Score) -> Gain:
     return Gain(mean(differences), stdev(differences) / math.sqrt(len(differences)))
 
 
-def near_best(
-    scores: Sequence[Score], least: float = 0.0, min_gain: float = 0.0, errors: float = 1.0
-) -> list[bool]:
+def near_best(scores: Sequence[Score], least: float = 0.0, errors: float = 1.0) -> list[bool]:
     """Whether each score is as good as the best: within `errors` standard errors of the paired
-    difference, within `least` dB, or within `min_gain` dB for every doubling of trained parameters
-    up to those of the best."""
+    difference, or within `least` dB."""
     best = max(scores, key=lambda score: score.mean)
-
-    def tolerance(score: Score) -> float:
-        larger = max(best.parameters, 1) / max(score.parameters, 1)
-        return max(least, min_gain * math.log2(max(larger, 1.0)))
-
     gains = [gain(best, score) for score in scores]
-    return [
-        g.mean <= max(errors * g.error, tolerance(s)) for g, s in zip(gains, scores, strict=True)
-    ]
+    return [g.mean <= max(errors * g.error, least) for g in gains]
 
 
-@dataclass(frozen=True)
-class Rule:
-    """How one of several candidates is chosen.
-
-    Attributes:
-        least, min_gain: as `near_best` has them.
-    """
-
-    least: float = 0.0
-    min_gain: float = 0.0
-
-
-def choose(scores: Sequence[Score], rule: Rule) -> int:
+def choose(scores: Sequence[Score], least: float = 0.0) -> int:
     """Index of the candidate to keep; scores are in order of cost."""
-    return near_best(scores, rule.least, rule.min_gain).index(True)
+    return near_best(scores, least).index(True)
 
 
-def ranked(scores: Sequence[Score], rule: Rule) -> list[int]:
+def ranked(scores: Sequence[Score], least: float = 0.0) -> list[int]:
     """Indices from the likeliest choice to the least likely: candidates that may be as good as the
     best by cost, then the others by score. The best itself is always among the first two.
 
@@ -291,7 +270,7 @@ def ranked(scores: Sequence[Score], rule: Rule) -> list[int]:
     exclude the one that they have to be compared with.
     """
     places = range(len(scores))
-    near = near_best(scores, rule.least, rule.min_gain, PATIENCE)
+    near = near_best(scores, least, PATIENCE)
     order = sorted(places, key=lambda k: (not near[k], k if near[k] else -scores[k].mean))
     best = max(places, key=lambda k: scores[k].mean)
     if order.index(best) > 1:
@@ -415,7 +394,7 @@ def successive_halving(
     advance: Advance,
     budget: StepBudget,
     *,
-    rule: Rule,
+    least: float,
     what: str = "",
 ) -> Halving:
     """Halve until two candidates are left, and choose between them.
@@ -424,6 +403,7 @@ def successive_halving(
         plan: from `plan`. costs: of a step of each candidate, the cheapest first.
         frames: number of frames scored in each round. advance: trains and scores a candidate.
         budget: each training is entered before it runs, as `what`.
+        least: dB, as `near_best` has it.
 
     Raises:
         BudgetError: the plan exceeds the budget; no training beyond it has run.
@@ -432,11 +412,11 @@ def successive_halving(
     alive, before = list(range(len(costs))), 0
     for count, until in zip(plan.alive, plan.until, strict=True):
         if len(alive) > count:
-            order = ranked([scores[k][before] for k in alive], rule)
+            order = ranked([scores[k][before] for k in alive], least)
             alive = sorted(alive[place] for place in order[:count])
         for k in alive:
             budget.spend(f"{what}[{k}]", costs[k] * (until - before + SCORING * frames))
             scores[k][until] = advance(k, until)
         before = until
-    chosen = alive[choose([scores[k][before] for k in alive], rule)]
+    chosen = alive[choose([scores[k][before] for k in alive], least)]
     return Halving(chosen, tuple(scores))

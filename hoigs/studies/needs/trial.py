@@ -174,6 +174,7 @@ class Trial:
     ) -> None:
         torch.manual_seed(spec.train.seed)
         self.view, self.region, self.names = view, region, tuple(names)
+        self._made = spec, registry, device
         with warnings.catch_warnings():
             # few knots on a turning object are what is being tried
             warnings.filterwarnings("ignore", message="the object turns")
@@ -187,6 +188,11 @@ class Trial:
     @property
     def parameters(self) -> int:
         return sum(p.numel() for p in self.model.parameters() if p.requires_grad)
+
+    def on(self, view: Clip) -> Trial:
+        """The same trial from its beginning, on a view with other images."""
+        spec, registry, device = self._made
+        return Trial(spec, view, self.region, self.names, registry, device)
 
     def advance(self, until: int) -> Score:
         """Train on to a step, and score."""

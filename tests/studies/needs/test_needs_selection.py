@@ -12,7 +12,6 @@ from hoigs.studies.needs.search_space import (
     PATIENCE,
     SCORING,
     BudgetError,
-    Rule,
     Score,
     StepBudget,
     choose,
@@ -53,43 +52,25 @@ def test_gain_refuses_other_frames_and_single_ones():
 
 def test_cheapest_within_one_error_of_the_best():
     steady = [score(20, 21, 22), score(25, 26, 27), score(25.5, 26.5, 27.4)]
-    assert choose(steady, Rule()) == 2  # 0.47 dB better at an error of 0.03
+    assert choose(steady) == 2  # 0.47 dB better at an error of 0.03
     noisy = [score(20, 21, 22), score(25, 26, 27), score(27, 26.4, 26)]
     assert near_best(noisy) == [False, True, True]
-    assert choose(noisy, Rule()) == 1
+    assert choose(noisy) == 1
 
 
 def test_equal_candidates_give_the_cheapest():
-    assert choose([score(20, 21), score(20, 21), score(20, 21)], Rule()) == 0
-
-
-def test_a_doubling_of_parameters_must_gain_enough():
-    """Four times the parameters must gain twice `min_gain`, and more than the error."""
-    small = score(20, 22, 24, parameters=1000)
-    large = score(21.4, 23.5, 25.6, parameters=4000)  # 1.5 dB better
-    assert choose([small, large], Rule(min_gain=0.74)) == 1
-    assert choose([small, large], Rule(min_gain=0.76)) == 0
-    few = score(21.4, 23.5, 25.6, parameters=10)
-    assert choose([small, few], Rule(min_gain=9)) == 1  # fewer parameters: no gain is required
-    table = [small, score(20, 22, 24, parameters=2000), large]
-    assert ranked(table, Rule(0.1, 0.76)) == [
-        0,
-        2,
-        1,
-    ]  # 1.5 dB over half of it is worth it
-    assert ranked(table, Rule(0.1, 2.0)) == [0, 2, 1]  # the best stays all the same
-    assert ranked(table, Rule(0.1)) == [2, 0, 1]
+    assert choose([score(20, 21), score(20, 21), score(20, 21)]) == 0
 
 
 def test_least_gain_counts_for_nothing():
     table = [score(25, 26, 27), score(25.05, 26.06, 27.05)]
-    assert choose(table, Rule()) == 1
-    assert choose(table, Rule(least=0.1)) == 0
+    assert choose(table) == 1
+    assert choose(table, 0.1) == 0
 
 
 def test_ranking_puts_the_cheap_before_its_equals_and_the_good_before_the_bad():
     table = [score(10, 11), score(25, 26), score(20, 21), score(25, 26.1)]
-    assert ranked(table, Rule(0.1)) == [1, 3, 2, 0]
+    assert ranked(table, 0.1) == [1, 3, 2, 0]
 
 
 def test_the_best_is_not_crowded_out_by_those_that_few_frames_cannot_tell_from_it():
@@ -97,7 +78,7 @@ def test_the_best_is_not_crowded_out_by_those_that_few_frames_cannot_tell_from_i
     cheap, cheaper = score(10, 10.5, 19), score(10.2, 10, 19)
     table = [cheaper, cheap, score(10, 10.5, 19.5), score(16, 10.5, 19)]
     assert near_best(table, 0.1, errors=PATIENCE) == [True] * 4
-    assert ranked(table, Rule(0.1)) == [0, 3, 1, 2]
+    assert ranked(table, 0.1) == [0, 3, 1, 2]
 
 
 # -- halving ---------------------------------------------------------------------------------------
@@ -160,7 +141,7 @@ def test_halving_finds_the_cheapest_that_is_good_enough():
     toy, costs = Toy([15, 22, 30, 30.05, 30.1, 29.0, 30.0]), [1.0] * 7
     shape = plan(costs, 2000, 3, most=10_000)
     budget = StepBudget(2000)
-    halving = successive_halving(shape, costs, 3, toy, budget, rule=Rule(least=0.2))
+    halving = successive_halving(shape, costs, 3, toy, budget, least=0.2)
     assert halving.chosen == 2
     trained = [sum(1 for k, _ in toy.calls if k == candidate) for candidate in range(7)]
     assert trained[2] == 3 and trained[0] == 1 and sorted(trained) == [1, 1, 1, 2, 2, 3, 3]
@@ -173,7 +154,7 @@ def test_the_budget_is_checked_before_each_training():
     toy, costs = Toy([20, 21]), [1.0, 1.0]
     shape = plan(costs, 100, 3, most=1000)
     with pytest.raises(BudgetError, match="left"):
-        successive_halving(shape, costs, 3, toy, StepBudget(60), rule=Rule(), what="object")
+        successive_halving(shape, costs, 3, toy, StepBudget(60), least=0.0, what="object")
     assert len(toy.calls) == 1  # the second would have gone beyond
 
 

@@ -84,3 +84,15 @@ def test_frames_that_were_not_seen_weigh_a_tenth() -> None:
 def test_the_largest_step_between_keyframes() -> None:
     assert RigidTrack(track()).largest_step(3) == pytest.approx(0.5, abs=1e-3)
     assert RigidTrack(track()).largest_step(5) == pytest.approx(0.25, abs=1e-3)
+
+
+def test_two_frames_are_met_at_their_own_times() -> None:
+    motion = RigidTrack(track((0.0, 0.5), frames=2))
+    assert float(motion.at(0.25)[1][0]) == pytest.approx(0.5)  # of evenly spaced ones: 0.25
+
+
+def test_rounding_above_one_is_no_turn() -> None:
+    turned = quats_to_matrices(axis_angle_to_quats(torch.tensor([0.3, 0.5, 0.7])))
+    motion = RigidTrack(replace(track(), rotations=turned.expand(6, 3, 3)))
+    motion.quats *= 1 + 1e-6
+    assert motion.largest_step(5) == pytest.approx(0, abs=1e-2)

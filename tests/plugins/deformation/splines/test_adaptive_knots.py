@@ -254,3 +254,40 @@ def test_a_checkpoint_of_another_shape_is_refused():
     state["deformation.keyframe_means"] = state["deformation.keyframe_means"][:5]
     with pytest.raises(RuntimeError, match="size mismatch"):
         adaptive("chs").load_state_dict(state)
+
+
+def test_an_interval_s_error_is_the_mean_of_the_frames_that_were_drawn():
+    """Frames of the first interval are drawn often, and those of the last badly."""
+    entity = adaptive("rigid", count=5, insert_by="residual", share=0.1)
+    model = entity.deformation
+    for _ in range(9):
+        model.schedule.observe(seen(3 / 32, 1.0, 1))
+    for frame in range(FRAMES):
+        model.schedule.observe(seen(frame / 32, 2.0 if frame > 24 else 1.0, 1))
+    scores = model.schedule._scores(model, entity.canonical, model.knots.tolist())
+    assert scores[0] == pytest.approx(1.0) and scores[3] == pytest.approx(17 / 9)
+    model.schedule.insert(model, entity.canonical.detach())
+    assert model.knots.tolist() == [0, 0.25, 0.5, 0.75, 0.875, 1]
+
+
+def test_half_of_the_intervals_are_halved_where_half_may():
+    entity = adaptive("rigid", count=9, insert_by="residual", share=0.5)
+    for frame in range(FRAMES):
+        entity.deformation.schedule.observe(seen(frame / 32, 1.0, 1))
+    entity.deformation.schedule.insert(entity.deformation, entity.canonical.detach())
+    assert len(entity.deformation.knots) == 13
+
+
+def test_acceleration_is_the_second_difference_in_pixels():
+    """A parabola's is the same everywhere, and nothing at the ends of the clip."""
+    entity = adaptive("rigid", count=9, insert_by="acceleration")
+    follow(entity, lambda t: 0.4 * (t - 0.5) ** 2)
+    model, canonical = entity.deformation, entity.canonical.detach()
+    scores = model.schedule._scores(model, canonical, model.knots.tolist())
+    each = 2 * 0.4 / 32**2 / PIXEL / 8**2  # by the squared length of an interval
+    assert scores[3] == pytest.approx(each, rel=0.1)
+    assert scores[0] == pytest.approx(0.8 * each, rel=0.1)  # four of its five frames have one
+
+
+def test_knots_that_move_are_not_held_to_even_accelerations():
+    assert "acceleration" not in adaptive("rigid").deformation.regularizers()

@@ -1,0 +1,103 @@
+"""A gain counts only beyond what the same freedom brings where it is useless."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+import torch
+
+from hoigs.core.registry.registry import default_registry
+from hoigs.core.spec.schema import Spec
+from hoigs.runs.clip_source import read_clip
+from hoigs.studies.needs import calibration
+from hoigs.studies.needs.calibration import as_if_true, calibrated
+from hoigs.studies.needs.search_space import Halving, Score, StepBudget, as_settings
+from hoigs.studies.needs.trial import SELECTION, Trial, isolated, region_of, selection_view
+
+STEPS = 8
+
+
+def score(*psnr: float) -> Score:
+    return Score(psnr, tuple(1.0 for _ in psnr), tuple(100 for _ in psnr), 10)
+
+
+@dataclass
+class Pretended:
+    """A trial that scores what it is told to, on the clip and where a cheaper one is the truth."""
+
+    real: Score
+    useless: Score
+    advanced: list[str] = field(default_factory=list)
+
+    def advance(self, until: int) -> Score:
+        assert until == STEPS
+        self.advanced.append("clip")
+        return self.real
+
+    def on(self, view: Any) -> Pretended:
+        del view
+        return Pretended(self.useless, self.useless)
+
+
+SIMPLE = score(20.0, 21.0, 22.0)
+RICH = score(21.0, 22.1, 22.9)  # 1 dB ahead on the clip
+
+
+@pytest.fixture(autouse=True)
+def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibration, "as_if_true", lambda trial: trial)
+
+
+def chosen(useless: Score, allowance: float = 1e3) -> tuple[calibration.Calibrated, StepBudget]:
+    trials: Any = [Pretended(SIMPLE, SIMPLE), Pretended(RICH, useless)]
+    halving = Halving(0, ({4: SIMPLE}, {4: RICH, STEPS: RICH}))
+    budget = StepBudget(allowance)
+    return calibrated(trials, [0.5, 1.0], halving, STEPS, budget, least=0.0), budget
+
+
+def test_what_gains_as_much_where_it_is_useless_is_not_needed() -> None:
+    found, budget = chosen(useless=score(20.9, 22.0, 23.0))
+    assert found.chosen == 0 and found.useless[0].mean == pytest.approx(0.97, abs=0.01)
+    # what is left of the simple one's trial, two trainings on its drawings, three scorings
+    assert budget.spent == pytest.approx(0.5 * 4 + 1.5 * 8 + (0.5 + 1.5) * 0.4 * 3)
+
+
+def test_what_gains_nothing_where_it_is_useless_is_needed() -> None:
+    found, _ = chosen(useless=score(20.0, 20.9, 22.0))
+    assert found.chosen == 1
+
+
+def test_without_an_allowance_a_gain_counts_as_it_is() -> None:
+    found, budget = chosen(useless=score(20.9, 22.0, 23.0), allowance=1.0)
+    assert found.chosen == 1 and not found.useless and budget.spent == 0
+
+
+def test_an_obvious_gain_costs_nothing() -> None:
+    trials: Any = [Pretended(SIMPLE, SIMPLE), Pretended(score(30, 31, 32), SIMPLE)]
+    halving = Halving(0, ({4: SIMPLE}, {4: score(30, 31, 32), STEPS: score(30, 31, 32)}))
+    budget = StepBudget(1e3)
+    assert calibrated(trials, [1, 1], halving, STEPS, budget, least=0.0).chosen == 1
+    assert budget.spent == 0
+
+
+def test_the_drawn_view_differs_where_the_trial_is_scored_alone(monkeypatch) -> None:
+    monkeypatch.undo()
+    view = selection_view(read_clip(
+        "builtin:still-box?frames=12&width=32&height=32&samples=1&edge_samples=1&object_points=80"
+        "&scene_points=100&held_out_views=0"
+    ))  # fmt: skip
+    overrides = isolated("object", ["object"], {"object": ["object"], "human": ["human"]}, 4)
+    spec = Spec.load("hoigs", overrides=as_settings(overrides))
+    trial = Trial(spec, view, "own", ["object"], default_registry())
+    trial.advance(4)
+    drawn, again = as_if_true(trial), as_if_true(trial)
+    changed = 0
+    for position in (*view.split["train"], *view.split[SELECTION]):
+        before, after = view[position], drawn[position]
+        where = region_of(before, view, "own", ["object"])
+        assert torch.equal(before.rgb[~where], after.rgb[~where])
+        assert torch.equal(after.rgb, again[position].rgb)
+        changed += bool((before.rgb[where] != after.rgb[where]).any())
+    assert 0 < changed < len(view.split["train"]) + len(view.split[SELECTION])
