@@ -74,6 +74,7 @@ class Provenance(_Record):
     allow_faults: bool = False
     clip_faults: list[FaultRecord] = []
     clip_provenance: dict[str, Any] = {}
+    cuda_graphs: dict[str, Any] = {}
 
 
 class SamplerRecord(_Record):

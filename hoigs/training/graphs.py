@@ -233,8 +233,10 @@ class GraphKey:
 
 Mode = Literal["graph", "cached", "plain"]
 FIELDS = tuple(f.name for f in fields(Gaussians))
-# largest relative L2 difference of a tensor between a graph and eager execution
-VALUE_TOLERANCE, GRADIENT_TOLERANCE = 1e-4, 1e-3
+# Largest relative L2 difference of a tensor between a graph and eager execution. Sums in another
+# order differed by 6e-4 in tokens of a recorded clip; what a graph reads from memory that is not
+# its own any more is another picture.
+TOLERANCE = 2e-3
 
 
 @dataclass(frozen=True)
@@ -401,7 +403,7 @@ class GraphedScene:
             return "the graph does not have the outputs of eager execution"
         names = {" of ".join(key[::-1]): key for key in eager}
         pairs = {f"{n} of the graph": (graphed[k], eager[k].detach()) for n, k in names.items()}
-        difference = _first_difference(pairs, VALUE_TOLERANCE)
+        difference = _first_difference(pairs)
         if difference is not None:
             return difference
         generator = torch.Generator(self._model.device).manual_seed(0)  # not the run's own numbers
@@ -421,7 +423,7 @@ class GraphedScene:
                 return f"{name} has a gradient either by the graph or by eager execution, not both"
             if ours is not None and theirs is not None:
                 pairs[f"the gradient of {name} by the graph"] = (ours, theirs)
-        return _first_difference(pairs, GRADIENT_TOLERANCE)
+        return _first_difference(pairs)
 
 
 def components_of(model: SceneModel) -> dict[str, object]:
@@ -472,8 +474,8 @@ class _ModelStep(nn.Module):
         return found
 
 
-def _first_difference(pairs: Mapping[str, tuple[Tensor, Tensor]], tolerance: float) -> str | None:
-    """The first pair that differs by more than `tolerance`, as a message; one device-to-host copy.
+def _first_difference(pairs: Mapping[str, tuple[Tensor, Tensor]]) -> str | None:
+    """The first pair that differs by more than `TOLERANCE`, as a message; one device-to-host copy.
 
     Relative to each tensor's norm plus a millionth of the largest norm, which excuses tensors that
     hold nothing but rounding.
@@ -484,7 +486,7 @@ def _first_difference(pairs: Mapping[str, tuple[Tensor, Tensor]], tolerance: flo
     found = torch.stack(rows).tolist()
     floor = 1e-6 * max(norm for _, norm in found)
     for name, (distance, norm) in zip(pairs, found, strict=True):
-        if not distance <= tolerance * norm + floor:  # NaN differs too
+        if not distance <= TOLERANCE * norm + floor:  # NaN differs too
             return f"{name} differs by {distance:.3g}, of {norm:.3g}, from eager execution"
     return None
 

@@ -94,7 +94,10 @@ def train(
         session.train(on_step)
         for step, culprit in trainer.guard.skipped[:5]:
             report(f"skipped step {step}: {culprit} was not finite")
-        without = trainer.objective.graphed_scene.why_slower()
+        graphed = trainer.objective.graphed_scene
+        graphs = {"mode": graphed.mode, "captures": graphed.captures, "why": graphed.reason}
+        session.run.update(session.run.spec.read_text("utf-8"), {"cuda_graphs": graphs})
+        without = graphed.why_slower()
         if without is not None:
             report(f"trained without CUDA graphs, slower than it could be: {without}")
         report(f"run: {path}")

@@ -108,7 +108,9 @@ def test_training_in_windows_gives_an_ordinary_run(
     assert trained.code == 0, trained.err
     said = "trained in 4 windows of at most 6 frames"
     assert said in " ".join(trained.out.split())
-    assert json.loads((run / "provenance.json").read_text())["windows"].startswith(said)
+    record = json.loads((run / "provenance.json").read_text())
+    assert record["windows"].startswith(said)
+    assert record["cuda_graphs"] == {"mode": "plain", "captures": 0, "why": "train.graphs is off"}
     assert not (run / "windows").exists()
     assert (run / "evaluation.json").is_file()
     stored = LoadedRun.open(run).model.state_dict()
