@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from hoigs.core.clip_folder.format import HEADER, is_clip_folder
 from hoigs.core.clip_folder.write import refuse_to_overwrite, replace_folder, save_body
 from hoigs.core.errors import ClipError, SpecError
 from hoigs.core.interfaces.body import BodyModel
+from hoigs.core.maths.skinning import transform_points
 from hoigs.core.model.compose import compose, compose_density
 from hoigs.core.options import verb
 from hoigs.core.registry.registry import Registry, default_registry
@@ -29,6 +30,7 @@ from hoigs.core.system.files import write_whole
 from hoigs.core.system.random_state import callers_random_state
 from hoigs.core.system.threads import short_waits_when_busy
 from hoigs.core.values.clip import POSES_EXACT, BodyTrack, Clip
+from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.deformation.skinned_body import SkinnedBody
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_folder, read_clip, require_folder
@@ -51,6 +53,11 @@ SETTINGS = (
     "train.fill_unseen=[]",
     "train.preview_every=0",
 )
+
+
+FIELDS = ("global_orient", "body", "left_hand", "right_hand", "transl")
+SMOOTHED = (0.0, 0.05, 0.1, 0.2, 0.4)  # seconds
+BODY_JOINTS = 22  # without hands, jaw and eyes
 
 
 @dataclass(frozen=True)
@@ -122,8 +129,9 @@ def refine_poses(
     people = _trained(source, steps, options, registry, progress)
     tracks = {name: _refined(person, source, name, steps) for name, person in people.items()}
     moved = {
-        name: _moved(source.bodies[name], track, people[name].body)
+        name: float((_joints(track, body) - _joints(source.bodies[name], body)).norm(dim=-1).mean())
         for name, track in tracks.items()
+        for body in [people[name].body]
     }
     _write(folder, out, tracks)
     return RefinedPoses(out, steps, moved)
@@ -158,31 +166,60 @@ def _trained(
 
 @torch.no_grad()
 def _refined(person: SkinnedBody, clip: Clip, name: str, steps: int) -> BodyTrack:
-    """A person's track with the poses, and the betas of all frames, that were learned."""
+    """A person's track with the poses, and the betas of all frames, that were learned.
+
+    Images show an error of each frame's own, and put another in its place. Where there was none to
+    show, poses would tremble: changes are smoothed over time by as little as keeps them from it.
+    """
     track = clip.bodies[name]
     poses = {moment.index: person.pose(moment) for moment in clip.moments}
-    count = len(track.poses.transl)
-    every = [poses.get(i, track.poses.frame(i)) for i in range(count)]  # not all are in the clip
-    first = next(iter(poses.values()))
-    changes: dict[str, Any] = {
-        field: torch.stack([getattr(pose, field) for pose in every])
-        for field in ("global_orient", "body", "left_hand", "right_hand", "transl")
+    frames = sorted(poses)  # not all of the track's are in the clip
+    betas = poses[frames[0]].betas
+    changes = {
+        field: torch.stack([getattr(poses[i], field) for i in frames])
+        - getattr(track.poses, field)[frames]
+        for field in FIELDS
     }
+    most = _trembling(track, person.body)
+    refined, width = track, 0.0
+    for width in SMOOTHED:
+        refined = replace(track, poses=_changed(track.poses, changes, frames, width * clip.fps))
+        refined = replace(refined, poses=refined.poses.replace(betas=betas))
+        if _trembling(refined, person.body) <= most:
+            break
     text = f"{track.provenance}; refined on the images of all frames, test frames among them"
-    refined = track.poses.replace(**changes, betas=first.betas)
-    return replace(track, poses=refined, provenance=f"{text} ({steps} steps)")
+    text += f", with changes that are smoothed over {width:g} s" if width else ""
+    return replace(refined, provenance=f"{text} ({steps} steps)")
+
+
+def _changed(
+    poses: BodyPose, changes: Mapping[str, Tensor], frames: Sequence[int], width: float
+) -> BodyPose:
+    """Poses with changes of some frames, smoothed by a normal distribution `width` frames wide."""
+    from scipy import ndimage  # on use: it takes a while to import
+
+    fields: dict[str, Any] = {}
+    for field, change in changes.items():
+        fields[field] = getattr(poses, field).clone()
+        own = change.numpy()
+        smoothed = ndimage.gaussian_filter1d(own, width, axis=0, mode="nearest") if width else own
+        fields[field][frames] += torch.from_numpy(smoothed)
+    return poses.replace(**fields)
+
+
+def _trembling(track: BodyTrack, body: BodyModel) -> float:
+    """Median second difference of the body's joints, metres: that of what moves is not in it."""
+    at = _joints(track, body)[:, :BODY_JOINTS]
+    if len(at) < 3:
+        return 0.0
+    return float((at[2:] - 2 * at[1:-1] + at[:-2]).norm(dim=-1).median())
 
 
 @torch.no_grad()
-def _moved(before: BodyTrack, after: BodyTrack, body: BodyModel) -> float:
-    """Mean distance between the joints of two tracks, metres."""
-
-    def joints(track: BodyTrack, frame: int) -> Float[Tensor, "J 3"]:
-        return body(track.poses.frame(frame)).joints
-
-    frames = range(len(before.poses.transl))
-    apart = [(joints(after, i) - joints(before, i)).norm(dim=-1).mean() for i in frames]
-    return float(torch.stack(apart).mean())
+def _joints(track: BodyTrack, body: BodyModel) -> Float[Tensor, "F J 3"]:
+    """World."""
+    _, joints = body.shaped(track.poses.betas)
+    return transform_points(body.skinning_transforms(track.poses), joints)
 
 
 def _write(folder: Path, out: Path, tracks: Mapping[str, BodyTrack]) -> None:

@@ -15,8 +15,9 @@ from hoigs.plugins.estimators.mediapipe.mediapipe_doubts import FEW, FOUND, OFF,
 
 # as the script imports them, which knows nothing of hoigs
 sys.path.append(str(Path(mediapipe_doubts.__file__).parent))
-AGAIN, GuidedPose = (
-    getattr(importlib.import_module("mediapipe_guided"), name) for name in ("AGAIN", "GuidedPose")
+AGAIN, GuidedPose, seen_in = (
+    getattr(importlib.import_module("mediapipe_guided"), name)
+    for name in ("AGAIN", "GuidedPose", "seen_in")
 )
 Check = importlib.import_module("mediapipe_check").Check
 
@@ -119,6 +120,20 @@ def test_who_is_a_person_in_the_mirror_too(aside: int, person: bool) -> None:
         graph.places = {mark: (x + 9, y) for mark, (x, y) in graph.places.items()}
         fates = [pose.process(IMAGE, None)[3] for _ in range(9)]
         assert fates == [mediapipe_doubts.SQUARE] * 7 + [mediapipe_doubts.UNLIKE] * 2
+
+
+def test_left_and_right_are_treated_alike_in_space() -> None:
+    """The graph has the same places for a picture and for the mirrored one, left of the middle."""
+    square = (80.0, 45.0, 90.0)
+    for aside, alike in ((0, True), (8, False)):
+        graph = Lopsided(aside)
+        points, space, _ = seen_in(graph, Box, IMAGE, square)
+        even = Check(graph, Box).evened(IMAGE, (points, space), square)
+        if alike:
+            assert even[[0, 11, 12], 0].tolist() == pytest.approx([0, 30 / 160, -30 / 160])
+            np.testing.assert_array_equal(even[:, 1:], space[:, 1:])
+        else:  # two poses that differ have no mean
+            np.testing.assert_array_equal(even, space)
 
 
 def square(*places: slice) -> np.ndarray:

@@ -54,22 +54,50 @@ class Check:
         """As the function of this name."""
         return difference(self.graph, self.rect, image, points, square)
 
+    def evened(self, image, found, square=None):
+        """Landmarks in space without what the network makes different of left and right: the mean
+        of those in the picture and in the mirrored one, if both show the same pose.
+
+        Args:
+            found: landmarks in the image and in space.
+        """
+        points, space = found
+        back = mirrored(self.graph, self.rect, image, points, square)
+        if back is None or apart(points, back[0]) > UNLIKE:
+            return space
+        mean = space.copy()
+        mean[:, :3] = (space[:, :3] + back[1][:, :3]) / 2
+        return mean
+
     def lose(self) -> None:
         """Nobody is followed: whoever is found next is checked at once."""
         self.since = EVERY
 
 
-def difference(graph, rect, image, points, square=None) -> float:
-    """Mean distance of the mirrored picture's landmarks from the given ones, in lengths of the
-    torso; infinite where fewer than `LEAST` are seen both ways."""
+def mirrored(graph, rect, image, points, square=None):
+    """Landmarks in the image and in space that the mirrored picture shows, mirrored back; None if
+    it shows nobody."""
     width = image.shape[1]
     x, y, side = square or hips_square(points)
-    mirrored = np.ascontiguousarray(image[:, ::-1])
-    found = seen_in(graph, rect, mirrored, (width - x, y, side))
+    found = seen_in(graph, rect, np.ascontiguousarray(image[:, ::-1]), (width - x, y, side))
     if found is None:
-        return float("inf")
-    other = found[0][SWAPPED]
+        return None
+    other, space = found[0][SWAPPED], found[1][SWAPPED]
     other[:, 0] = width - other[:, 0]
+    space[:, 0] *= -1
+    return other, space
+
+
+def difference(graph, rect, image, points, square=None) -> float:
+    """Mean distance of the mirrored picture's landmarks from the given ones, as `apart` has it;
+    infinite where it shows nobody."""
+    found = mirrored(graph, rect, image, points, square)
+    return float("inf") if found is None else apart(points, found[0])
+
+
+def apart(points, other) -> float:
+    """Mean distance of two poses' landmarks, in lengths of the torso; infinite where fewer than
+    `LEAST` are seen in both."""
     both = (points[BODY, 3] > SEEN) & (other[BODY, 3] > SEEN)
     if both.sum() < LEAST:
         return float("inf")

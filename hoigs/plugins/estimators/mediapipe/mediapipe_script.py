@@ -99,6 +99,7 @@ class Finder:
         self.people: Any = None
         names, frames = [""], range(settings["count"])
         if settings["people"] is not None:
+            from mediapipe_check import Check
             from mediapipe_guided import landmark_graph
             from mediapipe_people import People
 
@@ -114,7 +115,9 @@ class Finder:
                 }
                 for name, clicks in given["prompts"].items()
             }
-            self.people = People(*landmark_graph(self.complexity), prompts, order, *places)
+            graph = landmark_graph(self.complexity)
+            self.check = Check(*graph)
+            self.people = People(*graph, prompts, order, *places)
             names, frames = list(prompts), range(min(order), max(order) + 1)
         self.first, rows = frames[0], (len(names), len(frames), 33, 4)
         self.names, self.rows = names, {n: np.full(rows, np.nan, np.float32) for n in ROWS}
@@ -123,6 +126,13 @@ class Finder:
         self.several = np.zeros(len(frames), bool)  # others are seen beside the person followed
         self.alone = np.zeros(len(frames), bool)  # masks of the segmentation of selfies alone
 
+    def even(self, image, points, space):
+        """Landmarks in space of which left and right are treated alike."""
+        if not np.isfinite(points).all():
+            return space
+        square = self.guided.square if self.following else None
+        return self.check.evened(image, (points, space), square)
+
     def add(self, place, image) -> None:
         """The frame that comes at this place."""
         wide = None if self.selfie is None else self.selfie.process(image).segmentation_mask
@@ -130,9 +140,8 @@ class Finder:
             self.add_people(place, image, wide)
             return
         image_xyzv, world_xyzv, own, self.fate[0, place] = self.landmarks(image, wide)
-        self.rows["image_xyzv"][0, place], self.rows["world_xyzv"][0, place] = (
-            image_xyzv, world_xyzv
-        )  # fmt: skip
+        self.rows["image_xyzv"][0, place] = image_xyzv
+        self.rows["world_xyzv"][0, place] = self.even(image, image_xyzv, world_xyzv)
         seen = image_xyzv[image_xyzv[:, 3] > 0.5, :2]
         if len(seen):
             self.last = (*seen.min(0), *seen.max(0))
@@ -172,7 +181,8 @@ class Finder:
             self.fate[self.names.index(name), i] = FOUND if name in seen else GONE
         for name, (image_xyzv, world_xyzv, _) in seen.items():
             k = self.names.index(name)
-            self.rows["image_xyzv"][k, i], self.rows["world_xyzv"][k, i] = image_xyzv, world_xyzv
+            self.rows["image_xyzv"][k, i] = image_xyzv
+            self.rows["world_xyzv"][k, i] = self.even(image, image_xyzv, world_xyzv)
         if wide is None:
             return
         owns = {name: own for name, (_, _, own) in seen.items()}
