@@ -68,11 +68,12 @@ def estimates_of(name: str, cache: Path) -> tuple[np.ndarray, np.ndarray | None]
     file = cache / f"{name}.npz"
     if not file.is_file():
         from hoigs.preparation.kept import last_kept
-        from hoigs.preparation.options import PrepareOptions
         from hoigs.preparation.prepare import prepare_until, work_folder
 
         out = cache / "prepared" / name
-        prepare_until("estimates", recording(name), out, options=PrepareOptions(objects=("none",)))
+        prepare_until(
+            "estimates", recording(name), out, object="none", estimators="offline", yes=True
+        )
         found = last_kept(work_folder(out), "estimates")["estimates"]
         masks = np.stack([found.masks.human[i] for i in range(len(found.masks.human))])
         arrays = {}

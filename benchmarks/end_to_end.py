@@ -117,7 +117,7 @@ def measure(name: str, folder: Path, args: argparse.Namespace) -> Any:
 
 def figures(made: Any, truth: Any, true_folder: Path, found: Any, body: Any) -> dict[str, Any]:
     """Everything that can be measured without a training."""
-    row = landmark_figures(found.landmarks.image, truth, body)
+    row = landmark_figures(np.asarray(found.person.image), truth, body)
     if len(made) != len(truth):
         return row | {"others": f"not computed: {len(made)} of {len(truth)} frames have a camera"}
     row["person_iou"] = overlaps([f.masks["human"] for f in made], truth, "human")
@@ -149,7 +149,7 @@ def landmark_figures(image: np.ndarray, truth: Any, body: Any) -> dict[str, Any]
     """Pixels between MediaPipe's landmarks and the points of the true body that they stand for.
     Hidden ones count if MediaPipe calls them visible."""
     true = landmarks(truth, body, (0.0, 0.0), 0)["image_xyzv"]
-    seen = np.isfinite(true[..., 0]) & (image[..., 3] > VISIBLE)
+    seen = np.isfinite(true[..., 0]) & (image[..., -1] > VISIBLE)
     frames = int(np.isfinite(image[..., 0]).any(1).sum())
     if not seen.any():
         return {"frames_with_landmarks": frames, "landmarks_px": "not computed: none is visible"}
