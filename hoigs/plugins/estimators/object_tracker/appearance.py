@@ -101,8 +101,7 @@ class Appearance:
             twins: pixels of things that look like it, from which nothing is learnt.
         """
         area = float(np.mean([mask.sum() for mask in known.values()]))
-        thickest = max(ndimage.distance_transform_edt(np.pad(m, 1)).max() for m in known.values())
-        side = int(np.clip(min(np.sqrt(area / np.pi) / CELLS, thickest), FINE, COARSE))
+        side = int(np.clip(np.sqrt(area / np.pi) / CELLS, FINE, COARSE))
         of_object, others = [], []
         for image, mask, free in _pictures(footage, known, twins or {}):
             cells, share = cell_features(image, side), cell_shares(mask, side)

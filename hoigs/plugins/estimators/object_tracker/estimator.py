@@ -24,7 +24,6 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.plugins.estimators.object_tracker.alike import told_apart
 from hoigs.plugins.estimators.object_tracker.appearance import one_thread
-from hoigs.plugins.estimators.object_tracker.closer import closer, part_about
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage, skeletons
 from hoigs.plugins.estimators.object_tracker.prompts import (
     PromptedMask,
@@ -106,8 +105,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 13  # of what is kept in `work`; raised when masks change
-CLOSER = 2  # times the usual size: the largest at which small and thin things are followed
+VERSION = 12  # of what is kept in `work`; raised when masks change
 SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
 
 
@@ -167,68 +165,56 @@ class ObjectTrackerEstimator(Estimator):
                     f"estimator:object-tracker: a prompt is in frame {number}; the video has "
                     f"frames 0 to {video.frames - 1}"
                 )
-        footage, scene = self._read(video, also, self.config.size, progress)
-        notes: list[str] = []
-        prompts = {e.name: _prompted(e, footage, scene, notes) for e in wanted if e.prompts}
-        part, longest = None, CLOSER * self.config.size
-        if len(prompts) == len(wanted):
-            part = part_about(footage, [m for masks in prompts.values() for m in masks], longest)
-        if part is not None:
-            near = closer(replace(video, entities=tuple(wanted)), part)
-            footage, scene = self._read(near, also, longest, progress)
-            notes = []
-            prompts = {e.name: _prompted(e, footage, scene, notes) for e in near.entities}
+        footage = read_footage(
+            video, _person(video), also, self.config.size, lambda x: progress(0.3 * x, "frames")
+        )
+        still = video.static_camera or is_static(footage)
+        scene: Scene = static_scene(footage) if still else moving_scene(footage)
         progress(0.35, "object")
+        people = skeletons(video, footage.numbers, footage.scale)
         tracks: dict[str, Track | None] = {}
+        prompts: dict[str, list[PromptedMask]] = {}
+        notes: list[str] = []
         chosen: dict[str, list[FramePrompt]] = {}
         for k, entity in enumerate(wanted):
             start, share = 0.35 + 0.65 * k / len(wanted), 0.65 / len(wanted)
-            if not entity.prompts:
-                people = skeletons(video, footage.numbers, footage.scale)
-                prompts[entity.name], chosen[entity.name] = _proposed(
+            if entity.prompts:
+                masks = self._prompted(entity, footage, scene, notes)
+            else:
+                masks, chosen[entity.name] = _proposed(
                     entity, footage, scene, people, tracks, notes
                 )
-            masks, done = prompts[entity.name], _part(progress, start, share)
-            tracks[entity.name] = followed(footage, scene, masks, done) if masks else None
+            prompts[entity.name] = masks
+            part = _part(progress, start, share)
+            tracks[entity.name] = followed(footage, scene, masks, part) if masks else None
         tracks, alike = told_apart(footage, scene, prompts, tracks)
         notes += [*alike, *doubts(tracks, footage)]
-        states = states_of(footage, tracks)
-        write_tracks(file, video, footage, tracks, Said(chosen, notes, states, part))
+        write_tracks(file, video, footage, tracks, Said(chosen, notes, states_of(footage, tracks)))
 
-    def _read(
-        self, video: VideoRequest, also: Sequence[int], longest: int, progress: Progress
-    ) -> tuple[Footage, Scene]:
-        footage = read_footage(
-            video, _person(video), also, longest, lambda x: progress(0.3 * x, "frames")
-        )
-        still = video.static_camera or is_static(footage)
-        return footage, static_scene(footage) if still else moving_scene(footage)
-
-
-def _prompted(
-    entity: EntityRequest, footage: Footage, scene: Scene, notes: list[str]
-) -> list[PromptedMask]:
-    """Masks of the entity's prompts."""
-    masks: list[PromptedMask] = []
-    for prompt in entity.prompts:
-        i = footage.numbers.index(prompt.frame)
-        known = color_model(footage, {m.frame: m.soft for m in masks}) if masks else None
-        found = prompted_mask(footage, scene, i, prompt, known)
-        if not (found.soft > 0.5).any():
-            raise HoigsError(nothing_there(entity, prompt, footage, i))
-        if looks_like_person(footage, found):
-            notes.append(
-                f"{entity.name}: what was clicked in frame {prompt.frame} lies on the person "
-                "and has their colours: if it is a part of them, click on the object"
-            )
-        if found.quality < SET_OFF and at_rest(scene, {i: found.soft > 0.5}):
-            notes.append(
-                f"{entity.name}: what was clicked in frame {prompt.frame} hardly differs from "
-                "what is around it, and looks like a part of the scene: if it is none, click "
-                "where it is seen better, or give a box"
-            )
-        masks.append(found)
-    return masks
+    def _prompted(
+        self, entity: EntityRequest, footage: Footage, scene: Scene, notes: list[str]
+    ) -> list[PromptedMask]:
+        """Masks of the entity's prompts."""
+        masks: list[PromptedMask] = []
+        for prompt in entity.prompts:
+            i = footage.numbers.index(prompt.frame)
+            known = color_model(footage, {m.frame: m.soft for m in masks}) if masks else None
+            found = prompted_mask(footage, scene, i, prompt, known)
+            if not (found.soft > 0.5).any():
+                raise HoigsError(nothing_there(entity, prompt, footage, i))
+            if looks_like_person(footage, found):
+                notes.append(
+                    f"{entity.name}: what was clicked in frame {prompt.frame} lies on the person "
+                    "and has their colours: if it is a part of them, click on the object"
+                )
+            if found.quality < SET_OFF and at_rest(scene, {i: found.soft > 0.5}):
+                notes.append(
+                    f"{entity.name}: what was clicked in frame {prompt.frame} hardly differs from "
+                    "what is around it, and looks like a part of the scene: if it is none, click "
+                    "where it is seen better, or give a box"
+                )
+            masks.append(found)
+        return masks
 
 
 def _proposed(

@@ -248,8 +248,8 @@ class Window:
     step: int
 
     @classmethod
-    def around(cls, x: float, y: float, half: float, side: int = SIDE) -> Window:
-        step = max(1, int(np.ceil(2 * half / side)))
+    def around(cls, x: float, y: float, half: float) -> Window:
+        step = max(1, int(np.ceil(2 * half / SIDE)))
         n = int(np.ceil(2 * half / step))
         return cls(round(x - n * step / 2), round(y - n * step / 2), n, step)
 

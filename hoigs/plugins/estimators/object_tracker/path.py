@@ -11,21 +11,13 @@ from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.appearance import Appearance
 from hoigs.plugins.estimators.object_tracker.footage import ColorModel, Footage, bins_of, histogram
-from hoigs.plugins.estimators.object_tracker.scene import (
-    MovingScene,
-    Scene,
-    StaticScene,
-    median_of,
-)
+from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, median_of
 
 CANDIDATES = 8
 ABSENT = 1.1  # cost of a frame in which the object is not seen
 TURN = 0.8  # and of its going or coming back
 JUMP = 8.0  # and of lying, all at once, elsewhere, as if it had been there before
 BY_COLOR, BY_LOOKS = 0.4, 0.8  # weights of their log-odds
-# largest log-odds against what looks like the scene of a moving camera, where a plain thing that
-# moves little does, and of a still one, of which a thing that rests is no part by `Evidence`
-UNCHANGED = (0.3, 1.0)
 CHANGED = 4  # units of noise by which a pixel differs from the scene
 
 
@@ -55,7 +47,7 @@ def object_odds(evidence: Evidence, i: int) -> Float[np.ndarray, "h w"]:
     odds = odds + BY_LOOKS * evidence.looks.odds(i) - 0.7 * footage.body(i)
     if scene is not None:
         changed = np.nan_to_num(np.tanh((scene.difference(i) - 4) / 3), nan=0.0)
-        odds = odds + np.maximum(changed, -UNCHANGED[isinstance(scene, StaticScene)])
+        odds = odds + np.maximum(changed, -0.3)  # a plain or resting thing may look unchanged
     odds[footage.blank[i]] = -6
     return odds
 

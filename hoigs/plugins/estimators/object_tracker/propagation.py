@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.footage import (
-    SIDE,
     Window,
     bins_of,
     histogram,
@@ -17,7 +16,6 @@ from hoigs.plugins.estimators.object_tracker.footage import (
 )
 from hoigs.plugins.estimators.object_tracker.path import Evidence, Path, center_of, found_path
 from hoigs.plugins.estimators.object_tracker.prompts import Behind, PromptedMask, walked
-from hoigs.plugins.estimators.object_tracker.together import shift_of
 
 # Labels of pixels from frames in which they are known: by similar patches nearby.
 
@@ -66,12 +64,41 @@ def transferred(
     return prior.numpy(), torch.exp(-least / 150).numpy()
 
 
+def shift_of(
+    colors: Float[np.ndarray, "N N 3"],
+    template: Float[np.ndarray, "n n 3"],
+    soft: Float[np.ndarray, "n n"],
+    odds: Float[np.ndarray, "N N"],
+    slack: float,
+) -> tuple[float, float, float]:
+    """Where the template's object lies in a larger window: shift x, y of the middle, and the error.
+
+    The sum of squared differences over the mask, by correlation; `odds` of the pixels help where
+    the object turns, and places off the middle cost a little.
+    """
+    from scipy.signal import fftconvolve
+
+    weight = soft / max(soft.sum(), 1e-6)
+
+    def correlate(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+        return fftconvolve(image, kernel[::-1, ::-1], mode="valid")
+
+    error = correlate((colors**2).sum(-1), weight) + float((weight[..., None] * template**2).sum())
+    for c in range(3):
+        error = error - 2 * correlate(colors[..., c], weight * template[..., c])
+    error = np.maximum(error, 0) / 120
+    error = np.minimum(error, 4) - 0.6 * correlate(np.tanh(odds), weight)
+    rows, columns = error.shape
+    y, x = np.mgrid[:rows, :columns]
+    y, x = y - (rows - 1) / 2, x - (columns - 1) / 2
+    error = error + 0.5 * (np.hypot(x, y) / slack) ** 2
+    k = np.unravel_index(error.argmin(), error.shape)
+    return float(x[k]), float(y[k]), float(error[k])
+
+
 BY_COLOR, BY_LOOKS = 0.6, 0.2  # weights of their log-odds
-COAST = 3  # frames in which an object that its path does not show is looked for by its motion
-LONG, TURN = 1.5, 0.14  # lengths in breadths from which turns are tried, radians between them
 AGAIN, AHEAD = 6, 14  # frames after which the path is found anew, and how far
 NEAR = 0.4  # of the object's breadth: an arm before it may part it by so much
-THIN = 3.0  # pixels, the radius at its thickest of what is cut out in finer cells
 SURE = 0.35  # confidence below which the object counts as not seen
 
 
@@ -90,29 +117,6 @@ class Sighting:
     window: Window
     colors: Float[np.ndarray, "n n 3"]
     soft: Float[np.ndarray, "n n"]
-
-    def turned(self, angle: float) -> Sighting:
-        """Turned about the window's middle, radians."""
-        if not angle:
-            return self
-        c, s = np.cos(angle), np.sin(angle)
-        matrix, middle = np.array([[c, s], [-s, c]]), np.full(2, (self.window.n - 1) / 2)
-        layers = [
-            ndimage.affine_transform(layer, matrix, middle - matrix @ middle, order=1, mode=mode)
-            for layer, mode in (
-                *((c, "nearest") for c in np.moveaxis(self.colors, -1, 0)), (self.soft, "constant"),
-            )
-        ]  # fmt: skip
-        return Sighting(self.window, np.stack(layers[:3], -1), layers[3])
-
-
-def elongation(mask: Bool[np.ndarray, "n n"]) -> float:
-    """The length of a mask in its breadths, by its second moments; 1 where it is empty."""
-    at = np.argwhere(mask).astype(float)
-    if len(at) < 6:
-        return 1.0
-    small, large = np.linalg.eigvalsh(np.cov(at.T) + np.eye(2) / 12)
-    return float(np.sqrt(large / small))
 
 
 class Propagation:
@@ -137,7 +141,7 @@ class Propagation:
         self.center = np.array(window.center)  # of the last window
         self.off = self.center - path.centers[start.frame]  # of windows from the path
         self.velocity = np.zeros(2)
-        self.unseen, self.turn = 0, 0.0  # frames since it was seen; radians from frame to frame
+        self.unseen = 0
         self.moving = moving  # the camera, so that the path is found anew on the way
         self.seen, self.steps = (start.frame, start.soft > 0.5), 0
         self.area = float(self.seen[1].sum())
@@ -151,11 +155,11 @@ class Propagation:
         if self.moving and not self.unseen and self.steps % AGAIN == 0:
             self._look_ahead(i)
         self.steps += 1
-        if not self.path.seen[i] and self.unseen >= COAST:
+        if not self.path.seen[i]:
             self.unseen += 1
             return 0.0, nothing
         away = None if self.scene is None else self.scene.difference(i)
-        window, self.last = self._aligned(i, away)
+        window = self._aligned(i, away)
         soft, prior = self._segmented(i, window, away)
         mask = self._kept(soft > 0.5, prior, window.step)
         soft = np.where(ndimage.binary_dilation(mask, iterations=2), soft, 0)
@@ -181,37 +185,27 @@ class Propagation:
     def _colors(self, i: int, window: Window) -> np.ndarray:
         return to_features(window.cut(self.footage.lab[i]))
 
-    def _aligned(self, i: int, away: np.ndarray | None) -> tuple[Window, Sighting]:
-        """The last sighting's window moved to where it fits best near the path, and the sighting,
-        turned as it fits best."""
+    def _aligned(self, i: int, away: np.ndarray | None) -> Window:
+        """The last sighting's window moved to where it fits best near the path."""
         last, step = self.last, self.last.window.step
         reach = self.path.centers[i] + self.off
-        ahead = self.center + self.velocity
-        guesses = [reach] if self.unseen else [reach, ahead]
-        if not self.path.seen[i]:
-            guesses, reach = [ahead], ahead
+        guesses = [reach] if self.unseen else [reach, self.center + self.velocity]
         slack = max(4, int(0.22 * last.window.n))
         n = last.window.n + 2 * slack
-        turns: tuple[float, ...] = (0.0,)
-        if elongation(last.soft > 0.5) > LONG:
-            turns = tuple(dict.fromkeys((0.0, *(self.turn + k * TURN for k in (-1, 0, 1)))))
         best = None
         for x, y in guesses:
             wide = Window(round(x - n * step / 2), round(y - n * step / 2), n, step)
             colors = self._colors(i, wide)
             odds = self._odds(i, wide, colors, away)
             odds = np.where(wide.inside(self.footage.shape), odds, -3)
-            for turn in turns:
-                seen = last.turned(turn)
-                dx, dy, error = shift_of(colors, seen.colors, seen.soft, odds, slack)
-                place = np.array(wide.center) + np.array((dx, dy)) * step
-                # a place far from the path is unlikely
-                error += 0.5 * (np.hypot(*(place - reach)) / (last.window.n * step / 2)) ** 2
-                if best is None or error < best[0]:
-                    best = (error, place, seen, turn)
+            dx, dy, error = shift_of(colors, last.colors, last.soft, odds, slack)
+            place = np.array(wide.center) + np.array((dx, dy)) * step
+            # a place far from the path is unlikely
+            error += 0.5 * (np.hypot(*(place - reach)) / (last.window.n * step / 2)) ** 2
+            if best is None or error < best[0]:
+                best = (error, place)
         assert best is not None
-        self.turn = 0.5 * (self.turn + best[3])
-        return last.window.at(*best[1]), best[2]
+        return last.window.at(*best[1])
 
     def _segmented(
         self, i: int, window: Window, away: np.ndarray | None
@@ -327,6 +321,4 @@ def window_of(mask: Bool[np.ndarray, "h w"]) -> Window:
     """A window with room about a mask."""
     y, x = np.nonzero(mask)
     half = 0.5 * max(np.ptp(x), np.ptp(y)) + 1
-    middle = (x.min() + x.max() + 1) / 2, (y.min() + y.max() + 1) / 2
-    side = 3 * SIDE // 2 if ndimage.distance_transform_edt(mask).max() < THIN else SIDE
-    return Window.around(*middle, 1.5 * half + 8, side)
+    return Window.around((x.min() + x.max() + 1) / 2, (y.min() + y.max() + 1) / 2, 1.5 * half + 8)

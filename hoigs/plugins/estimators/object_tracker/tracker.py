@@ -20,7 +20,6 @@ from hoigs.core.interfaces.estimator import (
     VideoRequest,
 )
 from hoigs.plugins.estimators.object_tracker.appearance import Appearance, twins_of
-from hoigs.plugins.estimators.object_tracker.closer import Part
 from hoigs.plugins.estimators.object_tracker.footage import ColorModel, Footage, bins_of, histogram
 from hoigs.plugins.estimators.object_tracker.path import (
     Evidence,
@@ -279,13 +278,11 @@ def _walks(known: list[int], count: int) -> list[tuple[int, range]]:
 @dataclass(frozen=True)
 class Said:
     """What is said of the tracks: prompts that were chosen for objects that had none, notes, and
-    where each object is in each frame (`states.states_of`), and the part of the picture that they
-    are of; None: the whole."""
+    where each object is in each frame (`states.states_of`)."""
 
     chosen: dict[str, list[FramePrompt]]
     notes: list[str]
     states: dict[str, list[str]]
-    part: Part | None = None
 
 
 def write_tracks(
@@ -309,7 +306,6 @@ def write_tracks(
         "numbers": footage.numbers,
         "notes": said.notes,
         "states": said.states,
-        "part": said.part,
         "chosen": {
             n: [[p.frame, [[q.x, q.y, q.inside] for q in p.points], p.box] for p in prompts]
             for n, prompts in said.chosen.items()
@@ -331,9 +327,7 @@ def read_tracks(file: FilePath, video: VideoRequest, names: Sequence[str]) -> En
         soft = {n: saved[f"soft {n}"] for n in names}
         confidence = {n: saved[f"confidence {n}"] for n in names}
     row = {number: k for k, number in enumerate(about["numbers"])}
-    part = tuple(about["part"] or (0, 0, video.width, video.height))
-    at = partial(_mask_at, row=row, video=video, part=part)
-    masks = {n: LazyFrames(video.frames, partial(at, soft[n])) for n in names}
+    masks = {n: LazyFrames(video.frames, partial(_mask_at, soft[n], row, video)) for n in names}
     chosen = {
         n: tuple(
             FramePrompt(frame, tuple(PromptPoint(*p) for p in points), tuple(box) if box else None)
@@ -351,15 +345,17 @@ def read_tracks(file: FilePath, video: VideoRequest, names: Sequence[str]) -> En
     )  # fmt: skip
 
 
-def _mask_at(
-    soft: np.ndarray, i: int, *, row: dict[int, int], video: VideoRequest, part: Part
-) -> Bool[np.ndarray, "H W"]:
+def _mask_at(soft: np.ndarray, row: dict[int, int], video: VideoRequest, i: int) -> np.ndarray:
+    return _enlarged(soft, row.get(i), video)
+
+
+def _enlarged(soft: np.ndarray, row: int | None, video: VideoRequest) -> np.ndarray:
     """A mask at the video's size; empty in frames that were not wanted."""
     from PIL import Image
 
-    mask = np.zeros((video.height, video.width), bool)
-    if i in row and soft[row[i]].any():
-        x0, y0, x1, y1 = part
-        large = Image.fromarray(soft[row[i]]).resize((x1 - x0, y1 - y0), Image.Resampling.BILINEAR)
-        mask[y0:y1, x0:x1] = np.asarray(large) > 127
-    return mask
+    if row is None or not soft[row].any():
+        return np.zeros((video.height, video.width), bool)
+    image = Image.fromarray(soft[row]).resize(
+        (video.width, video.height), Image.Resampling.BILINEAR
+    )
+    return np.asarray(image) > 127

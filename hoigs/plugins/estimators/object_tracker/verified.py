@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
-from scipy import ndimage
 from torch import Tensor
 
 from hoigs.plugins.estimators.object_tracker.appearance import (
@@ -27,18 +26,16 @@ from hoigs.plugins.estimators.object_tracker.footage import Footage
 from hoigs.plugins.estimators.object_tracker.path import center_of
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
 from hoigs.plugins.estimators.object_tracker.propagation import Track
-from hoigs.plugins.estimators.object_tracker.scene import Scene, StaticScene, carried
+from hoigs.plugins.estimators.object_tracker.scene import Scene, carried
 
 PROVEN = 0.5  # agreement from which a mask is proven by itself
 CARRIED = 0.3  # and from which it is by the frames beside it, from which it does not differ much
 SIZES = (0.3, 1.5)  # of its usual area about then: half hidden, and not with a thing beside it
 AROUND = 6  # proven frames before and after a frame that say what is usual
 STEP = 1.5  # diameters a frame beside what the motion foretells: farther is a jump
-SWING = 0.02  # of the diagonal more: a hand moves small things as fast as large ones
 BESIDE, ALONE = 0.6, (0.6, 1.4)  # of an object that has twins: its breadth, and its area before
 SAME = 6.0  # units of colour within which a place looks as it did
 THERE = 0.7  # share of a mask that looks as it did while the object was elsewhere
-FEW, FADED = 0.3, 0.5  # of a mask: share before a known scene, and of its difference from it then
 BANK = 4000  # cells of other things that are compared with
 
 
@@ -145,8 +142,7 @@ def _was_there(
     i: int,
     mask: Bool[np.ndarray, "h w"],
 ) -> bool:
-    """Whether a place looks as it did in a frame in which the object is known to be elsewhere, or
-    as the still scene does, from which the object differed when it was there."""
+    """Whether a place looks as it did in a frame in which the object is known to be elsewhere."""
     y, x = np.nonzero(mask)
     here = footage.colors(i)[y, x]
     for frame in given:
@@ -154,20 +150,11 @@ def _was_there(
         inside = ((to >= 0) & (to < np.array(footage.shape[::-1]))).all(1)
         row, column = to[inside].T[::-1]
         elsewhere = (known.others(frame) & ~footage.blank[frame])[row, column]
-        if not len(row):
+        if elsewhere.mean() < THERE if len(row) else True:
             continue
-        if elsewhere.mean() >= THERE:
-            away = np.abs(here[inside] - footage.colors(frame)[row, column]).max(1)
-            if (away[elsewhere] < SAME).mean() > THERE:
-                return True
-        same_place = ndimage.binary_dilation(known.masks[frame], iterations=2 * footage.unit)
-        if isinstance(scene, StaticScene) and same_place[mask].mean() >= THERE:
-            now, then = (scene.difference(k)[mask] for k in (i, frame))
-            known_there = np.isfinite(now) & np.isfinite(then)
-            if known_there.mean() > FEW:
-                now, then = (np.minimum(v[known_there], 10).mean() for v in (now, then))
-                if now < FADED * then:
-                    return True
+        away = np.abs(here[inside] - footage.colors(frame)[row, column]).max(1)
+        if (away[elsewhere] < SAME).mean() > THERE:
+            return True
     return False
 
 
@@ -201,7 +188,6 @@ def _continued(
     found[given] = True
     place = np.array([center_of(m) if m.any() else (np.nan, np.nan) for m in masks])
     size = 2 * np.sqrt(masks.sum((1, 2)) / np.pi)
-    swing = SWING * np.hypot(*masks.shape[1:])
     for start in given:
         for step in (1, -1):
             last, speed = start, np.zeros(2)
@@ -211,7 +197,7 @@ def _continued(
                 gap = abs(i - last)
                 off = np.hypot(*(place[i] - place[last] - speed * gap))
                 off = min(off, np.hypot(*(place[i] - place[last])))
-                reach = (STEP * max(size[i], size[last]) + swing) * gap
+                reach = STEP * max(size[i], size[last]) * gap
                 enough = proven[i] or (gap == 1 and agreement[i] >= CARRIED)
                 if not enough or not off <= reach:
                     continue
