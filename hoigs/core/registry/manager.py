@@ -13,7 +13,7 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from contextlib import redirect_stdout
+from contextlib import nullcontext, redirect_stdout
 from dataclasses import dataclass, field
 from enum import StrEnum
 from importlib import metadata
@@ -25,7 +25,7 @@ import pluggy
 from hoigs.core.errors import PluginError, did_you_mean
 from hoigs.core.registry import component as hookspecs
 from hoigs.core.registry.component import API, Component
-from hoigs.core.registry.import_watch import traceback_tail, watched
+from hoigs.core.registry.import_watch import limited, traceback_tail, watched
 
 # Extras of a distribution: their requirements, and which of these are not installed.
 
@@ -169,7 +169,9 @@ class PluginManager(pluggy.PluginManager):
             if reason:
                 plugin.fail(Status.BLOCKED, reason)
                 continue
-            with watched() as seen:
+            what = f"plugin {plugin.name} of {plugin.dist} ({plugin.module})"
+            guard = nullcontext() if plugin.builtin else limited(what, plugin.dist)
+            with guard, watched() as seen:
                 self._load(plugin, entry)
             plugin.seconds = seen.seconds
             plugin.remarks = [] if plugin.builtin else seen.remarks()
@@ -195,7 +197,7 @@ class PluginManager(pluggy.PluginManager):
         module = importlib.util.module_from_spec(spec)
         sys.modules[name] = module  # targets are imported by this name
         try:
-            with redirect_stdout(sys.stderr):
+            with limited(f"--plugin {path}", None), redirect_stdout(sys.stderr):
                 spec.loader.exec_module(module)
         except KeyboardInterrupt:
             raise

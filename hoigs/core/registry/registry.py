@@ -5,14 +5,14 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Iterable, Mapping
-from contextlib import redirect_stdout
+from contextlib import ExitStack, redirect_stdout
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
 from hoigs.core.errors import HoigsError, PluginError, did_you_mean
 from hoigs.core.registry.component import INTERFACES, KINDS, Component, missing_target
-from hoigs.core.registry.import_watch import traceback_tail
+from hoigs.core.registry.import_watch import limited, traceback_tail
 from hoigs.core.registry.manager import Offer, PluginManager, Status, describe, normal_name
 from hoigs.core.system.environments import ManagedEnvironment
 
@@ -174,7 +174,11 @@ class Registry:
 
     def _load(self, offer: Offer, target: str) -> Any:
         try:
-            with redirect_stdout(sys.stderr):  # stdout belongs to the command, and may be JSON
+            with ExitStack() as stack:
+                # stdout belongs to the command, and may be JSON
+                stack.enter_context(redirect_stdout(sys.stderr))
+                if not offer.plugin.builtin:
+                    stack.enter_context(limited(f"{offer.exact} ({target})", offer.plugin.dist))
                 return _import(target)
         except KeyboardInterrupt:
             raise
