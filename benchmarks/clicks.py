@@ -1,7 +1,7 @@
 """One click on things in real recordings: how many frames are right, partial, wrong and empty.
 
     python benchmarks/clicks.py                        # all cases, about a minute each
-    python benchmarks/clicks.py club board-cam03 --sheet /tmp/sheets --jobs 8
+    python benchmarks/clicks.py club board-cam03 --sheet build/sheets --jobs 8
 
 Real frames with truth. Into recordings of shared/data an object is drawn whose mask is known: it
 follows landmarks of a hand or flies, is blurred by its motion, softened, given noise, and the whole

@@ -59,6 +59,7 @@ PLAN = {
         ("frames",),
         ("human_name", "further_people", "find_person", "everybody", "object_name"),
         slow=True,
+        version=2,
     ),
     "object_masks": Stage(
         30, ("estimates",), ("object_name", "further_objects"), slow=True, version=3
@@ -77,7 +78,7 @@ PLAN = {
     "objects": Stage(
         40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True, version=2
     ),
-    "scene": Stage(11, ("masks",), ("prompts", "scene_points", "backdrop"), slow=True),
+    "scene": Stage(10, ("masks",), ("prompts", "scene_points", "backdrop"), slow=True, version=2),
     "write": Stage(40, ("objects", "scene")),
 }
 

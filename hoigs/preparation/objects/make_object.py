@@ -338,6 +338,7 @@ def _colors(
     chosen = set(seen[np.linspace(0, len(seen) - 1, COLOR_FRAMES).round().astype(int)].tolist())
     for i, image in enumerate(filmed.images()):
         if i in chosen:
-            seen_by = filmed.masks[i], filmed.cameras[i]
-            sampler.add(image, *seen_by, track.rotations[i], track.translations[i])
+            sampler.add(
+                image, filmed.masks[i], filmed.cameras[i], track.rotations[i], track.translations[i]
+            )
     return sampler.colors()

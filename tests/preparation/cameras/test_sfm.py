@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -13,7 +14,7 @@ from PIL import Image
 from scipy import ndimage
 
 from hoigs.preparation.body.landmarks import Landmarks
-from hoigs.preparation.cameras.choose import BesideVideo, choose_cameras
+from hoigs.preparation.cameras.choose import BesideVideo, ChosenCameras, choose_cameras
 from hoigs.preparation.cameras.sfm import _what_to_do, structure_from_motion
 from hoigs.preparation.cameras.turning_cameras import background_motion
 from hoigs.preparation.estimates.reader import GivenMasks
@@ -72,19 +73,18 @@ def nobody(count: int) -> Landmarks:
     return Landmarks.from_mediapipe(unseen, unseen)
 
 
+def cameras_of(video: Frames, masks: GivenMasks, folder: Path, **options: Any) -> ChosenCameras:
+    """Chosen with nobody in view and nothing beside the video."""
+    asked = PrepareOptions(**options)
+    seen = nobody(len(video))
+    return choose_cameras(video, seen, masks, BesideVideo(), asked, folder, lambda _: None)
+
+
 def test_a_camera_that_stands_still(tmp_path: Path) -> None:
     video, masks = recorded(tmp_path / "still", [0.0] * COUNT)
     motion = background_motion(video, masks)
     assert motion.known and motion.static and motion.largest < 0.5
-    chosen = choose_cameras(
-        video,
-        nobody(COUNT),
-        masks,
-        BesideVideo(),
-        PrepareOptions(focal=FOCAL),
-        tmp_path,
-        lambda _: None,
-    )
+    chosen = cameras_of(video, masks, tmp_path, focal=FOCAL)
     assert chosen.track.static and "features outside the masks move by" in chosen.track.provenance
     assert chosen.track.figures["displacement_px"] < 0.5
 
@@ -96,9 +96,7 @@ def test_a_camera_that_moves_and_one_that_shows_nothing(tmp_path: Path) -> None:
     hidden = GivenMasks(together=MaskStack([np.ones((HEIGHT, WIDTH), bool)] * COUNT))
     nothing = background_motion(video, hidden)
     assert not nothing.known and nothing.static
-    chosen = choose_cameras(
-        video, nobody(COUNT), hidden, BesideVideo(), PrepareOptions(), tmp_path, lambda _: None
-    )
+    chosen = cameras_of(video, hidden, tmp_path)
     assert any("too few to tell" in warning for warning in chosen.warnings)
 
 
@@ -107,9 +105,7 @@ def test_a_camera_in_a_hand_is_one_that_turns(tmp_path: Path) -> None:
     video, masks = recorded(tmp_path / "hand", [0.0, 0.01, -0.01, 0.005], block=False)
     motion = background_motion(video, masks)
     assert not motion.static and motion.turned is not None and 0.3 < motion.parallax < 3
-    chosen = choose_cameras(
-        video, nobody(4), masks, BesideVideo(), PrepareOptions(), tmp_path, lambda _: None
-    )
+    chosen = cameras_of(video, masks, tmp_path)
     assert chosen.track.kind == "turning"
     # so small turns show no focal length, however small their residuals are
     assert float(chosen.track.cameras[0].K[0, 0]) == pytest.approx(0.8 * WIDTH)
@@ -136,15 +132,7 @@ def test_a_camera_that_turns_on_its_spot(tmp_path: Path) -> None:
     video, nothing = turning_video(tmp_path / "turns", yaw)
 
     def choose(**options):
-        return choose_cameras(
-            video,
-            nobody(4),
-            nothing,
-            BesideVideo(),
-            PrepareOptions(**options),
-            tmp_path,
-            lambda _: None,
-        )
+        return cameras_of(video, nothing, tmp_path, **options)
 
     chosen = choose()
     track = chosen.track
@@ -168,10 +156,7 @@ def test_a_turning_camera_of_which_some_frames_show_no_background(tmp_path: Path
 
     def choose():
         masks = GivenMasks(together=MaskStack(hidden))
-        options = PrepareOptions(camera="turning", focal=FOCAL)
-        return choose_cameras(
-            video, nobody(4), masks, BesideVideo(), options, tmp_path, lambda _: None
-        )
+        return cameras_of(video, masks, tmp_path, camera="turning", focal=FOCAL)
 
     chosen = choose()
     assert any("background of 1 frames (1) was not found" in w for w in chosen.warnings)
@@ -186,15 +171,7 @@ def test_a_turning_camera_of_which_some_frames_show_no_background(tmp_path: Path
 def test_the_way_of_a_moving_camera(tmp_path: Path) -> None:
     steps = [0.1 * i for i in range(COUNT)]
     video, masks = recorded(tmp_path / "moves", steps)
-    chosen = choose_cameras(
-        video,
-        nobody(COUNT),
-        masks,
-        BesideVideo(),
-        PrepareOptions(focal=FOCAL),
-        tmp_path,
-        lambda _: None,
-    )
+    chosen = cameras_of(video, masks, tmp_path, focal=FOCAL)
     track = chosen.track
     assert track.model is not None and track.positions == tuple(range(COUNT))
     assert track.figures["registered"] == COUNT and track.figures["reprojection_px"] < 1
@@ -223,15 +200,7 @@ def test_frames_without_features_are_refused_with_advice(tmp_path: Path) -> None
     video = open_frames(folder)
     empty = GivenMasks(together=MaskStack([np.zeros((HEIGHT, WIDTH), bool)] * 4))
     with pytest.raises(SourceError, match=r"0 of 4 .*--camera static"):
-        choose_cameras(
-            video,
-            nobody(4),
-            empty,
-            BesideVideo(),
-            PrepareOptions(camera="moving"),
-            tmp_path,
-            lambda _: None,
-        )
+        cameras_of(video, empty, tmp_path, camera="moving")
 
 
 def test_features_and_matches_survive_a_kill(
