@@ -369,27 +369,15 @@ class PrepareOptions(Options):
         return value
 
     @model_validator(mode="after")
-    def _one_lens(self) -> PrepareOptions:
+    def _consistent(self) -> PrepareOptions:
         given = [n for n in ("focal", "intrinsics", "calibration") if getattr(self, n) is not None]
         if len(given) > 1:
             raise ValueError(f"{' and '.join(given)} both give the focal length: leave one out")
-        return self
-
-    @model_validator(mode="after")
-    def _somebody_or_something(self) -> PrepareOptions:
         if not (self.find_person or self.find_object):
             raise ValueError("neither people nor objects are looked for: nothing would be fitted")
-        return self
-
-    @model_validator(mode="after")
-    def _windows_overlap(self) -> PrepareOptions:
         if self.chunk is None and self.overlap is not None:
             raise ValueError("overlap is of windows: give their length, chunk, too")
         _ = self.chunking
-        return self
-
-    @model_validator(mode="after")
-    def _span_is_one(self) -> PrepareOptions:
         try:
             Span.of(self.start, self.end)
         except SpecError as error:

@@ -11,7 +11,6 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,12 +79,7 @@ def frames(
     draft: Draft, options: PrepareOptions, estimators: Estimators, progress: Advance
 ) -> Draft:
     """Chooses frames and opens the video; clicks and lens are checked before anything slow."""
-    path = draft.source.video
-
-    def make() -> Draft:
-        found, notes = choose_frames(path, options)
-        return draft.noting(notes, frames=found)
-
+    path, make = draft.source.video, partial(choose_frames, draft, options)
     found = kept(draft, "frames", options, make, fingerprint([path]))
     clicks = placed_prompts(options.prompts, found.frames)
     check_prompts(clicks, found.frames)
@@ -121,15 +115,13 @@ LARGEST, REDUCED = 1920, 1280  # longer sides, pixels: of frames that are kept, 
 FEWEST = 3  # motion is judged by accelerations
 
 
-def choose_frames(path: Path, options: PrepareOptions) -> tuple[FrameList, list[str]]:
-    """The chosen frames, and what is to be said of them.
-
-    Args:
-        path: a video, or a folder of images. options: how many, how dense and from when to when.
+def choose_frames(draft: Draft, options: PrepareOptions) -> Draft:
+    """Chooses frames of the video or folder: how many, how dense and from when to when.
 
     Raises:
         SourceError: fewer than three are left, or they have nothing in them.
     """
+    path = draft.source.video
     choice = Choice(
         options.every, options.max_frames, options.fps, options.pick,
         Span.of(options.start, options.end), options.folder_fps,
@@ -149,7 +141,7 @@ def choose_frames(path: Path, options: PrepareOptions) -> tuple[FrameList, list[
             "the video's frames are not evenly spaced (a variable frame rate): the clip keeps "
             f"their true times, {frames.fps:.4g} a second on average"
         )
-    return frames.list, [*notes, *frames.notes]
+    return draft.noting([*notes, *frames.notes], frames=frames.list)
 
 
 def stored_width(found: FrameList) -> tuple[int | None, list[str]]:

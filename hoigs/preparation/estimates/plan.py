@@ -158,7 +158,6 @@ def plan_estimators(
         choice = _choose(place, source, options, given)
         if choice is not None:
             found[place] = choice
-    _check_prompt(found, options)
     known = source.cameras or source.colmap
     cameras = "" if known is None else _cameras(known)
     offline = options.preset == "auto" and any(c.spec is not None for c in found.values())
@@ -232,36 +231,38 @@ def _of_preset(place: Place, options: PrepareOptions) -> Choice:
     spec = (_HUB if hub else _OFFLINE)[place]
     why = "--estimators hub" if hub else "no file beside the video"
     if place == "landmarks" and not hub:
-        why = f"{_people(options)}{why}"
+        shown = [_shown(options, name) for name in options.people if name in options.prompts]
+        why = "; ".join([*shown, why])
     if place == "object":
-        why = "; ".join(_shown(name, options) for name in options.objects)
         if not _installed(spec.use):
             return Choice(place, "none", f"{spec.use} is not installed", 0.0)
+        why = "; ".join(_shown(options, name) for name in options.objects)
     return Choice(place, spec.use, why, COST.get(spec.use), spec)
 
 
-def _people(options: PrepareOptions) -> str:
-    """Whose, where there is a choice."""
-    shown = [name for name in options.people if name in options.prompts]
-    if not shown:
-        return ""
-    frames = {n: options.prompts[n].places() for n in shown}
-    texts = [
-        f"{n} in frame {', '.join('first' if at.frame is None else str(at.frame) for at in where)}"
-        for n, where in frames.items()
-    ]
-    return f"{'; '.join(texts)}; "
+def _shown(options: PrepareOptions, name: str) -> str:
+    """Where an entity's prompt is.
 
-
-def _shown(name: str, options: PrepareOptions) -> str:
-    """Where an object's prompt is."""
-    prompt = options.prompts.get(name)
-    if prompt is not None and prompt.text:
-        return f'"{prompt.text}"'
+    Raises:
+        SpecError: the preset's estimator of objects cannot read it.
+    """
+    prompt, person = options.prompts.get(name), name in options.people
     where = prompt.places() if prompt else []
-    if not where:
+    if prompt is None or not (where or prompt.text):
         return "what hands move or hold"
-    what = name if options.further_objects else "--object"
+    if options.preset != "hub" and not person and prompt.text is not None:
+        raise SpecError(
+            f'--object "{prompt.text}": words need a network that reads them; point at it, '
+            "such as --object 640,402, or use --estimators hub"
+        )
+    if options.preset == "hub" and not person and len(where) > 1:
+        raise SpecError(
+            "--object: SAM 2 takes points and a box of one frame; give those of one, or use "
+            "--estimators offline"
+        )
+    if prompt.text:
+        return f'"{prompt.text}"'
+    what = name if person or options.further_objects else "--object"
     frames = ", ".join("first" if at.frame is None else str(at.frame) for at in where)
     return f"{what} in frame {frames}"
 
@@ -272,23 +273,6 @@ def _installed(key: str) -> bool:
     except PluginError:
         return False
     return True
-
-
-def _check_prompt(found: Mapping[Place, Choice], options: PrepareOptions) -> None:
-    choice = found.get("object")
-    if choice is None or choice.spec is None:
-        return
-    for prompt in (options.prompts[name] for name in options.objects if name in options.prompts):
-        if choice.use == _OFFLINE["object"].use and prompt.text is not None:
-            raise SpecError(
-                f'--object "{prompt.text}": words need a network that reads them; point at it, '
-                "such as --object 640,402, or use --estimators hub"
-            )
-        if choice.use == _HUB["object"].use and len(prompt.places()) > 1:
-            raise SpecError(
-                "--object: SAM 2 takes points and a box of one frame; give those of one, or use "
-                "--estimators offline"
-            )
 
 
 # Before work begins: environments and weights that the plan needs are there, or are fetched.

@@ -16,7 +16,6 @@ SWAPPED = [0, 4, 5, 6, 1, 2, 3, 8, 7, 10, 9]
 SWAPPED += [mark + side for mark in range(11, 33, 2) for side in (1, 0)]
 BODY = [0, *range(11, 17), *range(23, 29)]  # nose, shoulders to wrists, hips to ankles
 UNLIKE = 0.15  # of the largest of torso, shoulders and thighs: mean distance of the two poses
-DOUBTED = 2.0  # times as much, of somebody who was believed: some frames show an arm alone
 THIGHS = ((23, 25), (24, 26))
 AROUND = 2.5  # side of a square about the hips, in distances of the farthest landmark
 EVERY = 8  # frames of somebody who is followed, of which one is checked
@@ -33,41 +32,33 @@ class Check:
         self.graph, self.rect, self.most = graph, rect, UNLIKE
         self.since = EVERY  # frames since the last check
 
-    def agrees(self, image, points, square=None, *, known=False) -> bool:
-        """Whether landmarks are found mirrored, too; always true of the frames between checks.
-
-        Args:
-            points: x, y in pixels, depth and visibility of the 33 landmarks.
-            square: x, y of the middle and side that the landmarks were found in, pixels; None: the
-                square about the hips that the model is trained on.
-            known: this person was believed before; it takes more not to believe them now.
-        """
+    def believes(self, off) -> bool:
+        """Whether landmarks that are so far off in the mirror are a person's; of the frames between
+        checks, always."""
         self.since += 1
         if self.since < EVERY:
             return True
-        most = DOUBTED * UNLIKE if known else UNLIKE
-        same = self.difference(image, points, square) < most
+        same = bool(off < UNLIKE)
         self.since = 0 if same else EVERY
         return same
 
-    def difference(self, image, points, square=None) -> float:
-        """As the function of this name."""
-        return difference(self.graph, self.rect, image, points, square)
-
-    def evened(self, image, found, square=None):
-        """Landmarks in space without what the network makes different of left and right: the mean
-        of those in the picture and in the mirrored one, if both show the same pose.
+    def seen(self, image, points, space, square=None):
+        """How far landmarks are off in the mirror, as `apart` has it, and those in space without
+        what the network makes different of left and right: the mean of those in the picture and in
+        the mirrored one, if both show the same pose.
 
         Args:
-            found: landmarks in the image and in space.
+            points: x, y in pixels, depth and visibility of the 33 landmarks; space: in metres.
+            square: x, y of the middle and side that the landmarks were found in, pixels; None: the
+                square about the hips that the model is trained on.
         """
-        points, space = found
         back = mirrored(self.graph, self.rect, image, points, square)
-        if back is None or apart(points, back[0]) > UNLIKE:
-            return space
+        off = float("inf") if back is None else apart(points, back[0])
+        if back is None or off > UNLIKE:
+            return off, space
         mean = space.copy()
         mean[:, :3] = (space[:, :3] + back[1][:, :3]) / 2
-        return mean
+        return off, mean
 
     def lose(self) -> None:
         """Nobody is followed: whoever is found next is checked at once."""

@@ -8,6 +8,8 @@ It imports nothing of hoigs.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from mediapipe_doubts import NARROW, SQUARE, TURNED, UNLIKE, UNSURE, doubt, share_on
 
@@ -18,6 +20,10 @@ FAIR, CLOSE = 0.35, 0.08  # or so much, if the pose in the mirror is off by so l
 KEPT = 0.5  # and of one who was clicked on or detected
 ON = 0.5  # share of the seen landmarks that lie on the frame's mask of people, to be found there
 TRIED = 4  # best squares, each of which is checked
+AROUND = ((0.0, 1.0), (0.0, 1.2), (0.0, 1.4), (-0.2, 1.5), (0.0, 0.85))  # squares about the one
+# that was found: shift of the middle, down, and side, in its sides
+DOUBTED = 2.0  # times as far off in the mirror as others may be: some frames show an arm alone
+STEP = 0.5  # doubt, as the mirror's, of shoulders that moved by their distance since they were seen
 AGAIN = 15  # frames until a search that found nobody is repeated, or one that was lost is left
 SHOULDERS, LEFT, RIGHT, HIPS = [11, 12], [13, 15], [14, 16], [23, 24]
 HEAD, LEGS = slice(0, 11), slice(25, 33)
@@ -57,7 +63,8 @@ class GuidedPose:
 
     def __init__(self, graph, rect, check) -> None:
         self.graph, self.rect, self.check = graph, rect, check
-        self.square: tuple[float, float, float] | None = None  # x, y of the middle and side, pixels
+        self.square: Any = None  # x, y of the middle and side, pixels
+        self.around = AROUND[0]  # which of the squares about it showed the person last
         self.broad = 0.0  # distance of the shoulders when the person was found, pixels
         self.wait = 0
 
@@ -71,8 +78,7 @@ class GuidedPose:
             wide: the frame's mask of people, or None.
         """
         if self.square is not None:
-            found = self.look(image, wide, self.square)
-            why = UNSURE if found is None else self.against(image, found)
+            found, why = self.followed(image, wide)
             if found is not None and not why:
                 return self.follow(found)
             self.wait += 1
@@ -89,6 +95,24 @@ class GuidedPose:
             return None
         return self.follow(found)
 
+    def followed(self, image, wide):
+        """What is seen in the square that showed the person last, or in the one about the first
+        that leaves the least doubt, and why it is not believed."""
+        x, y, side = self.square
+        best, why, least = None, UNSURE, np.inf
+        for around in (self.around, *(other for other in AROUND if other != self.around)):
+            found = self.look(image, wide, (x, y + around[0] * side, around[1] * side))
+            if found is None:
+                continue
+            reason, off, found = self.against(image, found, least)
+            if best is None or off < least:
+                best, why, least, nearest = found, reason, off, around
+            if least < CLOSE:
+                break
+        if not why:
+            self.around = nearest
+        return best, why
+
     def chosen(self, image, tried):
         """The one whose pose is most alike in the mirror, if it is alike; None if none is.
 
@@ -96,18 +120,30 @@ class GuidedPose:
         sleeve: how well they are seen does not tell the right square."""
         near: list[tuple] = []
         for found in [f for f in tried if not f[5] and f[0] >= FAIR][:TRIED]:
-            off = self.check.difference(image, found[1], found[4])
+            off, found = self.mirrored(image, found)
             if off < (self.check.most if found[0] >= SURE else CLOSE):
                 near.append((off, len(near), found))
-        self.check.since = 0
         return min(near)[2] if near else None
 
-    def against(self, image, found) -> int:
-        """Why somebody who is followed is not believed; 0 if they are."""
-        score, points, _, _, square, why = found
+    def mirrored(self, image, found):
+        """How far the pose in the mirror is off; what `look` found, with even places in space."""
+        score, points, space, mask, square, why = found
+        off, space = self.check.seen(image, points, space, square)
+        return off, (score, points, space, mask, square, why)
+
+    def against(self, image, found, least):
+        """Why somebody who is followed is not believed, 0 if they are; how much is against it, or
+        infinite from `least` on: how far the pose in the mirror is off, and how far the shoulders
+        moved; and `found`."""
+        score, points, *_, why = found
         if why or score < FAIR:
-            return why or UNSURE
-        return 0 if self.check.agrees(image, points, square, known=True) else UNLIKE
+            return why or UNSURE, np.inf, found
+        moved = np.linalg.norm(points[SHOULDERS, :2] - self.shoulders, axis=1).mean() / self.broad
+        if STEP * moved >= least:
+            return UNLIKE, np.inf, found
+        off, found = self.mirrored(image, found)
+        why = 0 if off < DOUBTED * self.check.most else UNLIKE
+        return why, off + STEP * moved, found
 
     def search(self, image, wide):
         """What is seen in all squares, the best first."""
@@ -142,15 +178,16 @@ class GuidedPose:
 
     def follow(self, found):
         """Keeps the square over the person: it moves with the shoulders, if they move far."""
-        _, points, space, mask, (x, y, side), _ = found
-        middle = points[SHOULDERS, :2].mean(0)
+        _, points, space, mask, square, _ = found
+        pair = points[SHOULDERS, :2]
         if self.square is None:
-            self.shoulders = middle
-        elif np.linalg.norm(middle - self.shoulders) > FAR * side:
-            x, y = np.array((x, y)) + middle - self.shoulders
-            self.shoulders = middle
-        self.square, self.wait = (x, y, side), 0
-        self.broad = self.broad or float(np.ptp(points[SHOULDERS, 0]))
+            self.square, self.around, self.placed = square, AROUND[0], pair.mean(0)
+            self.broad = self.broad or float(np.ptp(pair[:, 0]))
+        x, y, side = self.square
+        if np.linalg.norm(pair.mean(0) - self.placed) > FAR * side:
+            x, y = np.array((x, y)) + pair.mean(0) - self.placed
+            self.placed = pair.mean(0)
+        self.square, self.shoulders, self.wait = (x, y, side), pair, 0
         return points, space, mask, SQUARE
 
 

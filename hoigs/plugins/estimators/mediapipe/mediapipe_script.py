@@ -126,13 +126,6 @@ class Finder:
         self.several = np.zeros(len(frames), bool)  # others are seen beside the person followed
         self.alone = np.zeros(len(frames), bool)  # masks of the segmentation of selfies alone
 
-    def even(self, image, points, space):
-        """Landmarks in space of which left and right are treated alike."""
-        if not np.isfinite(points).all():
-            return space
-        square = self.guided.square if self.following else None
-        return self.check.evened(image, (points, space), square)
-
     def add(self, place, image) -> None:
         """The frame that comes at this place."""
         wide = None if self.selfie is None else self.selfie.process(image).segmentation_mask
@@ -141,7 +134,7 @@ class Finder:
             return
         image_xyzv, world_xyzv, own, self.fate[0, place] = self.landmarks(image, wide)
         self.rows["image_xyzv"][0, place] = image_xyzv
-        self.rows["world_xyzv"][0, place] = self.even(image, image_xyzv, world_xyzv)
+        self.rows["world_xyzv"][0, place] = world_xyzv
         seen = image_xyzv[image_xyzv[:, 3] > 0.5, :2]
         if len(seen):
             self.last = (*seen.min(0), *seen.max(0))
@@ -182,7 +175,7 @@ class Finder:
         for name, (image_xyzv, world_xyzv, _) in seen.items():
             k = self.names.index(name)
             self.rows["image_xyzv"][k, i] = image_xyzv
-            self.rows["world_xyzv"][k, i] = self.even(image, image_xyzv, world_xyzv)
+            _, self.rows["world_xyzv"][k, i] = self.check.seen(image, image_xyzv, world_xyzv)
         if wide is None:
             return
         owns = {name: own for name, (_, _, own) in seen.items()}
@@ -249,16 +242,17 @@ class Finder:
             # z is in the scale of x
             points = points_of(found.pose_landmarks) * [width, height + above, width, 1.0]
             points[:, 1] -= above
+            space = points_of(found.pose_world_landmarks)
             own = found.segmentation_mask[above:] if self.masks else None
-            doubted = doubt(points, own, wide)
-            if not doubted and not self.check.agrees(image, points):
-                doubted = UNLIKE
+            doubted, how = doubt(points, own, wide), BORDER if above else FOUND
+            if not doubted:
+                off, space = self.check.seen(image, points, space)
+                doubted = 0 if self.check.believes(off) else UNLIKE
             if doubted:
                 pose.reset()
                 fate = doubted if fate == NOBODY else fate
                 continue
-            how = BORDER if above else FOUND
-            return points, points_of(found.pose_world_landmarks), own, how
+            return points, space, own, how
         self.check.lose()
         if (found := self.guided.process(image, wide)) is not None:
             self.following = True
