@@ -82,7 +82,7 @@ def view(
     followed = []
     for path in runs:
         wait_for_checkpoint(path, report)
-        followed.append(FollowedRun(path, partial(options.open, path)))
+        followed.append(FollowedRun(path, partial(options.open, path, pixels=False)))
     drawings: list[Drawing]
     if followed:
         drawings = [RunDrawing(run.loaded) for run in followed]

@@ -19,7 +19,7 @@ from served import served
 import hoigs
 from hoigs.core.errors import HoigsError
 
-pytest.importorskip("viser", reason="viser is not installed: pip install 'hoigs[viewer]'")
+pytest.importorskip("viser", reason="viser is not installed: pip install 'hoigs[view]'")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 

@@ -25,7 +25,7 @@ from hoigs.viewing.viewer.takes import Path as TakenPath
 from hoigs.viewing.viewer.viewer import Viewer
 from hoigs.viewing.viewer.views import View
 
-pytest.importorskip("viser", reason="viser is not installed: pip install 'hoigs[viewer]'")
+pytest.importorskip("viser", reason="viser is not installed: pip install 'hoigs[view]'")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 NAN, INF = float("nan"), float("inf")

@@ -22,6 +22,7 @@ from hoigs.core.registry.registry import Registry
 from hoigs.core.values.between import moment_between
 from hoigs.core.values.clip import Clip, ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment
+from hoigs.runs.kept_clip import NoPixels
 from hoigs.viewing.viewer.panes import nearest_position
 from hoigs.viewing.viewer.run_drawing import entity_colors
 from hoigs.viewing.viewer.views import View
@@ -107,7 +108,7 @@ def offered(
         "skeleton": bool(bodies),
         "object track": bool(clip.objects),
         "cameras": True,
-        "camera images": True,
+        "camera images": not isinstance(clip.store, NoPixels),
         "object points": before_training and bool(clip.objects),
         "scene points": before_training and len(clip.points) > 0,
         "depth points": before_training and clip.depth_kind == "metric",

@@ -59,7 +59,7 @@ def open_server(host: str, port: int, label: str) -> Any:
 def require_viser() -> None:
     """Raise HoigsError if viser is not installed."""
     if find_spec("viser") is None:
-        raise HoigsError("the viewer needs viser: pip install 'hoigs[viewer]'")
+        raise HoigsError("the viewer needs viser: pip install 'hoigs[view]'")
 
 
 def free_port(port: int) -> int:
