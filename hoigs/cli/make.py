@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hoigs.cli.common import Display, print_table, with_json
+from hoigs.cli.common import Display, print_table, say, with_json
 from hoigs.cli.options import flags
 from hoigs.core.system.files import printable
 from hoigs.preparation.options import PrepareOptions
@@ -164,6 +164,7 @@ def annotate(
     ] = None,
 ) -> None:
     """Click on the people and objects of a video, see their masks, and prepare it."""
+    say(f"starting the page of {video} …")
     from hoigs.viewing.annotate.server import annotate as serve
 
     options = PrepareOptions.of(file, {"overrides": settings or ()}, "annotate")
