@@ -63,10 +63,15 @@ class Served:
         self.viewer = viewer
         self.ready.set()
 
+    @property
+    def visit(self) -> Any:
+        """The one visitor."""
+        return next(iter(self.viewer.visits.values()))
+
     def settle(self, page: Page) -> None:
         """Wait for a still picture."""
         page.wait_for_timeout(1500)
-        while not all(eye.full for eye in self.viewer._eyes.values()):
+        while not all(visit.eye.full for visit in self.viewer.visits.values()):
             page.wait_for_timeout(200)
         page.wait_for_timeout(1500)
 
@@ -74,11 +79,11 @@ class Served:
         """A page with the moment in the middle, still."""
         page: Page = browser.new_page(viewport=SIZE)
         page.goto(self.address)
-        while not self.viewer._eyes:
+        while not self.viewer.visits:
             page.wait_for_timeout(200)
         page.wait_for_timeout(5000)
         page.add_style_tag(content=".mantine-Notifications-root { display: none; }")
-        self.viewer.clock.seek(0.5 * self.viewer.clock.last, 0.0)
+        self.visit.clock.seek(0.5 * self.visit.clock.last, 0.0)
         self.settle(page)
         return page
 
@@ -97,7 +102,7 @@ def drag(page: Page, dx: int, dy: int) -> None:
 def of_run(browser: Any, run: Path) -> None:
     served = Served(run)
     page = served.open(browser)
-    viewer = served.viewer
+    viewer = served.visit
     with viewer.controls.lock:
         viewer.settings.layout, viewer.settings.share = "wipe", 0.32
     served.settle(page)
@@ -121,10 +126,10 @@ def of_modes(browser: Any, run: Path) -> None:
     page = served.open(browser)
     cells = []
     for mode in MODES[1:]:
-        with served.viewer.controls.lock:
-            served.viewer.settings.mode = mode
+        with served.visit.controls.lock:
+            served.visit.settings.mode = mode
         served.settle(page)
-        width, height = next(iter(served.viewer._eyes.values())).canvas
+        width, height = served.visit.eye.canvas
         left = (width - height) // 2  # the frame is square
         cells.append(shot_of(page).crop((left, 0, left + height, height)).resize((360, 360)))
     sheet = Image.new("RGB", (360 * len(cells), 360))
@@ -146,8 +151,8 @@ def of_two(browser: Any, run: Path, second: Path) -> None:
 def of_clip(browser: Any, clip: Path) -> None:
     served = Served(clip)
     page = served.open(browser)
-    with served.viewer.controls.lock:
-        served.viewer.settings.overlays.update(("skeleton", "object track"))
+    with served.visit.controls.lock:
+        served.visit.settings.overlays.update(("skeleton", "object track"))
     served.settle(page)
     save(shot_of(page), "clip")
     served.close()

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 from browser import in_thread
 
 import hoigs
-from hoigs.viewing.viewer.viewer import Viewer
+from hoigs.viewing.viewer.viewer import Viewer, Visit
 
 CAMERA = {
     "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 1.0, 3.0),
@@ -79,8 +79,16 @@ class Visitor:
 
 
 def controls(viewer: Viewer) -> dict[str, Any]:
-    """viser's handles of the panel's controls, by id."""
-    return dict(viewer.server.gui._gui_input_handle_from_uuid)
+    """viser's handles of the controls in the first visitor's panel, by id."""
+    return dict(visit_of(viewer).eye.client.gui._gui_input_handle_from_uuid)
+
+
+def visit_of(viewer: Viewer, seconds: float = 60) -> Visit:
+    """The first visitor, once there is one."""
+    end = time.monotonic() + seconds
+    while not viewer.visits and time.monotonic() < end:
+        time.sleep(0.05)
+    return next(iter(viewer.visits.values()))
 
 
 def uuid_of(viewer: Viewer, label: str) -> str:

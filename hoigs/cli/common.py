@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
+import json
 import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,7 +27,7 @@ SetOption = Annotated[
     typer.Option("--set", help="Set one key of the spec: train.steps=500. Repeatable."),
 ]
 DeviceOption = Annotated[
-    str, typer.Option("--device", help="cpu, cuda, or auto: cuda if available.")
+    str, typer.Option("--device", "-d", help="cpu, cuda, or auto: cuda if available.")
 ]
 ClipOption = Annotated[
     Path | None,
@@ -40,6 +44,53 @@ PluginOption = Annotated[
 ]
 
 
+class Talk:
+    """How much commands say, as `-q` and `-v` set it.
+
+    Attributes:
+        quiet: results and warnings alone. verbose: each step of the work as a line, with its time.
+        tables: where tables go in place of the terminal, with `--json`.
+    """
+
+    quiet = verbose = False
+    tables: list[dict[str, Any]] | None = None
+
+
+def with_json(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command that prints tables the flag --json: stdout is one list of them, and all else
+    that it says goes to stderr."""
+
+    @functools.wraps(command)
+    def called(*, as_json: bool, **values: Any) -> None:
+        if not as_json:
+            return command(**values)
+        Talk.tables = []
+        try:
+            with redirect_stdout(sys.stderr):
+                command(**values)
+        finally:
+            tables, Talk.tables = Talk.tables, None
+        typer.echo(json.dumps(tables, indent=1))
+
+    flag = Annotated[bool, typer.Option("--json", help="Print the tables as JSON.")]
+    own = inspect.signature(command, eval_str=True).parameters.values()
+    kinds = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own]
+    last = inspect.Parameter(
+        "as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=flag
+    )
+    called.__signature__ = inspect.Signature([*kinds, last])  # type: ignore[attr-defined]
+    called.__annotations__ = {p.name: p.annotation for p in (*kinds, last)}
+    return called
+
+
+def _plain(cell: Any) -> Any:
+    """A cell for JSON: a number where it is one."""
+    try:
+        return cell if isinstance(cell, int | float) else float(str(cell))
+    except ValueError:
+        return str(cell)
+
+
 def print_table(
     title: str,
     columns: Sequence[str],
@@ -50,9 +101,14 @@ def print_table(
 ) -> None:
     """Print a table on stdout; without rows its title and notes alone.
 
-    No cell is cut: in a terminal that is too narrow lines break, between words where these fit;
-    elsewhere lines are as long as they need to be, or as `widest` allows.
+    With --json it is kept for the end (`with_json`). No cell is cut: in a terminal that is too
+    narrow lines break, between words where these fit; elsewhere lines are as long as they need to
+    be, or as `widest` allows.
     """
+    if Talk.tables is not None:
+        lines = [dict(zip(columns, map(_plain, row), strict=True)) for row in rows]
+        Talk.tables.append({"title": title, "rows": lines, "notes": list(notes)})
+        return
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -113,7 +169,10 @@ class Bar:
 
 @contextmanager
 def progress_bar(title: str, total: float) -> Iterator[Bar]:
-    """A bar with elapsed time and ETA on stderr; quiet when stderr is not a terminal."""
+    """A bar with elapsed time and ETA on stderr; quiet when stderr is not a terminal, or with -q.
+
+    In a notebook it is the notebook's own kind of output, which rich makes.
+    """
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -135,7 +194,7 @@ def progress_bar(title: str, total: float) -> Iterator[Bar]:
         TextColumn("{task.fields[text]}"),
         console=console,
         transient=False,
-        disable=not console.is_terminal,
+        disable=Talk.quiet or not (console.is_terminal or console.is_jupyter),
     ) as progress:
         yield Bar(progress, progress.add_task(title, total=total, text=""))
 
@@ -144,7 +203,10 @@ def progress_bar(title: str, total: float) -> Iterator[Bar]:
 
 
 def say(text: str) -> None:
-    """A line on stdout; a reader that has left (`hoigs train … | head`) does not end the work."""
+    """A line on stdout, but not with -q; a reader that has left (`hoigs train … | head`) does not
+    end the work."""
+    if Talk.quiet:
+        return
     try:
         typer.echo(text)
     except BrokenPipeError:
@@ -158,6 +220,7 @@ class Display:
         self._bars = ExitStack()
         self._bar: Bar | None = None
         self._steps = 0
+        self._began, self._last = time.perf_counter(), ""
         self._psnr: dict[str, float] = {}
 
     def __enter__(self) -> Display:
@@ -211,7 +274,11 @@ class Display:
             )
 
     def fraction(self, done: float, text: str) -> None:
-        """`progress`: a bar over a job that reports fractions."""
+        """`progress`: a bar over a job that reports fractions; with -v also a line a step."""
+        if Talk.verbose and text != self._last:
+            self._last = text
+            seconds = time.perf_counter() - self._began
+            say(f"{seconds:7.1f} s  {100 * done:3.0f} %  {printable(text)}")
         if self._bar is None:
             self._bar = self._bars.enter_context(progress_bar("working", 1.0))
         self._bar.update(done, text)

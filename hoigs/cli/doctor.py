@@ -34,7 +34,7 @@ def bug_report(
     run: Annotated[
         Path | None, typer.Argument(help="A run folder whose text files are added.")
     ] = None,
-    out: Annotated[Path, typer.Option("--out", help="The zip to write.")] = Path(
+    out: Annotated[Path, typer.Option("--out", "-o", help="The zip to write.")] = Path(
         "hoigs-bug-report.zip"
     ),
 ) -> None:

@@ -1,7 +1,7 @@
 """The one place where the commands turn failures into a message and an exit code.
 
 2 is a mistake that the user can mend, 130 and 143 are Ctrl-C and SIGTERM. Mistakes in hoigs keep
-their traceback, and so does everything under HOIGS_TRACEBACK=1.
+their traceback, and so does everything with -v or under HOIGS_TRACEBACK=1.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 
 from typer.core import TyperGroup
 
+from hoigs.cli.common import Talk
 from hoigs.core.errors import HoigsError, Interrupted
 from hoigs.core.system.files import printable
 
@@ -92,7 +93,8 @@ def failures_as_messages() -> Iterator[None]:
         if stop_within is not None:
             _end(stop_within)
         message = message_of(error)
-        if message is None or os.environ.get("HOIGS_TRACEBACK", "0") not in ("", "0"):
+        wanted = Talk.verbose or os.environ.get("HOIGS_TRACEBACK", "0") not in ("", "0")
+        if message is None or wanted:
             raise
         print(f"error: {printable(message)}", file=sys.stderr)
         sys.exit(2)

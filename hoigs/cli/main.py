@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import typer
 
 from hoigs import __version__
-from hoigs.cli import doctor, study, train
+from hoigs.cli import common, doctor, study, train
 from hoigs.cli import doctor as bug_report
 from hoigs.cli import make as annotate
 from hoigs.cli import make as demo
@@ -28,19 +30,31 @@ from hoigs.core.system.threads import (
     share_processors,
     short_waits_when_busy,
 )
+from hoigs.plugins.builtin import PARTS as BUILT_IN
 
 MAKE, TRAIN, SEE = "From a video to a clip", "From a clip to a run", "Look at it, take it away"
 STUDY, PARTS, HELP = "Many runs", "Parts", "When something goes wrong"
 
+SAID_ANYWHERE = {"-q", "--quiet", "-v", "--verbose"}
+FORMATS = [(name.partition(":")[2], s) for name, *_, s in BUILT_IN if name.startswith("exporter:")]
+
+
+class Root(GuardedGroup):
+    """The command `hoigs`, whose -q and -v may also stand behind the verb."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        ours = [word for word in args if word in SAID_ANYWHERE]
+        return super().parse_args(ctx, ours + [w for w in args if w not in SAID_ANYWHERE])
+
+
 app = typer.Typer(
     name="hoigs",
-    cls=GuardedGroup,
+    cls=Root,
     help="People handling things, reconstructed from one video as moving 3D Gaussians.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
-    add_completion=False,
 )
 study_app = typer.Typer(no_args_is_help=True, help="Compare methods, and find their limits.")
 study_app.command("compare")(study.compare)
@@ -54,7 +68,11 @@ app.command("train", rich_help_panel=TRAIN)(train.train)
 app.command("eval", rich_help_panel=TRAIN)(evaluate.evaluate)
 app.command("render", rich_help_panel=SEE)(render.render)
 app.command("view", rich_help_panel=SEE)(view.view)
-app.command("export", rich_help_panel=SEE)(export.export)
+app.command(
+    "export",
+    rich_help_panel=SEE,
+    epilog="Formats:\n\n" + "\n".join(f"- `{name}`: {summary}" for name, summary in FORMATS),
+)(export.export)
 app.command("publish", rich_help_panel=SEE)(publish.publish)
 app.command("batch", rich_help_panel=STUDY)(batch.batch)
 app.command("work", rich_help_panel=STUDY)(batch.work)
@@ -78,8 +96,15 @@ def _options(
     version: bool = typer.Option(
         False, "--version", callback=_version, is_eager=True, help="Print the version and stop."
     ),
+    quiet: bool = typer.Option(
+        False, "--quiet", "-q", help="Print results and warnings alone; also after the command."
+    ),
+    verbose: bool = typer.Option(
+        False, "--verbose", "-v", help="Print every step of the work, and tracebacks of failures."
+    ),
 ) -> None:
     del version
+    common.Talk.quiet, common.Talk.verbose = quiet, verbose
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hoigs.cli.common import Display, print_table
+from hoigs.cli.common import Display, print_table, say, with_json
 from hoigs.cli.options import flags
 from hoigs.core.system.files import printable
 from hoigs.preparation.options import PrepareOptions
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hoigs.training.train import TrainedRun
 
 
+@with_json
 @flags(DemoOptions)
 def demo(*, options: DemoOptions) -> None:
     """Generate a clip with known truth, reconstruct it, and write report.html."""
@@ -55,6 +56,7 @@ def _compare(runs: dict[str, TrainedRun]) -> None:
 # `hoigs prepare`: make a clip folder from a video.
 
 
+@with_json
 @flags(PrepareOptions)
 def prepare(
     source: Annotated[
@@ -63,7 +65,7 @@ def prepare(
             help="A video, or a folder with a video or frames and further inputs; or a URL of one."
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", help="Clip folder to make.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Clip folder to make.")],
     stage: Annotated[
         str | None, typer.Option("--stage", help="Stop after this stage; no clip is written.")
     ] = None,
@@ -122,7 +124,8 @@ def _consent() -> Consent | None:
 def refine(
     clip: Annotated[Path, typer.Argument(help="Clip folder, as `hoigs prepare` makes it.")],
     out: Annotated[
-        Path, typer.Option("--out", help="Folder of the refined clip; with --overwrite also CLIP.")
+        Path,
+        typer.Option("--out", "-o", help="Folder of the refined clip; with --overwrite also CLIP."),
     ],
     *,
     options: RefineOptions,
@@ -145,7 +148,8 @@ def refine(
 def annotate(
     video: Annotated[Path, typer.Argument(help="A video, or a folder with one or with frames.")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="Clip to prepare; default: clips/VIDEO'S NAME.")
+        Path | None,
+        typer.Option("--out", "-o", help="Clip to prepare; default: clips/VIDEO'S NAME."),
     ] = None,
     port: Annotated[int, typer.Option("--port", help="0 finds a free one.")] = 8091,
     browser: Annotated[
@@ -160,6 +164,7 @@ def annotate(
     ] = None,
 ) -> None:
     """Click on the people and objects of a video, see their masks, and prepare it."""
+    say(f"starting the page of {video} …")
     from hoigs.viewing.annotate.server import annotate as serve
 
     options = PrepareOptions.of(file, {"overrides": settings or ()}, "annotate")

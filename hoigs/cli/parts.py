@@ -21,7 +21,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hoigs.cli.common import DeviceOption, Display, PluginOption, SetOption, print_table
+from hoigs.cli.common import (
+    DeviceOption,
+    Display,
+    PluginOption,
+    SetOption,
+    print_table,
+    with_json,
+)
 from hoigs.core.errors import HoigsError
 from hoigs.core.system.files import printable
 from hoigs.runs.choices import pick_device
@@ -257,7 +264,9 @@ USAGES = {
 def new_plugin(
     name: Annotated[str, typer.Argument(help="Of the package and the component: acme-bounce.")],
     kind: Annotated[NewKind, typer.Option("--kind", help="What it offers.")] = NewKind.deformation,
-    out: Annotated[Path, typer.Option("--out", help="Where the folder NAME is made.")] = Path(),
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Where the folder NAME is made.")
+    ] = Path(),
 ) -> None:
     """Write a package of your own: a working component, its tests, an entry point, a README."""
     folder = write_package(name, kind, out)
@@ -500,6 +509,7 @@ Name = Annotated[str, typer.Argument(help="Environment, as `hoigs estimators lis
 
 
 @estimators_app.command("list")
+@with_json
 def list_environments() -> None:
     """List the environments, and whether they are installed."""
     from hoigs.core.registry.registry import known_environments

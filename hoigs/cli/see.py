@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hoigs.cli.common import Display
+from hoigs.cli.common import Display, say
 from hoigs.cli.options import flags
 from hoigs.viewing.options import ExportOptions, RenderOptions, ViewOptions
 
@@ -24,6 +24,7 @@ def view(
     options: ViewOptions,
 ) -> None:
     """Look at a run from any side while it moves; of one in training, at its checkpoints."""
+    say(f"starting the viewer of {' and '.join(str(w) for w in (what, second) if w)} …")
     from hoigs.viewing.view import view as show
 
     with Display() as display:

@@ -176,7 +176,7 @@ def batch(
     manifest: Annotated[
         Path, typer.Argument(help="YAML or CSV: one row a video or clip, with its settings.")
     ],
-    out: Annotated[Path, typer.Option("--out", help="Folder of the rows and the summary.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the rows and the summary.")],
     *,
     options: BatchOptions,
 ) -> None:

@@ -15,6 +15,7 @@ from hoigs.cli.common import (
     PluginOption,
     print_scores,
     print_table,
+    with_json,
 )
 from hoigs.cli.options import flags
 from hoigs.evaluation.options import EvaluateOptions
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 # `hoigs study needs`: find how much of a spec a clip needs; the answer is a spec.
 
 
+@with_json
 @flags(NeedsOptions)
 def needs(
     clip: Annotated[
@@ -63,6 +65,7 @@ def print_needs(found: Needs) -> None:
         typer.echo(sentence)
 
 
+@with_json
 @flags(TrainOptions)
 def train(
     clip: Annotated[
@@ -117,6 +120,7 @@ def _print_after(after: After) -> None:
 # `hoigs eval`: score a run on its test frames and held-out cameras.
 
 
+@with_json
 @flags(EvaluateOptions)
 def evaluate(
     run: Annotated[Path, typer.Argument(help="Run folder, as `hoigs train` makes it.")],
@@ -143,7 +147,7 @@ def compress(
     run: Annotated[Path, typer.Argument(help="Run folder, as `hoigs train` makes it.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder of the compressed run; default RUN-compact."),
+        typer.Option("--out", "-o", help="Folder of the compressed run; default RUN-compact."),
     ] = None,
     clip: ClipOption = None,
     device: DeviceOption = "auto",

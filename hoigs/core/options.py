@@ -27,6 +27,9 @@ from hoigs.core.spec.loader import Document, Place
 Result = TypeVar("Result")
 
 
+SHORT = {"out": "-o", "format": "-f", "width": "-w", "device": "-d", "spec": "-s", "jobs": "-j"}
+
+
 class Flag:
     """How the command line writes an option, where that is not --its-name.
 
@@ -41,8 +44,10 @@ class Flag:
 
     @staticmethod
     def names_of(option: str, flag: Flag | None) -> tuple[str, ...]:
-        """How an option is written; empty where it has no flag."""
-        return flag.names if flag else (f"--{option.replace('_', '-')}",)
+        """How an option is written, with one letter where it has one; empty without a flag."""
+        if flag is not None:
+            return flag.names
+        return (f"--{option.replace('_', '-')}", *filter(None, [SHORT.get(option)]))
 
 
 class Options(ComponentConfig):

@@ -22,6 +22,7 @@ from hoigs.core.system.files import named
 from hoigs.core.system.random_state import callers_random_state
 from hoigs.core.system.threads import short_waits_when_busy
 from hoigs.core.system.urls import local_path
+from hoigs.core.system.video_files import pyav
 from hoigs.preparation import stages
 from hoigs.preparation.body.body_files import BodyFileEstimator, body_beside
 from hoigs.preparation.clip_writing import Cleanup
@@ -142,6 +143,7 @@ def _run(
     talk: _Talk,
     until: str | None = None,
 ) -> Draft:
+    pyav()  # without it the report's video would be missed at the end
     if isinstance(estimators, str):
         options = options.changed(preset=estimators)
     options = with_prompts(options)

@@ -181,10 +181,12 @@ def training_row(device: str) -> Inspected:
 
 def codec_rows() -> list[Inspected]:
     """The encoders that films need, and the decoders of usual videos, in this build of PyAV."""
-    import av
+    from hoigs.core.system.video_files import ENCODERS, pyav
 
-    from hoigs.core.system.video_files import ENCODERS
-
+    try:
+        av = pyav()
+    except HoigsError as error:
+        return [Inspected("videos", "none", str(error))]
     rows = []
     wanted: list[tuple[str, Literal["r", "w"], str]]
     wanted = [(encoder[0], "w", ending) for ending, encoder in ENCODERS.items()]

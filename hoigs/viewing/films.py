@@ -19,7 +19,7 @@ from hoigs.core.options import verb
 from hoigs.core.parameters import PIECE, release_time_rows
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.system.threads import short_waits_when_busy
-from hoigs.core.system.video_files import SUFFIXES, WITH_ALPHA, write_video
+from hoigs.core.system.video_files import ENCODERS, SUFFIXES, WITH_ALPHA, pyav, write_video
 from hoigs.core.values.between import frame_numbers
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
@@ -212,6 +212,8 @@ def _target(run: Path, path: str, options: RenderOptions) -> Path:
     if target.suffix.lower() not in kinds:
         what = "transparent videos" if clear else "videos"
         raise HoigsError(f"{target}: {what} end with {', '.join(kinds)}")
+    if target.suffix.lower() in ENCODERS:
+        pyav()
     return target
 
 

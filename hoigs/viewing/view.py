@@ -77,12 +77,11 @@ def view(
         )  # fmt: skip
     if options.max_mb is not None or options.entities:
         raise HoigsError("max_mb and entities are of the file that `html` names")
-    report(f"starting the viewer of {' and '.join([str(run) for run in runs] or [str(what)])}")
     registry = default_registry(plugin_files=options.plugins)
     followed = []
     for path in runs:
         wait_for_checkpoint(path, report)
-        followed.append(FollowedRun(path, partial(options.open, path)))
+        followed.append(FollowedRun(path, partial(options.open, path, pixels=False)))
     drawings: list[Drawing]
     if followed:
         drawings = [RunDrawing(run.loaded) for run in followed]

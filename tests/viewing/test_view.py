@@ -8,18 +8,19 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from served import served
+from served import CAMERA, Visitor, served, visit_of
 
 import hoigs
 from hoigs.core.errors import HoigsError
 
-pytest.importorskip("viser", reason="viser is not installed: pip install 'hoigs[viewer]'")
+pytest.importorskip("viser", reason="viser is not installed: pip install 'hoigs[view]'")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
@@ -31,6 +32,13 @@ def until(check: Callable[[], bool], page: Any, what: str, seconds: float = 40) 
     raise AssertionError(f"not within {seconds} s: {what}")
 
 
+def comes(visitor: Visitor, check: Callable[[], bool], seconds: float = 20) -> None:
+    end = time.monotonic() + seconds
+    while not check():
+        assert time.monotonic() < end
+        visitor.listen(0.05)
+
+
 def test_the_viewer_in_a_browser(tiny_run: Path, window: Any) -> None:
     with served(tiny_run) as (viewer, address, lines):
         assert address.startswith("http://127.0.0.1:") and not any("warning" in x for x in lines)
@@ -39,8 +47,7 @@ def test_the_viewer_in_a_browser(tiny_run: Path, window: Any) -> None:
         page.goto(address)
 
         def still() -> bool:
-            eyes = list(viewer._eyes.values())
-            return bool(eyes) and eyes[0].full
+            return bool(viewer.visits) and visit_of(viewer).eye.full
 
         def picture() -> np.ndarray:
             until(still, page, "a still picture")
@@ -59,17 +66,17 @@ def test_the_viewer_in_a_browser(tiny_run: Path, window: Any) -> None:
         page.get_by_role("button", name="frame ▶").click()
         page.wait_for_timeout(500)
         second = picture()
-        assert viewer.clock.frame(0.0) == 1.0
+        assert visit_of(viewer).clock.frame(0.0) == 1.0
         page.get_by_role("button", name="Play").click()
-        until(lambda: viewer.clock.playing, page, "playing")
+        until(lambda: visit_of(viewer).clock.playing, page, "playing")
         page.get_by_role("button", name="Pause").click()
-        until(lambda: not viewer.clock.playing, page, "the pause")
-        viewer.clock.seek(6.0, 0.0)
+        until(lambda: not visit_of(viewer).clock.playing, page, "the pause")
+        visit_of(viewer).clock.seek(6.0, 0.0)
         later = another(second)
         page.get_by_label("human", exact=True).click()
-        until(lambda: "human" not in viewer.settings.entities, page, "no human")
+        until(lambda: "human" not in visit_of(viewer).settings.entities, page, "no human")
         alone = another(later)
-        assert viewer.settings.video
+        assert visit_of(viewer).settings.video
 
         def dragged() -> bool:  # again where a busy browser took the video's camera once more
             page.mouse.move(150, 300)
@@ -77,12 +84,15 @@ def test_the_viewer_in_a_browser(tiny_run: Path, window: Any) -> None:
             page.mouse.move(190, 310, steps=5)
             page.mouse.up()
             page.wait_for_timeout(2000)
-            return not viewer.settings.video and bool(np.abs(picture() - alone).max() > 30)
+            return not visit_of(viewer).settings.video and bool(
+                np.abs(picture() - alone).max() > 30
+            )
 
         until(dragged, page, "a picture from elsewhere")
         page.get_by_label("body mesh").click()
-        until(lambda: "body mesh" in viewer.settings.overlays, page, "the body mesh")
-        viewer.settings.video = viewer.settings.see_through = True  # where the person is seen
+        until(lambda: "body mesh" in visit_of(viewer).settings.overlays, page, "the body mesh")
+        settings = visit_of(viewer).settings
+        settings.video = settings.see_through = True  # where the person is seen
 
         def drawn() -> bool:
             return 0.002 < (np.abs(opened.pixels()[:, :280] - alone).max(-1) > 30).mean() < 0.5
@@ -96,16 +106,53 @@ def test_a_clip_in_a_browser(tiny_run: Path, window: Any) -> None:
         opened = window()
         page = opened.page
         page.goto(address)
-        until(lambda: any(e.full for e in viewer._eyes.values()), page, "the frame")
+        until(lambda: any(v.eye.full for v in viewer.visits.values()), page, "the frame")
         page.wait_for_timeout(1500)
         tinted = opened.pixels()[:, :280]
         assert tinted.std() > 5
         for name in ("cameras", "scene points", "object points"):
             page.get_by_label(name, exact=True).click()
-        until(lambda: len(viewer.settings.overlays) == 3, page, "overlays")
+        until(lambda: len(visit_of(viewer).settings.overlays) == 3, page, "overlays")
         page.wait_for_timeout(1500)
         assert np.abs(opened.pixels()[:, :280] - tinted).max() > 30
         assert opened.errors == []
+
+
+def test_visitors_have_what_they_chose_and_keys(tiny_run: Path) -> None:
+    from hoigs.viewing.viewer.viewer import AROUND
+
+    with served(tiny_run) as (viewer, address, _), Visitor(address) as one, Visitor(address) as two:
+        assert one.gets_a_picture() and two.gets_a_picture()
+        first, second = viewer.visits.values()
+        assert first.settings.follow == "human" and first.settings.video
+        one.press(viewer, "human", False)
+        commands = first.eye.client.gui._command_handle_from_uuid
+        keys = {command.hotkey: uuid for uuid, command in commands.items()}
+        one.send(type="CommandTriggerMessage", uuid=keys["arrowright"])
+        one.send(type="CommandTriggerMessage", uuid="none")
+        comes(one, lambda: first.clock.frame(0.0) == 1.0)
+        assert "human" not in first.settings.entities
+        assert "human" in second.settings.entities and second.clock.frame(0.0) == 0.0
+
+        wide = viewer.picture((256, 64), viewer.initial(), 0.0, first.eye.view).image
+        assert (wide[:, :90] == AROUND).all() and (wide[:, -90:] == AROUND).all()
+        assert wide[:, 100:156].std() > 5  # the video's frame is square, and stands in the middle
+
+
+def test_a_drag_of_a_clip_shows_it_in_3d_above_the_floor(tiny_run: Path) -> None:
+    with served(tiny_run.parent / "clip") as (viewer, address, _), Visitor(address) as visitor:
+        assert visitor.gets_a_picture()
+        (visit,) = viewer.visits.values()
+        viewer._dragged(visit)
+        wanted = {"body mesh", "object points", "scene points"}
+        assert visit.settings.overlays == wanted and not visit.settings.video
+        floor, up = viewer.clip.world.floor, viewer.up
+        assert floor is not None
+        low = (3 * np.eye(3)[2] + (floor - 1) * up).tolist()
+        visitor.send(**CAMERA | {"position": low})
+        comes(visitor, lambda: float(visit.eye.view.position @ up) > floor)
+        visitor.press(viewer, "Camera of the video", True)
+        comes(visitor, lambda: visit.settings.video and not visit.settings.overlays)
 
 
 def test_a_run_in_training_is_followed(tiny_run: Path, tmp_path: Path) -> None:
@@ -133,7 +180,7 @@ def test_two_runs_have_one_clock(tiny_run: Path) -> None:
         from hoigs.viewing.viewer.views import View
 
         view = View.of_camera(viewer.clip.cameras[0], 2.0, (128, 64))
-        both = viewer.picture((128, 64), viewer.settings, 2.0, view).image.astype(int)
+        both = viewer.picture((128, 64), viewer.initial(), 2.0, view).image.astype(int)
         assert both.shape == (64, 128, 3)
         assert np.abs(both[:, 1:63] - both[:, 65:127]).max() == 0  # the same run on both sides
         assert both.std() > 5
@@ -213,7 +260,6 @@ def test_a_training_is_shown_while_it_lasts(tiny_run: Path, tmp_path: Path) -> N
 
 def answers(address: str, seconds: float) -> bool:
     """Whether a page is served at an address, within this time."""
-    import time
     import urllib.request
 
     end = time.monotonic() + seconds

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from served import CAMERA, Visitor, controls, served, uuid_of
+from served import CAMERA, Visitor, controls, served, uuid_of, visit_of
 
 from hoigs.core.errors import HoigsError
 from hoigs.viewing.viewer.access import Door
@@ -25,7 +25,7 @@ from hoigs.viewing.viewer.takes import Path as TakenPath
 from hoigs.viewing.viewer.viewer import Viewer
 from hoigs.viewing.viewer.views import View
 
-pytest.importorskip("viser", reason="viser is not installed: pip install 'hoigs[viewer]'")
+pytest.importorskip("viser", reason="viser is not installed: pip install 'hoigs[view]'")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 NAN, INF = float("nan"), float("inf")
@@ -141,8 +141,13 @@ def test_cameras_come_out_finite_and_bounded() -> None:
 
 
 def test_controls_get_only_what_they_offer(running: tuple[Viewer, str]) -> None:
-    viewer, _ = running
+    viewer, address = running
+    with Visitor(address) as visitor:
+        assert visitor.gets_a_picture()
+        bounds_are_kept(viewer)
 
+
+def bounds_are_kept(viewer: Viewer) -> None:
     def put(label: str, value: Any) -> Any:
         handle = controls(viewer)[uuid_of(viewer, label)]
         got = read({"type": "GuiUpdateMessage", "uuid": "", "updates": {"value": value}}, handle)
@@ -219,7 +224,7 @@ def test_500_mutated_messages_leave_the_viewer_to_others(tiny_run: Path) -> None
             assert other.gets_a_picture(position=(0.4, 1.0, 3.0))
         for handle in controls(viewer).values():
             assert np.isfinite(handle.value).all() if isinstance(handle.value, float) else True
-        assert viewer.settings.follow in (None, *viewer.drawings[0].names)
+        assert visit_of(viewer).settings.follow in (None, *viewer.drawings[0].names)
         visitor.socket.close()
     assert time.monotonic() - began < 240
 
@@ -251,13 +256,14 @@ def test_a_film_does_not_keep_others_waiting(running: tuple[Viewer, str]) -> Non
         assert maker.gets_a_picture() and other.gets_a_picture()
         for x in (0.5, 1.0):
             assert maker.gets_a_picture(position=(x, 1.0, 3.0))
-            count = len(viewer.path.keys)
+            count = len(visit_of(viewer).path.keys)
             maker.press(viewer, "Add this view to the path")
-            until(lambda n=count: len(viewer.path.keys) > n)
+            until(lambda n=count: len(visit_of(viewer).path.keys) > n)
         maker.press(viewer, "Seconds of film", 1e9)
         maker.press(viewer, "Film the path (mp4)")
-        until(lambda: bool(viewer._films))
-        film = next(iter(viewer._films.values()))
+        until(lambda: visit_of(viewer).film is not None)
+        film = visit_of(viewer).film
+        assert film is not None
         assert film.count == 20 * FILM_FPS
         assert other.gets_a_picture(position=(0.1, 1.0, 3.0))
         assert film.drawn < film.count

@@ -71,6 +71,9 @@ class ExportRequest:
         return [name for name in self.entities if self.scene.entity(name).kind == kind]
 
 
+FEW = 4  # files that are listed one by one
+
+
 @dataclass(frozen=True)
 class Exported:
     """What an export has written.
@@ -88,7 +91,12 @@ class Exported:
     supposed: Mapping[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        lines = [f"{self.folder / name}: {size} bytes" for name, size in self.files.items()]
+        sizes = list(self.files.items())
+        lines = [f"{self.folder / name}: {size} bytes" for name, size in sizes[:FEW]]
+        if len(sizes) > FEW:
+            (first, _), (last, _) = sizes[0], sizes[-1]
+            total = sum(self.files.values())
+            lines = [f"{self.folder}: {len(sizes)} files, {total} bytes: {first} … {last}"]
         lines += [f"not exported: {k}: {v}" for k, v in self.omitted.items()]
         return "\n".join([*lines, *(f"supposed: {k}: {v}" for k, v in self.supposed.items())])
 

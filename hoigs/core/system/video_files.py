@@ -32,6 +32,22 @@ BLOCK = 32  # pixels
 BT709, SRGB = 1, 13  # primaries and transfer function, as ITU-T H.273 numbers them
 
 
+def pyav() -> Any:
+    """PyAV, which only those need who read or write videos.
+
+    Raises:
+        HoigsError: it is not installed.
+    """
+    try:
+        import av
+    except ImportError as error:
+        raise HoigsError(
+            f"videos are read and written by PyAV ({error}): pip install 'hoigs[prepare]' (a .gif "
+            "is written without it)"
+        ) from error
+    return av
+
+
 def write_video(
     path: Path | str, frames: Iterable[UInt8[np.ndarray, "H W C"]], *, fps: float = 30.0
 ) -> Path:
@@ -87,8 +103,7 @@ def _checked(frames: Iterable[np.ndarray], *, even: bool) -> Iterator[np.ndarray
 def _encode(
     path: Path, kind: str, frames: Iterator[np.ndarray], first: np.ndarray, fps: float
 ) -> None:
-    import av
-
+    av = pyav()
     name, rgb, rgba, options = ENCODERS[kind]
     alpha = first.shape[2] == 4
     # without a date and a version in the file, the same frames give the same bytes
@@ -122,7 +137,7 @@ def coded(image: UInt8[np.ndarray, "H W C"], stream: Any) -> Any:
     whatever was there: rows are continued by their last pixel, so that equal pictures give equal
     files.
     """
-    import av
+    av = pyav()
     from av.video.reformatter import ColorRange, Colorspace
 
     height, width = image.shape[:2]

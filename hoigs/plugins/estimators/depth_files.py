@@ -27,6 +27,7 @@ from hoigs.core.interfaces.estimator import (
 )
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.system.files import regular_file
+from hoigs.core.system.video_files import pyav
 from hoigs.plugins.estimators.frame_files import (
     FileDiagnostics,
     absent,
@@ -79,7 +80,7 @@ def read_exr(path: Path) -> Float[np.ndarray, "H W"]:
     Raises:
         HoigsError: unreadable, or channels that differ, which is no depth.
     """
-    import av
+    av = pyav()
 
     try:
         with av.open(str(regular_file(path))) as container:

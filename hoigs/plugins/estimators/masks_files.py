@@ -28,6 +28,7 @@ from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.system.files import regular_file
 from hoigs.core.system.images import mask_values
 from hoigs.core.system.npz import load_array
+from hoigs.core.system.video_files import pyav
 from hoigs.plugins.estimators.frame_files import (
     FileDiagnostics,
     absent,
@@ -150,7 +151,7 @@ def _labels_of_colours(rgb: np.ndarray, path: Path) -> Int[np.ndarray, "H W"]:
 
 def read_video_masks(path: Path, inside: Inside, problems: FileDiagnostics) -> PackedMasks:
     """The masks of a black and white video; it must be bright inside, or dark."""
-    import av
+    av = pyav()
 
     stack = PackedMasks()
     try:

@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw
 from scipy import ndimage
 from torch import Tensor
 
-from hoigs.core.system.video_files import coded, declare_colors
+from hoigs.core.system.video_files import coded, declare_colors, pyav
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.video.pictures import shrink, shrink_mask
 
@@ -78,7 +78,7 @@ class VideoWriter:
         self._stream: Any = None
 
     def __enter__(self) -> VideoWriter:
-        import av
+        av = pyav()
 
         self._container = av.open(str(self.path), "w")
         return self

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hoigs.core.system.video_files import pyav
 from hoigs.preparation.video.source import SourceError, require_regular
 
 
@@ -16,7 +17,7 @@ def open_video(path: Path) -> tuple[Any, Any]:
     Raises:
         SourceError: it is no regular file, no video, or has no video stream.
     """
-    import av
+    av = pyav()
 
     require_regular(path)
     try:
@@ -48,7 +49,7 @@ MOST = 0.97  # of the header's frames, which are an estimate where it gives seco
 
 def video_header(path: Path) -> tuple[int, float] | None:
     """Number of frames and frames a second, as the header has them; None if it has not."""
-    import av
+    av = pyav()
 
     try:
         container, stream = open_video(path)

@@ -14,6 +14,7 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import UInt8
 
+from hoigs.core.system.video_files import pyav
 from hoigs.preparation.video.container import PacketIndex, open_video, packet_index, unreadable
 from hoigs.preparation.video.pictures import FilePicture, Picture, VideoPicture, sharpness
 from hoigs.preparation.video.source import IMAGE_SUFFIXES, SourceError, numbered_frames
@@ -350,7 +351,7 @@ class VideoFrames(Frames):
     @contextmanager
     def _opened(self) -> Iterator[tuple[Any, Any]]:
         """The file and its video stream; errors of the decoder are named."""
-        import av
+        av = pyav()
 
         container, stream = open_video(self.path)
         try:

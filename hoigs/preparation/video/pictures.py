@@ -15,6 +15,7 @@ from PIL import Image
 from scipy import ndimage
 
 from hoigs.core.system.images import eight_bits
+from hoigs.core.system.video_files import pyav
 from hoigs.preparation.video.source import SourceError
 
 # numbers are those of ITU-T H.273
@@ -34,7 +35,7 @@ def converted(frame: Any, width: int, height: int, form: str = "rgb24") -> Any:
     Raises:
         SourceError: its colours cannot be converted; it names their matrix, curve and primaries.
     """
-    import av
+    av = pyav()
 
     for tag in ("colorspace", "color_trc", "color_primaries"):  # reserved: nothing is known
         if int(getattr(frame, tag)) == 3 or (int(getattr(frame, tag)) == 0 and tag != "colorspace"):

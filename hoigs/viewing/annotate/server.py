@@ -23,6 +23,7 @@ from pydantic import ValidationError
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.system.files import json_value, name_from
+from hoigs.core.system.video_files import pyav
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.source import find_source
 from hoigs.viewing.annotate.session import Session
@@ -240,6 +241,7 @@ def annotate(
         SourceError: this is no video. SpecError: options, or stored clicks, are wrong.
         HoigsError: the port is in use.
     """
+    pyav()
     chosen = PrepareOptions.of(options, verb="annotate")
     found = find_source(Path(video), complete=False).video
     given = Path("clips") / name_from(found.stem, "mine") if out is None else Path(out)

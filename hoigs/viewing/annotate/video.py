@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from hoigs.core.system.video_files import pyav
 from hoigs.preparation.video.container import open_video, packet_index
 from hoigs.preparation.video.pictures import FilePicture, Picture, VideoPicture
 from hoigs.preparation.video.source import SourceError, numbered_frames
@@ -140,7 +141,7 @@ class ScrubbedVideo:
 
     def _decoded(self, number: int) -> Picture:
         """Decodes a frame, keeping those on the way."""
-        import av
+        av = pyav()
 
         start = self.keyframes[max(0, bisect.bisect_right(self.keyframes, number) - 1)]
         cursor = self._cursor(number, start)

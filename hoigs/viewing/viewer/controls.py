@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -134,8 +134,9 @@ class Controls:
 
     Args:
         gui: viser's. drawing: gives modes and entities. overlays: names on offer.
-        wake: called after every change. act: called with the name of a button and the client who
-            pressed it: "screenshot", "add key", "clear keys", "film".
+        wake: called after every change. act: called with the name of a button that was pressed:
+            "screenshot", "add key", "clear keys", "film".
+        folded: whether folders are closed at first, as on a phone.
     """
 
     def __init__(
@@ -147,12 +148,15 @@ class Controls:
         overlays: Sequence[str],
         *,
         wake: Callable[[], None],
-        act: Callable[[str, Any], None],
+        act: Callable[[str], None],
+        folded: bool = False,
     ) -> None:
         self.gui, self.settings, self.clock = gui, settings, clock
         self._wake, self._act = wake, act
         self.lock = threading.RLock()
         self._sent_at, self._sent_frame = 0.0, -1.0
+        self._open, self._boxes = not folded, dict[str, Any]()
+        self._instead = set[str]()  # overlays that stand in for the video's frames
         self.status = gui.add_markdown("connecting …")
         self._time()
         self._picture(drawing, settings.other == "run")
@@ -160,11 +164,14 @@ class Controls:
         self._overlays(overlays)
         self._takes(drawing)
 
+    def _folder(self, label: str) -> Any:
+        return self.gui.add_folder(label, expand_by_default=self._open)
+
     def _time(self) -> None:
         gui, clock = self.gui, self.clock
-        with gui.add_folder("Time"):
-            self.frame = gui.add_slider("Frame", 0.0, float(max(clock.last, 1)), 0.05, 0.0)
-            self.play = gui.add_button("Play", icon="player-play")
+        self.frame = gui.add_slider("Frame", 0.0, float(max(clock.last, 1)), 0.05, 0.0)
+        self.play = gui.add_button("Play", icon="player-play", hint="Space")
+        with self._folder("Time"):
             steps = gui.add_button_group("Step", ("◀ frame", "frame ▶"))
             speed = gui.add_slider("Speed", 0.1, 4.0, 0.1, 1.0)
             loop = gui.add_checkbox("Loop", clock.loop)
@@ -187,6 +194,11 @@ class Controls:
             if event.client is not None:  # not by the server itself
                 clock.seek(event.target.value, now())
 
+        keys = (("Play or pause", "space", press),
+                ("Next frame", "arrowright", lambda _: clock.step(1, now())),
+                ("Frame before", "arrowleft", lambda _: clock.step(-1, now())))  # fmt: skip
+        for label, key, change in keys:
+            gui.add_command(label, hotkey=key).on_trigger(self._locked(change))
         self.play.on_click(self._locked(press))
         steps.on_click(self._locked(step))
         speed.on_update(self._locked(faster))
@@ -196,7 +208,7 @@ class Controls:
     def _picture(self, drawing: Drawing, second: bool) -> None:
         gui, settings = self.gui, self.settings
         choices = COMPARE | (WITH_RUN if second else {})
-        with gui.add_folder("Picture"):
+        with self._folder("Picture"):
             mode = gui.add_dropdown("Show", drawing.modes, initial_value=settings.mode)
             self._bind(mode, "mode")
             for name in drawing.names:
@@ -225,29 +237,36 @@ class Controls:
     def _camera(self, drawing: Drawing) -> None:
         gui, settings = self.gui, self.settings
         moving = [name for name in drawing.names if name != "scene"]
-        with gui.add_folder("Camera"):
+        with self._folder("Camera"):
             self.video = gui.add_checkbox(
                 "Camera of the video", settings.video, hint="A drag of the mouse ends it."
             )
-            self.follow = gui.add_dropdown("Orbit about", ("free", *moving), initial_value="free")
+            self.follow = gui.add_dropdown(
+                "Orbit about", ("free", *moving), initial_value=settings.follow or "free"
+            )
 
         def follow(event: Any) -> None:
             settings.follow = None if event.target.value == "free" else event.target.value
             if settings.follow and self.video.value:
                 self.leave_video()
 
-        self._bind(self.video, "video")
+        def video(event: Any) -> None:
+            settings.video = event.target.value
+            if settings.video:
+                self._show(self._instead, False)
+
+        self.video.on_update(self._locked(video))
         self.follow.on_update(self._locked(follow))
 
     def _overlays(self, names: Sequence[str]) -> None:
         gui, settings = self.gui, self.settings
-        with gui.add_folder("In 3D"):
+        with self._folder("In 3D"):
             through = gui.add_checkbox(
                 "See through", settings.see_through, hint="Draw what follows over everything."
             )
             self._bind(through, "see_through")
             for name in names:
-                box = gui.add_checkbox(name, name in settings.overlays)
+                box = self._boxes[name] = gui.add_checkbox(name, name in settings.overlays)
                 box.on_update(self._toggle(settings.overlays, name))
                 if name == "skeleton":  # it lies inside of the person
                     box.on_update(lambda event: _set(through, event.target.value or through.value))
@@ -265,13 +284,20 @@ class Controls:
 
     def _button(self, label: str, icon: str, action: str) -> None:
         button = self.gui.add_button(label, icon=icon)
-        button.on_click(lambda event: self._act(action, event.client))
+        button.on_click(lambda _: self._act(action))
 
-    def leave_video(self) -> None:
-        """End "camera of the video", and what needs it."""
+    def leave_video(self, instead: Iterable[str] = ()) -> None:
+        """End "camera of the video", and show these overlays until it is back."""
         with self.lock:
             self.settings.video = False
             self.video.value = False
+            self._instead = {n for n in instead if n in self._boxes} - self.settings.overlays
+            self._show(self._instead, True)
+
+    def _show(self, names: Iterable[str], on: bool) -> None:
+        for name in names:
+            (self.settings.overlays.add if on else self.settings.overlays.discard)(name)
+            self._boxes[name].value = on
 
     def show_time(self, frame: float, now: float) -> None:
         """Bring slider and button in line with the clock, ten times a second at most."""

@@ -1,4 +1,4 @@
-"""What a browser may send to the viewer: its camera, and values of the panel's controls.
+"""What a browser may send to the viewer: its camera, keys, and values of the panel's controls.
 
 viser applies every message of a client to its camera and controls without checks. A number that is
 not finite, an unknown option or a huge canvas size would reach the viewer and other browsers. So
@@ -53,8 +53,13 @@ class _Update(BaseModel):
     updates: _Value
 
 
-_MESSAGE: TypeAdapter[_Camera | _Update] = TypeAdapter(
-    Annotated[_Camera | _Update, Field(discriminator="type")]
+class _Command(BaseModel):
+    type: Literal["CommandTriggerMessage"]
+    uuid: StrictStr
+
+
+_MESSAGE: TypeAdapter[_Camera | _Update | _Command] = TypeAdapter(
+    Annotated[_Camera | _Update | _Command, Field(discriminator="type")]
 )
 
 
@@ -65,6 +70,7 @@ def checked(raw: bytes | str, control: Callable[[str], Any]) -> bytes | None:
         raw: as it came. control: viser's handle of an id, or None.
     """
     import msgspec
+    from viser import CommandHandle
 
     if isinstance(raw, str):
         return None
@@ -72,7 +78,14 @@ def checked(raw: bytes | str, control: Callable[[str], Any]) -> bytes | None:
         message = _MESSAGE.validate_python(msgspec.msgpack.decode(raw))
     except (msgspec.DecodeError, ValueError, RecursionError):
         return None
-    good = _bounded(message) if isinstance(message, _Camera) else _offered(message, control)
+    good: BaseModel | None
+    match message:
+        case _Camera():
+            good = _bounded(message)
+        case _Command():  # a key
+            good = message if isinstance(control(message.uuid), CommandHandle) else None
+        case _:
+            good = _offered(message, control)
     return None if good is None else msgspec.msgpack.encode(good.model_dump())
 
 

@@ -22,6 +22,7 @@ from hoigs.core.registry.registry import Registry
 from hoigs.core.values.between import moment_between
 from hoigs.core.values.clip import Clip, ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment
+from hoigs.runs.kept_clip import NoPixels
 from hoigs.viewing.viewer.panes import nearest_position
 from hoigs.viewing.viewer.run_drawing import entity_colors
 from hoigs.viewing.viewer.views import View
@@ -94,6 +95,10 @@ def _reader(name: str) -> Callable[[Moment], BodyPose]:
 
 
 CAMERAS = 24  # frusta that are drawn at most
+APART = 0.02  # of the scene's size: nearer cameras would cover each other
+AT_THE_CAMERA = frozenset({"cameras", "camera images"})
+# shown of a clip where a drag has left its frames
+IN_PLACE_OF_FRAMES = ("body mesh", "object points", "scene points")
 THUMBNAIL = 160  # pixels of width of a camera's image
 DEPTH_POINTS = 30_000  # of the depth of one frame at most
 
@@ -107,7 +112,7 @@ def offered(
         "skeleton": bool(bodies),
         "object track": bool(clip.objects),
         "cameras": True,
-        "camera images": True,
+        "camera images": not isinstance(clip.store, NoPixels),
         "object points": before_training and bool(clip.objects),
         "scene points": before_training and len(clip.points) > 0,
         "depth points": before_training and clip.depth_kind == "metric",
@@ -119,7 +124,7 @@ class Overlays:
     """The nodes in a viser scene. A node is made when it is first shown.
 
     Args:
-        scene: viser's scene of all browsers. bodies: by entity.
+        scene: viser's scene of one browser. bodies: by entity.
     """
 
     def __init__(self, scene: Any, clip: Clip, bodies: Mapping[str, PosedBody]) -> None:
@@ -231,9 +236,12 @@ class Overlays:
         yield from self._frusta("/camera_images", images=True)
 
     def _frusta(self, place: str, images: bool) -> Any:
-        clip = self.clip
+        clip, last = self.clip, None
         for i in range(0, len(clip), -(-len(clip) // CAMERAS)):
             camera = clip.cameras[i]
+            if last is not None and float((camera.center - last).norm()) < APART * self.size:
+                continue
+            last = camera.center
             view = View.of_camera(camera, 1.0, (camera.width, camera.height))
             image = None
             if images:

@@ -44,7 +44,15 @@ def open_server(host: str, port: int, label: str) -> Any:
             f"viser {viser.__version__} starts its server in a way that is not known here, so "
             "other pages could not be kept out: pip install viser==1.1.1"
         )
-    door.control = server.gui._gui_input_handle_from_uuid.get
+
+    def control(uuid: str) -> Any:
+        for gui in (server.gui, *(client.gui for client in server.get_clients().values())):
+            for handles in (gui._gui_input_handle_from_uuid, gui._command_handle_from_uuid):
+                if uuid in handles:
+                    return handles[uuid]
+        return None
+
+    door.control = control
     if port not in (0, server.get_port()):  # taken in between: viser goes on to the next
         stop(server)
         raise HoigsError(_in_use(port))
@@ -59,7 +67,7 @@ def open_server(host: str, port: int, label: str) -> Any:
 def require_viser() -> None:
     """Raise HoigsError if viser is not installed."""
     if find_spec("viser") is None:
-        raise HoigsError("the viewer needs viser: pip install 'hoigs[viewer]'")
+        raise HoigsError("the viewer needs viser: pip install 'hoigs[view]'")
 
 
 def free_port(port: int) -> int:
