@@ -33,7 +33,9 @@ from hoigs.plugins.exporters.posed import (
     world_move,
 )
 
-COMPONENTS = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}
+COMPONENTS = {
+    "float32": 5126, "uint32": 5125, "uint16": 5123, "int16": 5122, "uint8": 5121, "int8": 5120,
+}  # fmt: skip
 SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 VERTICES, INDICES = 34962, 34963  # what a buffer view is for
 
@@ -59,32 +61,45 @@ class Glb:
         """Store an array [N] or [N, k]; gives the index of its accessor.
 
         Args:
-            target: VERTICES or INDICES for what a mesh reads.
-            normalized: integers stand for [0, 1].
+            target: VERTICES or INDICES for what a mesh reads; of the former each row begins at a
+                multiple of four bytes.
+            normalized: integers stand for [0, 1], signed ones for [-1, 1].
         """
-        array = np.ascontiguousarray(array)
         width = 1 if array.ndim == 1 else int(np.prod(array.shape[1:]))
-        view: dict[str, Any] = {
-            "buffer": 0, "byteOffset": len(self._data), "byteLength": array.nbytes,
-        }  # fmt: skip
+        array = np.ascontiguousarray(array).reshape(len(array), width)
+        view: dict[str, Any] = {}
+        flat, row = array, width * array.itemsize
+        if target == VERTICES and row % 4:
+            array = np.pad(array, ((0, 0), (0, -row % 4 // array.itemsize)))
+            view["byteStride"] = array.shape[1] * array.itemsize
         if target is not None:
             view["target"] = target
-        self._data += array.tobytes()
-        self._data += b"\0" * (-len(self._data) % 4)
         entry: dict[str, Any] = {
-            "bufferView": self.add("bufferViews", **view),
-            "componentType": COMPONENTS[array.dtype.name],
-            "count": len(array),
+            "bufferView": self.view(array.tobytes(), **view),
+            "componentType": COMPONENTS[flat.dtype.name],
+            "count": len(flat),
             "type": SHAPES[width],
         }
         if normalized:
             entry["normalized"] = True
-        if (array.dtype == np.float32 and width <= 4) or width == 1:
-            flat = array.reshape(len(array), width)
+        if width <= 4:
             entry["min"], entry["max"] = flat.min(0).tolist(), flat.max(0).tolist()
         return self.add("accessors", **entry)
 
-    def bytes(self) -> bytes:
+    def view(self, data: bytes, **entry: Any) -> int:
+        """Store bytes; gives the index of their buffer view."""
+        place = {"buffer": 0, "byteOffset": len(self._data), "byteLength": len(data)}
+        self._data += data + b"\0" * (-len(data) % 4)
+        return self.add("bufferViews", **place, **entry)
+
+    def zeros(self, count: int) -> int:
+        """The accessor of positions that are all zero, which takes no room."""
+        none = [0.0, 0.0, 0.0]
+        return self.add(
+            "accessors", componentType=5126, count=count, type="VEC3", min=none, max=none
+        )
+
+    def whole(self) -> bytes:
         """The file."""
         if self._data:
             self.document["buffers"] = [{"byteLength": len(self._data)}]
@@ -98,6 +113,10 @@ class Glb:
 # exporter:gltf-splat: the Gaussians of one moment as glTF's KHR_gaussian_splatting.
 
 NAME = "KHR_gaussian_splatting"
+KERNEL = {
+    "kernel": "ellipse", "colorSpace": "srgb_rec709_display",
+    "sortingMethod": "cameraDistance", "projection": "perspective",
+}  # fmt: skip
 
 
 class GltfSplatExporter(Exporter):
@@ -130,7 +149,7 @@ class GltfSplatExporter(Exporter):
         glb.add("scenes", nodes=nodes)
         glb.document["scene"] = 0
         progress(0.5, "writing")
-        (folder / "splats.glb").write_bytes(glb.bytes())
+        (folder / "splats.glb").write_bytes(glb.whole())
         lost = {"support": f"{NAME} is new: programs without it show coloured points"}
         if len(request.moments) > 1:
             lost["motion"] = "the extension holds one moment, the first; usd holds all"
@@ -142,6 +161,7 @@ def add_splats(glb: Glb, name: str, gaussians: Gaussians) -> int:
     g = gaussians.detach().to("cpu", torch.float32)
     quats = torch.nn.functional.normalize(g.quats, dim=-1)[:, [1, 2, 3, 0]]
     fallback = torch.cat((g.colors.clamp(0, 1), g.opacities[:, None]), 1)
+    fallback[:, :3] = torch.from_numpy(linear_color(fallback[:, :3].numpy()))
     values = {
         "POSITION": g.means,
         "COLOR_0": fallback,
@@ -155,11 +175,7 @@ def add_splats(glb: Glb, name: str, gaussians: Gaussians) -> int:
     attributes = {
         key: glb.accessor(value.float().numpy(), VERTICES) for key, value in values.items()
     }
-    extension = {
-        "kernel": "ellipse", "colorSpace": "srgb_rec709_display",
-        "sortingMethod": "cameraDistance", "projection": "perspective",
-    }  # fmt: skip
-    shape = {"attributes": attributes, "mode": 0, "extensions": {NAME: extension}}
+    shape = {"attributes": attributes, "mode": 0, "extensions": {NAME: KERNEL}}
     return glb.add("meshes", name=name, primitives=[shape])
 
 
@@ -195,7 +211,7 @@ class GltfBodyExporter(Exporter):
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
         glb = Glb()
         seconds = np.arange(len(request.moments), dtype=np.float32) / np.float32(request.fps)
-        clock = _Clock(glb, glb.accessor(seconds))
+        clock = Clock(glb, glb.accessor(seconds))
         lost = {"looks": "Gaussians are left out; ply-sequence and usd hold them"}
         children, skins = [], []  # what carries a skin stands at the root: its bones place it
         people = request.of_kind("human")
@@ -222,17 +238,17 @@ class GltfBodyExporter(Exporter):
             children.append(add_camera(clock, cameras))
         move = world_move(request.clip, "y")
         root = glb.add(
-            "nodes", name="world", rotation=_xyzw(matrices_to_quats(move.turn)).tolist(),
+            "nodes", name="world", rotation=xyzw(matrices_to_quats(move.turn)).tolist(),
             translation=move.shift.tolist(), children=children,
         )  # fmt: skip
         glb.add("scenes", nodes=[root, *skins])
         glb.document["scene"] = 0
         progress(0.9, "writing")
-        (folder / "body.glb").write_bytes(glb.bytes())
+        (folder / "body.glb").write_bytes(glb.whole())
         return lost
 
 
-class _Clock:
+class Clock:
     """The one animation of the file, and the accessor of its times."""
 
     def __init__(self, glb: Glb, times: int) -> None:
@@ -248,11 +264,11 @@ class _Clock:
         entry["channels"].append({"sampler": len(entry["samplers"]) - 1, "target": target})
 
 
-def add_person(clock: _Clock, motion: BodyMotion, colors: Float[Tensor, "V 3"]) -> tuple[int, int]:
-    """Joints, skin and mesh of a person; gives the nodes of the pelvis and of the mesh."""
+def add_bones(clock: Clock, motion: BodyMotion) -> list[int]:
+    """The joints of a person, animated: their nodes, the pelvis first."""
     glb, parents = clock.glb, motion.body.parents
     rest = motion.rest_joints.numpy()
-    quats = _continuous(_xyzw(axis_angle_to_quats(motion.rotations)))
+    quats = continuous(xyzw(axis_angle_to_quats(motion.rotations)))
     joints: list[int] = []
     for joint, parent in enumerate(parents):
         place = rest[joint] - rest[parent] if parent >= 0 else motion.pelvis[0].numpy()
@@ -265,10 +281,25 @@ def add_person(clock: _Clock, motion: BodyMotion, colors: Float[Tensor, "V 3"]) 
             glb.document["nodes"][joints[parent]].setdefault("children", []).append(joints[joint])
         clock.move(joints[joint], "rotation", quats[:, joint])
     clock.move(joints[0], "translation", motion.pelvis.numpy())
-    inverse = np.tile(np.eye(4, dtype=np.float32), (len(rest), 1, 1))
-    inverse[:, 3, :3] = -rest  # column by column, as glTF stores matrices
+    return joints
+
+
+def add_skin(
+    glb: Glb, joints: Sequence[int], motion: BodyMotion, low: float | np.ndarray = 0.0,
+    size: float = 1.0,
+) -> int:  # fmt: skip
+    """The skin of a mesh whose vertices times `size` plus `low` are the body at rest."""
+    inverse = np.tile(np.diag(np.array((size, size, size, 1), np.float32)), (len(joints), 1, 1))
+    inverse[:, 3, :3] = low - motion.rest_joints.numpy()  # column by column, as glTF has matrices
     bound = glb.accessor(inverse.reshape(-1, 16))
-    skeleton = glb.add("skins", joints=joints, inverseBindMatrices=bound, skeleton=joints[0])
+    return glb.add("skins", joints=list(joints), inverseBindMatrices=bound, skeleton=joints[0])
+
+
+def add_person(clock: Clock, motion: BodyMotion, colors: Float[Tensor, "V 3"]) -> tuple[int, int]:
+    """Joints, skin and mesh of a person; gives the nodes of the pelvis and of the mesh."""
+    glb = clock.glb
+    joints = add_bones(clock, motion)
+    skeleton = add_skin(glb, joints, motion)
     vertices = motion.body.shaped(motion.betas)[0].numpy()
     chosen, weights = influences(motion.body.skinning_weights)
     attributes = {
@@ -313,10 +344,10 @@ def skinning_error(motion: BodyMotion) -> float:
     return worst
 
 
-def add_object(clock: _Clock, motion: ObjectMotion) -> int:
+def add_object(clock: Clock, motion: ObjectMotion) -> int:
     """An object's points on an animated node."""
     glb = clock.glb
-    quats = _continuous(_xyzw(matrices_to_quats(motion.rotations))[:, None])[:, 0]
+    quats = continuous(xyzw(matrices_to_quats(motion.rotations))[:, None])[:, 0]
     attributes = {
         "POSITION": glb.accessor(motion.points.numpy(), VERTICES),
         "COLOR_0": _color(glb, motion.colors),
@@ -331,7 +362,7 @@ def add_object(clock: _Clock, motion: ObjectMotion) -> int:
     return node
 
 
-def add_camera(clock: _Clock, cameras: Sequence[Camera]) -> int:
+def add_camera(clock: Clock, cameras: Sequence[Camera]) -> int:
     """The camera of the video on an animated node; glTF's looks along -z with y up."""
     glb, first = clock.glb, cameras[0]
     lens = {
@@ -342,7 +373,7 @@ def add_camera(clock: _Clock, cameras: Sequence[Camera]) -> int:
     index = glb.add("cameras", type="perspective", perspective=lens, name="video")
     flip = torch.diag(torch.tensor((1.0, -1.0, -1.0)))
     turns = torch.stack([c.world_to_camera[:3, :3].mT @ flip for c in cameras])
-    quats = _continuous(_xyzw(matrices_to_quats(turns))[:, None])[:, 0]
+    quats = continuous(xyzw(matrices_to_quats(turns))[:, None])[:, 0]
     places = torch.stack([c.center for c in cameras])
     node = glb.add(
         "nodes", name="camera", camera=index, rotation=quats[0].tolist(),
@@ -364,19 +395,24 @@ def _looks(request: ExportRequest, motion: BodyMotion) -> Float[Tensor, "V 3"]:
 
 
 def _color(glb: Glb, colors: Float[Tensor, "N 3"]) -> int:
-    """COLOR_0 of display colours: glTF's are linear (inverse of the sRGB transfer function)."""
-    value = colors.double().numpy()
+    """COLOR_0 of display colours."""
+    return glb.accessor(linear_color(colors.numpy()), VERTICES)
+
+
+def linear_color(colors: np.ndarray) -> np.ndarray:
+    """glTF's linear colours of display colours (inverse of the sRGB transfer function)."""
+    value = colors.astype(np.float64)
     linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    return glb.accessor(linear.astype(np.float32), VERTICES)
+    return linear.astype(np.float32)
 
 
-def _xyzw(quats: Float[Tensor, "*batch 4"]) -> np.ndarray:
+def xyzw(quats: Float[Tensor, "*batch 4"]) -> np.ndarray:
     """glTF's order, unit, from wxyz."""
     unit = torch.nn.functional.normalize(quats.double(), dim=-1)
     return unit[..., [1, 2, 3, 0]].numpy().astype(np.float32)
 
 
-def _continuous(quats: np.ndarray) -> np.ndarray:
+def continuous(quats: np.ndarray) -> np.ndarray:
     """[F, J, 4] with signs such that neighbours in time are near."""
     turned = quats.copy()
     for i in range(1, len(turned)):
