@@ -470,8 +470,9 @@ function tick(now) {
     stale = true; controls();
   }
   before = now;
+  const began = performance.now();
   if (stale) { place(); upload(); stale = false; dirty = true; }
-  if (dirty) { dirty = false; draw(); window.drawn = (window.drawn || 0) + 1; }
+  if (dirty) { dirty = false; draw(); window.drawn = (window.drawn || 0) + 1; window.spent = (window.spent || 0) + performance.now() - began; }
   requestAnimationFrame(tick);
 }
 
