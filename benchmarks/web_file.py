@@ -34,11 +34,11 @@ from hoigs.viewing.viewer.panes import fitted
 from hoigs.viewing.viewer.run_drawing import Look, RunDrawing
 
 SAMPLES = 4
-FLAGS = (
-    "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking "
-    "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader "
-    "--enable-unsafe-swiftshader"
-).split()
+FLAGS = [
+    "--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update", "--use-gl=angle",
+    "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+]  # fmt: skip
 SEEK = "f => { const t = document.getElementById('time'); t.value = f; t.oninput({target: t}); }"
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from hoigs.core.interfaces.deformation import ProvidesTemplate
 from hoigs.core.maths.rotations import (
     conjugate_quats,
     matrices_to_quats,
@@ -19,11 +20,21 @@ from hoigs.core.maths.rotations import (
 )
 from hoigs.core.maths.skinning import ancestor_table, joint_transforms, joint_turns
 from hoigs.core.maths.spherical_harmonics import mean_colors
+from hoigs.core.model.exporter import ExportRequest
+from hoigs.core.reporting import Progress
 from hoigs.core.values.gaussians import SH_C0, Gaussians
-from hoigs.plugins.exporters.posed import BodyMotion, ObjectMotion
+from hoigs.plugins.exporters.posed import (
+    BodyMotion,
+    Move,
+    ObjectMotion,
+    body_motion,
+    object_motion,
+    world_move,
+)
 
 INFLUENCES = 4  # joints that may carry a Gaussian, as many as one set of glTF's has
 NEAR = 6  # moments at which Gaussians are compared with the body, spread over all
+EYES = 8  # cameras of the video whose views of a colour are averaged, where it has no SH
 STILL_M = 5e-4  # Gaussians that all stay within this are stored once
 STEADY = 0.02  # change of colour, opacity and logarithm of sizes of what is stored once
 PARTS = {"means": 3, "quats": 4, "log_scales": 3, "opacity": 1, "color": 3}
@@ -124,13 +135,16 @@ def rigid_joint(motion: ObjectMotion) -> Joints:
 
 
 def body_weights(
-    motion: BodyMotion, means: Float[Tensor, "F N 3"], own: Float[Tensor, "N J"] | None
+    request: ExportRequest, motion: BodyMotion, means: Float[Tensor, "F N 3"]
 ) -> tuple[Int[Tensor, "N 4"], Float[Tensor, "N 4"]]:
-    """Which joints carry each Gaussian: by its `own` weights, or where the model tells none, those
-    of the vertex that stays nearest to it over time."""
+    """Which joints carry each Gaussian: as the model has it, or where it tells nothing, those of
+    the vertex that stays nearest to it over time."""
+    entity, own = request.scene.entity(motion.name), None
+    if isinstance(entity.deformation, ProvidesTemplate):
+        own = entity.deformation.template(entity.canonical).weights
     if own is None:
         own = _nearest_weights(motion, means)
-    found = own.float().topk(INFLUENCES, dim=1)
+    found = own.detach().cpu().float().topk(INFLUENCES, dim=1)
     return found.indices, quantised(found.values / found.values.sum(1, keepdim=True)) / 65535
 
 
@@ -250,3 +264,75 @@ def _modes(
         for k, v in changes.items()
     }
     return axes / peaks, modes
+
+
+# Entities of a run.
+
+
+@dataclass(frozen=True)
+class Entity:
+    """What is written of one entity. motion: of its joints; None if it is still."""
+
+    carried: Carried
+    motion: BodyMotion | ObjectMotion | None
+
+
+def collect(request: ExportRequest, modes: int, progress: Progress) -> list[Entity]:
+    """Every entity that is exported, in the world of the file."""
+    move = world_move(request.clip, "y")
+    frames: dict[str, list[Gaussians]] = {name: [] for name in request.entities}
+    for i, moment in enumerate(request.moments):
+        progress(0.5 * i / len(request.moments), f"moment {i + 1} of {len(request.moments)}")
+        state = request.scene(moment.to(request.scene.device), request.entities)
+        for name, gaussians in state.gaussians.items():
+            seen = gaussians.detach().to("cpu", torch.float32)
+            seen, known = move.gaussians(seen), frames[name]
+            known.append(known[0] if known and same(known[0], seen) else seen)
+    eyes = [move.points(eye) for eye in _eyes(request)]
+    made = []
+    for i, (name, seen) in enumerate(frames.items()):
+        progress(0.5 + 0.4 * i / len(frames), name)
+        made.append(_entity(request, name, seen, move, eyes, modes))
+        seen.clear()
+    return made
+
+
+def _entity(
+    request: ExportRequest, name: str, frames: list[Gaussians], move: Move, eyes: Any, modes: int
+) -> Entity:
+    if all(g is frames[0] for g in frames):
+        return Entity(still(name, frames[0]), None)
+    if request.scene.entity(name).kind == "human" and name in request.bodies:
+        body = body_motion(request, name).moved(move)
+        bound = body_weights(request, body, torch.stack([g.means for g in frames]))
+        return Entity(carried(name, frames, body_joints(body), bound, eyes, modes), body)
+    rigid = object_motion(request, name)
+    rigid = replace(
+        rigid, rotations=move.turn @ rigid.rotations, translations=move.points(rigid.translations)
+    )
+    first = torch.zeros(len(frames[0]), INFLUENCES)
+    bound = first.long(), torch.cat((first[:, :1] + 1, first[:, 1:]), 1)
+    return Entity(carried(name, frames, rigid_joint(rigid), bound, eyes, modes), rigid)
+
+
+@torch.no_grad()
+def at_rest(request: ExportRequest, motion: BodyMotion) -> Gaussians:
+    """The Gaussians of a person in the zero pose of its body, of the mean colours of some moments.
+
+    Args:
+        motion: in the world of the clip.
+    """
+    some = np.unique(np.linspace(0, len(motion) - 1, NEAR).round().astype(int)).tolist()
+    frames = [request.scene(request.moments[i], [motion.name]).gaussians[motion.name] for i in some]
+    frames = [g.detach().to("cpu", torch.float32) for g in frames]
+    joints = body_joints(motion)
+    joints = Joints(joints.transforms[some], joints.turns[some])
+    few = replace(motion, rotations=motion.rotations[some], transl=motion.transl[some])
+    bound = body_weights(request, few, torch.stack([g.means for g in frames]))
+    return carried(motion.name, frames, joints, bound, _eyes(request), 0).gaussians
+
+
+def _eyes(request: ExportRequest) -> list[Float[Tensor, " 3"]]:
+    """Some camera centres of the video, world of the clip."""
+    eyes = [camera.to("cpu").center for camera in request.clip.cameras]
+    return eyes[:: max(1, len(eyes) // EYES)]

@@ -12,10 +12,10 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.maths.nearest import nearest
 from hoigs.core.maths.rotations import axis_angle_to_quats, matrices_to_quats
 from hoigs.core.maths.skinning import skin
 from hoigs.core.model.exporter import Exporter, ExportRequest
@@ -23,15 +23,16 @@ from hoigs.core.reporting import Progress
 from hoigs.core.values.between import camera_between, frame_of
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
+from hoigs.plugins.exporters.carried import at_rest
 from hoigs.plugins.exporters.posed import (
     AXES,
-    SEEN,
     BodyMotion,
     ObjectMotion,
     body_motion,
     object_motions,
     world_move,
 )
+from hoigs.plugins.exporters.surfaces import Surface, body_surface, motion_surface
 
 COMPONENTS = {
     "float32": 5126, "uint32": 5125, "uint16": 5123, "int16": 5122, "uint8": 5121, "int8": 5120,
@@ -189,11 +190,13 @@ class GltfBodyConfig(ComponentConfig):
 
     camera: bool = True
     """the camera of the video, animated"""
+    texture: int = Field(default=1024, ge=64, le=8192)
+    """pixels of a side of each texture"""
 
 
 class GltfBodyExporter(Exporter):
-    """`body.glb`: each person as a skinned mesh with one animation, each object as coloured points
-    on an animated node.
+    """`body.glb`: each person as a skinned mesh, each object as a mesh on an animated node, closed,
+    with normals and a baked texture.
     """
 
     Config: ClassVar = GltfBodyConfig
@@ -203,8 +206,8 @@ class GltfBodyExporter(Exporter):
     up = "y"
     axes = AXES["y"]
     keeps: ClassVar = {
-        "people": "skinned meshes in their shape, coloured by the nearest Gaussians",
-        "objects": "the centres of their visible Gaussians as coloured points, moved rigidly",
+        "people": "skinned meshes in their shape; textures of the mean colours of their Gaussians",
+        "objects": "closed meshes through the centres of their Gaussians, textured, moved rigidly",
         "camera": "of the video, with its vertical field of view at the first moment",
     }
 
@@ -221,7 +224,8 @@ class GltfBodyExporter(Exporter):
                 lost[name] = "it has no body model"
                 continue
             motion = body_motion(request, name)
-            bones, skin = add_person(clock, motion, _looks(request, motion))
+            surface = body_surface(motion, at_rest(request, motion), self.config.texture)
+            bones, skin = add_person(clock, motion, surface)
             children.append(bones)
             skins.append(skin)
             worst = skinning_error(motion)
@@ -231,7 +235,10 @@ class GltfBodyExporter(Exporter):
                     "also corrects its vertices by pose or weighs more joints"
                 )
         progress(0.8, "objects")
-        children += [add_object(clock, motion) for motion in object_motions(request)]
+        for rigid in object_motions(request):
+            mesh, why = motion_surface(request, rigid, self.config.texture)
+            children.append(add_object(clock, rigid, mesh))
+            lost |= why
         if self.config.camera:
             frames = [frame_of(request.clip, moment) for moment in request.moments]
             cameras = [camera_between(request.clip, frame).to("cpu") for frame in frames]
@@ -295,25 +302,42 @@ def add_skin(
     return glb.add("skins", joints=list(joints), inverseBindMatrices=bound, skeleton=joints[0])
 
 
-def add_person(clock: Clock, motion: BodyMotion, colors: Float[Tensor, "V 3"]) -> tuple[int, int]:
+def add_person(clock: Clock, motion: BodyMotion, surface: Surface) -> tuple[int, int]:
     """Joints, skin and mesh of a person; gives the nodes of the pelvis and of the mesh."""
     glb = clock.glb
     joints = add_bones(clock, motion)
     skeleton = add_skin(glb, joints, motion)
-    vertices = motion.body.shaped(motion.betas)[0].numpy()
     chosen, weights = influences(motion.body.skinning_weights)
-    attributes = {
-        "POSITION": glb.accessor(vertices, VERTICES),
-        "COLOR_0": _color(glb, colors),
-    }
+    carried = {}
     for k in range(0, chosen.shape[1], 4):
-        attributes[f"JOINTS_{k // 4}"] = glb.accessor(chosen[:, k : k + 4], VERTICES)
-        attributes[f"WEIGHTS_{k // 4}"] = glb.accessor(weights[:, k : k + 4], VERTICES)
-    faces = glb.accessor(motion.body.faces.numpy().astype(np.uint32).reshape(-1), INDICES)
-    material = glb.add("materials", pbrMetallicRoughness={"metallicFactor": 0.0}, doubleSided=True)
-    shape = {"attributes": attributes, "indices": faces, "material": material}
-    mesh = glb.add("meshes", name=motion.name, primitives=[shape])
+        carried[f"JOINTS_{k // 4}"] = chosen[:, k : k + 4]
+        carried[f"WEIGHTS_{k // 4}"] = weights[:, k : k + 4]
+    mesh = add_surface(glb, motion.name, surface, carried)
     return joints[0], glb.add("nodes", name=motion.name, mesh=mesh, skin=skeleton)
+
+
+def add_surface(
+    glb: Glb, name: str, surface: Surface, more: Mapping[str, np.ndarray] | None = None
+) -> int:
+    """The mesh of a surface, with its texture; `more` are attributes of its vertices."""
+    rows, faces, uv = surface.split()
+    vertices = {"POSITION": surface.vertices, "NORMAL": surface.normals, **(more or {})}
+    attributes = {
+        key: glb.accessor(_float32(value)[rows], VERTICES) for key, value in vertices.items()
+    }
+    # glTF's texture coordinates begin on top
+    attributes["TEXCOORD_0"] = glb.accessor(_float32(uv * (1, -1) + (0, 1)), VERTICES)
+    image = glb.add("images", bufferView=glb.view(surface.png()), mimeType="image/png", name=name)
+    paint = {"baseColorTexture": {"index": glb.add("textures", source=image)}}
+    matt = {**paint, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    material = glb.add("materials", name=name, pbrMetallicRoughness=matt)
+    indices = glb.accessor(faces.astype(np.uint32).reshape(-1), INDICES)
+    shape = {"attributes": attributes, "indices": indices, "material": material}
+    return glb.add("meshes", name=name, primitives=[shape])
+
+
+def _float32(values: np.ndarray) -> np.ndarray:
+    return values.astype(np.float32) if values.dtype == np.float64 else values
 
 
 def influences(weights: Float[Tensor, "V J"]) -> tuple[np.ndarray, np.ndarray]:
@@ -344,15 +368,16 @@ def skinning_error(motion: BodyMotion) -> float:
     return worst
 
 
-def add_object(clock: Clock, motion: ObjectMotion) -> int:
-    """An object's points on an animated node."""
+def add_object(clock: Clock, motion: ObjectMotion, surface: Surface | None) -> int:
+    """An object's mesh on an animated node; its points, where there is none."""
     glb = clock.glb
     quats = continuous(xyzw(matrices_to_quats(motion.rotations))[:, None])[:, 0]
-    attributes = {
-        "POSITION": glb.accessor(motion.points.numpy(), VERTICES),
-        "COLOR_0": _color(glb, motion.colors),
-    }
-    mesh = glb.add("meshes", name=motion.name, primitives=[{"attributes": attributes, "mode": 0}])
+    if surface is not None:
+        mesh = add_surface(glb, motion.name, surface)
+    else:
+        color = glb.accessor(linear_color(motion.colors.numpy()), VERTICES)
+        shape = {"POSITION": glb.accessor(motion.points.numpy(), VERTICES), "COLOR_0": color}
+        mesh = glb.add("meshes", name=motion.name, primitives=[{"attributes": shape, "mode": 0}])
     place = motion.translations[0].tolist()
     node = glb.add(
         "nodes", name=motion.name, mesh=mesh, rotation=quats[0].tolist(), translation=place
@@ -382,21 +407,6 @@ def add_camera(clock: Clock, cameras: Sequence[Camera]) -> int:
     clock.move(node, "rotation", quats)
     clock.move(node, "translation", places.numpy())
     return node
-
-
-def _looks(request: ExportRequest, motion: BodyMotion) -> Float[Tensor, "V 3"]:
-    """Colours of a body's vertices: those of the nearest visible Gaussians at the first moment."""
-    with torch.no_grad():
-        gaussians = request.scene(request.moments[0], [motion.name]).gaussians[motion.name]
-        seen = gaussians.opacities > SEEN
-        gaussians = gaussians[seen] if bool(seen.any()) else gaussians
-        found = nearest(motion.vertices(0), 3, gaussians.means.cpu())[0]
-        return gaussians.colors.cpu().clamp(0, 1)[found].mean(1)
-
-
-def _color(glb: Glb, colors: Float[Tensor, "N 3"]) -> int:
-    """COLOR_0 of display colours."""
-    return glb.accessor(linear_color(colors.numpy()), VERTICES)
 
 
 def linear_color(colors: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -20,22 +20,16 @@ from pydantic import Field
 from torch import Tensor
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.interfaces.deformation import ProvidesTemplate
 from hoigs.core.model.exporter import Exporter, ExportRequest
 from hoigs.core.reporting import Progress
 from hoigs.core.values.between import camera_between, frame_of
-from hoigs.core.values.gaussians import Gaussians
 from hoigs.plugins.exporters.carried import (
     FLOORS,
-    INFLUENCES,
     Carried,
-    body_joints,
-    body_weights,
-    carried,
+    Entity,
+    collect,
     quantised,
     rigid_joint,
-    same,
-    still,
 )
 from hoigs.plugins.exporters.glb import (
     KERNEL,
@@ -53,16 +47,12 @@ from hoigs.plugins.exporters.glb import (
 from hoigs.plugins.exporters.posed import (
     AXES,
     BodyMotion,
-    Move,
     ObjectMotion,
-    body_motion,
-    object_motion,
     world_move,
 )
 
 EXTENSION = "HOIGS_gaussian_motion"
 FINE = 2e-4  # metres; steps of positions and sizes that are coarser are stored as float32
-EYES = 8  # cameras of the video whose views of a colour are averaged, where it has no SH
 TARGETS = {"quats": "ROTATION", "log_scales": "SCALE", "opacity": "OPACITY", "color": "COLOR"}
 
 
@@ -74,14 +64,6 @@ class Gltf4dConfig(ComponentConfig):
     sh: bool = True
     """colours of what stands still change with the direction, for players that know the extension;
     a third of the file"""
-
-
-@dataclass(frozen=True)
-class Entity:
-    """What is written of one entity. motion: of its joints; None if it is still."""
-
-    carried: Carried
-    motion: BodyMotion | ObjectMotion | None
 
 
 class Gltf4dExporter(Exporter):
@@ -119,51 +101,6 @@ def losses(request: ExportRequest, entities: Sequence[Entity]) -> dict[str, str]
             if request.scene.entity(part.name).canonical.sh.shape[1] > 1:
                 lost[f"SH of {part.name}"] = "one colour a moment, the mean over the cameras"
     return lost
-
-
-def collect(request: ExportRequest, modes: int, progress: Progress) -> list[Entity]:
-    """Every entity that is exported, in the world of the file."""
-    move = world_move(request.clip, "y")
-    frames: dict[str, list[Gaussians]] = {name: [] for name in request.entities}
-    for i, moment in enumerate(request.moments):
-        progress(0.5 * i / len(request.moments), f"moment {i + 1} of {len(request.moments)}")
-        state = request.scene(moment.to(request.scene.device), request.entities)
-        for name, gaussians in state.gaussians.items():
-            seen = gaussians.detach().to("cpu", torch.float32)
-            seen, known = move.gaussians(seen), frames[name]
-            known.append(known[0] if known and same(known[0], seen) else seen)
-    eyes = [move.points(c.to("cpu").center) for c in request.clip.cameras]
-    eyes = eyes[:: max(1, len(eyes) // EYES)]
-    made = []
-    for i, (name, seen) in enumerate(frames.items()):
-        progress(0.5 + 0.4 * i / len(frames), name)
-        made.append(_entity(request, name, seen, move, eyes, modes))
-        seen.clear()
-    return made
-
-
-def _entity(
-    request: ExportRequest, name: str, frames: list[Gaussians], move: Move, eyes: Any, modes: int
-) -> Entity:
-    if all(g is frames[0] for g in frames):
-        return Entity(still(name, frames[0]), None)
-    if request.scene.entity(name).kind == "human" and name in request.bodies:
-        body = body_motion(request, name).moved(move)
-        joints = body_joints(body)
-        deformation = request.scene.entity(name).deformation
-        own = None
-        if isinstance(deformation, ProvidesTemplate):
-            own = deformation.template(request.scene.entity(name).canonical).weights
-        means = torch.stack([g.means for g in frames])
-        bound = body_weights(body, means, own if own is None else own.cpu())
-        return Entity(carried(name, frames, joints, bound, eyes, modes), body)
-    rigid = object_motion(request, name)
-    rigid = replace(
-        rigid, rotations=move.turn @ rigid.rotations, translations=move.points(rigid.translations)
-    )
-    first = torch.zeros(len(frames[0]), INFLUENCES)
-    bound = first.long(), torch.cat((first[:, :1] + 1, first[:, 1:]), 1)
-    return Entity(carried(name, frames, rigid_joint(rigid), bound, eyes, modes), rigid)
 
 
 def motion_glb(request: ExportRequest, entities: Sequence[Entity], *, sh: bool = True) -> bytes:

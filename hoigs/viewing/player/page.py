@@ -18,7 +18,8 @@ from hoigs.core.model.exporter import ExportRequest
 from hoigs.core.model.standing import in_known_world
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.system.files import write_whole
-from hoigs.plugins.exporters.gltf_4d import Entity, Gltf4dConfig, collect, losses, motion_glb
+from hoigs.plugins.exporters.carried import Entity, collect
+from hoigs.plugins.exporters.gltf_4d import Gltf4dConfig, losses, motion_glb
 from hoigs.runs.loaded_run import LoadedRun
 
 FEWEST = 0.02  # share of the Gaussians below which a size is refused

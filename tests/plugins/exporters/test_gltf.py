@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import trimesh
 from gltf_file import Read, khronos_finds_nothing
+from scipy.spatial import cKDTree
 
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.plugins.exporters.glb import NAME, GltfBodyExporter, GltfSplatExporter
+from hoigs.plugins.exporters.glb import NAME, GltfBodyConfig, GltfBodyExporter, GltfSplatExporter
 from hoigs.plugins.exporters.posed import Move, body_motion, object_motion
 
 
@@ -16,7 +18,7 @@ from hoigs.plugins.exporters.posed import Move, body_motion, object_motion
 def body(request_of, tmp_path_factory):
     request = request_of("human", "object", end=2.0)
     folder = tmp_path_factory.mktemp("gltf") / "out"
-    GltfBodyExporter().export(request, folder)
+    GltfBodyExporter(GltfBodyConfig(texture=64)).export(request, folder)
     return request, folder / "body.glb"
 
 
@@ -41,6 +43,9 @@ def test_the_skin_is_the_body(body, upright):
     sets = range(sum(k.startswith("JOINTS_") for k in shape["attributes"]))
     joints = np.concatenate([read.array(shape["attributes"][f"JOINTS_{k}"]) for k in sets], 1)
     weights = np.concatenate([read.array(shape["attributes"][f"WEIGHTS_{k}"]) for k in sets], 1)
+    # seams of the texture cut the mesh: some vertices are there twice
+    rows = cKDTree(motion.body.shaped(motion.betas)[0].numpy()).query(points)[1]
+    assert len(np.unique(rows)) == len(motion.vertices(0))
     inverse = read.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
     move = upright(request, "y")
     turn, shift = move[:3, :3], move[:3, 3]
@@ -48,10 +53,22 @@ def test_the_skin_is_the_body(body, upright):
         moves = np.stack([read.world(j, frame) for j in skin["joints"]]) @ inverse
         blended = np.einsum("vk,vkab->vab", weights, moves[joints.astype(int)])
         posed = (blended[:, :3, :3] @ points[..., None])[..., 0] + blended[:, :3, 3]
-        away = np.linalg.norm(posed - motion.vertices(frame).numpy() @ turn.T - shift, axis=1)
+        away = np.linalg.norm(posed - motion.vertices(frame).numpy()[rows] @ turn.T - shift, axis=1)
         assert away.mean() < 1e-3 and np.quantile(away, 0.99) < 5e-3
         hips = read.world(skin["joints"][0], frame)[:3, 3]
         assert np.abs(hips - turn @ motion.joints(frame)[0].numpy() - shift).max() < 1e-4
+
+
+def test_trimesh_reads_closed_textured_meshes(body):
+    scene = trimesh.load(body[1])
+    assert set(scene.geometry) == {"human", "object"}
+    for mesh in scene.geometry.values():
+        texture = np.asarray(mesh.visual.material.baseColorTexture)
+        assert texture.ndim == 3 and texture.std() > 5 and np.ptp(mesh.visual.uv, 0).min() > 0.3
+        welded = trimesh.Trimesh(mesh.vertices, mesh.faces)
+        welded.merge_vertices(merge_tex=True, merge_norm=True)
+        assert welded.is_watertight and welded.volume > 0
+        assert (mesh.vertex_normals * (mesh.vertices - mesh.centroid)).sum(1).mean() > 0
 
 
 def test_objects_and_the_camera_move(body, upright):
