@@ -65,7 +65,7 @@ def sizes(run: Path, frames: int, folder: Path) -> dict[str, float]:
 
 def played(run: Path, page: Path, side: int, seconds: float) -> dict[str, Any]:
     """PSNR by frame, and how fast it plays."""
-    loaded = LoadedRun.open(run)
+    loaded = LoadedRun.open(run, pixels=False)
     drawing = RunDrawing(loaded)
     look, last = Look(entities=frozenset(drawing.names)), loaded.clip.num_frames - 1
     binary = os.environ.get("HOIGS_CHROMIUM") or shutil.which("chromium")
@@ -111,7 +111,7 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=512, help="pixels of the page")
     parser.add_argument("--seconds", type=float, default=10.0)
     given = parser.parse_args()
-    loaded = LoadedRun.open(given.run)
+    loaded = LoadedRun.open(given.run, pixels=False)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         found: dict[str, Any] = {

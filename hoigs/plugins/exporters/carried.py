@@ -36,9 +36,10 @@ INFLUENCES = 4  # joints that may carry a Gaussian, as many as one set of glTF's
 NEAR = 6  # moments at which Gaussians are compared with the body, spread over all
 EYES = 8  # cameras of the video whose views of a colour are averaged, where it has no SH
 STILL_M = 5e-4  # Gaussians that all stay within this are stored once
+VISIBLE = 2 / 255  # root mean square change of colour, or what shows as much, that needs no mode
 STEADY = 0.02  # change of colour, opacity and logarithm of sizes of what is stored once
 PARTS = {"means": 3, "quats": 4, "log_scales": 3, "opacity": 1, "color": 3}
-FLOORS = {"means": 1e-5, "quats": 1e-3, "log_scales": 5e-3, "opacity": 2e-3, "color": 2e-3}
+FLOORS = {"means": 2e-4, "quats": 4e-3, "log_scales": 1e-2, "opacity": 2e-3, "color": 2e-3}
 
 
 @dataclass(frozen=True)
@@ -236,7 +237,7 @@ def _visible(middle: dict[str, Tensor]) -> dict[str, Float[Tensor, "N 1"]]:
     size = middle["log_scales"].mean(-1, keepdim=True).exp()
     seen = middle["opacity"] * size
     return {
-        "means": middle["opacity"], "quats": 0.5 * seen, "log_scales": 0.5 * seen,
+        "means": 0.25 * middle["opacity"], "quats": 0.5 * seen, "log_scales": 0.5 * seen,
         "opacity": size, "color": seen,
     }  # fmt: skip
 
@@ -244,17 +245,19 @@ def _visible(middle: dict[str, Tensor]) -> dict[str, Float[Tensor, "N 1"]]:
 def _modes(
     changes: dict[str, Float[Tensor, "F N d"]], weights: dict[str, Tensor], most: int
 ) -> tuple[Float[Tensor, "F K"], dict[str, Tensor]]:
-    """The principal components of what changes over time, at most `most`, and none that is noise.
-
-    Parts that hardly change have none.
+    """The principal components of what changes over time, at most `most`, and no more than make
+    what is left as little visible as VISIBLE of colour. Parts that hardly change have none.
     """
-    moving = {k: v for k, v in changes.items() if float(v.abs().max()) > FLOORS[k]}
+    moving = {k: v for k, v in changes.items() if float(v.square().mean()) ** 0.5 > FLOORS[k] / 4}
     count = len(next(iter(changes.values())))
     if not moving or count < 2:
         return torch.zeros(count, 0), {k: v[:0] for k, v in changes.items()}
     rows = torch.cat([(v * weights[k]).flatten(1) for k, v in moving.items()], 1).double()
     power, axes = torch.linalg.eigh(rows @ rows.mT)
-    kept = min(most, count - 1, int((power > 1e-4 * power.sum()).sum()))
+    left = (
+        power.clamp_min(0).cumsum(0) / (count * weights["color"].double().square().sum())
+    ).sqrt()
+    kept = min(most, count - 1, int((left > VISIBLE).sum()))
     axes = axes.flip(-1)[:, :kept].float()
     # signs of eigenvectors are free: the largest entry is positive, on every machine
     axes = axes * axes.gather(0, axes.abs().argmax(0, keepdim=True)).sign()

@@ -59,7 +59,7 @@ TARGETS = {"quats": "ROTATION", "log_scales": "SCALE", "opacity": "OPACITY", "co
 class Gltf4dConfig(ComponentConfig):
     """Settings of `exporter:gltf-4d`."""
 
-    modes: int = Field(default=8, ge=0, le=32)
+    modes: int = Field(default=24, ge=0, le=64)
     """morph targets of each entity at the most: what is not a motion of its joints"""
     sh: bool = True
     """colours of what stands still change with the direction, for players that know the extension;
@@ -228,9 +228,15 @@ class _More:
         self.entry: dict[str, Any] = {}
         self._data = bytearray()
 
-    def part(self, values: Float[np.ndarray, "N d"], unit: float) -> dict[str, Any]:
-        """Append a part; `step` times a byte / 127 are its values, divided by `unit`."""
-        codes, peak = _bytes(values)
+    def part(
+        self, values: Float[np.ndarray, "N d"], unit: float, least: float = 0.0
+    ) -> dict[str, Any]:
+        """Append a part; `step` times a byte / 127 are its values, divided by `unit`.
+
+        Args:
+            least: change that is worth a bit: small numbers then deflate well.
+        """
+        codes, peak = _bytes(values, 127 * least)
         place = {"offset": len(self._data), "step": peak / unit}
         self._data += np.ascontiguousarray(codes.T).tobytes()
         return place
@@ -248,7 +254,7 @@ def _targets(
     Displacements are bytes whose largest is 1, so weights have the unit of POSITION.
     """
     count, modes = part.coefficients.shape[1], part.modes
-    used = [k for k in modes if count and float(modes[k].abs().max()) > FLOORS[k]]
+    used = [k for k in modes if count and modes[k].any()]
     moving, targets, shares = "means" in used, [], []
     fixed = None if moving or not count else glb.zeros(len(part))
     for k in range(count):
@@ -264,7 +270,7 @@ def _targets(
         for key in (key for key in used if key != "means"):
             values = modes[key][k]
             values = values[:, [1, 2, 3, 0]] if key == "quats" else values
-            change[TARGETS[key]] = more.part(values.numpy(), share)
+            change[TARGETS[key]] = more.part(values.numpy(), share, FLOORS[key])
         if change:
             more.entry.setdefault("targets", []).append(change)
     return targets, torch.stack(shares, 1) if shares else part.coefficients
@@ -277,7 +283,7 @@ def _share(values: np.ndarray, fine: bool) -> np.ndarray:
     return np.round(values.clip(0, 1) * 65535).astype(np.uint16)
 
 
-def _bytes(values: np.ndarray) -> tuple[np.ndarray, float]:
-    """Numbers as signed bytes, and what 127 stands for."""
-    peak = float(np.abs(values).max()) if values.size else 0.0
+def _bytes(values: np.ndarray, least: float = 0.0) -> tuple[np.ndarray, float]:
+    """Numbers as signed bytes, and what 127 stands for, at least `least`."""
+    peak = max(float(np.abs(values).max()) if values.size else 0.0, least)
     return np.round(values / max(peak, 1e-12) * 127).astype(np.int8), peak
