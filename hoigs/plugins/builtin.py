@@ -137,6 +137,8 @@ PARTS = (
      "skinned people, moving objects and the camera in one animated glb"),
     ("exporter:gltf-splat", "hoigs.plugins.exporters.glb", "GltfSplatExporter", None,
      "Gaussians of one moment by KHR_gaussian_splatting, which is new"),
+    ("exporter:gltf-4d", "hoigs.plugins.exporters.gltf_4d", "Gltf4dExporter", "Gltf4dConfig",
+     "Gaussians over time in one small glb that a browser plays: skins, nodes, morph targets"),
     ("exporter:mesh-sequence", "hoigs.plugins.exporters.mesh_sequence", "MeshSequenceExporter",
      "MeshSequenceConfig", "meshes of people and objects at every moment: ply, obj or glb"),
     ("exporter:spz", "hoigs.plugins.exporters.gaussforge", "SpzExporter", None,

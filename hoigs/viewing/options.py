@@ -21,8 +21,8 @@ class ViewOptions(RunOptions):
     html: Path | str | None = None
     """Write one file that plays the run without a server."""
     max_mb: Annotated[float, Field(ge=0.1)] | None = None
-    """Largest size of the file of --html, in megabytes: it then has fewer frames of what moves, and
-    if need be fewer Gaussians."""
+    """Largest size of the file of --html, in megabytes: colours then do not change with the
+    direction, and if need be it has fewer Gaussians."""
     entities: tuple[str, ...] = ()
     """Write only this entity with --html."""
     width: Annotated[int, Field(ge=64)] = 1280

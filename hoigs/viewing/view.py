@@ -72,8 +72,8 @@ def view(
                 "leave them out"
             )
         return write_page(
-            options.open(runs[0]), options.html, max_mb=options.max_mb, entities=options.entities,
-            progress=progress,
+            options.open(runs[0], pixels=False), options.html, max_mb=options.max_mb,
+            entities=options.entities, progress=progress,
         )  # fmt: skip
     if options.max_mb is not None or options.entities:
         raise HoigsError("max_mb and entities are of the file that `html` names")

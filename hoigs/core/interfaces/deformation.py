@@ -243,6 +243,7 @@ class Template:
         points: surface points, one a Gaussian, metres. normals: outward unit normals there.
         mirrored: `points` reflected in the body's plane of symmetry.
         parts: body part of each point (`hoigs.core.interfaces.body`).
+        weights: of the body's joints, by which each Gaussian is posed; None if it is not.
     """
 
     gaussians: Gaussians
@@ -250,6 +251,7 @@ class Template:
     normals: Float[Tensor, "N 3"]
     mirrored: Float[Tensor, "N 3"]
     parts: Int[Tensor, " N"]
+    weights: Float[Tensor, "N J"] | None = None
 
 
 @runtime_checkable

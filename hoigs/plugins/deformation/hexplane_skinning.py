@@ -281,9 +281,9 @@ class HexPlaneSkinning(SurfaceBody):
         return at_frame(self.camera_centers, moment.time, self.frame_times)
 
     def template(self, canonical: Gaussians) -> Template:
-        attributes, _ = self._attributes(canonical)
+        attributes, weights = self._attributes(canonical)
         drawn = self._canonical(canonical, attributes, None)
-        return replace(super().template(canonical), gaussians=drawn)
+        return replace(super().template(canonical), gaussians=drawn, weights=weights)
 
     def _attributes(self, canonical: Gaussians) -> tuple[CanonicalAttributes, Float[Tensor, "N J"]]:
         """psi_h of every canonical point, and its skinning weights.

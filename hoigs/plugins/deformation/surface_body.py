@@ -185,7 +185,8 @@ class SurfaceBody(SkinnedBody):
         middle = torch.zeros_like(points)
         middle[:, 0] = 2 * (self.rest_joints[PELVIS, 0] - points[:, 0])
         normals = normalize(normals, dim=-1)
-        return Template(canonical, points, normals, points + middle, self.parts)
+        weights = getattr(self, "template_weights", None)
+        return Template(canonical, points, normals, points + middle, self.parts, weights)
 
     def point_parts(self) -> Int[Tensor, " N"]:
         return self.parts

@@ -12,10 +12,10 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.maths.nearest import nearest
 from hoigs.core.maths.rotations import axis_angle_to_quats, matrices_to_quats
 from hoigs.core.maths.skinning import skin
 from hoigs.core.model.exporter import Exporter, ExportRequest
@@ -23,17 +23,20 @@ from hoigs.core.reporting import Progress
 from hoigs.core.values.between import camera_between, frame_of
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
+from hoigs.plugins.exporters.carried import at_rest
 from hoigs.plugins.exporters.posed import (
     AXES,
-    SEEN,
     BodyMotion,
     ObjectMotion,
     body_motion,
     object_motions,
     world_move,
 )
+from hoigs.plugins.exporters.surfaces import Surface, body_surface, motion_surface
 
-COMPONENTS = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}
+COMPONENTS = {
+    "float32": 5126, "uint32": 5125, "uint16": 5123, "int16": 5122, "uint8": 5121, "int8": 5120,
+}  # fmt: skip
 SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 VERTICES, INDICES = 34962, 34963  # what a buffer view is for
 
@@ -59,32 +62,45 @@ class Glb:
         """Store an array [N] or [N, k]; gives the index of its accessor.
 
         Args:
-            target: VERTICES or INDICES for what a mesh reads.
-            normalized: integers stand for [0, 1].
+            target: VERTICES or INDICES for what a mesh reads; of the former each row begins at a
+                multiple of four bytes.
+            normalized: integers stand for [0, 1], signed ones for [-1, 1].
         """
-        array = np.ascontiguousarray(array)
         width = 1 if array.ndim == 1 else int(np.prod(array.shape[1:]))
-        view: dict[str, Any] = {
-            "buffer": 0, "byteOffset": len(self._data), "byteLength": array.nbytes,
-        }  # fmt: skip
+        array = np.ascontiguousarray(array).reshape(len(array), width)
+        view: dict[str, Any] = {}
+        flat, row = array, width * array.itemsize
+        if target == VERTICES and row % 4:
+            array = np.pad(array, ((0, 0), (0, -row % 4 // array.itemsize)))
+            view["byteStride"] = array.shape[1] * array.itemsize
         if target is not None:
             view["target"] = target
-        self._data += array.tobytes()
-        self._data += b"\0" * (-len(self._data) % 4)
         entry: dict[str, Any] = {
-            "bufferView": self.add("bufferViews", **view),
-            "componentType": COMPONENTS[array.dtype.name],
-            "count": len(array),
+            "bufferView": self.view(array.tobytes(), **view),
+            "componentType": COMPONENTS[flat.dtype.name],
+            "count": len(flat),
             "type": SHAPES[width],
         }
         if normalized:
             entry["normalized"] = True
-        if (array.dtype == np.float32 and width <= 4) or width == 1:
-            flat = array.reshape(len(array), width)
+        if width <= 4:
             entry["min"], entry["max"] = flat.min(0).tolist(), flat.max(0).tolist()
         return self.add("accessors", **entry)
 
-    def bytes(self) -> bytes:
+    def view(self, data: bytes, **entry: Any) -> int:
+        """Store bytes; gives the index of their buffer view."""
+        place = {"buffer": 0, "byteOffset": len(self._data), "byteLength": len(data)}
+        self._data += data + b"\0" * (-len(data) % 4)
+        return self.add("bufferViews", **place, **entry)
+
+    def zeros(self, count: int) -> int:
+        """The accessor of positions that are all zero, which takes no room."""
+        none = [0.0, 0.0, 0.0]
+        return self.add(
+            "accessors", componentType=5126, count=count, type="VEC3", min=none, max=none
+        )
+
+    def whole(self) -> bytes:
         """The file."""
         if self._data:
             self.document["buffers"] = [{"byteLength": len(self._data)}]
@@ -98,6 +114,10 @@ class Glb:
 # exporter:gltf-splat: the Gaussians of one moment as glTF's KHR_gaussian_splatting.
 
 NAME = "KHR_gaussian_splatting"
+KERNEL = {
+    "kernel": "ellipse", "colorSpace": "srgb_rec709_display",
+    "sortingMethod": "cameraDistance", "projection": "perspective",
+}  # fmt: skip
 
 
 class GltfSplatExporter(Exporter):
@@ -130,7 +150,7 @@ class GltfSplatExporter(Exporter):
         glb.add("scenes", nodes=nodes)
         glb.document["scene"] = 0
         progress(0.5, "writing")
-        (folder / "splats.glb").write_bytes(glb.bytes())
+        (folder / "splats.glb").write_bytes(glb.whole())
         lost = {"support": f"{NAME} is new: programs without it show coloured points"}
         if len(request.moments) > 1:
             lost["motion"] = "the extension holds one moment, the first; usd holds all"
@@ -142,6 +162,7 @@ def add_splats(glb: Glb, name: str, gaussians: Gaussians) -> int:
     g = gaussians.detach().to("cpu", torch.float32)
     quats = torch.nn.functional.normalize(g.quats, dim=-1)[:, [1, 2, 3, 0]]
     fallback = torch.cat((g.colors.clamp(0, 1), g.opacities[:, None]), 1)
+    fallback[:, :3] = torch.from_numpy(linear_color(fallback[:, :3].numpy()))
     values = {
         "POSITION": g.means,
         "COLOR_0": fallback,
@@ -155,11 +176,7 @@ def add_splats(glb: Glb, name: str, gaussians: Gaussians) -> int:
     attributes = {
         key: glb.accessor(value.float().numpy(), VERTICES) for key, value in values.items()
     }
-    extension = {
-        "kernel": "ellipse", "colorSpace": "srgb_rec709_display",
-        "sortingMethod": "cameraDistance", "projection": "perspective",
-    }  # fmt: skip
-    shape = {"attributes": attributes, "mode": 0, "extensions": {NAME: extension}}
+    shape = {"attributes": attributes, "mode": 0, "extensions": {NAME: KERNEL}}
     return glb.add("meshes", name=name, primitives=[shape])
 
 
@@ -173,11 +190,13 @@ class GltfBodyConfig(ComponentConfig):
 
     camera: bool = True
     """the camera of the video, animated"""
+    texture: int = Field(default=1024, ge=64, le=8192)
+    """pixels of a side of each texture"""
 
 
 class GltfBodyExporter(Exporter):
-    """`body.glb`: each person as a skinned mesh with one animation, each object as coloured points
-    on an animated node.
+    """`body.glb`: each person as a skinned mesh, each object as a mesh on an animated node, closed,
+    with normals and a baked texture.
     """
 
     Config: ClassVar = GltfBodyConfig
@@ -187,15 +206,15 @@ class GltfBodyExporter(Exporter):
     up = "y"
     axes = AXES["y"]
     keeps: ClassVar = {
-        "people": "skinned meshes in their shape, coloured by the nearest Gaussians",
-        "objects": "the centres of their visible Gaussians as coloured points, moved rigidly",
+        "people": "skinned meshes in their shape; textures of the mean colours of their Gaussians",
+        "objects": "closed meshes through the centres of their Gaussians, textured, moved rigidly",
         "camera": "of the video, with its vertical field of view at the first moment",
     }
 
     def write(self, request: ExportRequest, folder: Path, progress: Progress) -> Mapping[str, str]:
         glb = Glb()
         seconds = np.arange(len(request.moments), dtype=np.float32) / np.float32(request.fps)
-        clock = _Clock(glb, glb.accessor(seconds))
+        clock = Clock(glb, glb.accessor(seconds))
         lost = {"looks": "Gaussians are left out; ply-sequence and usd hold them"}
         children, skins = [], []  # what carries a skin stands at the root: its bones place it
         people = request.of_kind("human")
@@ -205,7 +224,8 @@ class GltfBodyExporter(Exporter):
                 lost[name] = "it has no body model"
                 continue
             motion = body_motion(request, name)
-            bones, skin = add_person(clock, motion, _looks(request, motion))
+            surface = body_surface(motion, at_rest(request, motion), self.config.texture)
+            bones, skin = add_person(clock, motion, surface)
             children.append(bones)
             skins.append(skin)
             worst = skinning_error(motion)
@@ -215,24 +235,27 @@ class GltfBodyExporter(Exporter):
                     "also corrects its vertices by pose or weighs more joints"
                 )
         progress(0.8, "objects")
-        children += [add_object(clock, motion) for motion in object_motions(request)]
+        for rigid in object_motions(request):
+            mesh, why = motion_surface(request, rigid, self.config.texture)
+            children.append(add_object(clock, rigid, mesh))
+            lost |= why
         if self.config.camera:
             frames = [frame_of(request.clip, moment) for moment in request.moments]
             cameras = [camera_between(request.clip, frame).to("cpu") for frame in frames]
             children.append(add_camera(clock, cameras))
         move = world_move(request.clip, "y")
         root = glb.add(
-            "nodes", name="world", rotation=_xyzw(matrices_to_quats(move.turn)).tolist(),
+            "nodes", name="world", rotation=xyzw(matrices_to_quats(move.turn)).tolist(),
             translation=move.shift.tolist(), children=children,
         )  # fmt: skip
         glb.add("scenes", nodes=[root, *skins])
         glb.document["scene"] = 0
         progress(0.9, "writing")
-        (folder / "body.glb").write_bytes(glb.bytes())
+        (folder / "body.glb").write_bytes(glb.whole())
         return lost
 
 
-class _Clock:
+class Clock:
     """The one animation of the file, and the accessor of its times."""
 
     def __init__(self, glb: Glb, times: int) -> None:
@@ -248,11 +271,11 @@ class _Clock:
         entry["channels"].append({"sampler": len(entry["samplers"]) - 1, "target": target})
 
 
-def add_person(clock: _Clock, motion: BodyMotion, colors: Float[Tensor, "V 3"]) -> tuple[int, int]:
-    """Joints, skin and mesh of a person; gives the nodes of the pelvis and of the mesh."""
+def add_bones(clock: Clock, motion: BodyMotion) -> list[int]:
+    """The joints of a person, animated: their nodes, the pelvis first."""
     glb, parents = clock.glb, motion.body.parents
     rest = motion.rest_joints.numpy()
-    quats = _continuous(_xyzw(axis_angle_to_quats(motion.rotations)))
+    quats = continuous(xyzw(axis_angle_to_quats(motion.rotations)))
     joints: list[int] = []
     for joint, parent in enumerate(parents):
         place = rest[joint] - rest[parent] if parent >= 0 else motion.pelvis[0].numpy()
@@ -265,24 +288,56 @@ def add_person(clock: _Clock, motion: BodyMotion, colors: Float[Tensor, "V 3"]) 
             glb.document["nodes"][joints[parent]].setdefault("children", []).append(joints[joint])
         clock.move(joints[joint], "rotation", quats[:, joint])
     clock.move(joints[0], "translation", motion.pelvis.numpy())
-    inverse = np.tile(np.eye(4, dtype=np.float32), (len(rest), 1, 1))
-    inverse[:, 3, :3] = -rest  # column by column, as glTF stores matrices
+    return joints
+
+
+def add_skin(
+    glb: Glb, joints: Sequence[int], motion: BodyMotion, low: float | np.ndarray = 0.0,
+    size: float = 1.0,
+) -> int:  # fmt: skip
+    """The skin of a mesh whose vertices times `size` plus `low` are the body at rest."""
+    inverse = np.tile(np.diag(np.array((size, size, size, 1), np.float32)), (len(joints), 1, 1))
+    inverse[:, 3, :3] = low - motion.rest_joints.numpy()  # column by column, as glTF has matrices
     bound = glb.accessor(inverse.reshape(-1, 16))
-    skeleton = glb.add("skins", joints=joints, inverseBindMatrices=bound, skeleton=joints[0])
-    vertices = motion.body.shaped(motion.betas)[0].numpy()
+    return glb.add("skins", joints=list(joints), inverseBindMatrices=bound, skeleton=joints[0])
+
+
+def add_person(clock: Clock, motion: BodyMotion, surface: Surface) -> tuple[int, int]:
+    """Joints, skin and mesh of a person; gives the nodes of the pelvis and of the mesh."""
+    glb = clock.glb
+    joints = add_bones(clock, motion)
+    skeleton = add_skin(glb, joints, motion)
     chosen, weights = influences(motion.body.skinning_weights)
-    attributes = {
-        "POSITION": glb.accessor(vertices, VERTICES),
-        "COLOR_0": _color(glb, colors),
-    }
+    carried = {}
     for k in range(0, chosen.shape[1], 4):
-        attributes[f"JOINTS_{k // 4}"] = glb.accessor(chosen[:, k : k + 4], VERTICES)
-        attributes[f"WEIGHTS_{k // 4}"] = glb.accessor(weights[:, k : k + 4], VERTICES)
-    faces = glb.accessor(motion.body.faces.numpy().astype(np.uint32).reshape(-1), INDICES)
-    material = glb.add("materials", pbrMetallicRoughness={"metallicFactor": 0.0}, doubleSided=True)
-    shape = {"attributes": attributes, "indices": faces, "material": material}
-    mesh = glb.add("meshes", name=motion.name, primitives=[shape])
+        carried[f"JOINTS_{k // 4}"] = chosen[:, k : k + 4]
+        carried[f"WEIGHTS_{k // 4}"] = weights[:, k : k + 4]
+    mesh = add_surface(glb, motion.name, surface, carried)
     return joints[0], glb.add("nodes", name=motion.name, mesh=mesh, skin=skeleton)
+
+
+def add_surface(
+    glb: Glb, name: str, surface: Surface, more: Mapping[str, np.ndarray] | None = None
+) -> int:
+    """The mesh of a surface, with its texture; `more` are attributes of its vertices."""
+    rows, faces, uv = surface.split()
+    vertices = {"POSITION": surface.vertices, "NORMAL": surface.normals, **(more or {})}
+    attributes = {
+        key: glb.accessor(_float32(value)[rows], VERTICES) for key, value in vertices.items()
+    }
+    # glTF's texture coordinates begin on top
+    attributes["TEXCOORD_0"] = glb.accessor(_float32(uv * (1, -1) + (0, 1)), VERTICES)
+    image = glb.add("images", bufferView=glb.view(surface.png()), mimeType="image/png", name=name)
+    paint = {"baseColorTexture": {"index": glb.add("textures", source=image)}}
+    matt = {**paint, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    material = glb.add("materials", name=name, pbrMetallicRoughness=matt)
+    indices = glb.accessor(faces.astype(np.uint32).reshape(-1), INDICES)
+    shape = {"attributes": attributes, "indices": indices, "material": material}
+    return glb.add("meshes", name=name, primitives=[shape])
+
+
+def _float32(values: np.ndarray) -> np.ndarray:
+    return values.astype(np.float32) if values.dtype == np.float64 else values
 
 
 def influences(weights: Float[Tensor, "V J"]) -> tuple[np.ndarray, np.ndarray]:
@@ -313,15 +368,16 @@ def skinning_error(motion: BodyMotion) -> float:
     return worst
 
 
-def add_object(clock: _Clock, motion: ObjectMotion) -> int:
-    """An object's points on an animated node."""
+def add_object(clock: Clock, motion: ObjectMotion, surface: Surface | None) -> int:
+    """An object's mesh on an animated node; its points, where there is none."""
     glb = clock.glb
-    quats = _continuous(_xyzw(matrices_to_quats(motion.rotations))[:, None])[:, 0]
-    attributes = {
-        "POSITION": glb.accessor(motion.points.numpy(), VERTICES),
-        "COLOR_0": _color(glb, motion.colors),
-    }
-    mesh = glb.add("meshes", name=motion.name, primitives=[{"attributes": attributes, "mode": 0}])
+    quats = continuous(xyzw(matrices_to_quats(motion.rotations))[:, None])[:, 0]
+    if surface is not None:
+        mesh = add_surface(glb, motion.name, surface)
+    else:
+        color = glb.accessor(linear_color(motion.colors.numpy()), VERTICES)
+        shape = {"POSITION": glb.accessor(motion.points.numpy(), VERTICES), "COLOR_0": color}
+        mesh = glb.add("meshes", name=motion.name, primitives=[{"attributes": shape, "mode": 0}])
     place = motion.translations[0].tolist()
     node = glb.add(
         "nodes", name=motion.name, mesh=mesh, rotation=quats[0].tolist(), translation=place
@@ -331,7 +387,7 @@ def add_object(clock: _Clock, motion: ObjectMotion) -> int:
     return node
 
 
-def add_camera(clock: _Clock, cameras: Sequence[Camera]) -> int:
+def add_camera(clock: Clock, cameras: Sequence[Camera]) -> int:
     """The camera of the video on an animated node; glTF's looks along -z with y up."""
     glb, first = clock.glb, cameras[0]
     lens = {
@@ -342,7 +398,7 @@ def add_camera(clock: _Clock, cameras: Sequence[Camera]) -> int:
     index = glb.add("cameras", type="perspective", perspective=lens, name="video")
     flip = torch.diag(torch.tensor((1.0, -1.0, -1.0)))
     turns = torch.stack([c.world_to_camera[:3, :3].mT @ flip for c in cameras])
-    quats = _continuous(_xyzw(matrices_to_quats(turns))[:, None])[:, 0]
+    quats = continuous(xyzw(matrices_to_quats(turns))[:, None])[:, 0]
     places = torch.stack([c.center for c in cameras])
     node = glb.add(
         "nodes", name="camera", camera=index, rotation=quats[0].tolist(),
@@ -353,30 +409,20 @@ def add_camera(clock: _Clock, cameras: Sequence[Camera]) -> int:
     return node
 
 
-def _looks(request: ExportRequest, motion: BodyMotion) -> Float[Tensor, "V 3"]:
-    """Colours of a body's vertices: those of the nearest visible Gaussians at the first moment."""
-    with torch.no_grad():
-        gaussians = request.scene(request.moments[0], [motion.name]).gaussians[motion.name]
-        seen = gaussians.opacities > SEEN
-        gaussians = gaussians[seen] if bool(seen.any()) else gaussians
-        found = nearest(motion.vertices(0), 3, gaussians.means.cpu())[0]
-        return gaussians.colors.cpu().clamp(0, 1)[found].mean(1)
-
-
-def _color(glb: Glb, colors: Float[Tensor, "N 3"]) -> int:
-    """COLOR_0 of display colours: glTF's are linear (inverse of the sRGB transfer function)."""
-    value = colors.double().numpy()
+def linear_color(colors: np.ndarray) -> np.ndarray:
+    """glTF's linear colours of display colours (inverse of the sRGB transfer function)."""
+    value = colors.astype(np.float64)
     linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    return glb.accessor(linear.astype(np.float32), VERTICES)
+    return linear.astype(np.float32)
 
 
-def _xyzw(quats: Float[Tensor, "*batch 4"]) -> np.ndarray:
+def xyzw(quats: Float[Tensor, "*batch 4"]) -> np.ndarray:
     """glTF's order, unit, from wxyz."""
     unit = torch.nn.functional.normalize(quats.double(), dim=-1)
     return unit[..., [1, 2, 3, 0]].numpy().astype(np.float32)
 
 
-def _continuous(quats: np.ndarray) -> np.ndarray:
+def continuous(quats: np.ndarray) -> np.ndarray:
     """[F, J, 4] with signs such that neighbours in time are near."""
     turned = quats.copy()
     for i in range(1, len(turned)):

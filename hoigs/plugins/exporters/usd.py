@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from jaxtyping import Float
-from pxr import Gf, Tf, Usd, UsdGeom, UsdSkel, UsdVol, Vt
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdVol, Vt
+from pydantic import Field
 from torch import Tensor
 
 from hoigs.core.config import ComponentConfig
@@ -19,6 +20,8 @@ from hoigs.core.reporting import Progress
 from hoigs.core.values.between import camera_between, frame_of
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
+from hoigs.plugins.exporters.carried import at_rest
+from hoigs.plugins.exporters.glb import linear_color
 from hoigs.plugins.exporters.posed import (
     AXES,
     BodyMotion,
@@ -28,6 +31,7 @@ from hoigs.plugins.exporters.posed import (
     object_motions,
     world_move,
 )
+from hoigs.plugins.exporters.surfaces import Surface, body_surface, motion_surface
 
 INFLUENCES = 8  # joints that may move a vertex
 FILM = 36.0  # width of the camera's aperture, millimetres
@@ -40,6 +44,11 @@ class UsdConfig(ComponentConfig):
     """Gaussians, a ParticleField3DGaussianSplat for each entity"""
     skeletons: bool = True
     """people as UsdSkel, invisible where there are splats"""
+    textures: bool = False
+    """materials with texture files beside the stage (name a folder or a zip); without, meshes have
+    the colours at their vertices"""
+    texture: int = Field(default=1024, ge=64, le=8192)
+    """pixels of a side of each texture"""
 
 
 class UsdExporter(Exporter):
@@ -55,8 +64,8 @@ class UsdExporter(Exporter):
     axes = AXES["y"]
     keeps: ClassVar = {
         "Gaussians": "ParticleField3DGaussianSplat, float32, all SH bands, time samples",
-        "people": "UsdSkel: skeleton, animation and skinned mesh",
-        "objects": "an Xform that moves, with the centres of the visible Gaussians as points",
+        "people": "UsdSkel: skeleton, animation, skinned mesh with normals, st and colours",
+        "objects": "an Xform that moves, with a closed mesh through the centres of its Gaussians",
         "camera": "of the video, with time samples",
     }
 
@@ -69,13 +78,18 @@ class UsdExporter(Exporter):
         for name in request.of_kind("human") if self.config.skeletons else ():
             progress(0.7, name)
             if name in request.bodies:
-                motion = body_motion(request, name).moved(move)
-                _add_person(stage, motion, hidden=self.config.splats)
+                motion = body_motion(request, name)
+                surface = body_surface(motion, at_rest(request, motion), self.config.texture)
+                picture = self._picture(folder, name, surface)
+                _add_person(stage, motion.moved(move), surface, picture, hidden=self.config.splats)
             else:
                 lost[f"skeleton of {name}"] = "it has no body model"
         progress(0.8, "objects and camera")
         for rigid in object_motions(request):
-            _add_object(stage, rigid, move, hidden=self.config.splats)
+            found, why = motion_surface(request, rigid, self.config.texture)
+            lost |= why
+            picture = None if found is None else self._picture(folder, rigid.name, found)
+            _add_object(stage, rigid, move, (found, picture), hidden=self.config.splats)
             if rigid.residual > 1e-4:
                 lost[f"deformation of the points of {rigid.name}"] = (
                     f"the Xform is rigid, {1000 * rigid.residual:.2f} mm (RMS) from the Gaussians"
@@ -85,6 +99,13 @@ class UsdExporter(Exporter):
         progress(0.9, "writing")
         stage.GetRootLayer().Export(str(folder / "scene.usd"))
         return lost
+
+    def _picture(self, folder: Path, name: str, surface: Surface) -> str | None:
+        """Write a texture beside the stage, if any are; its path."""
+        if not self.config.textures:
+            return None
+        (folder / f"{_name(name)}.png").write_bytes(surface.png())
+        return f"./{_name(name)}.png"
 
 
 def _stage(request: ExportRequest) -> Usd.Stage:
@@ -153,7 +174,9 @@ def _extent(points: Float[Tensor, "N 3"], reach: Float[Tensor, " N"] | float = 0
     return _vectors(torch.stack((low, high)))
 
 
-def _add_person(stage: Usd.Stage, motion: BodyMotion, *, hidden: bool) -> None:
+def _add_person(
+    stage: Usd.Stage, motion: BodyMotion, surface: Surface, picture: str | None, *, hidden: bool
+) -> None:
     path = f"/World/people/{_name(motion.name)}"
     UsdGeom.Scope.Define(stage, "/World/people")
     root = UsdSkel.Root.Define(stage, path)
@@ -179,7 +202,7 @@ def _add_person(stage: Usd.Stage, motion: BodyMotion, *, hidden: bool) -> None:
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets(
         [animation.GetPath()]
     )
-    _add_skin(stage, f"{path}/mesh", motion, skeleton)
+    _add_skin(_add_mesh(stage, f"{path}/mesh", surface, picture), motion, skeleton)
     UsdSkel.BindingAPI.Apply(root.GetPrim())
     span = [motion.vertices(i) for i in range(len(motion))]
     _set(root.CreateExtentAttr(), [_extent(v) for v in span])
@@ -187,15 +210,52 @@ def _add_person(stage: Usd.Stage, motion: BodyMotion, *, hidden: bool) -> None:
         root.CreateVisibilityAttr(UsdGeom.Tokens.invisible)
 
 
-def _add_skin(stage: Usd.Stage, path: str, motion: BodyMotion, skeleton: UsdSkel.Skeleton) -> None:
+def _add_mesh(stage: Usd.Stage, path: str, surface: Surface, picture: str | None) -> UsdGeom.Mesh:
+    """A closed mesh: normals a vertex, st a corner, colours a vertex, and a texture if any."""
     mesh = UsdGeom.Mesh.Define(stage, path)
-    vertices = motion.body.shaped(motion.betas)[0]
-    faces = motion.body.faces.numpy().astype(np.int32)
-    mesh.CreatePointsAttr(_vectors(vertices))
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces.reshape(-1))))
+    points = torch.from_numpy(surface.vertices)
+    mesh.CreatePointsAttr(_vectors(points))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(surface.faces), 3))
+    corners = np.ascontiguousarray(surface.faces.reshape(-1), np.int32)
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(corners))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    mesh.CreateExtentAttr(_extent(vertices))
+    mesh.CreateExtentAttr(_extent(points))
+    mesh.CreateNormalsAttr(_vectors(torch.from_numpy(surface.normals)))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    primvars = UsdGeom.PrimvarsAPI(mesh.GetPrim())
+    uv = np.ascontiguousarray(surface.uv.reshape(-1, 2), np.float32)
+    kind, each = Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying
+    primvars.CreatePrimvar("st", kind, each).Set(Vt.Vec2fArray.FromNumpy(uv))
+    colors = torch.from_numpy(linear_color(surface.vertex_colors()))
+    mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(_vectors(colors))
+    if picture is not None:
+        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_material(stage, path, picture))
+    return mesh
+
+
+def _material(stage: Usd.Stage, path: str, picture: str) -> UsdShade.Material:
+    """UsdPreviewSurface whose colour is a texture's."""
+    material = UsdShade.Material.Define(stage, f"{path}_material")
+    shaders = {}
+    kinds = {"surface": "PreviewSurface", "texture": "UVTexture", "st": "PrimvarReader_float2"}
+    for name, kind in kinds.items():
+        shaders[name] = UsdShade.Shader.Define(stage, f"{path}_material/{name}")
+        shaders[name].CreateIdAttr(f"Usd{kind}")
+    types = Sdf.ValueTypeNames
+    shaders["st"].CreateInput("varname", types.String).Set("st")
+    place = shaders["st"].CreateOutput("result", types.Float2)
+    shaders["texture"].CreateInput("file", types.Asset).Set(picture)
+    shaders["texture"].CreateInput("sourceColorSpace", types.Token).Set("sRGB")
+    shaders["texture"].CreateInput("st", types.Float2).ConnectToSource(place)
+    color = shaders["texture"].CreateOutput("rgb", types.Float3)
+    shaders["surface"].CreateInput("diffuseColor", types.Color3f).ConnectToSource(color)
+    shaders["surface"].CreateInput("roughness", types.Float).Set(1.0)
+    whole = shaders["surface"].CreateOutput("surface", types.Token)
+    material.CreateSurfaceOutput().ConnectToSource(whole)
+    return material
+
+
+def _add_skin(mesh: UsdGeom.Mesh, motion: BodyMotion, skeleton: UsdSkel.Skeleton) -> None:
     weights = motion.body.skinning_weights.float()
     found = weights.topk(min(INFLUENCES, weights.shape[1]), dim=1)
     kept = found.values / found.values.sum(1, keepdim=True)
@@ -220,18 +280,31 @@ def _matrix(turn: Float[Tensor, "3 3"], place: Float[Tensor, " 3"]) -> Gf.Matrix
     return Gf.Matrix4d(*whole.flatten().tolist())
 
 
-def _add_object(stage: Usd.Stage, motion: ObjectMotion, move: Move, *, hidden: bool) -> None:
+def _add_object(
+    stage: Usd.Stage,
+    motion: ObjectMotion,
+    move: Move,
+    found: tuple[Surface | None, str | None],
+    *,
+    hidden: bool,
+) -> None:
+    """An object's mesh, with its texture's path, on a frame that moves; points if it has none."""
     UsdGeom.Scope.Define(stage, "/World/objects")
     frame = UsdGeom.Xform.Define(stage, f"/World/objects/{_name(motion.name)}")
     poses = zip(motion.rotations, motion.translations, strict=True)
     _set(frame.AddTransformOp(), [_matrix(move.turn @ r, move.points(t)) for r, t in poses])
-    points = UsdGeom.Points.Define(stage, frame.GetPath().AppendChild("points"))
-    points.CreatePointsAttr(_vectors(motion.points))
-    points.CreateWidthsAttr(Vt.FloatArray(len(motion.points), 0.005))
-    points.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(_vectors(motion.colors))
-    points.CreateExtentAttr(_extent(motion.points, 0.0025))
+    shape: UsdGeom.PointBased
+    if found[0] is not None:
+        shape = _add_mesh(stage, f"{frame.GetPath()}/mesh", found[0], found[1])
+    else:
+        shape = points = UsdGeom.Points.Define(stage, frame.GetPath().AppendChild("points"))
+        points.CreatePointsAttr(_vectors(motion.points))
+        points.CreateWidthsAttr(Vt.FloatArray(len(motion.points), 0.005))
+        colors = torch.from_numpy(linear_color(motion.colors.numpy()))
+        points.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(_vectors(colors))
+        points.CreateExtentAttr(_extent(motion.points, 0.0025))
     if hidden:
-        points.CreateVisibilityAttr(UsdGeom.Tokens.invisible)
+        shape.CreateVisibilityAttr(UsdGeom.Tokens.invisible)
 
 
 def _add_camera(stage: Usd.Stage, cameras: Sequence[Camera], move: Move) -> None:

@@ -21,7 +21,8 @@ Gf, Usd, UsdGeom, UsdSkel, UsdVol = (
 def written(request_of, tmp_path_factory):
     request = request_of(end=2.0)
     folder = tmp_path_factory.mktemp("usd") / "out"
-    default_registry().get("exporter:usd")().export(request, folder)
+    usd = default_registry().get("exporter:usd")
+    usd(usd.Config(textures=True, texture=64)).export(request, folder)
     return request, Usd.Stage.Open(str(folder / "scene.usd"))
 
 
@@ -81,6 +82,22 @@ def test_usdskel_poses_the_body(written, upright):
             points - motion.vertices(frame).numpy() @ move[:3, :3].T - move[:3, 3], axis=1
         )
         assert away.mean() < 1e-3
+
+
+def test_meshes_are_closed_and_textured(written):
+    import trimesh
+
+    stage = written[1]
+    for path in ("/World/people/human/mesh", "/World/objects/object/mesh"):
+        prim = UsdGeom.Mesh(stage.GetPrimAtPath(path))
+        faces = np.array(prim.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+        mesh = trimesh.Trimesh(np.array(prim.GetPointsAttr().Get()), faces, process=False)
+        assert mesh.is_watertight and mesh.volume > 0
+        assert np.allclose(prim.GetNormalsAttr().Get(), mesh.vertex_normals, atol=1e-3)
+        st = UsdGeom.PrimvarsAPI(prim.GetPrim()).GetPrimvar("st")
+        assert len(st.Get()) == 3 * len(faces) and st.GetInterpolation() == "faceVarying"
+        shader = stage.GetPrimAtPath(f"{path}_material/texture")
+        assert shader.GetAttribute("inputs:file").Get().resolvedPath.endswith(".png")
 
 
 def test_objects_and_the_camera_move(written, upright):
