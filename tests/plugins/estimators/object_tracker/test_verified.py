@@ -18,7 +18,14 @@ from hoigs.plugins.estimators.object_tracker.prompts import (
 )
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.scene import static_scene
-from hoigs.plugins.estimators.object_tracker.states import LOST, OUT, PERSON, SEEN, states_of
+from hoigs.plugins.estimators.object_tracker.states import (
+    DOUBTFUL,
+    LOST,
+    OUT,
+    PERSON,
+    SEEN,
+    states_of,
+)
 from hoigs.plugins.estimators.object_tracker.tracker import _learnt
 from hoigs.plugins.estimators.object_tracker.verified import (
     Known,
@@ -153,3 +160,14 @@ def test_the_hand_that_threw_the_ball_and_the_wall_behind_it_are_not_believed() 
     scene, known = static_scene(footage), Known({6: balls[6]}, {})
     assert _was_there(footage, scene, known, [6], 1, balls[6])  # the wall, before it came there
     assert not _was_there(footage, scene, known, [6], 7, balls[7])
+
+
+def test_a_hand_that_was_clicked_is_doubtful() -> None:
+    person = (np.abs(X - 40) < 15) & (Y > 10)
+    image = np.full((H, W, 3), 90, np.uint8)
+    image[person] = 190, 140, 115
+    shown, cup = image.copy(), np.hypot(X - 40, Y - 40) < 3
+    shown[cup] = 240
+    soft = np.uint8(255) * np.stack([np.hypot(X - 40, Y - 40) < 5, cup])
+    states = states_of(footage_of([image, shown], [person] * 2), {"o": Track(soft, np.ones(2))})
+    assert states["o"] == [DOUBTFUL, SEEN]
