@@ -45,6 +45,7 @@ from hoigs.core.interfaces.estimator import (
     VideoRequest,
 )
 from hoigs.plugins.estimators.object_tracker.estimator import WEAK, ObjectTrackerEstimator
+from hoigs.plugins.estimators.object_tracker.states import DOUBTFUL
 
 SHARED = Path(os.environ.get("HOIGS_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 DATA = SHARED / "data"
@@ -476,21 +477,22 @@ def run(name: str, cache: Path, sheet: Path | None) -> dict:
             return row | {"error": str(error).splitlines()[0]}
         row["seconds"] = time.process_time() - start
         masks = [found.entities["object"][i] for i in range(len(frames))]
-    counts, said, ious, words = Counter(), 0, [], []
+    counts, said, ious, words, states = Counter(), 0, [], [], found.states["object"]
     for i, (mask, true) in enumerate(zip(masks, film.truth, strict=True)):
         if true is None:
             words.append("?")
             continue
         word, iou = verdict(mask, true, case.thin)
         counts[word] += 1
-        said += bool(word == "wrong" and found.confidence["object"][i] < WEAK)
+        doubtful = states[i] == DOUBTFUL or found.confidence["object"][i] < WEAK
+        said += bool(word == "wrong" and doubtful)
         ious += [iou] if mask.any() else []
         words.append(word)
     first = film.truth[at]
     row |= {k: counts[k] for k in ("right", "partial", "wrong", "empty")} | {"said": said}
     row["click"] = verdict(masks[at], first, case.thin)[1] if first is not None else None
     row["iou"] = float(np.mean(ious)) if ious else 0.0
-    row["states"] = dict(Counter(found.states["object"]))
+    row["states"] = dict(Counter(states))
     row["notes"] = list(found.notes)
     if sheet is not None:
         draw(film, masks, found.confidence["object"], words, sheet / f"{name}.png", at)

@@ -196,7 +196,8 @@ class EntityMasks:
         chosen: prompts found for each entity that was requested without one.
         notes: sentences for the report, on what is doubtful.
         states: of each entity, where it is in each frame of the video: "seen" where its mask is
-            verified, else "out of the picture", "hidden by …" or "lost"; absent: not computed.
+            verified, else "doubtful" (there is one), "out of the picture", "hidden by …" or "lost";
+            absent: not computed.
     """
 
     entities: Mapping[str, Frames] = field(default_factory=dict)

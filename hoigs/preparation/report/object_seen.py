@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from itertools import groupby
 
 SEEN = "seen"  # `EntityMasks.states` of a frame whose mask is verified
+UNKNOWN = ("lost", "doubtful")  # of a frame in which a click may help
 DOUBTFUL = 0.5  # agreement of a verified frame's cues below which a click there helps
 
 
@@ -63,18 +64,18 @@ def by_state(states: Sequence[str]) -> dict[str, list[int]]:
 def best_click(
     states: Sequence[str], confidence: Sequence[float], numbers: Sequence[int]
 ) -> tuple[int, str] | None:
-    """The middle of the longest run of frames in which the object is lost; if it never is, the
-    verified frame of most doubt."""
+    """The middle of the longest run of frames in which the object is lost, or its mask may be a
+    part of a person; if there is none, the verified frame of most doubt."""
     runs = [
-        [i for i, _ in group]
+        (state, [i for i, _ in group])
         for state, group in groupby(enumerate(states), key=lambda pair: pair[1])
-        if state == "lost"
+        if state in UNKNOWN
     ]
     if runs:
-        longest = max(runs, key=len)
+        state, longest = max(runs, key=lambda run: len(run[1]))
         middle = longest[len(longest) // 2]
         count = f"{len(longest)} frames" if len(longest) > 1 else "a frame"
-        return numbers[middle], f"the middle of {count} in which it is lost, if it is in view"
+        return numbers[middle], f"the middle of {count} in which it is {state}, if it is in view"
     seen = [(confidence[i], i) for i, state in enumerate(states) if state == SEEN]
     if seen and min(seen)[0] < DOUBTFUL:
         return numbers[min(seen)[1]], "it is seen there with most doubt"

@@ -61,10 +61,12 @@ def walked(
     return solved.reshape(n, m).clip(0, 1).astype(np.float32)
 
 
-RADII = (0.025, 0.04, 0.06, 0.09, 0.13, 0.19)  # of the object, in diagonals of the image
+RADII = (0.022, 0.04, 0.065, 0.1, 0.16)  # of the object, in diagonals of the image
 ROUNDS = 4
 USUAL, LARGEST = 0.25, 0.55  # of the person's mask: what a held thing may, and cannot, cover of it
-LIKE, HELD = 0.45, 0.5  # likeness to the person's colours, share that no limb reaches: see below
+OF_PERSON, HELD = 0.8, 0.5  # share of the person's colours, and that no limb reaches: see below
+UNEXPLAINED = (4.0, 7.0, 12.0)  # units of noise by which pixels differ from the scene
+WEIGHTS = (1.0, 0.8, -1.0, 0.7)  # of `_Judge.features`, fitted to benchmarks/clicks.py
 INSIDE = (0.6, 1.5, 3.0)  # log-odds of the inside of a box, tried in turn
 
 
@@ -89,7 +91,8 @@ class PromptedMask:
 def prompted_mask(
     footage: Footage, scene: Scene, i: int, prompt: FramePrompt, known: ColorModel | None = None
 ) -> PromptedMask:
-    """The best of masks grown from the prompt at several sizes."""
+    """The best of masks grown from the prompt at several sizes, by colours and edges, and by what
+    the scene leaves unexplained."""
     inside, outside, box = _scaled(prompt, footage)
     center = inside.mean(0) if box is None else (box[:2] + box[2:]) / 2
     if not len(inside):
@@ -105,29 +108,106 @@ def prompted_mask(
     fixed[seed] = 6
     if box is not None:
         barred = barred | ~shown
-    if box is None:
-        reach = float(np.hypot(*(inside - center).T).max())
-        spreads = [reach + r * footage.diagonal for r in RADII]
-        grown = [_grown(footage, i, fixed, center, s, inside, known) for s in spreads]
-    else:
-        half = float(max(box[2:] - box[:2])) / 2
-        grown = [
-            _grown(footage, i, fixed, center, half, inside, known, box, odds) for odds in INSIDE
-        ]
-    tried = [g for g in grown if g is not None]
+    growth = _Growth(footage, i, fixed, center, inside, known, box)
+    tried = growth.masks()
+    judge = _Judge(footage, i, away, on_person, box, _disc(footage.shape, inside, 4.0))
+    if box is None and not at_rest and not on_person:
+        tried += growth.unexplained(away)
     if not tried:
         return PromptedMask(i, np.zeros(footage.shape, np.float32), 0.0, on_person, barred)
-    masks = [soft > 0.5 for _, soft in tried]
-    new = np.ones(len(masks)) if on_person else _novelty(masks, away, footage.diagonal)
-    scores = [
-        score * (0.4 + 0.6 * _steadiness(masks, k)) * _plausible(footage, i, masks[k], on_person)
-        for k, (score, _) in enumerate(tried)
+    scores = judge.scores(tried)
+    k = int(scores.argmax())
+    return PromptedMask(i, tried[k].soft, judge.quality(tried)[k], on_person, barred)
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """A mask of a frame that may be the object's.
+
+    Attributes:
+        set_off: of `set_off`. spread: size at which it was grown, pixels. steady: how little it
+            changes at the next size.
+    """
+
+    soft: Float[np.ndarray, "h w"]
+    set_off: float
+    spread: float
+    steady: float = 1.0
+
+
+def _steadied(family: list[_Tried]) -> list[_Tried]:
+    """Masks that were grown at neighbouring sizes."""
+    masks = [t.soft > 0.5 for t in family]
+    near = [[j for j in (k - 1, k + 1) if 0 <= j < len(masks)] for k in range(len(masks))]
+    return [
+        replace(t, steady=max((overlap(masks[k], masks[j]) for j in near[k]), default=1.0))
+        for k, t in enumerate(family)
     ]
-    scores = [score * n for score, n in zip(scores, new)]
-    if box is not None:  # which is drawn so that the object reaches its sides
-        scores = [score * _reaching(m, box) ** 2 for score, m in zip(scores, masks)]
-    best = int(np.argmax(scores))
-    return PromptedMask(i, tried[best][1], scores[best], on_person, barred)
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """How good a mask of one frame is."""
+
+    footage: Footage
+    i: int
+    away: Float[np.ndarray, "h w"]
+    on_person: bool
+    box: np.ndarray | None
+    clicked: Bool[np.ndarray, "h w"]
+
+    def quality(self, tried: list[_Tried]) -> list[float]:
+        """How well each is set off, 0 to about 1."""
+        masks = [t.soft > 0.5 for t in tried]
+        new = np.ones(len(masks))
+        if not self.on_person:
+            new = _novelty(masks, self.away, self.footage.diagonal)
+        found = []
+        for t, mask, share in zip(tried, masks, new):
+            score = t.set_off * t.spread**0.1 * (0.4 + 0.6 * t.steady) * float(share)
+            score *= _plausible(self.footage, self.i, mask, self.on_person)
+            if self.box is not None:  # which is drawn so that the object reaches its sides
+                score *= _reaching(mask, self.box) ** 2
+            found.append(score)
+        return found
+
+    def scores(self, tried: list[_Tried]) -> Float[np.ndarray, " N"]:
+        """Logarithms by which the best is chosen."""
+        return self.features(tried) @ np.array(WEIGHTS)
+
+    def features(self, tried: list[_Tried]) -> Float[np.ndarray, "N 4"]:
+        """What speaks for each mask: how well it is set off; how much it takes in of what differs
+        from the scene; how like the person it is; how like what was clicked its colours are."""
+        masks = [t.soft > 0.5 for t in tried]
+        part = self._unexplained(masks)
+        taken = [0.0 if part is None else (m & part).sum() / part.sum() for m in masks]
+        return np.stack((
+            np.log(np.array(self.quality(tried)) + 1e-4),
+            np.zeros(len(masks)) if part is None else np.log(np.array(taken) + 1e-3),
+            [self._of_person(m) for m in masks],
+            np.log([self._like(m, self.clicked) + 0.1 for m in masks]),
+        ), -1)  # fmt: skip
+
+    def _unexplained(self, masks: list[np.ndarray]) -> Bool[np.ndarray, "h w"] | None:
+        """The part of what differs from the scene and is no body that all masks meet; None where
+        there is none, or most of the picture does."""
+        if self.on_person:
+            return None
+        changed = (np.nan_to_num(self.away, nan=0.0) > UNEXPLAINED[1]) & ~self.footage.body(self.i)
+        labels, _ = ndimage.label(ndimage.binary_closing(changed))
+        own = np.bincount(labels[np.all(masks, axis=0)], minlength=2)
+        part = labels == 1 + own[1:].argmax()
+        return part if own[1:].max() > 0 and part.sum() < 0.1 * part.size else None
+
+    def _of_person(self, mask: Bool[np.ndarray, "h w"]) -> float:
+        share = float((self.footage.person[self.i] & mask).sum() / max(mask.sum(), 1))
+        return share * of_person(self.footage, self.i, mask)
+
+    def _like(self, mask: Bool[np.ndarray, "h w"], other: Bool[np.ndarray, "h w"]) -> float:
+        """Bhattacharyya coefficient of the colours of two regions."""
+        bins = bins_of(self.footage.colors(self.i))
+        own, theirs = (histogram(bins, region * 1.0) for region in (mask, other))
+        return float(np.sqrt(own * theirs).sum())
 
 
 def looks_like_person(footage: Footage, found: PromptedMask) -> bool:
@@ -137,16 +217,15 @@ def looks_like_person(footage: Footage, found: PromptedMask) -> bool:
     i, mask = found.frame, found.soft > 0.5
     if not found.on_person or footage.held[i][mask].mean() > HELD:
         return False
+    return of_person(footage, i, mask) > OF_PERSON
+
+
+def of_person(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]) -> float:
+    """The share of a mask's pixels for which the person has as many of their colour beside it."""
     rest = footage.person[i] & ~ndimage.binary_dilation(mask, iterations=2 * footage.unit)
     bins = bins_of(footage.colors(i))
-    own, theirs = (histogram(bins, region * 1.0) for region in (mask, rest))
-    return float(np.sqrt(own * theirs).sum()) > LIKE
-
-
-def _steadiness(masks: list[np.ndarray], k: int) -> float:
-    """How little a mask changes when it is grown at the next size."""
-    near = [masks[j] for j in (k - 1, k + 1) if 0 <= j < len(masks)]
-    return max((overlap(masks[k], m) for m in near), default=1.0)
+    own, theirs = (region.sum() * histogram(bins, region * 1.0) for region in (mask, rest))
+    return float(np.minimum(own, theirs).sum() / max(mask.sum(), 1))
 
 
 def _novelty(masks: list[np.ndarray], away: np.ndarray, diagonal: float) -> np.ndarray:
@@ -222,53 +301,101 @@ def _evidence(
     return odds.astype(np.float32)
 
 
-def _grown(
-    footage: Footage,
-    i: int,
-    fixed: np.ndarray,
-    center: np.ndarray,
-    spread: float,
-    seeds: np.ndarray,
-    known: ColorModel | None,
-    box: np.ndarray | None = None,
-    inside: float = 0.0,
-) -> tuple[float, np.ndarray] | None:
-    """Score and soft mask at one size: colours and mask in turns, as in GrabCut (Rother 2004).
+@dataclass(frozen=True)
+class _Growth:
+    """Masks grown from the seeds of one frame: colours and mask in turns, as in GrabCut (Rother
+    2004).
 
-    inside: log-odds of the pixels of `box`.
+    Attributes:
+        fixed: log-odds of pixels that do not change on the way. known: colours of the object.
     """
-    window = Window.around(center[0], center[1], 1.6 * spread + 4)
-    colors = window.cut(footage.colors(i))
-    valid = window.inside(footage.shape)
-    bins = bins_of(colors)
-    fixed_here = np.where(valid, window.cut(fixed), -9)
-    y, x = np.mgrid[: window.n, : window.n] + 0.5
-    if box is None:
-        cx, cy = window.cells(*np.asarray(seeds, float).T)
-        distance = np.min([np.hypot(x - a, y - b) for a, b in zip(cx, cy)], 0)
-        # a seed's own surroundings count, so that a line of clicks marks a long thing
-        space = 1.5 * (1 - (distance * window.step / spread) ** 2).clip(-2.5, 1)
-    else:
-        x0, y0 = window.cells(box[0], box[1])
-        x1, y1 = window.cells(box[2], box[3])
-        space = np.where((x > x0) & (x < x1) & (y > y0) & (y < y1), inside, -8.0)
-    soft = 1 / (1 + np.exp(-(space + fixed_here)))
-    if box is None:
-        soft = soft * (space > 0.4)
-    whole = histogram(bins_of(footage.colors(i)[::3, ::3]), np.ones_like(fixed[::3, ::3]))
-    for _ in range(ROUNDS):
-        near = histogram(bins, (soft < 0.5) * valid * 1.0)
-        inner = histogram(bins, np.where(soft > 0.5, soft, 0) + 1e-9)
-        if known is not None:
-            inner = 0.5 * (inner + known.inside)
-        odds = 0.8 * odds_of(inner, 0.7 * near + 0.3 * whole)[bins] + space + fixed_here
-        soft = walked(np.where(valid, odds, -9), colors)
-    mask = _connected(soft > 0.5, window, seeds)
-    if mask.sum() < 9:
-        return None
-    score = set_off(mask, colors, bins, valid)
-    soft = np.where(ndimage.binary_dilation(mask, iterations=2), soft, 0)
-    return score * spread**0.1, window.paste(soft, footage.shape) / np.float32(255)
+
+    footage: Footage
+    i: int
+    fixed: Float[np.ndarray, "h w"]
+    center: Float[np.ndarray, "2"]
+    seeds: Float[np.ndarray, "N 2"]
+    known: ColorModel | None
+    box: np.ndarray | None
+
+    def masks(self) -> list[_Tried]:
+        """Those that grow, at several sizes, or odds of a box."""
+        if self.box is None:
+            reach = float(np.hypot(*(self.seeds - self.center).T).max())
+            sizes = [(reach + r * self.footage.diagonal, 0.0) for r in RADII]
+        else:
+            sizes = [(float(max(self.box[2:] - self.box[:2])) / 2, odds) for odds in INSIDE]
+        return _steadied([found for size in sizes if (found := self._grown(*size)) is not None])
+
+    def _grown(self, spread: float, inside: float) -> _Tried | None:
+        """inside: log-odds of the pixels of `box`."""
+        window = Window.around(self.center[0], self.center[1], 1.6 * spread + 4)
+        colors = window.cut(self.footage.colors(self.i))
+        valid = window.inside(self.footage.shape)
+        bins = bins_of(colors)
+        fixed = np.where(valid, window.cut(self.fixed), -9)
+        y, x = np.mgrid[: window.n, : window.n] + 0.5
+        if self.box is None:
+            cx, cy = window.cells(*np.asarray(self.seeds, float).T)
+            distance = np.min([np.hypot(x - a, y - b) for a, b in zip(cx, cy)], 0)
+            # a seed's own surroundings count, so that a line of clicks marks a long thing
+            space = 1.5 * (1 - (distance * window.step / spread) ** 2).clip(-2.5, 1)
+        else:
+            x0, y0 = window.cells(self.box[0], self.box[1])
+            x1, y1 = window.cells(self.box[2], self.box[3])
+            space = np.where((x > x0) & (x < x1) & (y > y0) & (y < y1), inside, -8.0)
+        soft = 1 / (1 + np.exp(-(space + fixed)))
+        if self.box is None:
+            soft = soft * (space > 0.4)
+        whole = bins_of(self.footage.colors(self.i)[::3, ::3])
+        others = histogram(whole, np.ones(whole.shape))
+        person = self.footage.person[self.i]
+        if (window.cut(person) * valid).mean() > 0.05:  # hands have their colours
+            theirs = person & (window.paste(np.ones((window.n, window.n)), person.shape) == 0)
+            if theirs.any():
+                bins_all = bins_of(self.footage.colors(self.i))
+                others = 0.4 * others + 0.6 * histogram(bins_all, theirs * 1.0)
+        for _ in range(ROUNDS):
+            near = histogram(bins, (soft < 0.5) * valid * 1.0)
+            inner = histogram(bins, np.where(soft > 0.5, soft, 0) + 1e-9)
+            if self.known is not None:
+                inner = 0.5 * (inner + self.known.inside)
+            odds = 0.8 * odds_of(inner, 0.7 * near + 0.3 * others)[bins] + space + fixed
+            soft = walked(np.where(valid, odds, -9), colors)
+        mask = _connected(soft > 0.5, window, self.seeds)
+        if mask.sum() < 9:
+            return None
+        score = set_off(mask, colors, bins, valid)
+        soft = np.where(ndimage.binary_dilation(mask, iterations=2), soft, 0)
+        soft = window.paste(soft, self.footage.shape) / np.float32(255)
+        return _Tried(soft, score, spread)
+
+    def unexplained(self, away: Float[np.ndarray, "h w"]) -> list[_Tried]:
+        """The parts that hold a seed of what neither the scene nor the body explains: they keep
+        what is thin."""
+        found = []
+        for least in UNEXPLAINED:
+            region = (np.nan_to_num(away) > least) & (self.fixed > -6)
+            region &= ~self.footage.body(self.i)
+            mask = _connected(
+                ndimage.binary_closing(region) | (self.fixed >= 6), _whole(region), self.seeds
+            )
+            mask = ndimage.binary_opening(mask, np.ones((2, 2))) | (mask & (self.fixed >= 6))
+            if not 9 <= mask.sum() < 0.1 * mask.size:
+                continue
+            y, x = np.nonzero(mask)
+            half = 0.5 * max(np.ptp(x), np.ptp(y)) + 8
+            window = Window.around((x.min() + x.max()) / 2, (y.min() + y.max()) / 2, half)
+            colors = window.cut(self.footage.colors(self.i))
+            valid = window.inside(self.footage.shape)
+            score = set_off(window.cut(mask) > 0.5, colors, bins_of(colors), valid)
+            found.append(_Tried(mask.astype(np.float32), score, half))
+        return _steadied(found)
+
+
+def _whole(image: np.ndarray) -> Window:
+    """A window whose cells are a frame's pixels."""
+    return Window(0, 0, max(image.shape), 1)
 
 
 def _connected(mask: np.ndarray, window: Window, seeds: np.ndarray) -> np.ndarray:

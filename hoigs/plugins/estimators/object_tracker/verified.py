@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
 from torch import Tensor
 
 from hoigs.plugins.estimators.object_tracker.appearance import (
@@ -24,9 +25,9 @@ from hoigs.plugins.estimators.object_tracker.appearance import (
 )
 from hoigs.plugins.estimators.object_tracker.footage import Footage
 from hoigs.plugins.estimators.object_tracker.path import center_of
-from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
+from hoigs.plugins.estimators.object_tracker.prompts import OF_PERSON, PromptedMask, of_person
 from hoigs.plugins.estimators.object_tracker.propagation import Track
-from hoigs.plugins.estimators.object_tracker.scene import Scene, carried
+from hoigs.plugins.estimators.object_tracker.scene import Scene, StaticScene, carried
 
 PROVEN = 0.5  # agreement from which a mask is proven by itself
 CARRIED = 0.3  # and from which it is by the frames beside it, from which it does not differ much
@@ -36,6 +37,8 @@ STEP = 1.5  # diameters a frame beside what the motion foretells: farther is a j
 BESIDE, ALONE = 0.6, (0.6, 1.4)  # of an object that has twins: its breadth, and its area before
 SAME = 6.0  # units of colour within which a place looks as it did
 THERE = 0.7  # share of a mask that looks as it did while the object was elsewhere
+FEW, FADED = 0.3, 0.5  # of a mask: share before a known scene, and of its difference from it then
+ON_PERSON, MORE = 0.6, 0.15  # share of a mask on people; how much more theirs than as clicked
 BANK = 4000  # cells of other things that are compared with
 
 
@@ -84,11 +87,13 @@ def proof_of(
     bank = _Bank.of(footage, looks, known)
     agreement = np.array([_agreement(bank, looks, i, m) for i, m in enumerate(masks)])
     agreement[given] = 1.0
-    strays = np.array([
-        i not in given and m.any() and _was_there(footage, scene, known, given, i, m)
-        for i, m in enumerate(masks)
-    ])  # fmt: skip
-    agreement[strays] = 0.0
+    most = max(OF_PERSON, MORE + max(of_person(footage, i, known.masks[i]) for i in given))
+    for i in np.flatnonzero(agreement >= CARRIED).tolist():
+        if i not in given and (
+            _was_there(footage, scene, known, given, i, masks[i])
+            or _of_people(footage, i, masks[i], most)
+        ):
+            agreement[i] = 0.0
     area = masks.sum((1, 2)).astype(float)
     agreement[~_usual_size(area, agreement >= PROVEN, given)] = 0.0
     proven = agreement >= PROVEN
@@ -142,7 +147,8 @@ def _was_there(
     i: int,
     mask: Bool[np.ndarray, "h w"],
 ) -> bool:
-    """Whether a place looks as it did in a frame in which the object is known to be elsewhere."""
+    """Whether a place looks as it did in a frame in which the object is known to be elsewhere, or
+    as the still scene does, from which the object differed when it was there."""
     y, x = np.nonzero(mask)
     here = footage.colors(i)[y, x]
     for frame in given:
@@ -150,12 +156,28 @@ def _was_there(
         inside = ((to >= 0) & (to < np.array(footage.shape[::-1]))).all(1)
         row, column = to[inside].T[::-1]
         elsewhere = (known.others(frame) & ~footage.blank[frame])[row, column]
-        if elsewhere.mean() < THERE if len(row) else True:
+        if not len(row):
             continue
-        away = np.abs(here[inside] - footage.colors(frame)[row, column]).max(1)
-        if (away[elsewhere] < SAME).mean() > THERE:
-            return True
+        if elsewhere.mean() >= THERE:
+            away = np.abs(here[inside] - footage.colors(frame)[row, column]).max(1)
+            if (away[elsewhere] < SAME).mean() > THERE:
+                return True
+        same_place = ndimage.binary_dilation(known.masks[frame], iterations=2 * footage.unit)
+        if isinstance(scene, StaticScene) and same_place[mask].mean() >= THERE:
+            now, then = (scene.difference(k)[mask] for k in (i, frame))
+            told = np.isfinite(now) & np.isfinite(then)
+            if told.mean() > FEW:
+                now, then = (np.minimum(v[told], 10).mean() for v in (now, then))
+                if now < FADED * then:
+                    return True
     return False
+
+
+def _of_people(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"], most: float) -> bool:
+    """Whether a mask lies on people and has their colours, which the object has at `most`: it is
+    the hand that held the object, or a shirt before which it was."""
+    on_person = footage.person[i][mask].mean() >= ON_PERSON
+    return bool(on_person and of_person(footage, i, mask) > most)
 
 
 def _usual_size(

@@ -10,11 +10,31 @@ import pytest
 from disc_world import COUNT, RADIUS, H, W, click, masks_of, overlaps, request, texture, world
 from test_behind import footage_of
 
-from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
+from hoigs.core.interfaces.estimator import FramePrompt, PromptPoint
+from hoigs.plugins.estimators.object_tracker.prompts import (
+    PromptedMask,
+    of_person,
+    prompted_mask,
+)
 from hoigs.plugins.estimators.object_tracker.propagation import Track
-from hoigs.plugins.estimators.object_tracker.states import LOST, OUT, PERSON, SEEN, states_of
+from hoigs.plugins.estimators.object_tracker.scene import static_scene
+from hoigs.plugins.estimators.object_tracker.states import (
+    DOUBTFUL,
+    LOST,
+    OUT,
+    PERSON,
+    SEEN,
+    states_of,
+)
 from hoigs.plugins.estimators.object_tracker.tracker import _learnt
-from hoigs.plugins.estimators.object_tracker.verified import _continued, _followed, _usual_size
+from hoigs.plugins.estimators.object_tracker.verified import (
+    Known,
+    _continued,
+    _followed,
+    _of_people,
+    _usual_size,
+    _was_there,
+)
 
 Y, X = np.mgrid[:H, :W] + 0.5
 
@@ -102,3 +122,52 @@ def test_twins_count_only_for_what_somebody_marked() -> None:
     marked = PromptedMask(0, mask.astype(np.float32), 1.0, False, nobody)
     assert _learnt(footage, [marked])[1].twins
     assert not _learnt(footage, [replace(marked, proposed=True)])[1].twins
+
+
+def thrown() -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """A ball of nearly a hand's colour on a hand, which a face shares; then it flies away."""
+    wall, skin = texture(0, (70, 80, 90))[:, :W], texture(2, (190, 140, 115))[:, :W]
+    hand, face = disc(40, 50) | (np.abs(X - 40) < 4) & (Y > 50), np.hypot(X - 80, Y - 24) < 14
+    frames, people, balls = [], [], []
+    for i in range(9):
+        image, ball = (
+            wall.copy(),
+            np.hypot(X - 40 - 4 * max(i - 3, 0), Y - 46 + 6 * max(i - 3, 0)) < 5,
+        )
+        image[hand | face] = skin[hand | face]
+        image[ball] = 205, 160, 140
+        frames.append(image.astype(np.uint8))
+        people.append(hand | face | (ball & hand))
+        balls.append(ball)
+    return frames, people, balls
+
+
+def test_a_ball_on_a_hand_is_clicked_without_the_hand() -> None:
+    frames, people, balls = thrown()
+    footage = footage_of(frames, people)
+    prompt = FramePrompt(2, (PromptPoint(40, 46),))
+    mask = prompted_mask(footage, static_scene(footage), 2, prompt).soft > 0.5
+    assert (mask & balls[2]).sum() > 0.6 * (mask | balls[2]).sum()
+
+
+def test_the_hand_that_threw_the_ball_and_the_wall_behind_it_are_not_believed() -> None:
+    frames, people, balls = thrown()
+    footage = footage_of(frames, people)
+    hand, usual = disc(40, 48), of_person(footage, 2, balls[2])
+    assert usual < 0.65
+    assert _of_people(footage, 6, hand, usual + 0.15)
+    assert not _of_people(footage, 3, balls[3], usual + 0.15)
+    scene, known = static_scene(footage), Known({6: balls[6]}, {})
+    assert _was_there(footage, scene, known, [6], 1, balls[6])  # the wall, before it came there
+    assert not _was_there(footage, scene, known, [6], 7, balls[7])
+
+
+def test_a_hand_that_was_clicked_is_doubtful() -> None:
+    person = (np.abs(X - 40) < 15) & (Y > 10)
+    image = np.full((H, W, 3), 90, np.uint8)
+    image[person] = 190, 140, 115
+    shown, cup = image.copy(), np.hypot(X - 40, Y - 40) < 3
+    shown[cup] = 240
+    soft = np.uint8(255) * np.stack([np.hypot(X - 40, Y - 40) < 5, cup])
+    states = states_of(footage_of([image, shown], [person] * 2), {"o": Track(soft, np.ones(2))})
+    assert states["o"] == [DOUBTFUL, SEEN]
