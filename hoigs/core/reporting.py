@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from html import escape
+from importlib import import_module
 from typing import Any, Literal
 
 Severity = Literal["good", "fair", "bad"]
@@ -60,3 +64,35 @@ Progress = Callable[[float, str], None]  # the share that is done, in [0, 1], an
 
 def no_progress(done: float, text: str) -> None:
     """A Progress that reports nothing."""
+
+
+EVERY_S = 0.2  # between two pictures of a bar
+
+
+class NotebookBar:
+    """A Progress as a bar below the cell of a notebook, which needs no widgets."""
+
+    def __init__(self) -> None:
+        self._shown = import_module("IPython.display").display(
+            {"text/plain": ""}, raw=True, display_id=True
+        )
+        self._last = 0.0
+
+    def __call__(self, done: float, text: str) -> None:
+        now = time.monotonic()
+        if done < 1 and now - self._last < EVERY_S:
+            return
+        self._last = now
+        bar = f"<progress max=1 value={done:.3f}></progress> {100 * done:.0f} % {escape(text)}"
+        self._shown.update({"text/html": bar, "text/plain": f"{100 * done:.0f} % {text}"}, raw=True)
+
+
+def in_notebook() -> bool:
+    """Whether this is the kernel of a notebook; a program without IPython does not import it."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return hasattr(shell, "kernel")
+
+
+def default_progress() -> Progress:
+    """What a verb reports to if its caller named nothing: a bar in a notebook, else nothing."""
+    return NotebookBar() if in_notebook() else no_progress

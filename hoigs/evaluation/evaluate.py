@@ -15,7 +15,7 @@ from hoigs.core.interfaces.rasterizer import RenderOutput
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.options import verb
 from hoigs.core.parameters import PIECE, release_time_rows
-from hoigs.core.reporting import Progress, no_progress
+from hoigs.core.reporting import Progress, default_progress
 from hoigs.core.system.threads import short_waits_when_busy
 from hoigs.core.values.clip import CAMERAS_REFINED, Clip, Frame
 from hoigs.core.values.tokens import EntityKind
@@ -58,7 +58,7 @@ def score(
     lpips: Lpips | NotComputed = NotComputed(found.reason)
     if found.location is not None:
         lpips = Lpips.load(found).to(model.device)
-    report = progress or no_progress
+    report = progress or default_progress()
     was_training = model.training
     model.eval()
     trained = {clip.moments[p].index for p in clip.split.get("train", ())}

@@ -33,6 +33,9 @@ class EvaluatedRun:
     scores: Path
     report: Path | None
 
+    def _repr_html_(self) -> str:
+        return self.evaluation._repr_html_()
+
 
 @verb(EvaluateOptions)
 @callers_random_state()

@@ -17,7 +17,7 @@ from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.options import verb
 from hoigs.core.registry.registry import default_registry
-from hoigs.core.reporting import Progress, no_progress
+from hoigs.core.reporting import Progress, default_progress
 from hoigs.core.system.files import named
 from hoigs.core.system.random_state import callers_random_state
 from hoigs.core.system.threads import short_waits_when_busy
@@ -92,7 +92,7 @@ def prepare(
         ClipError: `out` is there already, or another process is preparing it.
         HoigsError: there is no stage of a name in `redo`.
     """
-    talk = _Talk(consent, announce, progress or no_progress)
+    talk = _Talk(consent, announce, progress or default_progress())
     return _run((Path(source), Path(out)), options, body, estimators, talk).report
 
 
@@ -120,7 +120,7 @@ def prepare_until(
     check_stage(stage)
     if stage == list(PLAN)[-1]:
         raise HoigsError(f"{stage} is the last stage: run prepare as a whole")
-    talk = _Talk(consent, announce, progress or no_progress)
+    talk = _Talk(consent, announce, progress or default_progress())
     return _run((Path(source), Path(out)), options, body, estimators, talk, stage).seconds
 
 

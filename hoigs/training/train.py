@@ -8,11 +8,12 @@ import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 
 from hoigs.core.errors import Interrupted
 from hoigs.core.options import verb
-from hoigs.core.reporting import Progress
+from hoigs.core.reporting import NotebookBar, Progress, in_notebook
 from hoigs.core.system.random_state import callers_random_state
 from hoigs.evaluation.evaluate_run import EvaluatedRun
 from hoigs.evaluation.evaluate_run import evaluate as evaluate_run
@@ -47,6 +48,10 @@ class TrainedRun:
     session: Session
     evaluated: EvaluatedRun | None
 
+    def _repr_html_(self) -> str:
+        scores = "" if self.evaluated is None else self.evaluated._repr_html_()
+        return f"<p>run: {escape(str(self.path))}</p>{scores}"
+
 
 @verb(TrainOptions, "spec")
 @callers_random_state()
@@ -65,6 +70,7 @@ def train(
         clip: a clip folder, or "builtin:NAME"; with `resume` by default the run's.
         on_start: called with the Session once all input has been checked, before the first step.
         on_step: called with the StepReport of each logged step.
+            A notebook shows bars in place of both, if neither is given.
         progress: called during the evaluation with the share done, in [0, 1], and the work.
         report: called with a line of text after each part of the work.
 
@@ -91,7 +97,7 @@ def train(
             report(trainer.windows.sentence())
         if on_start is not None:
             on_start(session)
-        session.train(on_step)
+        session.train(on_step if on_step or not in_notebook() else _bar(session.spec.train.steps))
         for step, culprit in trainer.guard.skipped[:5]:
             report(f"skipped step {step}: {culprit} was not finite")
         graphed = trainer.objective.graphed_scene
@@ -106,6 +112,12 @@ def train(
         took = clock(time.perf_counter() - began)
         report(f"budget {clock(plan.limit_s)}: it took {took}")
     return TrainedRun(path, session, evaluated)
+
+
+def _bar(steps: int) -> OnStep:
+    """The steps as a notebook's bar."""
+    show = NotebookBar()
+    return lambda now: show(now.step / steps, f"step {now.step}, loss {now.loss:.4f}")
 
 
 def _scored(

@@ -16,7 +16,7 @@ from hoigs.core.model.exporter import SHEET, Exported, Exporter, ExportRequest
 from hoigs.core.model.standing import in_known_world
 from hoigs.core.options import verb
 from hoigs.core.registry.registry import Registry, default_registry
-from hoigs.core.reporting import Progress, no_progress
+from hoigs.core.reporting import Progress, default_progress
 from hoigs.core.system.files import named
 from hoigs.core.system.folder_lock import FolderLock
 from hoigs.core.values.between import frame_numbers, moment_between
@@ -78,7 +78,7 @@ def export(
         with FolderLock(target, "hoigs export"):
             refuse_existing(target)  # another process may have written it meanwhile
             _remove_unfinished(target)
-            return write_to(exporter, request, target, progress or no_progress)
+            return write_to(exporter, request, target, progress or default_progress())
     except OSError as error:
         raise HoigsError(f"{target} cannot be written: {error.strerror or error}") from error
 

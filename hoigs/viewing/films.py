@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.options import verb
 from hoigs.core.parameters import PIECE, release_time_rows
-from hoigs.core.reporting import Progress, no_progress
+from hoigs.core.reporting import Progress, default_progress
 from hoigs.core.system.threads import short_waits_when_busy
 from hoigs.core.system.video_files import ENCODERS, SUFFIXES, WITH_ALPHA, pyav, write_video
 from hoigs.core.values.between import frame_numbers
@@ -151,6 +152,13 @@ class Film:
     reason: str
     replaced: bool = False
 
+    def _repr_html_(self) -> str:
+        """The film itself, inside the page of a notebook."""
+        data, kind = base64.b64encode(self.path.read_bytes()).decode(), self.path.suffix[1:]
+        if kind == "gif":
+            return f"<img src='data:image/gif;base64,{data}'>"
+        return f"<video controls autoplay loop muted src='data:video/{kind};base64,{data}'></video>"
+
     @property
     def fps(self) -> float:
         """Frames rendered per second, without encoding."""
@@ -196,7 +204,7 @@ def render(run: Path | str, *, options: RenderOptions, progress: Progress | None
     film = [(moment, fitted(camera, options.width, options.height)) for moment, camera in views]
     several = len({(camera.width, camera.height) for camera in loaded.clip.cameras}) > 1
     shape = (views[0][1].width, views[0][1].height) if several else None
-    return _draw(loaded, film, target, rate, shape, options, progress or no_progress)
+    return _draw(loaded, film, target, rate, shape, options, progress or default_progress())
 
 
 def _target(run: Path, path: str, options: RenderOptions) -> Path:

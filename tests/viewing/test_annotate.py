@@ -18,6 +18,7 @@ from tiny import BALL, FRAMES, landmarks, masks, picture
 
 from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.errors import HoigsError
+from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.report.overlay import VideoWriter
 from hoigs.viewing.annotate.server import PageServer, annotate
 
@@ -67,7 +68,7 @@ def test_from_a_click_to_a_clip(video: Path, tmp_path: Path, window: Any) -> Non
     def prompts() -> Any:
         return json.loads(stored.read_text())["object"] if stored.exists() else []
 
-    with served(video, out=clip, overrides=QUICK) as server:
+    with served(video, out=clip, options=PrepareOptions(overrides=QUICK)) as server:
         opened = window()
         page = opened.page
         page.set_viewport_size({"width": 1000, "height": 640})
@@ -180,3 +181,15 @@ def test_a_damaged_prompt_file_is_named(video: Path, tmp_path: Path) -> None:
     shutil.copy(__file__, other)
     with pytest.raises(HoigsError, match=r"notes\.mp4 .*is not a readable video"):
         annotate(other, port=0)
+
+
+def test_the_page_fits_a_phone(video: Path, tmp_path: Path, window: Any) -> None:
+    """It is no wider than the window, and the video takes all of that."""
+    with served(video, out=tmp_path / "clip") as server:
+        page = window().page
+        page.set_viewport_size({"width": 390, "height": 844})
+        page.goto(server.address)
+        until(lambda: page.evaluate("frames.has(0)"), page, "the first frame")
+        wide = "document.documentElement.scrollWidth"
+        assert page.evaluate(wide) <= 390
+        assert page.evaluate("$('view').getBoundingClientRect().width") >= 380

@@ -13,7 +13,7 @@ from typing import Any
 
 import hoigs
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.reporting import Progress, no_progress
+from hoigs.core.reporting import Progress, default_progress
 from hoigs.core.spec.loader import load_yaml
 from hoigs.core.system.files import write_whole
 from hoigs.core.values.clip import Clip
@@ -42,7 +42,7 @@ def write_report(
         HoigsError: metrics.jsonl is damaged.
     """
     folder = Path(run_folder)
-    report = progress or no_progress
+    report = progress or default_progress()
     records = RunFolder(folder).read_metrics()
     was_training = model.training
     model.eval()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -429,7 +430,7 @@ def _views(report: Measures) -> Iterator[MeasureDiagnostic]:
     )
 
 
-# report.html: one file, which loads nothing from the network but overlay.mp4 beside it.
+# report.html: one file, which has overlay.mp4 and object.jpg inside and loads nothing.
 
 WIDTH, HEIGHT = 300, 90  # of a plot, in its own units
 Series = Mapping[str, Sequence[float | None]]
@@ -444,11 +445,10 @@ def report_page(
     diagnostics: Sequence[MeasureDiagnostic],
     rows: Sequence[Sequence[str]],
     *,
-    overlay: bool,
-    object_picture: bool = False,
+    folder: Path,
 ) -> str:
-    """The page; `rows` are what, value and note of each measure, `overlay` links overlay.mp4 and
-    `object_picture` object.jpg."""
+    """The page; `rows` are what, value and note of each measure, `folder` may have overlay.mp4 and
+    object.jpg."""
     page = (resources.files(__package__) / "page.html").read_text(encoding="utf-8")
     camera = CAMERAS[report.camera]
     return Template(page).substitute(
@@ -457,7 +457,7 @@ def report_page(
             f"{report.frames} frames of {report.video}, {report.width}×{report.height} at "
             f"{report.fps:g} a second, from {camera}."
         ),
-        video=(_video() if overlay else "") + (_object_picture() if object_picture else ""),
+        video=_within(_VIDEO, folder / "overlay.mp4") + _within(_OBJECT, folder / "object.jpg"),
         diagnostics="\n".join(map(_diagnostic, diagnostics)),
         plots=_plots(report),
         rows=_rows(rows),
@@ -467,21 +467,22 @@ def report_page(
     )
 
 
-def _video() -> str:
-    return (
-        "<video src='overlay.mp4' controls loop muted playsinline></video><p class='note'>The "
-        "fitted body in blue, the masks' outlines in green and yellow, points of the object in "
-        "magenta. If the body does not lie on the person here, nothing after it will be right.</p>"
-    )
+_VIDEO = (
+    "<video src='data:video/mp4;base64,{}' controls loop muted playsinline></video><p class='note'>"
+    "The fitted body in blue, the masks' outlines in green and yellow, points of the object in "
+    "magenta. If the body does not lie on the person here, nothing after it will be right.</p>"
+)
+_OBJECT = (
+    "<img src='data:image/jpeg;base64,{}' alt='the object in one frame' width='100%'><p "
+    "class='note'>What was taken for the object. If it is something else, run the same command "
+    "with <code>--object X,Y@FRAME</code>, a point on it in pixels of the video: only what depends "
+    "on the object is made again.</p>"
+)
 
 
-def _object_picture() -> str:
-    return (
-        "<img src='object.jpg' alt='the object in one frame' width='100%'><p class='note'>What was "
-        "taken for the object. If it is something else, run the same command with <code>--object "
-        "X,Y@FRAME</code>, a point on it in pixels of the video: only what depends on the object "
-        "is made again.</p>"
-    )
+def _within(text: str, path: Path) -> str:
+    """The text with the file's bytes; nothing where there is none."""
+    return text.format(base64.b64encode(path.read_bytes()).decode()) if path.is_file() else ""
 
 
 def _diagnostic(one: MeasureDiagnostic) -> str:
@@ -630,13 +631,7 @@ class PrepareReport(Measures):
         """report.json, report.md and report.html."""
         (folder / "report.json").write_text(self.to_json(), encoding="utf-8")
         (folder / "report.md").write_text(self.to_markdown(), encoding="utf-8")
-        page = report_page(
-            self,
-            self.diagnostics(),
-            self.rows(),
-            overlay=(folder / "overlay.mp4").is_file(),
-            object_picture=(folder / "object.jpg").is_file(),
-        )
+        page = report_page(self, self.diagnostics(), self.rows(), folder=folder)
         (folder / "report.html").write_text(page, encoding="utf-8")
 
 

@@ -173,7 +173,7 @@ class _Handler(BaseHTTPRequestHandler):
             "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
         )
         if kind.startswith("text/html") and self.path.split("/")[-1] == "report.html":
-            secure = "default-src 'none'; img-src 'self' data:; media-src 'self'; "
+            secure = "default-src 'none'; img-src 'self' data:; media-src 'self' data:; "
             secure += "style-src 'unsafe-inline'; frame-ancestors 'none'"
         try:
             self.send_response(status)

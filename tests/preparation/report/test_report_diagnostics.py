@@ -75,12 +75,13 @@ def test_the_page_is_whole_and_asks_for_nothing(tmp_path: Path) -> None:
         report(), name="<mine>", sharpness=[1.0] * 40, body_residuals_px=[None, 2.0, 3.0, None, 1.0]
     )
     parser = Tags()
-    page = report_page(shown, diagnose(shown), shown.rows(), overlay=True)
+    (tmp_path / "overlay.mp4").write_bytes(b"video")
+    page = report_page(shown, diagnose(shown), shown.rows(), folder=tmp_path)
     parser.feed(page.replace("/>", ">"))
-    assert parser.open == [] and parser.links == ["overlay.mp4"]
+    assert parser.open == [] and parser.links == ["data:video/mp4;base64,dmlkZW8="]
     assert "&lt;mine&gt;" in page and "<mine>" not in page and "$" not in page
     assert "beware of the dog" in page and "Masks, % of the image" in page
-    assert "<video" not in report_page(shown, [], [], overlay=False)
+    assert "<video" not in report_page(shown, [], [], folder=tmp_path / "none")
     shown.save(tmp_path)
     assert "What to do" in (tmp_path / "report.md").read_text()
     assert (tmp_path / "report.html").read_text().startswith("<!doctype html>")
