@@ -22,7 +22,7 @@ from hoigs.plugins.exporters.posed import SEEN, BodyMotion, ObjectMotion
 
 CELLS = 48  # of a grid along the longest side of an object
 VIEWS = 16  # cameras of the video that tell what of an object is empty
-FEWEST = 20  # points of a surface
+FEWEST = 8  # points of a surface
 ALONE = 4.0  # a point this much farther from others than usual is no part of a surface
 CELL_PX = 8  # least side of the square of two triangles, where a mesh has no texture coordinates
 NEIGHBOURS = 12  # points that a vertex of an object follows
@@ -149,6 +149,8 @@ def object_surface(
     usual = apart < ALONE * np.median(apart)
     points, spacing = points[usual], float(apart[usual].mean())
     field, low, step = _signed_distances(points, spacing, views)
+    if not (field < 0).any():  # so few points that cameras see through between them
+        field, low, step = _signed_distances(points, spacing, ())
     vertices, faces = isosurface(field)
     if not len(faces):
         return None
@@ -156,7 +158,7 @@ def object_surface(
     if not mesh.is_watertight:
         return None
     # where there are points, the surface goes through them
-    far, near = cKDTree(points).query(mesh.vertices, NEIGHBOURS)
+    far, near = cKDTree(points).query(mesh.vertices, min(NEIGHBOURS, len(points)))
     normals, reach = mesh.vertex_normals, far[:, :1] + 0.5 * spacing
     weights = np.exp(-0.5 * (far / reach) ** 2) * (far < 3 * spacing)
     middle = (points[near] * weights[..., None]).sum(1) / weights.sum(1, keepdims=True).clip(1e-9)
@@ -279,7 +281,7 @@ def _painted(
     """
     if uv is None:
         grid = int(np.ceil(np.sqrt((len(faces) + 1) // 2)))
-        side = max(side, CELL_PX * grid)
+        side = max(min(side, 3 * CELL_PX * grid), CELL_PX * grid)
         uv = _two_by_two(len(faces), grid, side)
     normals = trimesh.Trimesh(vertices, faces, process=False).vertex_normals
     texels, places = _samples(vertices[faces], uv, side)
@@ -315,7 +317,7 @@ def _two_by_two(count: int, grid: int, side: int) -> np.ndarray:
 def _samples(corners: np.ndarray, uv: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
     """Texels that faces cover, and the point of the surface at each."""
     edges = np.abs(uv - np.roll(uv, 1, 1)).max((1, 2)) * side
-    steps = 2 ** np.ceil(np.log2(2 * edges.clip(1))).astype(int)
+    steps = 2 ** np.ceil(np.log2(1.5 * edges.clip(1))).astype(int)
     found: dict[str, list[Any]] = {"texels": [], "places": []}
     for count in np.unique(steps):
         some = steps == count

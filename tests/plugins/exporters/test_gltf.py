@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -69,6 +75,41 @@ def test_trimesh_reads_closed_textured_meshes(body):
         welded.merge_vertices(merge_tex=True, merge_norm=True)
         assert welded.is_watertight and welded.volume > 0
         assert (mesh.vertex_normals * (mesh.vertices - mesh.centroid)).sum(1).mean() > 0
+
+
+IN_BLENDER = """
+import json, runpy, sys, bpy
+script, *sys.argv[1:] = sys.argv[1:]
+runpy.run_path(script, run_name="__main__")
+bpy.context.scene.frame_set(2)
+person = bpy.data.objects["human"].evaluated_get(bpy.context.evaluated_depsgraph_get())
+points = [person.matrix_world @ v.co for v in person.to_mesh().vertices]
+print("BOX", json.dumps([[f(p[k] for p in points) for k in range(3)] for f in (min, max)]))
+"""
+
+
+def test_blender_shows_the_same_body(body, upright, tmp_path):
+    python = os.environ.get("HOIGS_BPY")
+    if python is None:
+        pytest.skip("HOIGS_BPY names no Python that has Blender's bpy")
+    request, path = body
+    # as the command names the sheet of one file
+    shutil.copy(path, path.with_name("named.glb"))
+    shutil.copy(path.with_name("export.json"), path.with_name("named.glb.json"))
+    script = Path(__file__).parents[3] / "examples" / "blender_import.py"
+    wanted = tmp_path / "body.fbx", tmp_path / "run.blend"
+    done = subprocess.run(
+        [python, "-c", IN_BLENDER, script, path.with_name("named.glb"), "--fbx", wanted[0],
+         "--save", wanted[1]],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert all(p.stat().st_size > 100_000 for p in wanted)
+    box = json.loads(next(x for x in done.stdout.splitlines() if x.startswith("BOX"))[4:])
+    move = upright(request, "y")
+    seen = body_motion(request, "human").vertices(2).numpy() @ move[:3, :3].T + move[:3, 3]
+    seen = seen[:, [0, 2, 1]] * (1, -1, 1)  # z is up in Blender
+    assert np.allclose(box, (seen.min(0), seen.max(0)), atol=5e-3)
 
 
 def test_objects_and_the_camera_move(body, upright):
