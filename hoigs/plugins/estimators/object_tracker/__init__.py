@@ -2,11 +2,11 @@
 
 Entry point: `estimator`. In the order in which they work:
 
-- `pixels`: the frames, how the picture of the scene moves, and what single pixels say.
+- `footage`: the frames. `scene`: how its picture moves, and what single pixels say.
 - `proposal`: what moves and is not the person, where nothing was clicked, by `likeness`.
 - `prompts`: the mask in a clicked frame.
 - `path`: where the object is in each frame. `propagation`: its masks there. `tracker`: both, and
   again by what is `behind` it, or from `anchors`, frames in which it was found best.
-- `alike`: objects of which two tracks claim the same pixels. `notes`: what is doubtful.
-- `tracks_file`: the result, kept.
+- `verified`: the masks that are proven. `states`: where the object is in the other frames.
+- `alike`: objects of which two tracks claim the same pixels.
 """

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
+from hoigs.plugins.estimators.object_tracker.behind import Behind
 from hoigs.plugins.estimators.object_tracker.footage import (
     Window,
     bins_of,
@@ -15,7 +16,7 @@ from hoigs.plugins.estimators.object_tracker.footage import (
     to_features,
 )
 from hoigs.plugins.estimators.object_tracker.path import Evidence, Path, center_of, found_path
-from hoigs.plugins.estimators.object_tracker.prompts import Behind, PromptedMask, walked
+from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, walked
 
 # Labels of pixels from frames in which they are known: by similar patches nearby.
 

@@ -20,6 +20,7 @@ from hoigs.core.interfaces.estimator import (
     VideoRequest,
 )
 from hoigs.plugins.estimators.object_tracker.appearance import Appearance, twins_of
+from hoigs.plugins.estimators.object_tracker.behind import Behind
 from hoigs.plugins.estimators.object_tracker.footage import ColorModel, Footage, bins_of, histogram
 from hoigs.plugins.estimators.object_tracker.path import (
     Evidence,
@@ -27,7 +28,7 @@ from hoigs.plugins.estimators.object_tracker.path import (
     found_path,
     path_of,
 )
-from hoigs.plugins.estimators.object_tracker.prompts import Behind, PromptedMask, overlap, set_off
+from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overlap, set_off
 from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Track, window_of
 from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, StaticScene, median_of
 from hoigs.plugins.estimators.object_tracker.states import LOST

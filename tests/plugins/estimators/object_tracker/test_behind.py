@@ -7,6 +7,7 @@ from disc_world import COUNT, H, W, texture, world
 from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.alike import told_apart
+from hoigs.plugins.estimators.object_tracker.behind import Behind
 from hoigs.plugins.estimators.object_tracker.footage import (
     Footage,
     Window,
@@ -14,7 +15,7 @@ from hoigs.plugins.estimators.object_tracker.footage import (
     histogram,
     lab_of,
 )
-from hoigs.plugins.estimators.object_tracker.prompts import Behind, PromptedMask, overlap
+from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overlap
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.scene import static_scene
 
