@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -19,6 +20,8 @@ CAMERA = {
     "look_at": (0.0, 1.0, 0.0), "up_direction": (0.0, 1.0, 0.0), "fov": 0.7, "near": 0.01,
     "far": 100.0, "image_height": 96, "image_width": 128,
 }  # fmt: skip
+
+WAITS = 60.0  # seconds for a picture, on a busy machine
 
 
 @contextmanager
@@ -64,12 +67,14 @@ class Visitor:
         """Set the value of a control."""
         self.send(type="GuiUpdateMessage", uuid=uuid_of(viewer, label), updates={"value": value})
 
-    def gets_a_picture(self, seconds: float = 60, **camera: Any) -> bool:
-        """Whether one comes for a camera."""
-        self.send(**CAMERA | camera)
+    def gets_a_picture(self, seconds: float = WAITS, **camera: Any) -> bool:
+        """Whether one comes for a camera, which is sent until then, as by a hand at the mouse."""
         before, end = self.pictures, time.monotonic() + seconds
         while self.pictures == before and time.monotonic() < end:
+            self.send(**CAMERA | camera)
             self.listen(1)
+        if self.pictures == before and seconds >= WAITS:
+            faulthandler.dump_traceback(all_threads=True)  # what the viewer waits for
         return self.pictures > before
 
     def listen(self, seconds: float) -> None:
