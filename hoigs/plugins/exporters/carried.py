@@ -28,13 +28,13 @@ from hoigs.plugins.exporters.posed import (
     Move,
     ObjectMotion,
     body_motion,
+    eyes_of,
     object_motion,
     world_move,
 )
 
 INFLUENCES = 4  # joints that may carry a Gaussian, as many as one set of glTF's has
 NEAR = 6  # moments at which Gaussians are compared with the body, spread over all
-EYES = 8  # cameras of the video whose views of a colour are averaged, where it has no SH
 STILL_M = 5e-4  # Gaussians that all stay within this are stored once
 VISIBLE = 2 / 255  # root mean square change of colour, or what shows as much, that needs no mode
 STEADY = 0.02  # change of colour, opacity and logarithm of sizes of what is stored once
@@ -291,7 +291,7 @@ def collect(request: ExportRequest, modes: int, progress: Progress) -> list[Enti
             seen = gaussians.detach().to("cpu", torch.float32)
             seen, known = move.gaussians(seen), frames[name]
             known.append(known[0] if known and same(known[0], seen) else seen)
-    eyes = [move.points(eye) for eye in _eyes(request)]
+    eyes = [move.points(eye) for eye in eyes_of(request.clip)]
     made = []
     for i, (name, seen) in enumerate(frames.items()):
         progress(0.5 + 0.4 * i / len(frames), name)
@@ -332,10 +332,4 @@ def at_rest(request: ExportRequest, motion: BodyMotion) -> Gaussians:
     joints = Joints(joints.transforms[some], joints.turns[some])
     few = replace(motion, rotations=motion.rotations[some], transl=motion.transl[some])
     bound = body_weights(request, few, torch.stack([g.means for g in frames]))
-    return carried(motion.name, frames, joints, bound, _eyes(request), 0).gaussians
-
-
-def _eyes(request: ExportRequest) -> list[Float[Tensor, " 3"]]:
-    """Some camera centres of the video, world of the clip."""
-    eyes = [camera.to("cpu").center for camera in request.clip.cameras]
-    return eyes[:: max(1, len(eyes) // EYES)]
+    return carried(motion.name, frames, joints, bound, eyes_of(request.clip), 0).gaussians

@@ -23,10 +23,9 @@ from hoigs.core.values.between import camera_between, frame_of
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import SH_C0, Gaussians
 from hoigs.plugins.exporters.ply import parse_ply, ply_bytes
-from hoigs.plugins.exporters.posed import Move
+from hoigs.plugins.exporters.posed import Move, eyes_of
 
 FLAGS, ANTIALIASED = 14, 1  # the byte of an SPZ header, and its bit
-EYES = 8  # cameras of the video, of which a colour is the mean
 
 
 class GaussForgeExporter(Exporter):
@@ -108,8 +107,7 @@ class SplatExporter(GaussForgeExporter):
         """Colours that do not depend on the direction: band 0 alone is far from what was seen."""
         if gaussians.sh_degree == 0:
             return gaussians
-        eyes = [camera.center for camera in clip.cameras[:: max(1, len(clip) // EYES)]]
-        colors = mean_colors(gaussians.sh, gaussians.means, eyes)
+        colors = mean_colors(gaussians.sh, gaussians.means, eyes_of(clip))
         return gaussians.replace(sh=((colors - 0.5) / SH_C0)[:, None])
 
 

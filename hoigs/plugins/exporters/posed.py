@@ -292,3 +292,11 @@ def track_pose(
     quats = matrices_to_quats(pair)
     places = track.translations[[low, high]].double().cpu()
     return quats_to_matrices(slerp(quats[0], quats[1], r)), torch.lerp(places[0], places[1], r)
+
+
+EYES = 8  # cameras of the video, of whose views of a colour the mean is taken
+
+
+def eyes_of(clip: Clip) -> list[Float[Tensor, " 3"]]:
+    """Centres of some cameras of the video, spread over it: world of the clip, metres."""
+    return [camera.to("cpu").center for camera in clip.cameras[:: max(1, len(clip) // EYES)]]

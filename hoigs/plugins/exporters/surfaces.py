@@ -18,7 +18,7 @@ from hoigs.core.maths.spherical_harmonics import mean_colors
 from hoigs.core.model.exporter import ExportRequest
 from hoigs.core.values.between import camera_between, frame_of
 from hoigs.core.values.gaussians import SH_C0, Gaussians
-from hoigs.plugins.exporters.posed import SEEN, BodyMotion, ObjectMotion
+from hoigs.plugins.exporters.posed import SEEN, BodyMotion, ObjectMotion, eyes_of
 
 CELLS = 48  # of a grid along the longest side of an object
 VIEWS = 16  # cameras of the video that tell what of an object is empty
@@ -115,10 +115,7 @@ def motion_surface(
     g = g.detach().to("cpu", torch.float32)
     g = g[g.opacities > SEEN]
     turn, place = motion.rotations[0], motion.translations[0]
-    eyes = [
-        (camera.to("cpu").center) for camera in request.clip.cameras[:: len(request.clip) // 8 + 1]
-    ]
-    sh = (mean_colors(g.sh, g.means, eyes) - 0.5) / SH_C0
+    sh = (mean_colors(g.sh, g.means, eyes_of(request.clip)) - 0.5) / SH_C0
     own = g.replace(means=(g.means - place) @ turn, sh=sh[:, None])
     found = object_surface(own, object_views(request, motion), side)
     name = f"surface of {motion.name}"

@@ -62,6 +62,7 @@ def walked(
 RADII = (0.022, 0.04, 0.065, 0.1, 0.16)  # of the object, in diagonals of the image
 ROUNDS = 4
 USUAL, LARGEST = 0.25, 0.55  # of the person's mask: what a held thing may, and cannot, cover of it
+ON_PERSON = 0.6  # share of a mask on people, from which it lies on them
 OF_PERSON, HELD = 0.8, 0.5  # share of the person's colours, and that no limb reaches: see below
 UNEXPLAINED = (4.0, 7.0, 12.0)  # units of noise by which pixels differ from the scene
 WEIGHTS = (1.0, 0.8, -1.0, 0.7)  # of `_Judge.features`, by 74 clicks in benchmarks/clicks.py
@@ -224,6 +225,13 @@ def of_person(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]) -> float:
     bins = bins_of(footage.colors(i))
     own, theirs = (region.sum() * histogram(bins, region * 1.0) for region in (mask, rest))
     return float(np.minimum(own, theirs).sum() / max(mask.sum(), 1))
+
+
+def lies_on_people(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"], most: float) -> bool:
+    """Whether a mask lies on people and a share of it above `most` has their colours: it may be the
+    hand that held the object, or a shirt before which it was."""
+    on_person = footage.person[i][mask].mean() >= ON_PERSON
+    return bool(on_person and of_person(footage, i, mask) > most)
 
 
 def _novelty(masks: list[np.ndarray], away: np.ndarray, diagonal: float) -> np.ndarray:

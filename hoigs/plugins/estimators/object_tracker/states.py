@@ -9,12 +9,11 @@ from jaxtyping import Bool
 
 from hoigs.plugins.estimators.object_tracker.footage import Footage
 from hoigs.plugins.estimators.object_tracker.path import center_of
-from hoigs.plugins.estimators.object_tracker.prompts import OF_PERSON, of_person
+from hoigs.plugins.estimators.object_tracker.prompts import OF_PERSON, lies_on_people
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 
 SEEN, OUT, LOST, PERSON = "seen", "out of the picture", "lost", "hidden by a person"
 DOUBTFUL = "doubtful"  # there is a mask, and it may be a part of a person
-ON_PERSON = 0.6  # share of such a mask on a person
 RIM = 2  # pixels from the edge of the picture within which a mask reaches it
 COVERED = 0.5  # share of its place from which something hides it
 SAME_PLACE = 1.5  # breadths between the sightings around a gap, up to which it stayed about there
@@ -36,7 +35,8 @@ def states_of(footage: Footage, tracks: Mapping[str, Track | None]) -> dict[str,
             continue
         others = {n: m for n, m in masks.items() if n != name and m is not None}
         seen = np.flatnonzero(own.any((1, 2)))
-        states = [_shown(footage, i, m) if m.any() else LOST for i, m in enumerate(own)]
+        states = [LOST if not m.any() else DOUBTFUL if lies_on_people(footage, i, m, OF_PERSON)
+                  else SEEN for i, m in enumerate(own)]  # fmt: skip
         for i in np.flatnonzero(~own.any((1, 2))).tolist():
             around = [*seen[seen < i][-1:], *seen[seen > i][:1]]
             if any(_at_edge(own[k]) for k in around):
@@ -45,12 +45,6 @@ def states_of(footage: Footage, tracks: Mapping[str, Track | None]) -> dict[str,
                 states[i] = _hidden(footage, own[around[0]], own[around[1]], others, i)
         found[name] = states
     return found
-
-
-def _shown(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]) -> str:
-    if footage.person[i][mask].mean() < ON_PERSON:
-        return SEEN
-    return DOUBTFUL if of_person(footage, i, mask) > OF_PERSON else SEEN
 
 
 def _at_edge(mask: Bool[np.ndarray, "h w"]) -> bool:

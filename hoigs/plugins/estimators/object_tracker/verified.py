@@ -25,7 +25,12 @@ from hoigs.plugins.estimators.object_tracker.appearance import (
 )
 from hoigs.plugins.estimators.object_tracker.footage import Footage
 from hoigs.plugins.estimators.object_tracker.path import center_of
-from hoigs.plugins.estimators.object_tracker.prompts import OF_PERSON, PromptedMask, of_person
+from hoigs.plugins.estimators.object_tracker.prompts import (
+    OF_PERSON,
+    PromptedMask,
+    lies_on_people,
+    of_person,
+)
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.scene import Scene, StaticScene, carried
 
@@ -38,7 +43,7 @@ BESIDE, ALONE = 0.6, (0.6, 1.4)  # of an object that has twins: its breadth, and
 SAME = 6.0  # units of colour within which a place looks as it did
 THERE = 0.7  # share of a mask that looks as it did while the object was elsewhere
 FEW, FADED = 0.3, 0.5  # of a mask: share before a known scene, and of its difference from it then
-ON_PERSON, MORE = 0.6, 0.15  # share of a mask on people; how much more theirs than as clicked
+MORE = 0.15  # how much more a mask on people has of their colours than the clicked one
 BANK = 4000  # cells of other things that are compared with
 
 
@@ -91,7 +96,7 @@ def proof_of(
     for i in np.flatnonzero(agreement >= CARRIED).tolist():
         if i not in given and (
             _was_there(footage, scene, known, given, i, masks[i])
-            or _of_people(footage, i, masks[i], most)
+            or lies_on_people(footage, i, masks[i], most)
         ):
             agreement[i] = 0.0
     area = masks.sum((1, 2)).astype(float)
@@ -171,13 +176,6 @@ def _was_there(
                 if now < FADED * then:
                     return True
     return False
-
-
-def _of_people(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"], most: float) -> bool:
-    """Whether a mask lies on people and has their colours, which the object has at `most`: it is
-    the hand that held the object, or a shirt before which it was."""
-    on_person = footage.person[i][mask].mean() >= ON_PERSON
-    return bool(on_person and of_person(footage, i, mask) > most)
 
 
 def _usual_size(

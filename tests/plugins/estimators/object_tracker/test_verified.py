@@ -31,9 +31,9 @@ from hoigs.plugins.estimators.object_tracker.verified import (
     Known,
     _continued,
     _followed,
-    _of_people,
     _usual_size,
     _was_there,
+    lies_on_people,
 )
 
 Y, X = np.mgrid[:H, :W] + 0.5
@@ -155,8 +155,8 @@ def test_the_hand_that_threw_the_ball_and_the_wall_behind_it_are_not_believed() 
     footage = footage_of(frames, people)
     hand, usual = disc(40, 48), of_person(footage, 2, balls[2])
     assert usual < 0.65
-    assert _of_people(footage, 6, hand, usual + 0.15)
-    assert not _of_people(footage, 3, balls[3], usual + 0.15)
+    assert lies_on_people(footage, 6, hand, usual + 0.15)
+    assert not lies_on_people(footage, 3, balls[3], usual + 0.15)
     scene, known = static_scene(footage), Known({6: balls[6]}, {})
     assert _was_there(footage, scene, known, [6], 1, balls[6])  # the wall, before it came there
     assert not _was_there(footage, scene, known, [6], 7, balls[7])
